@@ -1,0 +1,37 @@
+"""Every error that the package raises on purpose; all of them are a :class:`StavprError`."""
+
+
+class StavprError(Exception):
+    """
+    Root of all errors raised on purpose.
+
+    Its text names the value that came, what was expected and what to do.
+    """
+
+
+class InputError(StavprError, ValueError):
+    """An array or argument has the wrong shape, type or values."""
+
+
+class SettingsError(StavprError, ValueError):
+    """A setting is out of its range, or settings contradict each other."""
+
+
+class UnavailableError(StavprError):
+    """Something that was asked for by name is not here: a device, an extra, a file of weights."""
+
+
+class ImageError(StavprError):
+    """One image cannot be decoded; the next one may be fine."""
+
+
+class SourceError(StavprError):
+    """A folder or a bag of images cannot be read."""
+
+
+class MapFileError(StavprError):
+    """A map file cannot be written, or is damaged, truncated, foreign or too new to be read."""
+
+
+class FeatureMismatchError(StavprError):
+    """The query's features were made with other settings than the map's."""
