@@ -1,0 +1,65 @@
+"""Settings of the two alignments, in the paper's symbols and with its defaults."""
+
+import math
+from dataclasses import dataclass
+
+from stavpr_ros.errors import SettingsError
+
+STRATEGIES = ('adaptive', 'vanilla', 'sliding_window', 'none')
+
+
+@dataclass(frozen=True)
+class SpatialSettings:
+    """
+    How the distance of two images is made from the distances of their strips.
+
+    :param strategy: ``adaptive`` (weight a on diagonal steps), ``vanilla`` DTW (a = 1),
+        ``sliding_window`` (the best four strips in a row), ``none`` (whole images, no alignment).
+    :param sigma: how strongly the viewpoint change raises a = sqrt(1 + sigma |I_c - c|); >= 0.
+    :param xi: restricted alignment: strips i and j with |i - j| >= xi are never aligned;
+        1 <= xi <= W, None = no restriction.
+    """
+
+    strategy: str = 'adaptive'
+    sigma: float = 1.0
+    xi: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.strategy not in STRATEGIES:
+            raise SettingsError(f'strategy {self.strategy!r} is unknown: take one of {", ".join(STRATEGIES)}')
+        if not (math.isfinite(self.sigma) and self.sigma >= 0):
+            raise SettingsError(f'sigma = {self.sigma} must be a finite number >= 0')
+        if self.xi is not None and (self.xi != int(self.xi) or self.xi < 1):
+            raise SettingsError(f'xi = {self.xi} must be a whole number >= 1, or None for no restriction')
+
+    def band(self, W: int) -> int:
+        """Return the half width of the allowed band, xi or W; refuse xi > W."""
+        if self.xi is None:
+            return W
+        if self.xi > W:
+            raise SettingsError(f'xi = {self.xi} exceeds the number of strips W = {W}: choose 1 <= xi <= {W}')
+        return int(self.xi)
+
+
+@dataclass(frozen=True)
+class SequenceSettings:
+    """
+    How a window of query images is matched with the map (LM-DTW).
+
+    :param length: images in the window, l >= 2.
+    :param beta: map images considered per query image, > 1: each start sees k = ceil(beta l).
+    """
+
+    length: int = 20
+    beta: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.length != int(self.length) or self.length < 2:
+            raise SettingsError(f'sequence length l = {self.length} must be a whole number >= 2')
+        if not (math.isfinite(self.beta) and self.beta > 1):
+            raise SettingsError(f'beta = {self.beta} must be a finite number > 1')
+
+    @property
+    def k(self) -> int:
+        """Map images seen by one start: ceil(beta l), safe against binary fractions (1.1 * 10 is 11)."""
+        return math.ceil(self.beta * self.length - 1e-9)

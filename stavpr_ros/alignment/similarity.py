@@ -1,0 +1,64 @@
+"""Cosine distances between one query image and all map images, as products on the map's device."""
+
+import numpy as np
+import torch
+
+from stavpr_ros.errors import InputError
+
+
+def _check(query: torch.Tensor, reference: torch.Tensor) -> None:
+    if query.ndim != 2 or reference.ndim != 3:
+        raise InputError(
+            f'query has shape {tuple(query.shape)}, reference {tuple(reference.shape)}: '
+            'expected (W, d) and (W, n, d)'
+        )
+    if query.shape[0] != reference.shape[0] or query.shape[1] != reference.shape[2]:
+        raise InputError(
+            f'query strips {tuple(query.shape)} do not fit reference strips {tuple(reference.shape)}: '
+            'W and d must be equal'
+        )
+
+
+def strip_distances(query: np.ndarray | torch.Tensor, reference: np.ndarray | torch.Tensor) -> torch.Tensor:
+    """
+    Distances of every query strip to every strip of every map image: d[i, j] = 1 - <x_i, y_j>.
+
+    A zero feature has the distance 1 to everything.
+
+    :param query: unit-norm local features of one image, shape (W, d), float32.
+    :param reference: those of the map, strip-major, shape (W, n, d), float32.
+    :returns: shape (W, W, n), float32, on the reference's device; d[i, j, y] is query strip i against
+        strip j of map image y. Not clipped: after a random projection slightly outside [0, 1].
+    :raises InputError: shapes that do not fit.
+    """
+    reference = torch.as_tensor(reference)
+    query = torch.as_tensor(query).to(reference.device)
+    _check(query, reference)
+    W, n, d = reference.shape
+    # weights on the right, as `linear` has them: the skinny product in its fastest orientation
+    similarity = torch.nn.functional.linear(query, reference.reshape(W * n, d))
+    return similarity.neg_().add_(1).view(W, W, n)
+
+
+def holistic_distances(
+    query: np.ndarray | torch.Tensor,
+    query_weights: np.ndarray | torch.Tensor,
+    reference: np.ndarray | torch.Tensor,
+    reference_weights: np.ndarray | torch.Tensor,
+) -> torch.Tensor:
+    """
+    Cosine distances of whole feature maps ("no alignment"), put together again from their strips.
+
+    :param query: unit-norm local features, shape (W, d), float32.
+    :param query_weights: norm of each strip over the norm of all, shape (W,).
+    :param reference: shape (W, n, d).
+    :param reference_weights: shape (W, n).
+    :returns: shape (n,), float32, on the reference's device.
+    :raises InputError: shapes that do not fit.
+    """
+    reference = torch.as_tensor(reference)
+    query = torch.as_tensor(query).to(reference.device)
+    _check(query, reference)
+    weighted = query * torch.as_tensor(query_weights).to(reference.device)[:, None]
+    similarity = torch.bmm(reference, weighted[:, :, None])[:, :, 0]
+    return 1 - (similarity * torch.as_tensor(reference_weights).to(reference.device)).sum(dim=0)

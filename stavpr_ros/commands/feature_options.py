@@ -1,0 +1,81 @@
+"""Command-line options of the features, made from each kind's settings."""
+
+import argparse
+import dataclasses
+from typing import Any
+
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.features.backbone import KINDS, settings_class
+
+
+def _boolean(text: str) -> bool:
+    if text.lower() not in ('true', 'false'):
+        raise argparse.ArgumentTypeError(f'{text!r} must be true or false')
+    return text.lower() == 'true'
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    return tuple(float(part) for part in text.split(','))
+
+
+def _converter(example: Any) -> Any:
+    if isinstance(example, bool):
+        return _boolean
+    return _numbers if isinstance(example, tuple) else type(example)
+
+
+def add_feature_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--features``, the general options, and ``--KIND-NAME`` for each setting of each kind."""
+    group = parser.add_argument_group('features')
+    group.add_argument(
+        '--features', choices=list(KINDS), default='gradient', help='kind of features (%(default)s)'
+    )
+    group.add_argument(
+        '--strips', type=int, default=7, metavar='W', help='vertical strips of an image (%(default)s)'
+    )
+    group.add_argument(
+        '--projection', type=int, metavar='D', help='random projection of each strip to D dimensions (none)'
+    )
+    group.add_argument('--seed', type=int, default=0, help='of the random projection (%(default)s)')
+    group.add_argument('--device', default='cpu', choices=('cpu', 'cuda'), help='where features are computed')
+    for kind in KINDS:
+        group = parser.add_argument_group(f'features {kind}')
+        for row in dataclasses.fields(settings_class(kind)):
+            required = row.default is dataclasses.MISSING
+            example = '' if required else row.default
+            default = 'required' if required else str(example).strip('()') or 'none'
+            group.add_argument(
+                f'--{kind}-{row.name.replace("_", "-")}',
+                type=_converter(example),
+                metavar=row.name.upper(),
+                help=f'{row.metadata["help"]} ({default})'.replace('%', '%%'),
+            )
+
+
+def backbone_settings(arguments: argparse.Namespace) -> Any:
+    """
+    Return the settings of the chosen kind from the parsed options.
+
+    :raises SettingsError: an option of this kind is missing, or one of another kind was given.
+    """
+    given: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
+    for kind, values in given.items():
+        for row in dataclasses.fields(settings_class(kind)):
+            value = getattr(arguments, f'{kind}_{row.name}')
+            if value is not None:
+                values[row.name] = value
+    for kind, values in given.items():
+        if values and kind != arguments.features:
+            name = f'--{kind}-{next(iter(values))}'.replace('_', '-')
+            raise SettingsError(
+                f'{name} was given with --features {arguments.features}: give --features {kind}'
+            )
+    wanted = settings_class(arguments.features)
+    missing = [
+        f'--{arguments.features}-{row.name.replace("_", "-")}'
+        for row in dataclasses.fields(wanted)
+        if row.default is dataclasses.MISSING and row.name not in given[arguments.features]
+    ]
+    if missing:
+        raise SettingsError(f'--features {arguments.features} needs {" and ".join(missing)}')
+    return wanted(**given[arguments.features])

@@ -1,0 +1,63 @@
+"""``ros2 run stavpr_ros node``: the place-recognition node."""
+
+import sys
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+
+from stavpr_ros.errors import StavprError
+
+HELP = """usage: node [--ros-args -p map_path:=FILE -p threshold:=VALUE [-p NAME:=VALUE ...]
+            [-r image:=TOPIC]]
+
+Recognises where the images of the topic `image` (sensor_msgs/Image) were taken on the route of a map,
+and publishes one ~/match (stavpr_msgs/PlaceMatch) for every image received; for accepted matches also
+~/place_index (std_msgs/Int32) and ~/distance (std_msgs/Float32). ~/map_info describes the map.
+
+Make the map with `build_map`. Without map_path or threshold the node stays up, says what is missing
+and publishes no match; both can be set later with `ros2 param set`.
+
+parameters:
+{parameters}
+exit codes: 0 stopped by a signal, 1 a parameter or the device does not do
+"""
+
+
+def _help() -> str:
+    from stavpr_ros.ros.parameters import PARAMETERS
+
+    rows = [
+        f'  {row.name} (default {row.default!r})\n      {row.descriptor().description}\n'
+        for row in PARAMETERS
+    ]
+    return HELP.format(parameters=''.join(rows))
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until it is stopped."""
+    arguments = sys.argv[1:] if args is None else args
+    if arguments[:1] in (['-h'], ['--help']):
+        print(_help())
+        return 0
+    from stavpr_ros.ros.node import PlaceRecognitionNode
+
+    rclpy.init(args=args)
+    node = None
+    try:
+        node = PlaceRecognitionNode()
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (StavprError, rclpy.exceptions.ParameterException) as error:
+        rclpy.logging.get_logger('stavpr').fatal(f'cannot start: {error}')
+        return 1
+    finally:
+        if node is not None:
+            node.close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,90 @@
+"""``ros2 run stavpr_ros record``: write the matches that are published to a file, one JSON object a line."""
+
+import argparse
+import json
+import math
+import sys
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from stavpr_msgs.msg import PlaceMatch
+
+EPILOG = """
+The keys are the fields of stavpr_msgs/PlaceMatch; stamps are nanoseconds, numbers that are not there
+are null, the path is a list of [query_index, map_index], received is the time of arrival (ns, system clock).
+
+exit codes: 0 done (--count reached, or stopped by a signal), 1 the file cannot be written, 2 usage
+"""
+
+
+def _stamp(time: Any) -> int:
+    return int(time.sec) * 10**9 + int(time.nanosec)
+
+
+def match_record(message: 'PlaceMatch') -> dict[str, Any]:
+    """Return a match as plain values for JSON."""
+    record: dict[str, Any] = {'stamp': _stamp(message.header.stamp), 'frame_id': message.header.frame_id}
+    for name, kind in message.get_fields_and_field_types().items():
+        value = getattr(message, name)
+        if name == 'path':
+            record[name] = [[pair.query_index, pair.map_index] for pair in value]
+        elif kind == 'builtin_interfaces/Time':
+            record[name] = _stamp(value)
+        elif name != 'header':
+            record[name] = None if isinstance(value, float) and math.isnan(value) else value
+    return record
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command."""
+    parser = argparse.ArgumentParser(
+        prog='record',
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument('--output', required=True, metavar='FILE', help='the file to write (JSON lines)')
+    parser.add_argument('--topic', default='/stavpr/match', help='topic of the matches (%(default)s)')
+    parser.add_argument('--count', type=int, default=0, help='end after so many matches (0 = go on)')
+    import rclpy
+    from rclpy.utilities import remove_ros_args
+
+    arguments = parser.parse_args(remove_ros_args(args if args is not None else sys.argv)[args is None :])
+    try:
+        file = open(arguments.output, 'w')  # noqa: SIM115
+    except OSError as error:
+        print(f'record: {error}', file=sys.stderr)
+        return 1
+    from rclpy.executors import ExternalShutdownException
+    from rclpy.qos import QoSProfile
+
+    from stavpr_msgs.msg import PlaceMatch
+
+    rclpy.init(args=args)
+    node = rclpy.create_node('stavpr_record')
+    written = 0
+
+    def write(message: PlaceMatch) -> None:
+        nonlocal written
+        record = match_record(message)
+        record['received'] = node.get_clock().now().nanoseconds
+        file.write(json.dumps(record) + '\n')
+        file.flush()
+        written += 1
+
+    node.create_subscription(PlaceMatch, arguments.topic, write, QoSProfile(depth=1000))
+    try:
+        while arguments.count == 0 or written < arguments.count:
+            rclpy.spin_once(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        file.close()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    print(f'{written} matches written to {arguments.output}')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

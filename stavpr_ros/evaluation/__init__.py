@@ -1,0 +1,1 @@
+"""Evaluation: metrics, thresholds, the demonstration world, pictures."""

@@ -1,0 +1,60 @@
+"""What a kind of features must offer, and the table of the kinds there are."""
+
+import dataclasses
+import importlib
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from stavpr_ros.errors import SettingsError
+
+# One row a kind: its name and the class that makes it. Its settings, a frozen dataclass, give the
+# command-line options and what a map remembers; see `setting` below.
+KINDS = {
+    'gradient': 'stavpr_ros.features.gradient:Gradient',
+    'onnx': 'stavpr_ros.features.onnx:Onnx',
+}
+
+
+class Backbone(Protocol):
+    """
+    Images to feature maps.
+
+    A class with this shape has an attribute ``Settings``, the frozen dataclass of its settings, and is
+    called with an instance of it and the device (``cpu``, ``cuda``).
+    """
+
+    settings: Any
+
+    def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
+        """Turn RGB images, each (h, w, 3) uint8 of any size, into feature maps (n, C, H, Wf), float."""
+        ...
+
+
+def setting(default: Any = dataclasses.MISSING, *, help: str, identity: bool = True) -> Any:
+    """
+    Declare a field of a backbone's settings.
+
+    :param help: one sentence for ``--help``.
+    :param identity: False for what does not change the features (where a file lies).
+    """
+    return dataclasses.field(default=default, metadata={'help': help}, compare=identity)
+
+
+def backbone_class(kind: str) -> Any:
+    """
+    Return the class of a kind of features, importing its module now.
+
+    :raises SettingsError: no such kind.
+    """
+    if kind not in KINDS:
+        raise SettingsError(f'features {kind!r} are unknown: take one of {", ".join(KINDS)}')
+    module, name = KINDS[kind].split(':')
+    return getattr(importlib.import_module(module), name)
+
+
+def settings_class(kind: str) -> Any:
+    """Return the frozen dataclass of a kind's settings."""
+    return backbone_class(kind).Settings

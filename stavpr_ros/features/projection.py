@@ -1,0 +1,58 @@
+"""Gaussian random projection (GRP) of local features to fewer dimensions (section 3)."""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from stavpr_ros.errors import InputError, SettingsError
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """
+    A fixed linear map of local features; a map file keeps its matrix, so that it is the same everywhere.
+
+    :param matrix: shape (d, dimension), float32.
+    :param name: how it was made, for people.
+    """
+
+    matrix: np.ndarray
+    name: str
+
+    @classmethod
+    def gaussian(cls, dimension_in: int, dimension: int = 512, seed: int = 0) -> 'Projection':
+        """
+        Draw a Gaussian matrix, entries of variance 1 / dimension, so that norms are kept on average.
+
+        :raises SettingsError: a dimension below 1.
+        """
+        if dimension_in < 1 or dimension < 1:
+            raise SettingsError(f'projection {dimension_in} -> {dimension}: both must be at least 1')
+        matrix = np.random.default_rng(seed).standard_normal((dimension_in, dimension))
+        return cls(
+            np.ascontiguousarray(matrix / np.sqrt(dimension), np.float32),
+            f'gaussian {dimension_in} -> {dimension}, seed {seed}',
+        )
+
+    @cached_property
+    def identity(self) -> str:
+        """What two projections must share to be the same: their name and the hash of their matrix."""
+        digest = hashlib.sha256(np.ascontiguousarray(self.matrix).tobytes()).hexdigest()
+        return f'{self.name}, sha256 {digest[:16]}'
+
+    def apply(self, strips: torch.Tensor) -> torch.Tensor:
+        """
+        Project local features.
+
+        :param strips: shape (W, n, d), float32.
+        :returns: shape (W, n, dimension), float32.
+        :raises InputError: another d than the matrix has rows.
+        """
+        if strips.shape[-1] != self.matrix.shape[0]:
+            raise InputError(
+                f'local features have d = {strips.shape[-1]}, the projection takes {self.matrix.shape[0]}'
+            )
+        return strips @ torch.from_numpy(self.matrix).to(strips.device)

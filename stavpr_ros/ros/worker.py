@@ -1,0 +1,71 @@
+"""One thread does the heavy work; callbacks only hand over."""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
+
+
+class Worker:
+    """
+    A thread that works on items, newest kept: when the slot is full, the oldest item is dropped.
+
+    Calls, such as loading a map, are run by the same thread, before the next item: whatever the thread
+    owns needs no lock.
+
+    :param process: called with each item.
+    :param capacity: items that may wait.
+    """
+
+    def __init__(self, process: Callable[[Any], None], capacity: int) -> None:
+        self._process = process
+        self._capacity = capacity
+        self._items: deque[Any] = deque()
+        self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name='recognition', daemon=True)
+        self._thread.start()
+
+    def put(self, item: Any) -> Any | None:
+        """Hand over an item; return the item that was dropped for it, if any."""
+        with self._changed:
+            dropped = self._items.popleft() if len(self._items) >= self._capacity else None
+            self._items.append(item)
+            self._changed.notify()
+        return dropped
+
+    def call(self, function: Callable[[], Any]) -> Future[Any]:
+        """Have the thread call a function; the future holds its result or its exception."""
+        future: Future[Any] = Future()
+        with self._changed:
+            self._calls.append((future, function))
+            self._changed.notify()
+        return future
+
+    def stop(self) -> None:
+        """Finish the item in work, drop the rest, end the thread."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify()
+        self._thread.join()
+        for future, _ in self._calls:
+            future.cancel()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._stopping or self._items or self._calls)
+                if self._stopping:
+                    return
+                call = self._calls.popleft() if self._calls else None
+                item = None if call else self._items.popleft()
+            if call is None:
+                self._process(item)
+                continue
+            future, function = call
+            try:
+                future.set_result(function())
+            except Exception as error:  # handed to whoever asked
+                future.set_exception(error)
