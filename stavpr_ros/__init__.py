@@ -1,4 +1,5 @@
-"""STA-VPR place recognition: spatio-temporal alignment of image sequences, and a ROS 2 node for it.
+"""
+STA-VPR place recognition: spatio-temporal alignment of image sequences, and a ROS 2 node for it.
 
 Importing the package itself loads nothing heavy; import what you need from its folders:
 ``alignment`` (the mathematics), ``features`` (image to local features), ``mapping`` (the reference

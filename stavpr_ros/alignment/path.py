@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stavpr_ros.errors import InputError
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -60,6 +62,11 @@ def aligned_index(path: np.ndarray, query_index: int) -> int:
 
     :param path: a warping path, shape (m, 2).
     :param query_index: 0-based row of the path.
+    :raises InputError: the path has no such row.
     """
     columns = path[path[:, 0] == query_index, 1]
+    if not columns.size:
+        raise InputError(
+            f'query index {query_index} is not on the path, which has rows 0 to {path[:, 0].max()}'
+        )
     return int(columns[0] + columns[-1]) // 2

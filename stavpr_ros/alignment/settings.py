@@ -29,7 +29,7 @@ class SpatialSettings:
             raise SettingsError(f'strategy {self.strategy!r} is unknown: take one of {", ".join(STRATEGIES)}')
         if not (math.isfinite(self.sigma) and self.sigma >= 0):
             raise SettingsError(f'sigma = {self.sigma} must be a finite number >= 0')
-        if self.xi is not None and (self.xi != int(self.xi) or self.xi < 1):
+        if self.xi is not None and not (self.xi >= 1 and float(self.xi).is_integer()):
             raise SettingsError(f'xi = {self.xi} must be a whole number >= 1, or None for no restriction')
 
     def band(self, W: int) -> int:
@@ -54,12 +54,12 @@ class SequenceSettings:
     beta: float = 2.0
 
     def __post_init__(self) -> None:
-        if self.length != int(self.length) or self.length < 2:
+        if not (self.length >= 2 and float(self.length).is_integer()):
             raise SettingsError(f'sequence length l = {self.length} must be a whole number >= 2')
         if not (math.isfinite(self.beta) and self.beta > 1):
             raise SettingsError(f'beta = {self.beta} must be a finite number > 1')
 
     @property
     def k(self) -> int:
-        """Map images seen by one start: ceil(beta l), safe against binary fractions (1.1 * 10 is 11)."""
+        """Map images seen by one start: ceil(beta l), safe against binary fractions (1.1 * 50 is 55)."""
         return math.ceil(self.beta * self.length - 1e-9)

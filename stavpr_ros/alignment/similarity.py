@@ -6,7 +6,14 @@ import torch
 from stavpr_ros.errors import InputError
 
 
-def _check(query: torch.Tensor, reference: torch.Tensor) -> None:
+def _checked(
+    query: np.ndarray | torch.Tensor, reference: np.ndarray | torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return both as float32 tensors on the reference's device."""
+    reference = torch.as_tensor(reference)
+    query = torch.as_tensor(query).to(reference.device)
+    if query.dtype != torch.float32 or reference.dtype != torch.float32:
+        raise InputError(f'query is {query.dtype}, reference {reference.dtype}: expected float32')
     if query.ndim != 2 or reference.ndim != 3:
         raise InputError(
             f'query has shape {tuple(query.shape)}, reference {tuple(reference.shape)}: '
@@ -17,6 +24,7 @@ def _check(query: torch.Tensor, reference: torch.Tensor) -> None:
             f'query strips {tuple(query.shape)} do not fit reference strips {tuple(reference.shape)}: '
             'W and d must be equal'
         )
+    return query, reference
 
 
 def strip_distances(query: np.ndarray | torch.Tensor, reference: np.ndarray | torch.Tensor) -> torch.Tensor:
@@ -31,9 +39,7 @@ def strip_distances(query: np.ndarray | torch.Tensor, reference: np.ndarray | to
         strip j of map image y. Not clipped: after a random projection slightly outside [0, 1].
     :raises InputError: shapes that do not fit.
     """
-    reference = torch.as_tensor(reference)
-    query = torch.as_tensor(query).to(reference.device)
-    _check(query, reference)
+    query, reference = _checked(query, reference)
     W, n, d = reference.shape
     # weights on the right, as `linear` has them: the skinny product in its fastest orientation
     similarity = torch.nn.functional.linear(query, reference.reshape(W * n, d))
@@ -56,9 +62,14 @@ def holistic_distances(
     :returns: shape (n,), float32, on the reference's device.
     :raises InputError: shapes that do not fit.
     """
-    reference = torch.as_tensor(reference)
-    query = torch.as_tensor(query).to(reference.device)
-    _check(query, reference)
-    weighted = query * torch.as_tensor(query_weights).to(reference.device)[:, None]
+    query, reference = _checked(query, reference)
+    query_weights = torch.as_tensor(query_weights).to(reference.device)
+    reference_weights = torch.as_tensor(reference_weights).to(reference.device)
+    if query_weights.shape != query.shape[:1] or reference_weights.shape != reference.shape[:2]:
+        raise InputError(
+            f'weights have shapes {tuple(query_weights.shape)} and {tuple(reference_weights.shape)}: '
+            f'expected {tuple(query.shape[:1])} and {tuple(reference.shape[:2])}'
+        )
+    weighted = query * query_weights[:, None]
     similarity = torch.bmm(reference, weighted[:, :, None])[:, :, 0]
-    return 1 - (similarity * torch.as_tensor(reference_weights).to(reference.device)).sum(dim=0)
+    return 1 - (similarity * reference_weights).sum(dim=0)

@@ -27,10 +27,12 @@ class Projection:
         """
         Draw a Gaussian matrix, entries of variance 1 / dimension, so that norms are kept on average.
 
-        :raises SettingsError: a dimension below 1.
+        :raises SettingsError: a dimension below 1, or a negative seed.
         """
-        if dimension_in < 1 or dimension < 1:
-            raise SettingsError(f'projection {dimension_in} -> {dimension}: both must be at least 1')
+        if dimension_in < 1 or dimension < 1 or seed < 0:
+            raise SettingsError(
+                f'projection {dimension_in} -> {dimension}, seed {seed}: expected dimensions >= 1, seed >= 0'
+            )
         matrix = np.random.default_rng(seed).standard_normal((dimension_in, dimension))
         return cls(
             np.ascontiguousarray(matrix / np.sqrt(dimension), np.float32),

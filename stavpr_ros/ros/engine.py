@@ -4,13 +4,12 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
-from stavpr_ros.errors import StavprError, UnavailableError
+from stavpr_ros.errors import StavprError
 from stavpr_ros.features import Describer
 from stavpr_ros.mapping import PlaceMap, load_map
 from stavpr_ros.recognition import Recogniser, RecognitionSettings
@@ -27,20 +26,6 @@ class EngineOptions:
     device: str = 'cpu'
     model_path: str = ''
     threads: int = 0
-
-
-def choose_device(wish: str) -> str:
-    """
-    Turn ``auto`` into ``cuda`` or ``cpu``.
-
-    :raises UnavailableError: ``cuda`` was asked for and is not there.
-    """
-    available = torch.cuda.is_available()
-    if wish == 'cuda' and not available:
-        raise UnavailableError(
-            "device 'cuda' was asked for, but torch sees no CUDA device: take 'cpu' or 'auto'"
-        )
-    return ('cuda' if available else 'cpu') if wish == 'auto' else wish
 
 
 class Engine:
@@ -72,6 +57,7 @@ class Engine:
     def limit_threads(self) -> None:
         """Limit the numerics to the threads of the options, on the thread that calls."""
         import numba
+        import torch
 
         if self._options.threads:
             torch.set_num_threads(self._options.threads)

@@ -3,6 +3,7 @@
 import traceback
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
@@ -13,7 +14,8 @@ from std_msgs.msg import Float32, Int32
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import StavprError
-from stavpr_ros.ros.engine import Engine, EngineOptions, choose_device
+from stavpr_ros.ros.devices import choose_device
+from stavpr_ros.ros.engine import Engine, EngineOptions
 from stavpr_ros.ros.messages import blank_match, map_info_message
 from stavpr_ros.ros.parameters import declare_parameters
 from stavpr_ros.ros.worker import Worker
@@ -31,17 +33,18 @@ class PlaceRecognitionNode(Node):
     def __init__(self, **options: object) -> None:
         super().__init__('stavpr', **options)
         values = declare_parameters(self)
+        device = choose_device(values['device'])
+        self.get_logger().info(f'products are computed on {device}')
         self._engine = Engine(
             EngineOptions(
                 spatial=SpatialSettings(values['strategy'], values['sigma'], values['xi'] or None),
                 sequence=SequenceSettings(values['sequence_length'], values['beta']),
                 neighbourhood=values['neighbourhood'],
-                device=choose_device(values['device']),
+                device=device,
                 model_path=values['model_path'],
                 threads=values['threads'],
             )
         )
-        self.get_logger().info(f'products are computed on {choose_device(values["device"])}')
         self._received = self._dropped = 0
         answers = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -146,6 +149,7 @@ class PlaceRecognitionNode(Node):
     def close(self) -> None:
         """End the worker and say what was done; before ``destroy_node``."""
         self._worker.stop()
-        self.get_logger().info(
+        # not the node's own logger: after a signal its context is gone, and with it /rosout
+        get_logger('stavpr_ros').info(
             f'{self._received} images received, {self._dropped} dropped, {self._engine.invalid} invalid'
         )

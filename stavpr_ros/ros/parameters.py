@@ -7,6 +7,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 
 from stavpr_ros.alignment.settings import STRATEGIES
+from stavpr_ros.ros.devices import DEVICES
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ PARAMETERS = (
         'auto',
         '',
         'Where products are computed; auto takes cuda if there is one and says what it took.',
-        choices=('auto', 'cpu', 'cuda'),
+        choices=DEVICES,
     ),
     NodeParameter(
         'strategy',

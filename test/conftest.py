@@ -1,0 +1,48 @@
+"""Fixtures: the folder of real data, synthetic images and maps."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+# A machine-wide compile cache would leak between versions: numba's cache lies beside the modules.
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+
+
+@pytest.fixture(scope='session')
+def data_folder() -> Path:
+    """The folder of real images and bags: STAVPR_DATA, or the one beside the checkout."""
+    default = Path(__file__).resolve().parents[2] / 'shared' / 'data'
+    folder = Path(os.environ.get('STAVPR_DATA', default))
+    if not folder.is_dir():
+        pytest.skip('no data folder')
+    return folder
+
+
+def route_images(count: int, seed: int = 0, size: tuple[int, int] = (96, 128)) -> list[np.ndarray]:
+    """Views of one long random texture, each a step further along it: a route in miniature, RGB uint8."""
+    rng = np.random.default_rng(seed)
+    step, (height, width) = 24, size
+    coarse = rng.integers(0, 256, (height // 8, (count * step + width) // 8 + 1, 3), np.uint8)
+    texture = np.kron(coarse, np.ones((8, 8, 1), np.uint8))
+    return [np.ascontiguousarray(texture[:, i * step : i * step + width]) for i in range(count)]
+
+
+@pytest.fixture(scope='session')
+def route() -> list[np.ndarray]:
+    """Sixty views of a made-up route."""
+    return route_images(60)
+
+
+@pytest.fixture(scope='session')
+def small_map(route):
+    """A map of the made-up route, with everything that a map can have."""
+    from stavpr_ros.features import Describer
+    from stavpr_ros.mapping import build_map
+    from stavpr_ros.sources.frame import Frame
+
+    frames = [Frame(image, (i + 1) * 10**9, f'place {i}') for i, image in enumerate(route)]
+    poses = np.zeros((len(route), 7))
+    poses[:, 0], poses[:, 6] = np.arange(len(route)), 1
+    return build_map(frames, Describer(projection=64), poses, progress=False)

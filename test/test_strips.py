@@ -1,0 +1,227 @@
+"""Vertical strips of feature maps, their norms, and the distances between them, against the oracle."""
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stavpr_ros.alignment import holistic_distances, strip_distances
+from stavpr_ros.errors import InputError
+
+torch = pytest.importorskip('torch')
+strips_module = pytest.importorskip('stavpr_ros.features.strips')
+cut_strips, normalise = strips_module.cut_strips, strips_module.normalise
+
+TOLERANCE = 1e-5
+
+
+def random_strips(seed, W, n, d, zeros):
+    """Non-negative features as a ReLU leaves them, a share of the strips all zero, (W, n, d) float32."""
+    rng = np.random.default_rng(seed)
+    strips = np.maximum(rng.standard_normal((W, n, d)), 0) * 10 ** rng.uniform(-3, 3, (W, n, 1))
+    strips[rng.random((W, n)) < zeros] = 0
+    return strips.astype(np.float32)
+
+
+def unit(strips):
+    """Unit strips (W, n, d) and weights (W, n) as numpy."""
+    directions, weights = normalise(torch.from_numpy(strips))
+    return directions.numpy(), weights.numpy()
+
+
+# ------------------------------------------------ cutting
+
+
+def test_superfluous_columns_fall_off_the_right_first():
+    # 8 columns, 3 strips of 2: r = 2, one lost on each side: (1 2) (3 4) (5 6)
+    row = torch.arange(8.0).reshape(1, 1, 1, 8)
+    assert cut_strips(row, 3)[:, 0].tolist() == [[1, 2], [3, 4], [5, 6]]
+    # 9 columns, 4 strips of 2: r = 1, floor(1 / 2) = 0 on the left
+    row = torch.arange(9.0).reshape(1, 1, 1, 9)
+    assert cut_strips(row, 4)[:, 0].tolist() == [[0, 1], [2, 3], [4, 5], [6, 7]]
+    # 13 columns, 7 strips of 1: r = 6, 3 on each side (the SqueezeNet map)
+    row = torch.arange(13.0).reshape(1, 1, 1, 13)
+    assert cut_strips(row, 7)[:, 0].tolist() == [[3], [4], [5], [6], [7], [8], [9]]
+
+
+@pytest.mark.parametrize(
+    ('shape', 'W', 'd'),
+    [((2, 1488, 7, 7), 7, 10416), ((2, 512, 14, 14), 7, 14336)],  # the paper's two backbones
+)
+def test_sizes_of_the_paper(shape, W, d):
+    strips = cut_strips(torch.zeros(shape), W)
+    assert tuple(strips.shape) == (W, 2, d)
+    assert strips.dtype == torch.float32
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    n=st.integers(0, 3),
+    channels=st.integers(1, 4),
+    height=st.integers(1, 4),
+    width=st.integers(1, 19),
+    W=st.integers(1, 9),
+)
+def test_strips_equal_the_oracle(n, channels, height, width, W):
+    W = min(W, width)
+    size = n * channels * height * width
+    maps = np.arange(size, dtype=np.float32).reshape(n, channels, height, width)
+    np.testing.assert_array_equal(cut_strips(torch.from_numpy(maps), W).numpy(), oracle.cut_strips(maps, W))
+
+
+def test_strips_of_a_strided_map_of_another_type():
+    maps = np.random.default_rng(0).random((2, 4, 9, 3))
+    strided = torch.from_numpy(maps).permute(0, 3, 1, 2)  # (2, 3, 4, 9)
+    expected = oracle.cut_strips(maps.transpose(0, 3, 1, 2).astype(np.float32), 4)
+    strips = cut_strips(strided, 4)
+    assert strips.dtype == torch.float32
+    np.testing.assert_array_equal(strips.numpy(), expected)
+
+
+def test_fewer_columns_than_strips_is_refused_by_both_numbers():
+    with pytest.raises(InputError) as error:
+        cut_strips(torch.zeros(1, 3, 5, 6), 7)
+    assert '6' in str(error.value)
+    assert '7' in str(error.value)
+
+
+@pytest.mark.parametrize('W', [0, -1])
+def test_no_strips_at_all_is_refused(W):
+    with pytest.raises(InputError) as error:
+        cut_strips(torch.zeros(1, 3, 5, 6), W)
+    assert str(W) in str(error.value)
+
+
+@pytest.mark.parametrize('shape', [(3, 5, 6), (1, 1, 3, 5, 6)])
+def test_wrong_axes_are_refused_by_name(shape):
+    with pytest.raises(InputError) as error:
+        cut_strips(torch.zeros(shape), 2)
+    assert str(shape) in str(error.value)
+
+
+# ------------------------------------------------ norms
+
+
+def test_norms_by_hand():
+    # one image, strips (3 4), (0 0), (0 12): norms 5, 0, 12, together 13
+    directions, weights = unit(np.array([[[3.0, 4]], [[0, 0]], [[0, 12]]], np.float32))
+    np.testing.assert_allclose(directions[:, 0], [[0.6, 0.8], [0, 0], [0, 1]], atol=1e-7)
+    np.testing.assert_allclose(weights[:, 0], [5 / 13, 0, 12 / 13], atol=1e-7)
+    assert directions.dtype == weights.dtype == np.float32
+
+
+def test_a_black_image_has_zero_strips_and_weights():
+    directions, weights = unit(np.zeros((7, 2, 5), np.float32))
+    assert not directions.any()
+    assert not weights.any()
+
+
+def test_input_is_left_alone():
+    strips = random_strips(0, 3, 4, 5, 0.2)
+    before = strips.copy()
+    unit(strips)
+    np.testing.assert_array_equal(strips, before)
+
+
+# ------------------------------------------------ distances
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    W=st.integers(1, 9),
+    n=st.integers(0, 6),
+    d=st.integers(1, 20),
+    zeros=st.sampled_from([0.0, 0.3, 1.0]),
+)
+def test_strip_distances_equal_the_oracle(seed, W, n, d, zeros):
+    query, reference = random_strips(seed, W, 1, d, zeros), random_strips(seed + 1, W, n, d, zeros)
+    result = strip_distances(unit(query)[0][:, 0], unit(reference)[0])
+    assert tuple(result.shape) == (W, W, n)
+    assert result.dtype == torch.float32
+    np.testing.assert_allclose(
+        result.numpy(), oracle.distances(query[:, 0], reference), rtol=0, atol=TOLERANCE
+    )
+
+
+def test_precision_at_the_size_of_vgg_features():
+    query, reference = random_strips(0, 2, 1, 14336, 0.0), random_strips(1, 2, 2, 14336, 0.0)
+    reference[0, 0] = 3 * query[0, 0]  # the same place: distance 0
+    result = strip_distances(unit(query)[0][:, 0], unit(reference)[0])
+    expected = oracle.distances(query[:, 0], reference)
+    assert expected[0, 0, 0] == pytest.approx(0, abs=1e-6)
+    np.testing.assert_allclose(result.numpy(), expected, rtol=0, atol=TOLERANCE)
+
+
+def test_rows_are_the_query_strips():
+    query = torch.tensor([[1.0, 0], [0, 1]])
+    reference = torch.tensor([[[1.0, 0]], [[1, 0]]])  # both strips like the query's first
+    assert strip_distances(query, reference)[:, :, 0].tolist() == [[0, 0], [1, 1]]
+
+
+def test_zero_strips_are_exactly_one_away_from_everything():
+    reference = random_strips(1, 4, 3, 6, 0.0)
+    reference[2] = 0
+    d = strip_distances(torch.zeros(4, 6), unit(reference)[0])
+    assert (d == 1).all()
+    d = strip_distances(unit(random_strips(2, 4, 1, 6, 0.0))[0][:, 0], unit(reference)[0])
+    assert (d[:, 2] == 1).all()
+    assert (d[:, [0, 1, 3]] < 1).all()
+
+
+def test_distances_are_not_clipped():
+    query = torch.tensor([[0.6, 0.8]])
+    assert strip_distances(query, -query[:, None]).item() == pytest.approx(2)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    W=st.integers(1, 9),
+    n=st.integers(0, 6),
+    zeros=st.sampled_from([0.0, 0.3, 1.0]),
+)
+def test_no_alignment_equals_the_oracle(seed, W, n, zeros):
+    query, reference = random_strips(seed, W, 1, 5, zeros), random_strips(seed + 1, W, n, 5, zeros)
+    (x, x_weights), (y, y_weights) = unit(query), unit(reference)
+    result = np.asarray(holistic_distances(x[:, 0], x_weights[:, 0], y, y_weights))
+    expected = [oracle.holistic_distance(query[:, 0], reference[:, image]) for image in range(n)]
+    assert result.shape == (n,)
+    np.testing.assert_allclose(result, expected, rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize(
+    ('query', 'reference', 'named'),
+    [
+        ((7, 5), (7, 3, 6), '(7, 5)'),
+        ((6, 5), (7, 3, 5), '(6, 5)'),
+        ((7, 5, 1), (7, 3, 5), '(7, 5, 1)'),
+        ((7, 5), (7, 5), '(7, 5)'),
+    ],
+)
+def test_strips_that_do_not_fit_are_refused_by_name(query, reference, named):
+    with pytest.raises(InputError) as error:
+        strip_distances(torch.zeros(query), torch.zeros(reference))
+    assert named in str(error.value)
+    with pytest.raises(InputError) as error:
+        holistic_distances(
+            torch.zeros(query), torch.zeros(query[0]), torch.zeros(reference), torch.zeros(reference[:2])
+        )
+    assert named in str(error.value)
+
+
+@pytest.mark.parametrize(('x', 'y', 'named'), [((6,), (7, 3), '(6,)'), ((7,), (7, 4), '(7, 4)')])
+def test_weights_that_do_not_fit_are_refused_by_name(x, y, named):
+    with pytest.raises(InputError) as error:
+        holistic_distances(torch.zeros(7, 5), torch.zeros(x), torch.zeros(7, 3, 5), torch.zeros(y))
+    assert named in str(error.value)
+
+
+@pytest.mark.parametrize('dtype', [torch.float64, torch.int32])
+def test_another_type_than_float32_is_refused_by_name(dtype):
+    name = str(dtype).removeprefix('torch.')
+    for query, reference in ((dtype, torch.float32), (torch.float32, dtype)):
+        with pytest.raises(InputError) as error:
+            strip_distances(torch.zeros(7, 5, dtype=query), torch.zeros(7, 3, 5, dtype=reference))
+        assert name in str(error.value)
