@@ -117,7 +117,7 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
     except InputError as error:
         print(f'no threshold is suggested: {error}')
         return
-    print(f'threshold to start with: {suggestion.threshold:.3f} (other places of this map are seldom nearer)')
+    print(f'threshold to start with: {suggestion.threshold:.3f} (tune it with a second drive)')
 
 
 def main(args: list[str] | None = None) -> int:

@@ -1,7 +1,8 @@
-"""A starting value for the threshold, from the map alone."""
+"""A threshold to start with, from the map alone."""
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from tqdm import tqdm
 
@@ -17,52 +18,65 @@ class ThresholdSuggestion:
     A threshold and what it rests on.
 
     :param threshold: the suggested value.
-    :param impostors: for each window of the map that was tried, the distance of the nearest sequence
-        elsewhere in the map, shape (windows,).
+    :param elsewhere: for each altered window of the map, the distance of the nearest sequence in
+        another part of the map, shape (windows,).
     """
 
     threshold: float
-    impostors: np.ndarray
+    elsewhere: np.ndarray
+
+
+def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np.ndarray:
+    """
+    Alter an image as another day and another lane might: shifted, lit and exposed otherwise, duller, noisy.
+
+    :param image: RGB (h, w, 3) uint8.
+    :param variant: 0..3: shifted to one side or the other, darker or brighter.
+    """
+    height, width = image.shape[:2]
+    shift = round(0.15 * width)
+    kept = image[:, shift:] if variant % 2 else image[:, : width - shift]
+    value = cv2.resize(kept, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32) / 255
+    value **= 1.6 if variant // 2 % 2 else 0.6
+    shade = cv2.resize(rng.normal(0, 0.4, (4, 5)), (width, height), interpolation=cv2.INTER_CUBIC)
+    value *= np.exp(shade)[:, :, None].astype(np.float32)
+    value = cv2.GaussianBlur(value, (0, 0), width / 320) * 0.6 + 0.25
+    value += rng.normal(0, 0.02, value.shape).astype(np.float32)
+    return (np.clip(value, 0, 1) * 255).astype(np.uint8)
 
 
 def suggest_threshold(
-    place_map: PlaceMap,
-    settings: RecognitionSettings | None = None,
-    quantile: float = 0.05,
-    windows: int = 100,
-    progress: bool = False,
+    place_map: PlaceMap, settings: RecognitionSettings | None = None, windows: int = 24, progress: bool = False
 ) -> ThresholdSuggestion:
     """
-    Ask how near the map's own windows come to *other* places of the map.
+    Ask how near the map's places come to *other* places of it when they look different.
 
-    Windows spread over the map are matched with the map without their own neighbourhood: all those
-    answers are wrong, so their distances are what a threshold must stay below. The suggestion is a low
-    quantile of them. A route driven in other light is farther from its own map than the map is from
-    itself, so this is a start; evaluate with real drives where precision matters.
+    Windows spread over the map are altered (:func:`harder_look`, on the thumbnails) and matched with the
+    map without their own neighbourhood. All those answers are wrong; the suggestion is the median of
+    their distances. It is a start: where precision matters, evaluate with a second real drive.
 
     :param settings: of the recogniser; its threshold is not used.
-    :param quantile: share of the wrong answers that would be accepted.
     :param windows: how many windows are tried.
-    :raises InputError: the map is too short to have an elsewhere.
+    :raises InputError: the map has no thumbnails, or is too short to have an elsewhere.
     """
     settings = settings or RecognitionSettings(threshold=1.0)
     sequence = settings.sequence
     n, l = len(place_map), sequence.length
     if n < 4 * l:
         raise InputError(f'a map of {n} places is too short for a threshold: at least {4 * l} are needed')
-    recogniser = Recogniser(place_map, settings)
+    if not place_map.thumbnails:
+        raise InputError('the map was built without thumbnails: a threshold cannot be tried on it')
+    recogniser, describer = Recogniser(place_map, settings), place_map.describer()
+    rng = np.random.default_rng(0)
+    elsewhere = []
     starts = np.unique(np.linspace(0, n - l, min(windows, n - l + 1)).astype(int))
-    rows: dict[int, np.ndarray] = {}  # windows overlap in small maps: each row is computed once
-    impostors = []
-    for start in tqdm(starts, desc='threshold', unit='window', disable=not progress):
-        for i in [i for i in rows if i < start]:
-            del rows[i]
-        for i in range(start, start + l):
-            if i not in rows:
-                rows[i] = recogniser.distances(place_map.features[i : i + 1])
-        elsewhere = np.stack([rows[i] for i in range(start, start + l)])
-        elsewhere[:, max(0, start - l) : start + 2 * l] = np.inf
-        nearest = best_match(match_sequence(elsewhere, sequence), settings.neighbourhood)
+    for variant, start in enumerate(tqdm(starts, desc='threshold', unit='window', disable=not progress)):
+        pictures = [place_map.thumbnail(place) for place in range(start, start + l)]
+        altered = [harder_look(picture, variant, rng) for picture in pictures if picture is not None]
+        features = describer.describe(altered)
+        window = np.stack([recogniser.distances(features[i : i + 1]) for i in range(l)])
+        window[:, max(0, start - l) : start + 2 * l] = np.inf
+        nearest = best_match(match_sequence(window, sequence), settings.neighbourhood)
         if nearest is not None:
-            impostors.append(nearest.distance)
-    return ThresholdSuggestion(float(np.quantile(impostors, quantile)), np.array(impostors))
+            elsewhere.append(nearest.distance)
+    return ThresholdSuggestion(float(np.median(elsewhere)), np.array(elsewhere))

@@ -1,0 +1,203 @@
+"""``replay``: publish the images of a bag or folder, at a pace or as fast as the node answers."""
+
+import argparse
+import math
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import rclpy
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+from tqdm import tqdm
+
+from stavpr_ros.errors import ImageError, StavprError
+from stavpr_ros.ros.replay import NoAnswerError, NobodyListensError, Replayer, ReplaySettings
+from stavpr_ros.ros.transport import prepare_transport
+from stavpr_ros.sources import open_source
+from stavpr_ros.sources.folder import FolderSource
+from stavpr_ros.sources.frame import ImageRecord
+
+DONE, BAD_INPUT, BAD_USAGE, NOBODY_LISTENS, NO_ANSWER, INTERRUPTED = 0, 1, 2, 3, 4, 130
+FOLDER_RATE = 10.0
+
+BAD_ROS_ARGUMENTS = (
+    InvalidTopicNameException,
+    rclpy_implementation.UnknownROSArgsError,
+    rclpy_implementation.RCLInvalidROSArgsError,
+)
+
+EPILOG = """\
+examples:
+  ros2 run stavpr_ros replay drive.bag
+        a ROS 1 bag with one image topic, at its recorded pace, on the topic image
+  ros2 run stavpr_ros replay drive --topic /camera/image_raw --rate 2
+        a ROS 2 bag, twice as fast
+  ros2 run stavpr_ros replay drive.mcap --lossless
+        as fast as the node answers on /stavpr/match; nothing is dropped
+  ros2 run stavpr_ros replay photos --rate 5 --ros-args -r image:=/camera/image
+        a folder of images, 5 per second, on another topic
+
+exit codes:
+  0    all images were published, and arrived where that can be known
+  1    the bag or folder cannot be read, or not one of its images
+  2    wrong usage
+  3    nobody listened within --wait seconds
+  4    an image was not answered (--lossless) or not acknowledged
+  130  interrupted
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """
+    Run the command.
+
+    :param arguments: without the program's name; the process's own if not given.
+    :returns: exit code, see ``--help``.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    # SIGTERM takes Ctrl-C's way; rclpy's own handlers would pull the context away under us
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return _run(_parser().parse_args(remove_ros_args(given)), given)
+    except KeyboardInterrupt:
+        print('replay: interrupted', file=sys.stderr)
+        return INTERRUPTED
+    except BAD_ROS_ARGUMENTS as error:
+        print(f'replay: error: {error}', file=sys.stderr)
+        return BAD_USAGE
+    except StavprError as error:
+        print(f'replay: error: {error}', file=sys.stderr)
+        return _exit_code(error)
+
+
+def _exit_code(error: StavprError) -> int:
+    if isinstance(error, NobodyListensError):
+        return NOBODY_LISTENS
+    return NO_ANSWER if isinstance(error, NoAnswerError) else BAD_INPUT
+
+
+def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
+    skipped: list[ImageError] = []
+
+    def skip(error: ImageError) -> None:
+        skipped.append(error)
+        notify(f'skipped: {error}')
+        bar.update()
+
+    def notify(text: str) -> None:
+        tqdm.write(f'replay: {text}', file=sys.stderr)
+
+    source = open_source(options.bag, options.topic, skip)
+    if isinstance(source, FolderSource):
+        records, rate = source.records(options.rate or FOLDER_RATE), 1.0
+    else:
+        records, rate = source.records(), options.rate or 1.0
+    settings = ReplaySettings(
+        options.publish_to, options.match_topic, rate, options.lossless, options.timeout, options.wait
+    )
+    # no bar where there is no terminal
+    with tqdm(total=len(source), unit='image', desc='replay', disable=None) as bar:
+        report = _play(records, settings, ros_arguments, notify, bar.update)
+    print(f'{report}, {len(skipped)} skipped')
+    return BAD_INPUT if len(skipped) == len(source) else DONE
+
+
+def _play(
+    records: Iterator[ImageRecord],
+    settings: ReplaySettings,
+    ros_arguments: list[str],
+    notify: Callable[[str], None],
+    count: Callable[[], object],
+) -> str:
+    """Replay over ROS and say in words what was done."""
+    prepare_transport()
+    rclpy.init(args=ros_arguments, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = rclpy.create_node('stavpr_replay')
+        try:
+            replayer = Replayer(node, settings, notify)
+            try:
+                return _feed(replayer, records, count)
+            finally:
+                replayer.close()
+        finally:
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
+def _feed(replayer: Replayer, records: Iterator[ImageRecord], count: Callable[[], object]) -> str:
+    replayer.wait_for_listeners()
+    began = time.monotonic()
+    for record in records:
+        replayer.send(record)
+        count()
+    seconds = time.monotonic() - began
+    replayer.finish()
+    answers = ''
+    if replayer.settings.lossless:
+        answers = f', {replayer.resent} sent again, {replayer.dropped} dropped'
+    return (
+        f'{replayer.published} images published on {replayer.publisher.topic_name} in {seconds:.1f} s '
+        f'({replayer.published / max(seconds, 1e-9):.1f} per second){answers}'
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='replay',
+        description=__doc__.partition(': ')[2],
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        'bag',
+        metavar='BAG',
+        help='a ROS 2 bag (folder, .db3 or .mcap file), a ROS 1 .bag, or a folder of images',
+    )
+    parser.add_argument('--topic', help='image topic in the bag; needed if there are several')
+    parser.add_argument(
+        '--publish-to', default='image', metavar='TOPIC', help='where to publish (%(default)s)'
+    )
+    pace = parser.add_mutually_exclusive_group()
+    pace.add_argument(
+        '--rate',
+        type=_positive,
+        metavar='R',
+        help=f'factor on the recorded pace (1), or images per second of a folder ({FOLDER_RATE:g})',
+    )
+    pace.add_argument(
+        '--lossless', action='store_true', help='send the next image when the node has answered the last one'
+    )
+    parser.add_argument(
+        '--match-topic',
+        default='stavpr/match',
+        metavar='TOPIC',
+        help='where the node answers, one message per image, for --lossless (%(default)s)',
+    )
+    parser.add_argument(
+        '--timeout',
+        type=_positive,
+        default=20.0,
+        metavar='S',
+        help='seconds to wait for an answer before an image is sent again; 3 tries (%(default)g)',
+    )
+    parser.add_argument(
+        '--wait', type=_positive, metavar='S', help='seconds to wait for a listener (for ever)'
+    )
+    return parser
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not (value > 0 and math.isfinite(value)):
+        raise argparse.ArgumentTypeError(f'{text}: expected a number above 0')
+    return value
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,44 @@
+"""Everything that turns folders, bags and messages into images."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stavpr_ros.errors import ImageError, SourceError
+
+if TYPE_CHECKING:
+    from stavpr_ros.sources.bag import BagSource
+    from stavpr_ros.sources.folder import FolderSource
+
+
+def open_source(
+    path: str | Path,
+    topic: str | None = None,
+    on_error: Callable[[ImageError], None] | None = None,
+) -> 'FolderSource | BagSource':
+    """
+    Open a folder of images or a bag, whichever it is.
+
+    :param path: a folder of images; a ROS 2 bag (its folder, or its .db3 or .mcap file); a ROS 1 .bag file.
+    :param topic: the bag's image topic; may be left out if there is only one. Not for folders of images.
+    :param on_error: called with the error of an image that cannot be decoded, which is then skipped;
+        without it the error is raised.
+    :raises SourceError: it cannot be read, or which topic is meant is not clear.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise SourceError(f'{path} does not exist: expected a folder of images or a bag')
+    # imported here: rosbags and OpenCV take a moment that `import stavpr_ros` must not
+    from stavpr_ros.sources.bag import BagSource, is_bag
+    from stavpr_ros.sources.folder import FolderSource
+
+    if is_bag(path):
+        return BagSource(path, topic, on_error)
+    if not path.is_dir():
+        raise SourceError(
+            f'{path} is no folder and no bag: expected images, a ROS 2 bag (folder, .db3, .mcap) '
+            'or a ROS 1 .bag'
+        )
+    if topic is not None:
+        raise SourceError(f'topic {topic!r} was given, but {path} is a folder of images: leave the topic out')
+    return FolderSource(path, on_error)

@@ -1,0 +1,174 @@
+"""The images of one topic of a ROS 1 or ROS 2 bag as a sequence."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from stavpr_ros.errors import ImageError, SourceError
+from stavpr_ros.sources.bag_file import OpenBag, is_bag, message_type, open_bag, reading
+from stavpr_ros.sources.encodings import NOT_PICTURES, decode_compressed, decode_image
+from stavpr_ros.sources.frame import Frame, ImageRecord
+
+__all__ = ['BagSource', 'ImageRecord', 'image_topics', 'is_bag']
+
+RAW = 'sensor_msgs/msg/Image'
+COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+SECOND = 1_000_000_000
+Item = TypeVar('Item')
+
+
+def image_topics(path: str | Path) -> dict[str, tuple[str, int]]:
+    """
+    List the image topics of a bag.
+
+    :param path: as for :class:`BagSource`.
+    :returns: topic to (message type, number of messages), sorted by topic.
+    :raises SourceError: the bag cannot be read.
+    """
+    with open_bag(Path(path)) as bag:
+        return {topic: found for topic, found in _topics(bag).items() if found[0] in {RAW, COMPRESSED}}
+
+
+class BagSource:
+    """
+    The images of one topic, raw or compressed, in the order of recording.
+
+    Iterating gives :class:`Frame` with the header's stamp (the time of recording where that is 0) and
+    ``topic#i`` as identifier, i counting the topic's messages from 0. Every iteration opens the bag anew.
+
+    :param path: a ROS 1 .bag file; a ROS 2 bag: its folder, or its .db3 or .mcap file.
+    :param topic: the image topic; may be left out if there is only one.
+    :param on_error: called with the :class:`ImageError` of an image that cannot be decoded, which is then
+        skipped; without it the error is raised.
+    :raises SourceError: the bag cannot be read, there is no such topic, or which one is meant is not clear.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        topic: str | None = None,
+        on_error: Callable[[ImageError], None] | None = None,
+    ) -> None:
+        self.path = Path(path)
+        self.on_error = on_error
+        if not self.path.exists():
+            raise SourceError(f'{self.path} does not exist: expected a bag')
+        with open_bag(self.path) as bag:
+            topics = _topics(bag)
+        self.topic = _choose(self.path, topics, topic)
+        self.message_type, self._count = topics[self.topic]
+
+    def __len__(self) -> int:
+        """Return the number of the topic's messages, decodable or not, as the bag states it."""
+        return self._count
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Decode one image after the other."""
+        return self._each(self._frame)
+
+    def records(self) -> Iterator[ImageRecord]:
+        """
+        Give the messages as they were recorded; compressed images decoded to ``rgb8``.
+
+        :raises SourceError: the bag is damaged further on, or ends early.
+        """
+        return self._each(lambda _, record: record)
+
+    def _frame(self, index: int, record: ImageRecord) -> Frame:
+        image = decode_image(
+            record.height, record.width, record.encoding, record.is_bigendian, record.step, record.data
+        )
+        return Frame(image, record.stamp_ns or record.time_ns, f'{self.topic}#{index}')
+
+    def _each(self, finish: Callable[[int, ImageRecord], Item]) -> Iterator[Item]:
+        with open_bag(self.path) as bag:
+            index = -1
+            for index, (time_ns, raw) in enumerate(self._messages(bag)):
+                try:
+                    item = finish(index, self._record(bag, time_ns, raw))
+                except ImageError as error:
+                    named = ImageError(f'{self.path}, {self.topic}#{index}: {error}')
+                    if self.on_error is None:
+                        raise named from error
+                    self.on_error(named)
+                    continue
+                yield item
+            if index + 1 < self._count:
+                raise SourceError(
+                    f'{self.path} ends early: {index + 1} of the {self._count} messages of {self.topic} '
+                    'that it states are there; try `ros2 bag reindex`'
+                )
+
+    def _messages(self, bag: OpenBag) -> Iterator[tuple[int, bytes]]:
+        wanted = [connection for connection in bag.connections if connection.topic == self.topic]
+        with reading(self.path):
+            for _, time_ns, raw in bag.reader.messages(wanted):
+                yield time_ns, raw
+
+    def _record(self, bag: OpenBag, time_ns: int, raw: bytes) -> ImageRecord:
+        try:
+            message = bag.deserialize(raw, self.message_type)
+        except Exception as error:  # garbage makes a parser raise errors of many kinds
+            raise ImageError(f'{len(raw)} bytes are no {self.message_type}: {error}') from error
+        stamp = message.header.stamp
+        stamp_ns = stamp.sec * SECOND + stamp.nanosec
+        frame_id = message.header.frame_id
+        if self.message_type == COMPRESSED:
+            return ImageRecord.of_image(_decompress(message), time_ns, stamp_ns, frame_id)
+        return ImageRecord(
+            time_ns,
+            stamp_ns,
+            frame_id,
+            message.height,
+            message.width,
+            message.encoding,
+            bool(message.is_bigendian),
+            message.step,
+            message.data,
+        )
+
+
+def _decompress(message: Any) -> np.ndarray:
+    original = message.format.partition(';')[0].strip()
+    if original in NOT_PICTURES:
+        raise ImageError(
+            f'compressed format {message.format!r} holds depth or measurements, not a picture: '
+            "choose the camera's colour or grey topic"
+        )
+    return decode_compressed(message.data)
+
+
+def _topics(bag: OpenBag) -> dict[str, tuple[str, int]]:
+    """Topic to (type, messages); the publishers of one topic added up."""
+    types: dict[str, set[str]] = {}
+    counts: dict[str, int] = {}
+    for connection in bag.connections:
+        types.setdefault(connection.topic, set()).add(message_type(connection))
+        counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+    return {topic: (' and '.join(sorted(types[topic])), counts[topic]) for topic in sorted(types)}
+
+
+def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -> str:
+    """Find the topic that is meant, or say what there is."""
+    images = {name: found for name, found in topics.items() if found[0] in {RAW, COMPRESSED}}
+    if topic is not None:
+        name = next((name for name in topics if name.lstrip('/') == topic.lstrip('/')), None)
+        if name in images:
+            if not images[name][1]:
+                raise SourceError(f'topic {name!r} of {path} has no messages: there are {_listed(images)}')
+            return name
+        what = 'is not in' if name is None else f'is of type {topics[name][0]}, not an image, in'
+        raise SourceError(f'topic {topic!r} {what} {path}: expected one of {_listed(images or topics)}')
+    filled = {name: found for name, found in images.items() if found[1]}
+    if len(filled) == 1:
+        return next(iter(filled))
+    if filled:
+        raise SourceError(f'{path} has {len(filled)} image topics, choose one (--topic): {_listed(filled)}')
+    raise SourceError(f'{path} has no images (expected {RAW} or {COMPRESSED}): there are {_listed(topics)}')
+
+
+def _listed(topics: dict[str, tuple[str, int]]) -> str:
+    rows = [f'{name} ({kind}, {count} messages)' for name, (kind, count) in topics.items()]
+    return ', '.join(rows) or 'no topics at all'

@@ -1,0 +1,148 @@
+"""Opens bag files of every kind with rosbags, without ever writing beside them."""
+
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag2 import Reader as Ros2Reader
+from rosbags.typesys import Stores, get_typestore
+
+from stavpr_ros.errors import SourceError, StavprError
+
+METADATA = 'metadata.yaml'
+STORAGE_SUFFIXES = frozenset({'.db3', '.mcap'})
+LOG_SUFFIXES = ('-wal', '-journal')
+"""What SQLite keeps beside a database: writes that are not in the database itself yet."""
+
+
+@dataclass(frozen=True)
+class OpenBag:
+    """
+    A bag that is open for reading.
+
+    :param reader: of rosbags.
+    :param deserialize: (bytes, message type) to message. Only types of ``sensor_msgs`` are read here, which
+        are the same in every distribution, so no definition is needed from the bag: old bags have none.
+    """
+
+    reader: Ros1Reader | Ros2Reader
+    deserialize: Callable[[bytes, str], Any]
+
+    @property
+    def connections(self) -> list[Connection]:
+        """What was recorded, one entry per topic and publisher."""
+        return list(self.reader.connections)
+
+
+def is_bag(path: Path) -> bool:
+    """Tell a bag from a folder of images by its names; whether it is sound shows on reading."""
+    if path.is_dir():
+        return (path / METADATA).exists() or bool(_storage_files(path))
+    return path.suffix in STORAGE_SUFFIXES or path.suffix == '.bag'
+
+
+def message_type(connection: Connection) -> str:
+    """Full name of the type; bags of before 2019 say ``sensor_msgs/Image``."""
+    package, _, name = connection.msgtype.rpartition('/')
+    return connection.msgtype if package.endswith('/msg') else f'{package}/msg/{name}'
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[OpenBag]:
+    """
+    Open a bag for as long as the block runs.
+
+    :param path: a ROS 1 .bag file; a ROS 2 bag: its folder, or its .db3 or .mcap file.
+    :raises SourceError: it cannot be read.
+    """
+    with TemporaryDirectory(prefix='stavpr_bag_') as scratch:
+        with reading(path):
+            reader: Ros1Reader | Ros2Reader
+            if path.suffix == '.bag' and path.is_file():
+                reader = Ros1Reader(path)
+                deserialize = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
+            else:
+                reader = Ros2Reader(_stage(path, Path(scratch)))
+                deserialize = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
+            reader.open()
+        try:
+            yield OpenBag(reader, deserialize)
+        finally:
+            reader.close()
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn what rosbags raises on a damaged file, errors of many kinds, into one that names the file."""
+    try:
+        yield
+    except StavprError:
+        raise
+    except OSError as error:
+        raise SourceError(f'{path} cannot be read: {error}; check its name and permissions') from error
+    except Exception as error:
+        raise SourceError(
+            f'{path} is damaged, cut off or no bag: expected a ROS 2 bag (folder, .db3, .mcap) or a ROS 1 '
+            f'.bag ({type(error).__name__}: {error}); try `ros2 bag reindex` or `rosbag reindex`'
+        ) from error
+
+
+def _storage_files(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.iterdir() if file.suffix in STORAGE_SUFFIXES)
+
+
+def _stage(path: Path, scratch: Path) -> Path:
+    """
+    Make links (copies where needed) in a folder of our own, and give the path to open there.
+
+    rosbags opens databases as immutable, which writes nothing, but does not see what SQLite keeps in its
+    logs; and it does not quote file names. Both are settled by giving it files of ours.
+    """
+    if path.is_file():
+        return _stage_file(path, scratch / f'bag{path.suffix}')
+    if not (path / METADATA).exists():
+        return _stage_file(_only_storage_file(path), scratch)
+    folder = scratch / 'bag'
+    folder.mkdir()
+    for file in path.iterdir():
+        if file.is_file() and not file.name.endswith(LOG_SUFFIXES):
+            _stage_file(file, folder / file.name)
+    return folder
+
+
+def _only_storage_file(folder: Path) -> Path:
+    """Find the one file of a bag whose recording was killed before its metadata was written."""
+    files = _storage_files(folder)
+    if len(files) != 1:
+        names = ', '.join(file.name for file in files) or 'none'
+        raise SourceError(
+            f'{folder} has no {METADATA}: expected exactly one .db3 or .mcap file then, found {names}; '
+            'run `ros2 bag reindex`, or name one of the files'
+        )
+    return files[0]
+
+
+def _stage_file(file: Path, target: Path) -> Path:
+    if target.is_dir():
+        target /= f'bag{file.suffix}'
+    logs = [log for end in LOG_SUFFIXES if (log := Path(f'{file}{end}')).exists() and log.stat().st_size]
+    if file.suffix != '.db3' or not logs:
+        target.symlink_to(file.resolve())
+        return target
+    shutil.copyfile(file, target)
+    for log in logs:
+        shutil.copyfile(log, f'{target}{log.name.removeprefix(file.name)}')
+    database = sqlite3.connect(target)
+    try:
+        # opening it rolls a journal back; this brings a write-ahead log home
+        database.execute('PRAGMA wal_checkpoint(TRUNCATE)').fetchall()
+    finally:
+        database.close()
+    return target

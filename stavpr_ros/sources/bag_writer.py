@@ -1,0 +1,73 @@
+"""Writes image records into a new ROS 2 bag."""
+
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from stavpr_ros.errors import SettingsError, SourceError
+from stavpr_ros.sources.bag import RAW, SECOND
+from stavpr_ros.sources.frame import ImageRecord
+
+STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
+VERSION: int = 9
+"""Of the bag's metadata: the one that ROS 2 Jazzy writes."""
+
+
+def write_bag(
+    path: str | Path,
+    topic: str,
+    records: Iterable[ImageRecord],
+    storage: str = 'sqlite3',
+) -> int:
+    """
+    Write a bag with one topic of raw images; what was written is removed again if that fails.
+
+    :param path: the bag's folder, which must not exist yet.
+    :param topic: topic of the images.
+    :param records: the images, in the order of their times of recording.
+    :param storage: ``sqlite3`` or ``mcap``.
+    :returns: number of images written.
+    :raises SourceError: the folder exists, or cannot be written.
+    """
+    path = Path(path)
+    plugin = STORAGES.get(storage)
+    if plugin is None:
+        raise SettingsError(f'storage {storage!r}: expected one of {", ".join(STORAGES)}')
+    if path.exists():
+        raise SourceError(f'{path} exists already: expected a new folder; remove it or choose another name')
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    count = 0
+    try:
+        with Writer(path, version=VERSION, storage_plugin=plugin) as writer:  # type: ignore[arg-type]
+            connection = writer.add_connection(topic, RAW, typestore=typestore)
+            for record in records:
+                _write(writer, connection, typestore, record)
+                count += 1
+    except BaseException as error:
+        shutil.rmtree(path, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise SourceError(f'{path} cannot be written: {error}; check permissions and space') from error
+        raise
+    return count
+
+
+def _write(writer: Writer, connection: Connection, typestore: Typestore, record: ImageRecord) -> None:
+    types = typestore.types
+    seconds, nanoseconds = divmod(record.stamp_ns, SECOND)
+    stamp = types['builtin_interfaces/msg/Time'](sec=seconds, nanosec=nanoseconds)
+    message = types[RAW](
+        header=types['std_msgs/msg/Header'](stamp=stamp, frame_id=record.frame_id),
+        height=record.height,
+        width=record.width,
+        encoding=record.encoding,
+        is_bigendian=int(record.is_bigendian),
+        step=record.step,
+        data=np.frombuffer(record.data, np.uint8),
+    )
+    writer.write(connection, record.time_ns, typestore.serialize_cdr(message, RAW))

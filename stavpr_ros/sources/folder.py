@@ -1,0 +1,94 @@
+"""A folder of image files as a sequence."""
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from stavpr_ros.errors import ImageError, InputError, SourceError
+from stavpr_ros.sources.encodings import decode_compressed
+from stavpr_ros.sources.frame import Frame, ImageRecord
+
+SUFFIXES = frozenset({'.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'})
+SECOND = 1_000_000_000
+
+
+def natural_key(name: str) -> tuple[list[str | int], str]:
+    """Sort key that puts ``2.jpg`` before ``10.jpg``; the name itself decides between ``1`` and ``01``."""
+    # the parts alternate between text and number, so that like is compared with like
+    parts = re.split(r'(\d+)', name)
+    return [int(part) if i % 2 else part.casefold() for i, part in enumerate(parts)], name
+
+
+class FolderSource:
+    """
+    The images of one folder in natural order; sub-folders and hidden files are left out.
+
+    Iterating gives :class:`Frame` with the file's name as identifier and an unknown stamp.
+
+    :param path: the folder.
+    :param on_error: called with the :class:`ImageError` of a file that cannot be read, which is then
+        skipped; without it the error is raised.
+    :raises SourceError: there is no such folder, or no image in it.
+    """
+
+    def __init__(self, path: str | Path, on_error: Callable[[ImageError], None] | None = None) -> None:
+        self.path = Path(path)
+        self.on_error = on_error
+        if not self.path.is_dir():
+            raise SourceError(f'{self.path} is not a folder: expected a folder of images')
+        try:
+            files = [file for file in self.path.iterdir() if _is_image(file)]
+        except OSError as error:
+            raise SourceError(f'{self.path} cannot be listed: {error.strerror}; check permissions') from error
+        if not files:
+            expected = ' '.join(sorted(SUFFIXES))
+            raise SourceError(
+                f'{self.path} holds no images: expected files ending in {expected}, not in sub-folders'
+            )
+        self.files: list[Path] = sorted(files, key=lambda file: natural_key(file.name))
+
+    def __len__(self) -> int:
+        """Return the number of image files, readable or not."""
+        return len(self.files)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Decode one file after the other."""
+        for _, frame in self._numbered():
+            yield frame
+
+    def records(self, frames_per_second: float) -> Iterator[ImageRecord]:
+        """
+        Give the images as messages; file i (from 1) is stamped i / frames_per_second, since 0 means unknown.
+
+        :param frames_per_second: frame rate to pretend, above 0.
+        """
+        if not frames_per_second > 0:
+            raise InputError(f'{frames_per_second} frames per second: expected more than 0')
+        for i, frame in self._numbered():
+            yield ImageRecord.of_image(frame.image, round((i + 1) * SECOND / frames_per_second))
+
+    def _numbered(self) -> Iterator[tuple[int, Frame]]:
+        for i, file in enumerate(self.files):
+            try:
+                frame = Frame(_read(file), 0, file.name)
+            except ImageError as error:
+                if self.on_error is None:
+                    raise
+                self.on_error(error)
+                continue
+            yield i, frame
+
+
+def _is_image(file: Path) -> bool:
+    return file.suffix.lower() in SUFFIXES and not file.name.startswith('.') and file.is_file()
+
+
+def _read(file: Path) -> np.ndarray:
+    try:
+        return decode_compressed(file.read_bytes())
+    except OSError as error:
+        raise ImageError(f'{file} cannot be read: {error.strerror}; check its permissions') from error
+    except ImageError as error:
+        raise ImageError(f'{file}: {error}') from error

@@ -1,0 +1,69 @@
+"""What sources give: an image ready to use, or an image message as it was recorded."""
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """
+    One image of a sequence.
+
+    :param image: RGB, uint8, shape (height, width, 3), C-contiguous.
+    :param stamp: when it was taken, nanoseconds; 0 = unknown.
+    :param identifier: what to call it: a file name, or topic and number.
+    """
+
+    image: np.ndarray
+    stamp: int
+    identifier: str
+
+
+@dataclass(frozen=True, eq=False)
+class ImageRecord:
+    """
+    One recorded ``sensor_msgs/Image``, field by field, not decoded.
+
+    :param time_ns: when it was recorded, nanoseconds: the pace of a replay.
+    :param stamp_ns: header stamp, nanoseconds; may be 0 or repeat.
+    :param frame_id: header frame.
+    :param height: rows.
+    :param width: pixels per row.
+    :param encoding: as in ``sensor_msgs/image_encodings``.
+    :param is_bigendian: byte order of 16 bit values.
+    :param step: bytes from one row to the next.
+    :param data: the bytes: anything with the buffer protocol.
+    """
+
+    time_ns: int
+    stamp_ns: int
+    frame_id: str
+    height: int
+    width: int
+    encoding: str
+    is_bigendian: bool
+    step: int
+    data: Any
+
+    @classmethod
+    def of_image(
+        cls,
+        image: np.ndarray,
+        time_ns: int,
+        stamp_ns: int | None = None,
+        frame_id: str = '',
+    ) -> Self:
+        """
+        Make a record of an RGB image.
+
+        :param image: RGB, uint8, shape (height, width, 3).
+        :param time_ns: when it was recorded, nanoseconds.
+        :param stamp_ns: header stamp, nanoseconds; the time of recording if not given.
+        :param frame_id: header frame.
+        """
+        height, width = image.shape[:2]
+        stamp = time_ns if stamp_ns is None else stamp_ns
+        data = np.ascontiguousarray(image).reshape(-1)
+        return cls(time_ns, stamp, frame_id, height, width, 'rgb8', False, width * 3, data)

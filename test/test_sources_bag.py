@@ -1,0 +1,245 @@
+"""Bags of every kind: written and read back, real, damaged."""
+
+import hashlib
+import shutil
+import sqlite3
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_typestore
+
+from stavpr_ros.errors import ImageError, SettingsError, SourceError
+from stavpr_ros.sources import open_source
+from stavpr_ros.sources.bag import COMPRESSED, RAW, BagSource, image_topics
+from stavpr_ros.sources.bag_writer import write_bag
+from stavpr_ros.sources.frame import ImageRecord
+
+T0 = 1_700_000_000_000_000_000
+FIELDS = ('time_ns', 'stamp_ns', 'frame_id', 'height', 'width', 'encoding', 'is_bigendian', 'step')
+
+
+def records(count=5, stamped=True):
+    rng = np.random.default_rng(0)
+    for i in range(count):
+        image = rng.integers(0, 256, (6, 8, 3), np.uint8)
+        time_ns = T0 + i * 100_000_000
+        yield ImageRecord.of_image(image, time_ns, time_ns - 7 if stamped else 0, 'camera')
+
+
+def write_mixed(path, ros1=False, bad=()):
+    """A bag with /raw, /small (compressed, PNG) and /text; messages in `bad` of /small are damaged."""
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
+    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
+    types = store.types
+    extra = {'seq': 0} if ros1 else {}
+    with Ros1Writer(path) if ros1 else Ros2Writer(path, version=9) as writer:
+        kinds = {'/raw': RAW, '/small': COMPRESSED, '/text': 'std_msgs/msg/String', '/silent': RAW}
+        topics = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
+        for i, record in enumerate(records()):
+            stamp = types['builtin_interfaces/msg/Time'](sec=i, nanosec=5)
+            header = types['std_msgs/msg/Header'](stamp=stamp, frame_id='camera', **extra)
+            raw = types[RAW](
+                header=header, height=6, width=8, encoding='rgb8', is_bigendian=0, step=24, data=record.data
+            )
+            png = cv2.imencode('.png', record.data.reshape(6, 8, 3)[..., ::-1].copy())[1].ravel()
+            small = types[COMPRESSED](header=header, format='png', data=png[:40] if i in bad else png)
+            text = types['std_msgs/msg/String'](data='hello')
+            for topic, sent in (('/raw', raw), ('/small', small), ('/text', text)):
+                writer.write(topics[topic], record.time_ns, serialize(sent, kinds[topic]))
+    return path
+
+
+@pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
+def test_round_trip(tmp_path, storage):
+    path = tmp_path / 'bag'
+    assert write_bag(path, '/camera/image', records(), storage) == 5
+    assert image_topics(path) == {'/camera/image': (RAW, 5)}
+    file = next(file for file in path.iterdir() if file.suffix in {'.db3', '.mcap'})
+    for place in (path, file):
+        source = open_source(place)
+        assert isinstance(source, BagSource)
+        assert (len(source), source.topic) == (5, '/camera/image')
+        for original, read in zip(records(), source.records(), strict=True):
+            assert [getattr(read, name) for name in FIELDS] == [getattr(original, name) for name in FIELDS]
+            np.testing.assert_array_equal(read.data, original.data)
+        for i, (original, frame) in enumerate(zip(records(), source, strict=True)):
+            np.testing.assert_array_equal(frame.image, original.data.reshape(6, 8, 3))
+            assert (frame.stamp, frame.identifier) == (original.stamp_ns, f'/camera/image#{i}')
+
+
+def test_without_header_stamps_frames_take_the_time_of_recording(tmp_path):
+    write_bag(tmp_path / 'bag', '/image', records(stamped=False))
+    source = open_source(tmp_path / 'bag', 'image')
+    assert [frame.stamp for frame in source] == [record.time_ns for record in records()]
+    assert {record.stamp_ns for record in source.records()} == {0}
+
+
+@pytest.mark.parametrize('ros1', [False, True])
+def test_raw_and_compressed(tmp_path, ros1):
+    path = write_mixed(tmp_path / 'mixed.bag', ros1)
+    assert image_topics(path) == {'/raw': (RAW, 5), '/silent': (RAW, 0), '/small': (COMPRESSED, 5)}
+    for topic in ('/raw', '/small'):
+        source = open_source(path, topic)
+        for i, (original, frame, record) in enumerate(zip(records(), source, source.records(), strict=True)):
+            np.testing.assert_array_equal(frame.image, original.data.reshape(6, 8, 3))
+            assert frame.stamp == record.stamp_ns == i * 1_000_000_000 + 5
+            assert (record.time_ns, record.encoding, record.frame_id) == (original.time_ns, 'rgb8', 'camera')
+
+
+def test_topics_to_choose_from_are_listed(tmp_path):
+    path = write_mixed(tmp_path / 'bag')
+    with pytest.raises(
+        SourceError, match=r'2 image topics.*/raw \(sensor_msgs/msg/Image, 5 messages\), /small'
+    ):
+        open_source(path)
+    with pytest.raises(SourceError, match=r"'/other' is not in .*expected one of /raw"):
+        open_source(path, '/other')
+    with pytest.raises(SourceError, match='std_msgs/msg/String, not an image'):
+        open_source(path, '/text')
+    with pytest.raises(SourceError, match=r"'/silent' .* has no messages"):
+        open_source(path, '/silent')
+
+
+def test_a_bag_without_images_lists_its_topics(tmp_path):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Ros2Writer(tmp_path / 'bag', version=9) as writer:
+        writer.add_connection('/text', 'std_msgs/msg/String', typestore=store)
+    with pytest.raises(SourceError, match=r'no images.*there are /text \(std_msgs/msg/String, 0 messages\)'):
+        open_source(tmp_path / 'bag')
+
+
+@pytest.mark.parametrize('ros1', [False, True])
+def test_a_damaged_image_is_named_or_skipped(tmp_path, ros1):
+    path = write_mixed(tmp_path / 'mixed.bag', ros1, bad={1, 3})
+    with pytest.raises(ImageError, match=r'/small#1: .*damaged'):
+        list(open_source(path, '/small'))
+    errors = []
+    source = open_source(path, '/small', errors.append)
+    assert [frame.identifier for frame in source] == ['/small#0', '/small#2', '/small#4']
+    assert len(list(source.records())) == 3
+    assert len(errors) == 4
+
+
+@pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
+def test_a_recording_that_was_killed_has_no_metadata(tmp_path, storage):
+    write_bag(tmp_path / 'bag', '/image', records(), storage)
+    (tmp_path / 'bag' / 'metadata.yaml').unlink()
+    assert len(list(open_source(tmp_path / 'bag'))) == 5
+    file = next((tmp_path / 'bag').iterdir())
+    shutil.copy(file, file.with_stem('second'))
+    with pytest.raises(SourceError, match=r'expected exactly one .db3 or .mcap file then, found .*second'):
+        open_source(tmp_path / 'bag')
+
+
+def listing(folder):
+    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.iterdir()}
+
+
+def test_a_write_ahead_log_is_read_and_left_alone(tmp_path):
+    write_bag(tmp_path / 'made', '/image', records())
+    folder = tmp_path / 'odd #name%41?'
+    folder.mkdir()
+    file = folder / 'made#%.db3'
+    shutil.copy(tmp_path / 'made' / 'made.db3', file)
+    database = sqlite3.connect(file)
+    database.execute('PRAGMA journal_mode=WAL')
+    database.execute('PRAGMA wal_autocheckpoint=0')
+    database.execute(
+        'INSERT INTO messages SELECT 99, topic_id, timestamp + 1000000000, data FROM messages WHERE id=1'
+    )
+    database.commit()
+    before = listing(folder)
+    assert f'{file.name}-wal' in before
+    assert len(list(open_source(file))) == 6
+    assert listing(folder) == before
+    database.close()
+
+
+@pytest.mark.parametrize('kind', ['sqlite3', 'mcap', 'ros1'])
+@pytest.mark.parametrize('keep', [0.0, 0.02, 0.3, 0.6, 0.9, 0.99])
+def test_a_cut_off_bag_is_an_error(tmp_path, kind, keep):
+    if kind == 'ros1':
+        file = write_mixed(tmp_path / 'mixed.bag', ros1=True)
+    else:
+        write_bag(tmp_path / 'bag', '/raw', records(200), kind)
+        file = next(file for file in (tmp_path / 'bag').iterdir() if file.suffix != '.yaml')
+    data = file.read_bytes()
+    file.write_bytes(data[: int(len(data) * keep)])
+    with pytest.raises(SourceError, match=str(file)):
+        list(open_source(file, '/raw'))
+
+
+@pytest.mark.parametrize('kind', ['sqlite3', 'mcap', 'ros1'])
+def test_damaged_bytes_give_images_or_our_errors(tmp_path, kind):
+    if kind == 'ros1':
+        file = write_mixed(tmp_path / 'mixed.bag', ros1=True)
+    else:
+        write_bag(tmp_path / 'bag', '/raw', records(), kind)
+        file = next(file for file in (tmp_path / 'bag').iterdir() if file.suffix != '.yaml')
+    data, rng = file.read_bytes(), np.random.default_rng(0)
+    outcomes = set()
+    for _ in range(60):
+        damaged = np.frombuffer(data, np.uint8).copy()
+        at = rng.integers(0, len(damaged), 20)
+        damaged[at] = rng.integers(0, 256, 20)
+        file.write_bytes(damaged.tobytes())
+        try:
+            outcomes.add(len(list(open_source(file, '/raw'))))
+        except (SourceError, ImageError) as error:
+            outcomes.add(type(error))
+    assert SourceError in outcomes
+
+
+@pytest.mark.parametrize('name', ['x.db3', 'x.mcap', 'x.bag'])
+def test_foreign_files(tmp_path, name):
+    (tmp_path / name).write_bytes(b'this is no bag ' * 100)
+    with pytest.raises(SourceError, match=name):
+        open_source(tmp_path / name)
+
+
+@pytest.mark.parametrize('text', ['', 'a: [', 'rosbag2_bagfile_information: {version: 99}', '[1, 2]'])
+def test_foreign_metadata(tmp_path, text):
+    write_bag(tmp_path / 'bag', '/image', records())
+    (tmp_path / 'bag' / 'metadata.yaml').write_text(text)
+    with pytest.raises(SourceError, match='damaged, cut off or no bag'):
+        open_source(tmp_path / 'bag')
+
+
+def test_writing_never_overwrites_and_leaves_nothing_half_done(tmp_path):
+    def broken():
+        yield from records(2)
+        raise ImageError('the third one')
+
+    with pytest.raises(ImageError, match='the third one'):
+        write_bag(tmp_path / 'bag', '/image', broken())
+    assert not (tmp_path / 'bag').exists()
+    write_bag(tmp_path / 'bag', '/image', records())
+    with pytest.raises(SourceError, match='exists already'):
+        write_bag(tmp_path / 'bag', '/image', records())
+    with pytest.raises(SettingsError, match="'zip': expected one of sqlite3, mcap"):
+        write_bag(tmp_path / 'other', '/image', records(), 'zip')
+
+
+def test_the_real_old_bag(data_folder):
+    path = data_folder / 'bags' / 'klintan_rosbag2js_sample.db3'
+    before = sorted(path.parent.iterdir())
+    assert image_topics(path) == {'/image': (RAW, 1), '/image/compressed': (COMPRESSED, 1)}
+    for topic in ('/image', '/image/compressed'):
+        (record,), (frame,) = open_source(path, topic).records(), open_source(path, topic)
+        assert frame.image.shape == (480, 640, 3)
+        assert (record.stamp_ns, frame.stamp) == (0, record.time_ns)
+    assert sorted(path.parent.iterdir()) == before
+
+
+def test_the_real_ros1_bag(data_folder):
+    path = data_folder / 'bags' / 'kapture_t265_trimmed_locoffice.bag'
+    topics = image_topics(path)
+    assert {count for _, count in topics.values()} == {3}
+    for topic in topics:
+        frames = list(open_source(path, topic))
+        assert [frame.image.shape for frame in frames] == [(800, 848, 3)] * 3
+        assert [round(gap / 1e6) for gap in np.diff([frame.stamp for frame in frames])] == [33, 33]
+        assert all(np.ptp(frame.image) > 100 for frame in frames)

@@ -1,0 +1,93 @@
+"""A folder of images: order, what counts as one, what is refused."""
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from stavpr_ros.errors import ImageError, InputError, SourceError
+from stavpr_ros.sources import open_source
+from stavpr_ros.sources.folder import FolderSource, natural_key
+
+
+def fill(folder, names):
+    for i, name in enumerate(names):
+        cv2.imwrite(str(folder / name), np.full((4, 6, 3), 10 * i, np.uint8))
+
+
+def test_natural_order():
+    names = ['10.jpg', 'a2b10.png', '2.jpg', '1.jpg', 'a2b9.png', 'A1.png', '01.jpg', 'a.png', 'frame-3.png']
+    assert sorted(names, key=natural_key) == [
+        '01.jpg',
+        '1.jpg',
+        '2.jpg',
+        '10.jpg',
+        'A1.png',
+        'a2b9.png',
+        'a2b10.png',
+        'a.png',
+        'frame-3.png',
+    ]
+
+
+def test_frames(tmp_path):
+    fill(tmp_path, ['10.png', '9.PNG', '11.bmp', '.hidden.png'])
+    (tmp_path / 'notes.txt').write_text('no image')
+    (tmp_path / 'folder.png').mkdir()
+    source = open_source(tmp_path)
+    frames = list(source)
+    assert isinstance(source, FolderSource)
+    assert len(source) == 3
+    assert [frame.identifier for frame in frames] == ['9.PNG', '10.png', '11.bmp']
+    assert [frame.image[0, 0].tolist() for frame in frames] == [[10] * 3, [0] * 3, [20] * 3]
+    assert {frame.stamp for frame in frames} == {0}
+    assert len(list(source)) == 3
+
+
+def test_records_are_stamped_by_rate(tmp_path):
+    fill(tmp_path, ['1.png', '2.png', '3.png'])
+    (tmp_path / '2.png').write_bytes(b'damaged')
+    records = list(FolderSource(tmp_path, on_error=lambda _: None).records(4))
+    assert [record.stamp_ns for record in records] == [250_000_000, 750_000_000]
+    assert [record.time_ns for record in records] == [250_000_000, 750_000_000]
+    with pytest.raises(InputError, match='0 frames per second'):
+        next(FolderSource(tmp_path).records(0))
+
+
+def test_a_damaged_file_is_named_or_skipped(tmp_path):
+    fill(tmp_path, ['1.png', '3.png'])
+    (tmp_path / '2.png').write_bytes(b'\x89PNG damaged')
+    with pytest.raises(ImageError, match=r'2\.png: 12 bytes are no image'):
+        list(FolderSource(tmp_path))
+    errors = []
+    assert [frame.identifier for frame in FolderSource(tmp_path, errors.append)] == ['1.png', '3.png']
+    assert ['2.png' in str(error) for error in errors] == [True]
+
+
+def test_what_is_no_folder_of_images(tmp_path):
+    with pytest.raises(SourceError, match='holds no images: expected files ending in'):
+        open_source(tmp_path)
+    with pytest.raises(SourceError, match='does not exist'):
+        open_source(tmp_path / 'missing')
+    with pytest.raises(SourceError, match='is not a folder'):
+        FolderSource(tmp_path / 'missing')
+    fill(tmp_path, ['1.png'])
+    with pytest.raises(SourceError, match='is no folder and no bag'):
+        open_source(tmp_path / '1.png')
+    with pytest.raises(SourceError, match='leave the topic out'):
+        open_source(tmp_path, '/image')
+
+
+def test_importing_sources_is_light():
+    code = (
+        'import sys, stavpr_ros.sources; sys.exit(any(m in sys.modules for m in ("rosbags", "cv2", "rclpy")))'
+    )
+    assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0
+
+
+def test_real_folder(data_folder):
+    source = open_source(data_folder / 'rtabmap_hallway_loop' / 'samples')
+    assert [file.name for file in source.files] == [f'{i}.jpg' for i in range(1, 85)]
+    assert next(iter(source)).image.shape == (384, 512, 3)
