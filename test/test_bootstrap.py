@@ -19,8 +19,14 @@ from setup_stamps import digest_of, is_current, read_stamp, write_stamp
 import stavpr_ros
 
 ROOT = Path(__file__).resolve().parent.parent
-REQUIREMENTS = {'runtime': 'torch==1.0\nnumpy==1\n', 'ros': 'r==1\n', 'build': 'b==1\n', 'onnx': 'o==1\n',
-                'dev': 'd==1\n', 'constraints': 'c==1\n'}
+REQUIREMENTS = {
+    'runtime': 'torch==1.0\nnumpy==1\n',
+    'ros': 'r==1\n',
+    'build': 'b==1\n',
+    'onnx': 'o==1\n',
+    'dev': 'd==1\n',
+    'constraints': 'c==1\n',
+}
 
 
 def write_program(path: Path, script: str) -> None:
@@ -69,6 +75,7 @@ def checkout(tmp_path: Path) -> Path:
 
 # What is refused
 
+
 @pytest.mark.parametrize('version', [(3, 11, 0), (3, 12, 1), (3, 13, 9)])
 def test_supported_python(version: tuple[int, ...]) -> None:
     assert bootstrap.python_problem(version, 'cpython', False, '/bin/python3') == ''
@@ -94,9 +101,15 @@ def test_old_python_can_read_the_gate() -> None:
     assert '__future__' not in source
 
 
-@pytest.mark.parametrize(('machine', 'named'), [
-    (('Linux', 'x86_64', 'glibc'), ''), (('Linux', 'aarch64', 'glibc'), 'Linux on aarch64'),
-    (('Darwin', 'x86_64', ''), 'Darwin'), (('Linux', 'x86_64', ''), 'without the GNU C library')])
+@pytest.mark.parametrize(
+    ('machine', 'named'),
+    [
+        (('Linux', 'x86_64', 'glibc'), ''),
+        (('Linux', 'aarch64', 'glibc'), 'Linux on aarch64'),
+        (('Darwin', 'x86_64', ''), 'Darwin'),
+        (('Linux', 'x86_64', ''), 'without the GNU C library'),
+    ],
+)
 def test_platform(machine: tuple[str, str, str], named: str) -> None:
     text = bootstrap.platform_problem(*machine)
     assert bool(text) == bool(named)
@@ -120,9 +133,16 @@ def test_compiler_that_does_not_compile(bare_path: Path, monkeypatch: pytest.Mon
     assert 'CC=no-such-compiler' in bootstrap.compiler_problem(*bootstrap.COMPILERS[0])
 
 
-@pytest.mark.parametrize(('script', 'named'), [
-    ('echo cmake version 3.20.0', ''), ('echo cmake version 4.1.0-rc1', ''),
-    ('echo cmake version 3.16.3', '3.16.3'), ('exit 1', 'does not tell'), ('echo hello', 'does not tell')])
+@pytest.mark.parametrize(
+    ('script', 'named'),
+    [
+        ('echo cmake version 3.20.0', ''),
+        ('echo cmake version 4.1.0-rc1', ''),
+        ('echo cmake version 3.16.3', '3.16.3'),
+        ('exit 1', 'does not tell'),
+        ('echo hello', 'does not tell'),
+    ],
+)
 def test_cmake(bare_path: Path, script: str, named: str) -> None:
     write_program(bare_path / 'cmake', script)
     text = bootstrap.cmake_problem()
@@ -131,6 +151,7 @@ def test_cmake(bare_path: Path, script: str, named: str) -> None:
 
 
 # What is taken for done
+
 
 def test_digest_knows_names_and_contents(tmp_path: Path) -> None:
     for name in ('a', 'b'):
@@ -166,10 +187,12 @@ def test_steps_stop_at_the_first_failure(capsys: pytest.CaptureFixture[str]) -> 
     def forbidden() -> None:
         raise AssertionError('was done before')
 
-    steps = [Step('first', lambda: True, forbidden),
-             Step('second', lambda: False, lambda: done.append('second')),
-             Step('third', lambda: False, fail),
-             Step('fourth', lambda: False, lambda: done.append('fourth'))]
+    steps = [
+        Step('first', lambda: True, forbidden),
+        Step('second', lambda: False, lambda: done.append('second')),
+        Step('third', lambda: False, fail),
+        Step('fourth', lambda: False, lambda: done.append('fourth')),
+    ]
     with pytest.raises(StepFailedError):
         run_steps(steps)
     assert done == ['second']
@@ -244,11 +267,11 @@ def test_environment_of_another_place_is_made_anew(checkout: Path, recorder: Rec
 
 # What is changed
 
+
 def test_relocation(tmp_path: Path) -> None:
     built_on = '/opt/python/cp312-cp312'
     numpy = f'{built_on}/lib/python3.12/site-packages/numpy/_core/include'
-    text = (f'set(A "{built_on}/include/python3.12;{numpy}")\n'
-            f'set(B "{built_on}/lib/other")\n')
+    text = f'set(A "{built_on}/include/python3.12;{numpy}")\nset(B "{built_on}/lib/other")\n'
     file = tmp_path / 'share' / 'x' / 'cmake' / 'xExport.cmake'
     file.parent.mkdir(parents=True)
     file.write_text(text, encoding='utf-8')
@@ -258,7 +281,8 @@ def test_relocation(tmp_path: Path) -> None:
     note.write_text(text, encoding='utf-8')
     assert relocate(tmp_path / 'share', r'/usr/include/python3.11', r'/venv\1/numpy') == 1
     assert file.read_text(encoding='utf-8') == (
-        f'set(A "/usr/include/python3.11;/venv\\1/numpy")\nset(B "{built_on}/lib/other")\n')
+        f'set(A "/usr/include/python3.11;/venv\\1/numpy")\nset(B "{built_on}/lib/other")\n'
+    )
     assert shared.read_text(encoding='utf-8') == text
     assert note.read_text(encoding='utf-8') == text
     assert relocate(tmp_path / 'share', r'/usr/include/python3.11', r'/venv\1/numpy') == 0
@@ -275,23 +299,38 @@ def test_torn_packages_are_forgotten(tmp_path: Path) -> None:
 
 def test_another_ros_does_not_leak_in() -> None:
     variables = {
-        'PATH': '/opt/ros/jazzy/bin:/usr/bin:/ws/install/a/bin:/venv/bin', 'PYTHONPATH': '/opt/ros/jazzy/lib',
-        'AMENT_PREFIX_PATH': '/ws/install/a:/opt/ros/jazzy', 'ROS_DISTRO': 'humble', 'ROS_DOMAIN_ID': '7',
-        'COLCON_PREFIX_PATH': '/ws/install', 'MAKEFLAGS': 'j', 'STAVPR_DATA': '/data',
+        'PATH': '/opt/ros/jazzy/bin:/usr/bin:/ws/install/a/bin:/venv/bin',
+        'PYTHONPATH': '/opt/ros/jazzy/lib',
+        'AMENT_PREFIX_PATH': '/ws/install/a:/opt/ros/jazzy',
+        'ROS_DISTRO': 'humble',
+        'ROS_DOMAIN_ID': '7',
+        'COLCON_PREFIX_PATH': '/ws/install',
+        'MAKEFLAGS': 'j',
+        'STAVPR_DATA': '/data',
         'LD_LIBRARY_PATH': '/opt/ros/jazzy/lib:/v/lib/python3.11/site-packages/ros_rcl.libs',
-        '_ROS_WHEELS_BOOTSTRAP_COMPLETE': '1'}
+        '_ROS_WHEELS_BOOTSTRAP_COMPLETE': '1',
+    }
     assert clean_environment(variables, Path('/venv')) == {
-        'PATH': '/venv/bin:/usr/bin', 'VIRTUAL_ENV': '/venv', 'AMENT_PREFIX_PATH': '/venv',
-        'CMAKE_PREFIX_PATH': '/venv', 'ROS_DOMAIN_ID': '7', 'STAVPR_DATA': '/data', 'PIP_USER': '0'}
+        'PATH': '/venv/bin:/usr/bin',
+        'VIRTUAL_ENV': '/venv',
+        'AMENT_PREFIX_PATH': '/venv',
+        'CMAKE_PREFIX_PATH': '/venv',
+        'ROS_DOMAIN_ID': '7',
+        'STAVPR_DATA': '/data',
+        'PIP_USER': '0',
+    }
 
 
 # What the files of this package say
 
+
 def test_versions_agree() -> None:
     setup = re.search(r"version='([^']+)'", (ROOT / 'setup.py').read_text(encoding='utf-8'))
     assert setup is not None
-    manifests = [ElementTree.parse(ROOT / folder / 'package.xml').findtext('version')
-                 for folder in ('.', 'stavpr_msgs')]
+    manifests = [
+        ElementTree.parse(ROOT / folder / 'package.xml').findtext('version')
+        for folder in ('.', 'stavpr_msgs')
+    ]
     assert manifests == [setup.group(1)] * 2
     assert stavpr_ros.__version__ == setup.group(1)
 

@@ -20,8 +20,13 @@ OLDEST_CMAKE = (3, 20)
 COMPILERS = (
     # what, environment variable, names in CMake's order, language, a program that needs the standard library
     ('C compiler', 'CC', ('cc', 'gcc', 'clang'), 'c', '#include <stdio.h>\nint main(void) { return 0; }\n'),
-    ('C++ compiler', 'CXX', ('c++', 'g++', 'clang++'), 'c++',
-     '#include <string>\nint main() { return std::string().size(); }\n'),
+    (
+        'C++ compiler',
+        'CXX',
+        ('c++', 'g++', 'clang++'),
+        'c++',
+        '#include <string>\nint main() { return std::string().size(); }\n',
+    ),
 )
 
 
@@ -38,8 +43,10 @@ def python_problem(version: tuple, implementation: str, free_threaded: bool, exe
         reason = 'it is a free-threaded build, for which the ROS 2 wheels are not made'
     else:
         return ''
-    return (f'Python {came} ({executable}) is not supported: {reason}. Python {wanted} is needed; '
-            'name one of these, for example: make demo PYTHON=python3.12')
+    return (
+        f'Python {came} ({executable}) is not supported: {reason}. Python {wanted} is needed; '
+        'name one of these, for example: make demo PYTHON=python3.12'
+    )
 
 
 def platform_problem(system: str, machine: str, libc: str) -> str:
@@ -47,8 +54,10 @@ def platform_problem(system: str, machine: str, libc: str) -> str:
     if system == 'Linux' and machine in ('x86_64', 'AMD64') and libc == 'glibc':
         return ''
     came = f'{system} on {machine}' + ('' if libc or system != 'Linux' else ', without the GNU C library')
-    return (f'This machine is {came}: the ROS 2 Jazzy wheels are for Linux on x86-64 with the GNU C library. '
-            'On Ubuntu 24.04 install ROS 2 Jazzy with apt and build with colcon, as the README says.')
+    return (
+        f'This machine is {came}: the ROS 2 Jazzy wheels are for Linux on x86-64 with the GNU C library. '
+        'On Ubuntu 24.04 install ROS 2 Jazzy with apt and build with colcon, as the README says.'
+    )
 
 
 def compiler_problem(kind: str, variable: str, names: tuple, language: str, program: str) -> str:
@@ -61,11 +70,17 @@ def compiler_problem(kind: str, variable: str, names: tuple, language: str, prog
         return f'{variable}={chosen} names no program on the PATH: install it, or unset {variable}.'
     with tempfile.TemporaryDirectory() as folder:
         built = subprocess.run(
-            [*command, '-x', language, '-', '-o', os.path.join(folder, 'program')], input=program.encode(),
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
+            [*command, '-x', language, '-', '-o', os.path.join(folder, 'program')],
+            input=program.encode(),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            check=False,
+        )
     if built.returncode != 0:
-        return (f'The {kind} `{" ".join(command)}` cannot build a program of one line: '
-                'install build-essential (it brings the headers of the standard library).')
+        return (
+            f'The {kind} `{" ".join(command)}` cannot build a program of one line: '
+            'install build-essential (it brings the headers of the standard library).'
+        )
     return ''
 
 
@@ -91,8 +106,10 @@ def machine_problems() -> list:
     found = [platform_problem(platform.system(), platform.machine(), platform.libc_ver()[0])]
     package = f'python{sys.version_info[0]}.{sys.version_info[1]}'
     if not all(importlib.util.find_spec(name) for name in ('venv', 'ensurepip')):
-        found.append(f'{sys.executable} cannot make virtual environments (no module venv or ensurepip): '
-                     f'install {package}-venv.')
+        found.append(
+            f'{sys.executable} cannot make virtual environments (no module venv or ensurepip): '
+            f'install {package}-venv.'
+        )
     header = os.path.join(sysconfig.get_paths()['include'], 'Python.h')
     if not os.path.isfile(header):
         found.append(f'{sys.executable} has no headers ({header} is missing): install {package}-dev.')
@@ -116,11 +133,11 @@ def refuse(problems: list) -> int:
 def main(arguments: list) -> int:
     """Refuse a Python that does not do, together with all else that is missing, or do what is asked."""
     free_threaded = bool(sysconfig.get_config_var('Py_GIL_DISABLED'))
-    problem = python_problem(
-        tuple(sys.version_info), sys.implementation.name, free_threaded, sys.executable)
+    problem = python_problem(tuple(sys.version_info), sys.implementation.name, free_threaded, sys.executable)
     if problem:
         return refuse([problem, *machine_problems()])
     from setup_main import main as set_up  # not above: older Pythons cannot read it
+
     return set_up(arguments, machine_problems, refuse)
 
 

@@ -11,16 +11,33 @@ from pathlib import Path
 from setup_report import StepFailedError, run_logged
 from setup_stamps import digest_of, is_current, read_stamp, remove_stamp, write_stamp
 
-GROUPS = ('runtime', 'ros', 'build', 'onnx', 'dev')     # requirements/NAME.txt
+GROUPS = ('runtime', 'ros', 'build', 'onnx', 'dev')  # requirements/NAME.txt
 ALWAYS = ('runtime', 'ros', 'build')
 
 # Variables of another ROS, another Python or the make that called us; none of them may leak into ours.
 FOREIGN = (
-    'PYTHONPATH', 'PYTHONHOME', 'CONDA_PREFIX', 'PIP_TARGET', 'PIP_PREFIX', 'DESTDIR',
-    'AMENT_PREFIX_PATH', 'AMENT_CURRENT_PREFIX', 'CMAKE_PREFIX_PATH', 'RMW_IMPLEMENTATION',
-    'ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION', 'ROS_PACKAGE_PATH', 'ROS_ROOT', 'ROS_ETC_DIR',
+    'PYTHONPATH',
+    'PYTHONHOME',
+    'CONDA_PREFIX',
+    'PIP_TARGET',
+    'PIP_PREFIX',
+    'DESTDIR',
+    'AMENT_PREFIX_PATH',
+    'AMENT_CURRENT_PREFIX',
+    'CMAKE_PREFIX_PATH',
+    'RMW_IMPLEMENTATION',
+    'ROS_DISTRO',
+    'ROS_VERSION',
+    'ROS_PYTHON_VERSION',
+    'ROS_PACKAGE_PATH',
+    'ROS_ROOT',
+    'ROS_ETC_DIR',
     '_ROS_WHEELS_BOOTSTRAP_COMPLETE',
-    'MAKEFLAGS', 'MFLAGS', 'MAKEOVERRIDES', 'MAKELEVEL', 'MAKEFILES',
+    'MAKEFLAGS',
+    'MFLAGS',
+    'MAKEOVERRIDES',
+    'MAKELEVEL',
+    'MAKEFILES',
 )
 SEARCH_PATHS = ('PATH', 'LD_LIBRARY_PATH', 'PKG_CONFIG_PATH')
 
@@ -37,16 +54,23 @@ def clean_environment(variables: Mapping[str, str], venv: Path) -> dict[str, str
     :param variables: those of the caller, who may have sourced another ROS or activated another Python.
     :param venv: the virtual environment.
     """
-    others = [entry for name in ('AMENT_PREFIX_PATH', 'COLCON_PREFIX_PATH')
-              for entry in variables.get(name, '').split(os.pathsep) if entry]
+    others = [
+        entry
+        for name in ('AMENT_PREFIX_PATH', 'COLCON_PREFIX_PATH')
+        for entry in variables.get(name, '').split(os.pathsep)
+        if entry
+    ]
     roots = [Path(entry) for entry in ['/opt/ros', *others]]
 
     def is_foreign(entry: str) -> bool:
         # The wheels put their own libraries on the path of every Python that they start in.
         return '/site-packages/ros_' in entry or any(Path(entry).is_relative_to(root) for root in roots)
 
-    clean = {name: value for name, value in variables.items()
-             if name not in FOREIGN and not name.startswith('COLCON_')}
+    clean = {
+        name: value
+        for name, value in variables.items()
+        if name not in FOREIGN and not name.startswith('COLCON_')
+    }
     for name in SEARCH_PATHS:
         found = clean.pop(name, '').split(os.pathsep)
         entries = [entry for entry in found if entry and not is_foreign(entry)]
@@ -54,10 +78,14 @@ def clean_environment(variables: Mapping[str, str], venv: Path) -> dict[str, str
             entries = [str(venv / 'bin'), *(entry for entry in entries if entry != str(venv / 'bin'))]
         if entries:
             clean[name] = os.pathsep.join(entries)
-    clean.update({
-        'VIRTUAL_ENV': str(venv), 'AMENT_PREFIX_PATH': str(venv), 'CMAKE_PREFIX_PATH': str(venv),
-        'PIP_USER': '0',    # a user's pip.conf may say otherwise, and pip refuses that in an environment
-    })
+    clean.update(
+        {
+            'VIRTUAL_ENV': str(venv),
+            'AMENT_PREFIX_PATH': str(venv),
+            'CMAKE_PREFIX_PATH': str(venv),
+            'PIP_USER': '0',  # a user's pip.conf may say otherwise, and pip refuses that in an environment
+        }
+    )
     return clean
 
 
@@ -129,8 +157,11 @@ class Environment:
 
     def identity(self) -> dict[str, str]:
         """What the environment depends on: it cannot be moved, and belongs to one Python."""
-        return {'python': f'{sys.version_info.major}.{sys.version_info.minor}', 'base': sys.base_prefix,
-                'folder': str(self.venv)}
+        return {
+            'python': f'{sys.version_info.major}.{sys.version_info.minor}',
+            'base': sys.base_prefix,
+            'folder': str(self.venv),
+        }
 
     def ros_digest(self) -> str:
         """One number for everything that the built packages depend on in it."""
@@ -148,8 +179,11 @@ class Environment:
         command = [getattr(sys, '_base_executable', '') or sys.executable, '-m', 'venv']
         if read_stamp(self._stamp('venv')) or not self._resembles():
             command.append('--clear')
-        self._run('venv', [*command, str(self.venv)],
-                  f'Look at the log; if nothing helps, delete {self.venv} and run the same command again.')
+        self._run(
+            'venv',
+            [*command, str(self.venv)],
+            f'Look at the log; if nothing helps, delete {self.venv} and run the same command again.',
+        )
         write_stamp(self._stamp('venv'), self.identity())
 
     def _resembles(self) -> bool:
@@ -172,8 +206,10 @@ class Environment:
 
     def install_torch(self) -> None:
         """Install torch."""
-        advice = ('If it cannot be reached or is too large (torch may bring CUDA, several GB), name an index '
-                  'of CPU wheels: make demo TORCH_INDEX=URL')
+        advice = (
+            'If it cannot be reached or is too large (torch may bring CUDA, several GB), name an index '
+            'of CPU wheels: make demo TORCH_INDEX=URL'
+        )
         made_before = read_stamp(self._stamp('torch'))
         remove_stamp(self._stamp('torch'))
         if made_before and self.torch_index:
@@ -200,8 +236,11 @@ class Environment:
         if not is_current(self._stamp('relocated'), {'ros': self.ros_digest()}):
             remove_stamp(self._stamp('relocated'))
         files = [part for name in groups for part in ('-r', str(self._requirements(name)))]
-        self._pip('packages', [*files, '-c', str(self._requirements('constraints'))],
-                  'If the package index cannot be reached: once it can, run the same command again.')
+        self._pip(
+            'packages',
+            [*files, '-c', str(self._requirements('constraints'))],
+            'If the package index cannot be reached: once it can, run the same command again.',
+        )
         write_stamp(self._stamp('packages'), self._package_digests(tuple(groups)))
 
     def _package_digests(self, groups: tuple[str, ...]) -> dict[str, str]:
@@ -215,13 +254,21 @@ class Environment:
 
     def relocate_wheels(self) -> None:
         """Fit the wheels' CMake files to this machine."""
-        question = ('import numpy, sysconfig\n'
-                    'print(sysconfig.get_paths()["include"], numpy.get_include(), sep="\\n")')
-        answer = subprocess.run([str(self.python), '-c', question], env=self.variables(), capture_output=True,
-                                text=True, check=False)
+        question = (
+            'import numpy, sysconfig\nprint(sysconfig.get_paths()["include"], numpy.get_include(), sep="\\n")'
+        )
+        answer = subprocess.run(
+            [str(self.python), '-c', question],
+            env=self.variables(),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         if answer.returncode != 0:
-            raise StepFailedError(f'{self.python} cannot import numpy:\n{answer.stderr}\n'
-                                  f'Delete {self.venv} and run the same command again.')
+            raise StepFailedError(
+                f'{self.python} cannot import numpy:\n{answer.stderr}\n'
+                f'Delete {self.venv} and run the same command again.'
+            )
         include, numpy_include = answer.stdout.splitlines()
         relocate(self.venv / 'share', include, numpy_include)
         write_stamp(self._stamp('relocated'), {'ros': self.ros_digest()})

@@ -51,7 +51,8 @@ class Workspace:
     def is_built(self, package: str) -> bool:
         """Whether a package is built from the sources as they are now."""
         return (self.install / 'local_setup.bash').is_file() and is_current(
-            self._stamp(package), self._made_from(package))
+            self._stamp(package), self._made_from(package)
+        )
 
     def build(self, package: str) -> None:
         """Build and install a package from nothing: files that are no longer in the sources must go."""
@@ -62,12 +63,29 @@ class Workspace:
         # Defaults of the user's own workspaces (~/.colcon) must not change what is built here.
         variables['COLCON_HOME'] = str(self.environment.venv / 'stavpr_setup' / 'colcon')
         command = [
-            str(self.environment.python), '-m', 'colcon', '--log-base', 'log', 'build',
-            '--base-paths', '.', 'stavpr_msgs', '--packages-select', package,
-            '--cmake-args', '-DCMAKE_BUILD_TYPE=Release', '-DBUILD_TESTING=OFF',
-            f'-DPython3_EXECUTABLE={self.environment.python}']
-        run_logged(command, self.environment.log_folder / f'{package}.log', variables, self.root,
-                   'If what colcon says does not help, run: make distclean, and the same command again.')
+            str(self.environment.python),
+            '-m',
+            'colcon',
+            '--log-base',
+            'log',
+            'build',
+            '--base-paths',
+            '.',
+            'stavpr_msgs',
+            '--packages-select',
+            package,
+            '--cmake-args',
+            '-DCMAKE_BUILD_TYPE=Release',
+            '-DBUILD_TESTING=OFF',
+            f'-DPython3_EXECUTABLE={self.environment.python}',
+        ]
+        run_logged(
+            command,
+            self.environment.log_folder / f'{package}.log',
+            variables,
+            self.root,
+            'If what colcon says does not help, run: make distclean, and the same command again.',
+        )
         write_stamp(self._stamp(package), made_from)
 
     def run(self, command: list[str]) -> None:
@@ -77,8 +95,9 @@ class Workspace:
             raise StepFailedError(f'{setup_file} is missing: run `make build` first.')
         # No `set -u`: colcon's file reads variables that may be unset.
         script = 'source "$0" && exec "$@"'
-        os.execvpe('bash', ['bash', '--norc', '-c', script, str(setup_file), *command],
-                   self.environment.variables())
+        os.execvpe(
+            'bash', ['bash', '--norc', '-c', script, str(setup_file), *command], self.environment.variables()
+        )
 
 
 def steps_of(environment: Environment, with_packages: bool) -> list[Step]:
@@ -90,13 +109,17 @@ def steps_of(environment: Environment, with_packages: bool) -> list[Step]:
     steps = [
         Step('Virtual environment .venv', environment.is_made, environment.make),
         Step('PyTorch', environment.has_torch, environment.install_torch),
-        Step('ROS 2 Jazzy, build tools and Python packages', environment.has_packages,
-             environment.install_packages),
+        Step(
+            'ROS 2 Jazzy, build tools and Python packages',
+            environment.has_packages,
+            environment.install_packages,
+        ),
         Step("Paths in the ROS wheels' CMake files", environment.is_relocated, environment.relocate_wheels),
     ]
     if with_packages:
         workspace = Workspace(environment)
         for package in SOURCES:
+
             def is_done(name: str = package) -> bool:
                 return workspace.is_built(name)
 
@@ -122,8 +145,12 @@ def one_at_a_time(root: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def set_up(environment: Environment, with_packages: bool, machine_problems: Callable[[], list[str]],
-           refuse: Callable[[list[str]], int]) -> int:
+def set_up(
+    environment: Environment,
+    with_packages: bool,
+    machine_problems: Callable[[], list[str]],
+    refuse: Callable[[list[str]], int],
+) -> int:
     """Do what is not done yet."""
     with one_at_a_time(environment.root):
         steps = steps_of(environment, with_packages)
@@ -138,8 +165,11 @@ def set_up(environment: Environment, with_packages: bool, machine_problems: Call
         # Logs of an earlier try would be taken for those of this one.
         remove_folder(environment.log_folder)
         run_steps(steps)
-        print(f'Set up in {time.monotonic() - began:.0f} s; logs are in '
-              f'{environment.log_folder.relative_to(environment.root)}/', flush=True)
+        print(
+            f'Set up in {time.monotonic() - began:.0f} s; logs are in '
+            f'{environment.log_folder.relative_to(environment.root)}/',
+            flush=True,
+        )
     return 0
 
 
@@ -151,16 +181,24 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     for name, text in texts.items():
         command = commands.add_parser(name, help=text)
         extras = [group for group in GROUPS if group not in ALWAYS]
-        command.add_argument('--with', dest='extras', nargs='*', default=[], choices=extras, metavar='EXTRA',
-                             help=f'install these as well: {", ".join(extras)}')
+        command.add_argument(
+            '--with',
+            dest='extras',
+            nargs='*',
+            default=[],
+            choices=extras,
+            metavar='EXTRA',
+            help=f'install these as well: {", ".join(extras)}',
+        )
         command.add_argument('--torch-index', default='', metavar='URL', help='the package index for torch')
     command = commands.add_parser('run', help='run a command that finds the built packages')
     command.add_argument('argv', nargs=argparse.REMAINDER, metavar='COMMAND')
     return parser.parse_args(arguments)
 
 
-def main(arguments: list[str], machine_problems: Callable[[], list[str]],
-         refuse: Callable[[list[str]], int]) -> int:
+def main(
+    arguments: list[str], machine_problems: Callable[[], list[str]], refuse: Callable[[list[str]], int]
+) -> int:
     """
     Do what the command line asks for.
 

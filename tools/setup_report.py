@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 LAST_LINES = 25
-QUIET_SECONDS = 30.0     # without a terminal: how often a long step says that it is alive
-REDRAW_SECONDS = 0.5     # on a terminal
+QUIET_SECONDS = 30.0  # without a terminal: how often a long step says that it is alive
+REDRAW_SECONDS = 0.5  # on a terminal
 
 
 class StepFailedError(Exception):
@@ -40,8 +40,9 @@ def last_line(log: Path, width: int = 70) -> str:
     return text[:width]
 
 
-def run_logged(command: Sequence[str], log: Path, environment: Mapping[str, str], folder: Path,
-               advice: str) -> None:
+def run_logged(
+    command: Sequence[str], log: Path, environment: Mapping[str, str], folder: Path, advice: str
+) -> None:
     """
     Run a command with its output in a log file, and show that it goes on.
 
@@ -57,8 +58,13 @@ def run_logged(command: Sequence[str], log: Path, environment: Mapping[str, str]
         stream.write(('$ ' + ' '.join(command) + '\n').encode())
         stream.flush()
         process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=stream, stderr=subprocess.STDOUT,
-            env=dict(environment), cwd=folder)
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=stream,
+            stderr=subprocess.STDOUT,
+            env=dict(environment),
+            cwd=folder,
+        )
         try:
             while process.poll() is None:
                 now = time.monotonic()
@@ -77,7 +83,7 @@ def run_logged(command: Sequence[str], log: Path, environment: Mapping[str, str]
     if on_terminal:
         print('\x1b[K', end='')
     elif shown > began:
-        print('\n     ', end='')   # the time of the step stands on a line of its own
+        print('\n     ', end='')  # the time of the step stands on a line of its own
     if process.returncode != 0:
         raise StepFailedError(failure_text(command, process.returncode, log, advice))
 
@@ -85,9 +91,13 @@ def run_logged(command: Sequence[str], log: Path, environment: Mapping[str, str]
 def failure_text(command: Sequence[str], status: int, log: Path, advice: str) -> str:
     """What failed, the end of its log, and what to do."""
     lines = log.read_text(encoding='utf-8', errors='replace').splitlines()[-LAST_LINES:]
-    return '\n'.join([
-        f'`{" ".join(command)}` ended with status {status}. The end of {log}:',
-        *(f'  | {line}' for line in lines), advice])
+    return '\n'.join(
+        [
+            f'`{" ".join(command)}` ended with status {status}. The end of {log}:',
+            *(f'  | {line}' for line in lines),
+            advice,
+        ]
+    )
 
 
 def run_steps(steps: Sequence[Step]) -> None:

@@ -19,6 +19,10 @@ import numpy as np
 
 LANES = 64  # wide enough for LLVM to vectorise the lane loops instead of unrolling them: 10x faster than 32
 
+# Of numba's threading layers, the default's fallback aborts the process when two threads meet in it.
+if nb.config.THREADING_LAYER == 'default':
+    nb.config.THREADING_LAYER = 'threadsafe'
+
 _kernel = nb.njit(cache=True, nogil=True, error_model='numpy')
 _parallel_kernel = nb.njit(cache=True, nogil=True, parallel=True, error_model='numpy')
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stavpr_ros.errors import ImageError, SettingsError, SourceError, StavprError
+from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
     import numpy as np
@@ -122,6 +123,7 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
+    wait_passively()
     arguments = _parser().parse_args(args)
     try:
         place_map = _build(arguments)

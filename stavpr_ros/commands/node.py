@@ -6,6 +6,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 
 from stavpr_ros.errors import StavprError
+from stavpr_ros.threads import wait_passively
 
 HELP = """usage: node [--ros-args -p map_path:=FILE -p threshold:=VALUE [-p NAME:=VALUE ...]
             [-r image:=TOPIC]]
@@ -39,6 +40,7 @@ def main(args: list[str] | None = None) -> int:
     if arguments[:1] in (['-h'], ['--help']):
         print(_help())
         return 0
+    wait_passively()
     from stavpr_ros.ros.node import PlaceRecognitionNode
 
     rclpy.init(args=args)

@@ -37,18 +37,27 @@ class DriveResult:
         """Accepted and within the tolerance of the truth, shape (N,), bool."""
         return None if self.truth is None else self.accepted & self.answers.within(self.truth, self.tolerance)
 
+    @property
+    def headline(self) -> str:
+        """The result in a line."""
+        line = f'{np.count_nonzero(self.accepted)} of {len(self.accepted)} images matched'
+        if self.score is not None:
+            s = self.score
+            line += f', precision {s.precision:.2f}, recall {s.recall:.2f}, F1 {s.f1:.2f}'
+        return f'{line}; {1 / self.seconds.mean():.0f} images per second'
+
     def summary(self) -> str:
         """Return the result in words, a line each."""
         lines = [f'{np.count_nonzero(self.accepted)} of {len(self.accepted)} images matched']
         if self.truth is not None and self.score is not None:
-            unseen = self.truth < 0
-            lines += [
-                f'precision {self.score.precision:.3f}   recall {self.score.recall:.3f}   F1 {self.score.f1:.3f}   '
-                f'(right means within {self.tolerance} places)',
-            ]
+            s, unseen = self.score, self.truth < 0
+            lines.append(f'precision {s.precision:.3f}   recall {s.recall:.3f}   F1 {s.f1:.3f}')
+            lines.append(f'(right means within {self.tolerance} places of the truth)')
             if unseen.any():
                 wrong = np.count_nonzero(self.accepted & unseen)
-                lines.append(f'{wrong} of {np.count_nonzero(unseen)} images of unseen places matched all the same')
+                lines.append(
+                    f'{wrong} of {np.count_nonzero(unseen)} images of unseen places matched all the same'
+                )
         median, slow = np.percentile(self.seconds, [50, 99]) * 1e3
         lines.append(
             f'{1 / self.seconds.mean():.1f} images per second, one after the other; from image to answer '

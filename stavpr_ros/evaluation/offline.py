@@ -17,7 +17,7 @@ def recognise_all(
     :returns: N answers, one an image.
     """
     recogniser.reset()
-    images = tqdm(range(len(features)), desc='recognising', unit='image', disable=not progress)
+    images = tqdm(range(len(features)), desc='recognising', unit='image', disable=None if progress else True)
     return [recogniser.add(features[i : i + 1]) for i in images]
 
 

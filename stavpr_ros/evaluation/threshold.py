@@ -36,7 +36,9 @@ def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np
     height, width = image.shape[:2]
     shift = round(0.15 * width)
     kept = image[:, shift:] if variant % 2 else image[:, : width - shift]
-    value = cv2.resize(kept, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32) / 255
+    value: np.ndarray = (
+        cv2.resize(kept, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32) / 255
+    )
     value **= 1.6 if variant // 2 % 2 else 0.6
     shade = cv2.resize(rng.normal(0, 0.4, (4, 5)), (width, height), interpolation=cv2.INTER_CUBIC)
     value *= np.exp(shade)[:, :, None].astype(np.float32)
@@ -46,7 +48,10 @@ def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np
 
 
 def suggest_threshold(
-    place_map: PlaceMap, settings: RecognitionSettings | None = None, windows: int = 24, progress: bool = False
+    place_map: PlaceMap,
+    settings: RecognitionSettings | None = None,
+    windows: int = 24,
+    progress: bool = False,
 ) -> ThresholdSuggestion:
     """
     Ask how near the map's places come to *other* places of it when they look different.
@@ -70,7 +75,9 @@ def suggest_threshold(
     rng = np.random.default_rng(0)
     elsewhere = []
     starts = np.unique(np.linspace(0, n - l, min(windows, n - l + 1)).astype(int))
-    for variant, start in enumerate(tqdm(starts, desc='threshold', unit='window', disable=not progress)):
+    for variant, start in enumerate(
+        tqdm(starts, desc='threshold', unit='window', disable=None if progress else True)
+    ):
         pictures = [place_map.thumbnail(place) for place in range(start, start + l)]
         altered = [harder_look(picture, variant, rng) for picture in pictures if picture is not None]
         features = describer.describe(altered)

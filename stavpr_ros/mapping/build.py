@@ -53,7 +53,7 @@ def build_map(
     ids: list[str] = []
     pictures: list[bytes] = []
     total = len(frames) if isinstance(frames, Sized) else None
-    with tqdm(total=total, unit='image', desc='describing', disable=not progress) as bar:
+    with tqdm(total=total, unit='image', desc='describing', disable=None if progress else True) as bar:
         for batch in _batches(frames):
             features.append(describer.describe([frame.image for frame in batch]))
             stamps += [frame.stamp for frame in batch]

@@ -25,7 +25,6 @@ class EngineOptions:
     neighbourhood: int = 20
     device: str = 'cpu'
     model_path: str = ''
-    threads: int = 0
 
 
 class Engine:
@@ -53,15 +52,6 @@ class Engine:
         if self._threshold is None:
             return "parameter 'threshold' is not set: build_map suggests one, 'ros2 param set' sets it"
         return ''
-
-    def limit_threads(self) -> None:
-        """Limit the numerics to the threads of the options, on the thread that calls."""
-        import numba
-        import torch
-
-        if self._options.threads:
-            torch.set_num_threads(self._options.threads)
-            numba.set_num_threads(min(self._options.threads, numba.config.NUMBA_NUM_THREADS))
 
     def load(self, path: str) -> PlaceMap:
         """

@@ -19,6 +19,7 @@ from stavpr_ros.ros.engine import Engine, EngineOptions
 from stavpr_ros.ros.messages import blank_match, map_info_message
 from stavpr_ros.ros.parameters import declare_parameters
 from stavpr_ros.ros.worker import Worker
+from stavpr_ros.threads import limit_threads
 
 REPORT_PERIOD = 10.0  # seconds between repeated warnings
 
@@ -42,7 +43,6 @@ class PlaceRecognitionNode(Node):
                 neighbourhood=values['neighbourhood'],
                 device=device,
                 model_path=values['model_path'],
-                threads=values['threads'],
             )
         )
         self._received = self._dropped = 0
@@ -53,7 +53,7 @@ class PlaceRecognitionNode(Node):
         self._distance = self.create_publisher(Float32, '~/distance', answers)
         self._map_info = self.create_publisher(MapInfo, '~/map_info', latched)
         self._worker = Worker(self._answer, values['queue_size'])
-        self._worker.call(self._engine.limit_threads).result()
+        self._worker.call(lambda: limit_threads(values['threads'])).result()
         self._start(values['map_path'], values['threshold'])
         self.add_on_set_parameters_callback(self._on_parameters)
         self.create_subscription(

@@ -1,0 +1,219 @@
+"""``ros2 run stavpr_ros demo``: the whole way once, from two drives to matches, numbers and a picture."""
+
+import argparse
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stavpr_ros.errors import InputError, SettingsError, StavprError
+from stavpr_ros.threads import wait_passively
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from stavpr_ros.evaluation.drive import DriveResult
+    from stavpr_ros.evaluation.world import Drive
+    from stavpr_ros.mapping import PlaceMap
+
+TOPIC = '/camera/image_raw'
+LENGTH = 20
+
+DESCRIPTION = """
+Without options: makes a street, drives along it twice (the second time at dusk in the rain, from the other
+lane, at another and varying speed, with a detour that the map has never seen), writes two bags, builds the
+map from the first, starts the node, replays the second bag into it over ROS, listens from a third process,
+and tells and draws what came out. With --map and --query: the same with your own folders of images or bags.
+"""
+
+EPILOG = """
+examples:
+  demo
+  demo --map monday/ --query tuesday/ --truth identity --tolerance 3
+  demo --map monday.bag --query tuesday.bag --topic /camera/image_raw --threshold 0.2
+
+exit codes: 0 done, 1 something failed (the reason is printed), 2 usage, 130 interrupted
+"""
+
+
+@dataclass(frozen=True)
+class Drives:
+    """
+    What the map is made from and what is replayed.
+
+    :param truth: true place of each query image, -1 = not in the map; None = unknown.
+    """
+
+    reference: str
+    query: str
+    topic: str | None
+    truth: 'np.ndarray | None'
+    title: str
+
+
+def _parser() -> argparse.ArgumentParser:
+    from stavpr_ros.commands.feature_options import add_feature_options
+
+    parser = argparse.ArgumentParser(
+        prog='demo',
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        '--output', default='demo_output', metavar='FOLDER', help='where all is written (%(default)s)'
+    )
+    parser.add_argument('--map', metavar='FOLDER|BAG', help='first drive: the map is made from it')
+    parser.add_argument('--query', metavar='FOLDER|BAG', help='second drive: it is replayed')
+    parser.add_argument('--topic', help='image topic of the bags, if they have several')
+    parser.add_argument(
+        '--truth',
+        choices=('identity',),
+        help='identity: image i of the query was taken at image i of the map',
+    )
+    parser.add_argument(
+        '--tolerance', type=int, default=3, help='places that a right match may be off (%(default)s)'
+    )
+    parser.add_argument('--threshold', type=float, help='of the node (found from the first drive alone)')
+    parser.add_argument(
+        '--world-seed', type=int, default=7, help='another number, another street (%(default)s)'
+    )
+    add_feature_options(parser)
+    return parser
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+def _records(drive: 'Drive', name: str) -> Iterator[Any]:
+    from tqdm import tqdm
+
+    from stavpr_ros.sources.frame import ImageRecord
+
+    for frame in tqdm(drive, desc=name, unit='image', disable=None):
+        yield ImageRecord.of_image(frame.image, frame.stamp, frame_id='camera')
+
+
+def _make_world(folder: Path, seed: int) -> Drives:
+    """Drive twice through a made-up street and write a bag of each drive."""
+    from stavpr_ros.evaluation.world import World, first_drive, ground_truth, second_drive
+    from stavpr_ros.sources.bag_writer import write_bag
+
+    _say('1. Two drives through a made-up street')
+    world = World(seed)
+    first, second = first_drive(world), second_drive(world)
+    for drive, name in ((first, 'first_drive'), (second, 'second_drive')):
+        shutil.rmtree(folder / name, ignore_errors=True)
+        write_bag(folder / name, TOPIC, _records(drive, name.replace('_', ' ')))
+    title = 'A made-up street, by day and in the rain at dusk'
+    return Drives(
+        str(folder / 'first_drive'), str(folder / 'second_drive'), TOPIC, ground_truth(first, second), title
+    )
+
+
+def _users_drives(arguments: argparse.Namespace) -> Drives:
+    import numpy as np
+
+    from stavpr_ros.sources import open_source
+
+    _say(f'1. Your drives: {arguments.map} is the map, {arguments.query} the query')
+    truth = None
+    if arguments.truth == 'identity':
+        truth = np.arange(len(open_source(arguments.query, arguments.topic)))
+    title = f'{Path(arguments.query).name} recognised on the map of {Path(arguments.map).name}'
+    return Drives(arguments.map, arguments.query, arguments.topic, truth, title)
+
+
+def _make_map(drives: Drives, arguments: argparse.Namespace, path: Path) -> 'PlaceMap':
+    from stavpr_ros.commands.feature_options import backbone_settings
+    from stavpr_ros.features import Describer
+    from stavpr_ros.mapping import build_map, save_map
+    from stavpr_ros.sources import open_source
+
+    _say(f'2. The map of the first drive: {path}')
+    describer = Describer(
+        arguments.features,
+        backbone_settings(arguments),
+        arguments.strips,
+        arguments.projection,
+        arguments.seed,
+        arguments.device,
+    )
+    place_map = build_map(open_source(drives.reference, drives.topic), describer)
+    save_map(place_map, path)
+    return place_map
+
+
+def _choose_threshold(place_map: 'PlaceMap', given: float | None) -> float:
+    from stavpr_ros.evaluation.threshold import suggest_threshold
+
+    if given is not None:
+        return given
+    try:
+        threshold = suggest_threshold(place_map, progress=True).threshold
+    except InputError as error:
+        raise SettingsError(f'{error}; give --threshold') from error
+    _say(f'   threshold {threshold:.3f}, from the first drive alone')
+    return threshold
+
+
+def _tell(result: 'DriveResult', folder: Path) -> None:
+    _say('\n4. What came out')
+    for line in result.summary().splitlines():
+        _say(f'   {line}')
+    _say(f'   pictures and records are in {folder}/; look at {folder / "demo.png"}')
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.commands.demo_pictures import draw_result
+    from stavpr_ros.evaluation.drive import judge
+    from stavpr_ros.mapping import load_map
+    from stavpr_ros.ros.live import run_live
+    from stavpr_ros.sources import open_source
+
+    began = time.monotonic()
+    folder = Path(arguments.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    drives = _users_drives(arguments) if arguments.map else _make_world(folder, arguments.world_seed)
+    map_path = folder / 'map.stavpr'
+    place_map = _make_map(drives, arguments, map_path)
+    threshold = _choose_threshold(place_map, arguments.threshold)
+    _say(
+        '3. The second drive through the node, over ROS: node, replay and listener are processes of their own'
+    )
+    parameters = {'map_path': map_path, 'threshold': threshold, 'sequence_length': LENGTH}
+    images = len(open_source(drives.query, drives.topic))
+    records = run_live(parameters, drives.query, images, folder, drives.topic)
+    result = judge(records, LENGTH, threshold, drives.truth, arguments.tolerance)
+    query = open_source(drives.query, drives.topic)
+    draw_result(result, query, load_map(map_path), threshold, drives.title, folder)
+    _tell(result, folder)
+    _say(f'   {time.monotonic() - began:.0f} s in all')
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command."""
+    wait_passively()
+    parser = _parser()
+    arguments = parser.parse_args(args)
+    if (arguments.map is None) != (arguments.query is None):
+        parser.error('--map and --query go together')
+    if arguments.truth and arguments.map is None:
+        parser.error('--truth goes with --map and --query: the made-up street knows its own')
+    try:
+        _run(arguments)
+    except StavprError as error:
+        print(f'demo: {error}', file=sys.stderr)
+        return 2 if isinstance(error, SettingsError) else 1
+    except KeyboardInterrupt:
+        print('demo: interrupted', file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
