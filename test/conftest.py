@@ -46,3 +46,19 @@ def small_map(route):
     poses = np.zeros((len(route), 7))
     poses[:, 0], poses[:, 6] = np.arange(len(route)), 1
     return build_map(frames, Describer(projection=64), poses, progress=False)
+
+
+@pytest.fixture
+def squeezenet_settings(data_folder):
+    """The real network of the data folder, as it works best: its layer fire6/concat, 13 x 13 x 384."""
+    pytest.importorskip('onnxruntime', reason='the extra onnx is not installed')
+    from stavpr_ros.features.backbone import settings_class
+
+    return settings_class('onnx')(
+        model=str(data_folder / 'squeezenet1_1_imagenet' / 'squeezenet_fp16.onnx'),
+        layer='fire6/concat_1',
+        channels='bgr',
+        scale=1.0,
+        mean=(104, 117, 123),
+        std=(1, 1, 1),
+    )

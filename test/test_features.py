@@ -163,18 +163,9 @@ def test_a_map_remembers_the_network_not_its_place(tiny_onnx, tmp_path):
         Describer.from_settings(settings, None, model=str(moved))
 
 
-def test_squeezenet(data_folder):
+def test_squeezenet(squeezenet_settings):
     """The real network's inner layer: 13 x 13 x 384, cropped to seven strips of one column."""
-    pytest.importorskip('onnxruntime', reason='the extra onnx is not installed')
-    settings = settings_class('onnx')(
-        model=str(data_folder / 'squeezenet1_1_imagenet' / 'squeezenet_fp16.onnx'),
-        layer='fire6/concat_1',
-        channels='bgr',
-        scale=1.0,
-        mean=(104, 117, 123),
-        std=(1, 1, 1),
-    )
-    describer = Describer('onnx', settings)
+    describer = Describer('onnx', squeezenet_settings)
     rng = np.random.default_rng(0)
     features = describer.describe([rng.integers(0, 256, (60, 80, 3), np.uint8) for _ in range(3)])
     assert features.strips.shape == (7, 3, 13 * 384)

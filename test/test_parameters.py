@@ -8,7 +8,7 @@ import yaml
 from stavpr_ros.ros.parameters import PARAMETERS, configuration_yaml, documentation_markdown
 
 ROOT = Path(__file__).resolve().parents[1]
-REMEDY = 'make it anew: see "Parameters" in the README\'s section for developers'
+REMEDY = 'write it anew: python3 -m stavpr_ros.ros.parameters'
 
 
 def test_configuration_file_is_the_table():

@@ -72,8 +72,7 @@ def _read_poses(path: str) -> 'np.ndarray':
 
 
 def _build(arguments: argparse.Namespace) -> 'PlaceMap':
-    from stavpr_ros.commands.feature_options import backbone_settings
-    from stavpr_ros.features import Describer
+    from stavpr_ros.commands.feature_options import make_describer
     from stavpr_ros.mapping import build_map, save_map
     from stavpr_ros.sources import open_source
 
@@ -87,14 +86,7 @@ def _build(arguments: argparse.Namespace) -> 'PlaceMap':
         raise SettingsError(f'--every {arguments.every} must be at least 1')
     if not Path(arguments.output).absolute().parent.is_dir():
         raise SourceError(f'the folder of {arguments.output} does not exist: make it first')
-    describer = Describer(
-        arguments.features,
-        backbone_settings(arguments),
-        arguments.strips,
-        arguments.projection,
-        arguments.seed,
-        arguments.device,
-    )
+    describer = make_describer(arguments)
     source = open_source(arguments.input, arguments.topic, skip if arguments.skip_bad_images else None)
     frames = source if arguments.every == 1 else islice(source, 0, None, arguments.every)
     poses = _read_poses(arguments.poses) if arguments.poses else None

@@ -129,20 +129,12 @@ def _users_drives(arguments: argparse.Namespace) -> Drives:
 
 
 def _make_map(drives: Drives, arguments: argparse.Namespace, path: Path) -> 'PlaceMap':
-    from stavpr_ros.commands.feature_options import backbone_settings
-    from stavpr_ros.features import Describer
+    from stavpr_ros.commands.feature_options import make_describer
     from stavpr_ros.mapping import build_map, save_map
     from stavpr_ros.sources import open_source
 
     _say(f'2. The map of the first drive: {path}')
-    describer = Describer(
-        arguments.features,
-        backbone_settings(arguments),
-        arguments.strips,
-        arguments.projection,
-        arguments.seed,
-        arguments.device,
-    )
+    describer = make_describer(arguments)
     place_map = build_map(open_source(drives.reference, drives.topic), describer)
     save_map(place_map, path)
     return place_map

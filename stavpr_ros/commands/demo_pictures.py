@@ -26,15 +26,17 @@ def outcomes_of(result: DriveResult) -> list[Outcome]:
 
 
 def worth_seeing(outcomes: list[Outcome], count: int = 6) -> list[int]:
-    """Choose images spread over the drive: mostly of the commonest outcome, one of every other."""
+    """Choose images: one of each outcome, the rest of the commonest, far from those chosen already."""
     chosen: list[int] = []
     for outcome in dict.fromkeys(outcomes):
         same = [i for i, other in enumerate(outcomes) if other == outcome]
         chosen.append(same[len(same) // 2])
     common = max(set(outcomes), key=outcomes.count)
-    candidates = [i for i, other in enumerate(outcomes) if other == common]
-    more = np.linspace(0, len(candidates) - 1, max(0, count - len(chosen)) + 2)[1:-1]
-    return sorted({*chosen, *(candidates[int(i)] for i in more)})[:count]
+    candidates = np.array([i for i, other in enumerate(outcomes) if other == common])
+    while len(chosen) < min(count, len(outcomes)) and len(candidates):
+        gaps = np.abs(candidates[:, None] - np.array([0, len(outcomes), *chosen])).min(axis=1)
+        chosen.append(int(candidates[gaps.argmax()]))
+    return sorted(set(chosen))[:count]
 
 
 def _caption(result: DriveResult, image: int) -> str:

@@ -2,10 +2,13 @@
 
 import argparse
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features.backbone import KINDS, settings_class
+
+if TYPE_CHECKING:
+    from stavpr_ros.features import Describer
 
 
 def _boolean(text: str) -> bool:
@@ -52,7 +55,25 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
             )
 
 
-def backbone_settings(arguments: argparse.Namespace) -> Any:
+def make_describer(arguments: argparse.Namespace) -> 'Describer':
+    """
+    Make the describer that the parsed options ask for.
+
+    :raises SettingsError: options that are missing, out of range or of another kind.
+    """
+    from stavpr_ros.features import Describer
+
+    return Describer(
+        arguments.features,
+        _backbone_settings(arguments),
+        arguments.strips,
+        arguments.projection,
+        arguments.seed,
+        arguments.device,
+    )
+
+
+def _backbone_settings(arguments: argparse.Namespace) -> Any:
     """
     Return the settings of the chosen kind from the parsed options.
 

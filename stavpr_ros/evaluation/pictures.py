@@ -157,10 +157,18 @@ def warping_path(path: Path, distances: np.ndarray, pairs: np.ndarray, first: in
 
 
 def demo_sheet(
-    path: Path, pairs: Sequence[MatchPair], distances: np.ndarray, matched: np.ndarray, truth: np.ndarray | None,
-    best: np.ndarray, threshold: float, outcomes: Sequence[Outcome], tolerance: int = 3,
-    title: str = '', note: str = '',
-) -> Path:  # fmt: skip
+    path: Path,
+    pairs: Sequence[MatchPair],
+    distances: np.ndarray,
+    matched: np.ndarray,
+    truth: np.ndarray | None,
+    best: np.ndarray,
+    threshold: float,
+    outcomes: Sequence[Outcome],
+    tolerance: int = 3,
+    title: str = '',
+    note: str = '',
+) -> Path:
     """
     Draw one page of everything: pairs above, the matrix and the distance over time below.
 
@@ -267,7 +275,7 @@ def _draw_matrix(
 
 
 def _draw_matches(axes: 'Axes', matched: np.ndarray, truth: np.ndarray | None, tolerance: int) -> None:
-    """Draw the corridor of right answers, if it is known, and the matches in the colours of their outcomes."""
+    """Draw the corridor of right answers, if it is known, and the matches by outcome."""
     index = np.arange(len(matched))
     accepted = matched >= 0
     masks = {'match': accepted}

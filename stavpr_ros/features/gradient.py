@@ -17,6 +17,7 @@ from torch.nn.functional import avg_pool2d, pad
 
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features.backbone import setting
+from stavpr_ros.features.resize import resize_square
 
 
 @dataclass(frozen=True)
@@ -60,11 +61,7 @@ class Gradient:
         return self._normalise(self._histograms(grey.to(self._device)))
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
-        """Grey, and resized with area averaging: no aliasing, and no blur where an image is enlarged."""
-        size = (self.settings.size, self.settings.size)
-        shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        return cv2.resize(grey, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        return resize_square(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), self.settings.size)
 
     def _histograms(self, grey: torch.Tensor) -> torch.Tensor:
         """Pool the gradients by orientation over cells that overlap by half, (n, bins, cells, cells)."""

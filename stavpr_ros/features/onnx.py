@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 
-import cv2
 import numpy as np
 import torch
 
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
 from stavpr_ros.features.backbone import setting
+from stavpr_ros.features.resize import resize_square
 
 
 @dataclass(frozen=True)
@@ -126,9 +126,7 @@ class Onnx:
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         """Resize, order the channels, scale and shift: (3, size, size), float32."""
-        size = (self.settings.size, self.settings.size)
-        shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
-        resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        resized = resize_square(image, self.settings.size)
         if self.settings.channels == 'bgr':
             resized = resized[:, :, ::-1]
         values: np.ndarray = resized.astype(np.float32) * self.settings.scale

@@ -13,7 +13,8 @@ from stavpr_ros.errors import StavprError
 from stavpr_ros.features import Describer
 from stavpr_ros.mapping import PlaceMap, load_map
 from stavpr_ros.recognition import Recogniser, RecognitionSettings
-from stavpr_ros.ros.messages import blank_match, image_array, match_message
+from stavpr_ros.ros.messages import blank_match, match_message
+from stavpr_ros.sources.encodings import decode_message
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ class Engine:
         if self._recogniser is None or self._describer is None or self._map is None:
             return blank_match(message.header, PlaceMatch.NOT_READY, self.missing, self._threshold)
         try:
-            features = self._describer.describe([image_array(message)])
+            features = self._describer.describe([decode_message(message)])
             recognition = self._recogniser.add(features)
         except StavprError as error:
             self.invalid += 1

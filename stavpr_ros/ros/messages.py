@@ -2,16 +2,13 @@
 
 import math
 
-import numpy as np
 from builtin_interfaces.msg import Time
-from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from stavpr_msgs.msg import AlignedPair, MapInfo, PlaceMatch
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.storage import VERSION
 from stavpr_ros.recognition import Recognition, Verdict
-from stavpr_ros.sources.encodings import decode_image
 
 _VERDICTS = {
     Verdict.WARMING_UP: PlaceMatch.WARMING_UP,
@@ -23,23 +20,6 @@ _VERDICTS = {
 def time_message(nanoseconds: int) -> Time:
     """Return a time; 0 is 'unknown' wherever this package uses it."""
     return Time(sec=int(nanoseconds) // 10**9, nanosec=int(nanoseconds) % 10**9)
-
-
-def image_array(message: Image) -> np.ndarray:
-    """
-    Decode an image message.
-
-    :returns: RGB (h, w, 3) uint8.
-    :raises ImageError: an encoding that is not supported, or a header that lies.
-    """
-    return decode_image(
-        message.height,
-        message.width,
-        message.encoding,
-        bool(message.is_bigendian),
-        message.step,
-        message.data,
-    )
 
 
 def blank_match(header: Header, verdict: int, reason: str, threshold: float | None) -> PlaceMatch:

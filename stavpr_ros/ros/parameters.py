@@ -1,6 +1,7 @@
 """The node's parameters: one table, from which declaration, documentation and configuration follow."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -8,6 +9,8 @@ from rclpy.node import Node
 
 from stavpr_ros.alignment.settings import STRATEGIES
 from stavpr_ros.ros.devices import DEVICES
+
+TABLE_HEAD = '| parameter | default | unit | live | what it does |'
 
 
 @dataclass(frozen=True)
@@ -137,7 +140,7 @@ def configuration_yaml() -> str:
 
 def documentation_markdown() -> str:
     """Return the table as Markdown for the README."""
-    lines = ['| parameter | default | unit | live | what it does |', '|---|---|---|---|---|']
+    lines = [TABLE_HEAD, '|---|---|---|---|---|']
     for row in PARAMETERS:
         default = f"`'{row.default}'`" if isinstance(row.default, str) else f'`{row.default}`'
         sentence = row.sentence + (f' ({", ".join(row.choices)})' if row.choices else '')
@@ -145,3 +148,16 @@ def documentation_markdown() -> str:
             f'| `{row.name}` | {default} | {row.unit} | {"yes" if row.live else "no"} | {sentence} |'
         )
     return '\n'.join(lines) + '\n'
+
+
+def _write_documentation() -> None:
+    """Write the table into the configuration file and the README of the checkout in the current folder."""
+    Path('config/stavpr.yaml').write_text(configuration_yaml())
+    readme = Path('README.md')
+    before, _, rest = readme.read_text().partition(TABLE_HEAD)
+    after = rest.partition('\n\n')[2]
+    readme.write_text(f'{before}{documentation_markdown()}\n{after}')
+
+
+if __name__ == '__main__':
+    _write_documentation()

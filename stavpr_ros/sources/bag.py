@@ -8,7 +8,7 @@ import numpy as np
 
 from stavpr_ros.errors import ImageError, SourceError
 from stavpr_ros.sources.bag_file import OpenBag, is_bag, message_type, open_bag, reading
-from stavpr_ros.sources.encodings import NOT_PICTURES, decode_compressed, decode_image
+from stavpr_ros.sources.encodings import NOT_PICTURES, decode_compressed, decode_message
 from stavpr_ros.sources.frame import Frame, ImageRecord
 
 __all__ = ['BagSource', 'ImageRecord', 'image_topics', 'is_bag']
@@ -77,10 +77,7 @@ class BagSource:
         return self._each(lambda _, record: record)
 
     def _frame(self, index: int, record: ImageRecord) -> Frame:
-        image = decode_image(
-            record.height, record.width, record.encoding, record.is_bigendian, record.step, record.data
-        )
-        return Frame(image, record.stamp_ns or record.time_ns, f'{self.topic}#{index}')
+        return Frame(decode_message(record), record.stamp_ns or record.time_ns, f'{self.topic}#{index}')
 
     def _each(self, finish: Callable[[int, ImageRecord], Item]) -> Iterator[Item]:
         with open_bag(self.path) as bag:

@@ -120,6 +120,23 @@ def decode_image(
     return layout.to_rgb(pixels)
 
 
+def decode_message(message: Any) -> np.ndarray:
+    """
+    Decode an image message: a ``sensor_msgs/Image`` of rclpy or of rosbags, or anything with its fields.
+
+    :returns: RGB, uint8, shape (height, width, 3).
+    :raises ImageError: see :func:`decode_image`.
+    """
+    return decode_image(
+        message.height,
+        message.width,
+        message.encoding,
+        bool(message.is_bigendian),
+        message.step,
+        message.data,
+    )
+
+
 def decode_compressed(data: Any) -> np.ndarray:
     """
     Decode the bytes of an image file: JPEG, PNG, BMP, TIFF, PNM, WebP.
