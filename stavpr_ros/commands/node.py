@@ -3,7 +3,6 @@
 import sys
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 
 from stavpr_ros.errors import StavprError
 from stavpr_ros.threads import wait_passively
@@ -42,17 +41,21 @@ def main(args: list[str] | None = None) -> int:
         return 0
     wait_passively()
     from stavpr_ros.ros.node import PlaceRecognitionNode
+    from stavpr_ros.ros.spin import spin_until_shutdown
 
     rclpy.init(args=args)
     node = None
     try:
         node = PlaceRecognitionNode()
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
+        spin_until_shutdown(node)
+    except KeyboardInterrupt:  # while the map was loading
         pass
     except (StavprError, rclpy.exceptions.ParameterException) as error:
         rclpy.logging.get_logger('stavpr').fatal(f'cannot start: {error}')
         return 1
+    except Exception:  # of several types, when a signal has ended the context while the node was being made
+        if rclpy.ok():
+            raise
     finally:
         if node is not None:
             node.close()

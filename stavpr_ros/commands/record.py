@@ -55,10 +55,10 @@ def main(args: list[str] | None = None) -> int:
     except OSError as error:
         print(f'record: {error}', file=sys.stderr)
         return 1
-    from rclpy.executors import ExternalShutdownException
     from rclpy.qos import QoSProfile
 
     from stavpr_msgs.msg import PlaceMatch
+    from stavpr_ros.ros.spin import spin_until_shutdown
 
     rclpy.init(args=args)
     node = rclpy.create_node('stavpr_record')
@@ -74,10 +74,7 @@ def main(args: list[str] | None = None) -> int:
 
     node.create_subscription(PlaceMatch, arguments.topic, write, QoSProfile(depth=1000))
     try:
-        while arguments.count == 0 or written < arguments.count:
-            rclpy.spin_once(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        spin_until_shutdown(node, lambda: 0 < arguments.count <= written)
     finally:
         file.close()
         node.destroy_node()
