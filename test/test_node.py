@@ -253,3 +253,13 @@ def test_parameters_that_do_not_do_end_the_node(tmp_path, parameters, word):
     assert 'cannot start' in process.output()
     assert word in process.output()
     assert 'Traceback' not in process.output()
+
+
+def test_a_second_interrupt_does_not_spoil_the_end(bench, node, route):
+    """As `ros2 launch` does it: Ctrl-C reaches the whole group, and launch sends one more."""
+    for i in range(3):
+        bench.publisher.publish(image_message(route[i], i))
+    node.popen.send_signal(signal.SIGINT)
+    node.popen.send_signal(signal.SIGINT)
+    assert node.wait() == 0
+    assert 'Traceback' not in node.output()

@@ -41,7 +41,7 @@ def main(args: list[str] | None = None) -> int:
         return 0
     wait_passively()
     from stavpr_ros.ros.node import PlaceRecognitionNode
-    from stavpr_ros.ros.spin import spin_until_shutdown
+    from stavpr_ros.ros.spin import ignore_interrupts, spin_until_shutdown
 
     rclpy.init(args=args)
     node = None
@@ -57,6 +57,7 @@ def main(args: list[str] | None = None) -> int:
         if rclpy.ok():
             raise
     finally:
+        ignore_interrupts()
         if node is not None:
             node.close()
             node.destroy_node()

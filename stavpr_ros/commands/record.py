@@ -58,7 +58,7 @@ def main(args: list[str] | None = None) -> int:
     from rclpy.qos import QoSProfile
 
     from stavpr_msgs.msg import PlaceMatch
-    from stavpr_ros.ros.spin import spin_until_shutdown
+    from stavpr_ros.ros.spin import ignore_interrupts, spin_until_shutdown
 
     rclpy.init(args=args)
     node = rclpy.create_node('stavpr_record')
@@ -76,6 +76,7 @@ def main(args: list[str] | None = None) -> int:
     try:
         spin_until_shutdown(node, lambda: 0 < arguments.count <= written)
     finally:
+        ignore_interrupts()
         file.close()
         node.destroy_node()
         rclpy.try_shutdown()

@@ -1,11 +1,17 @@
-"""Spinning a node so that every signal ends it."""
+"""Spinning a node so that every signal ends it, and a second one does not spoil the end."""
 
+import signal
 from collections.abc import Callable
 
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 LONGEST_WAIT = 0.5  # seconds
+
+
+def ignore_interrupts() -> None:
+    """Be deaf to Ctrl-C from now on: ``ros2 launch`` sends a second one while the first is being obeyed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def spin_until_shutdown(node: Node, done: Callable[[], bool] = lambda: False) -> None:

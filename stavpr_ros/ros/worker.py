@@ -6,6 +6,8 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
+PATIENCE = 10.0  # seconds for the item in work when the thread is stopped
+
 
 class Worker:
     """
@@ -45,11 +47,11 @@ class Worker:
         return future
 
     def stop(self) -> None:
-        """Finish the item in work, drop the rest, end the thread."""
+        """Finish the item in work, drop the rest, end the thread (or leave it, if it takes too long)."""
         with self._changed:
             self._stopping = True
             self._changed.notify()
-        self._thread.join()
+        self._thread.join(PATIENCE)
         for future, _ in self._calls:
             future.cancel()
 
