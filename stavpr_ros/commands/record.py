@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from stavpr_msgs.msg import PlaceMatch
 
+LISTENING = 'recording {topic}'  # said when no message can be missed any more
+
 EPILOG = """
 The keys are the fields of stavpr_msgs/PlaceMatch; stamps are nanoseconds, numbers that are not there
 are null, the path is a list of [query_index, map_index], received is the time of arrival (ns, system clock).
@@ -58,6 +60,7 @@ def main(args: list[str] | None = None) -> int:
     from rclpy.qos import QoSProfile
 
     from stavpr_msgs.msg import PlaceMatch
+    from stavpr_ros.ros.discovery import Introduction
     from stavpr_ros.ros.spin import ignore_interrupts, spin_until_shutdown
 
     rclpy.init(args=args)
@@ -72,9 +75,20 @@ def main(args: list[str] | None = None) -> int:
         file.flush()
         written += 1
 
-    node.create_subscription(PlaceMatch, arguments.topic, write, QoSProfile(depth=1000))
+    subscription = node.create_subscription(PlaceMatch, arguments.topic, write, QoSProfile(depth=1000))
+    topic = subscription.topic_name
+    introduction = Introduction(node, lambda: node.get_publishers_info_by_topic(topic), timeout=10.0)
+
+    def complete() -> bool:
+        return 0 < arguments.count <= written
+
     try:
-        spin_until_shutdown(node, lambda: 0 < arguments.count <= written)
+        print(f'waiting for a publisher of {topic}', flush=True)
+        spin_until_shutdown(node, lambda: subscription.get_publisher_count() > 0)
+        spin_until_shutdown(node, lambda: introduction.done() or complete())
+        if node.context.ok():
+            print(LISTENING.format(topic=topic), flush=True)
+        spin_until_shutdown(node, complete)
     finally:
         ignore_interrupts()
         file.close()

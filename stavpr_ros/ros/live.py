@@ -15,6 +15,7 @@ from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
 from stavpr_ros.errors import StavprError, UnavailableError
 
+START_PATIENCE = 180.0  # seconds for the node to load the map and to compile
 PATIENCE = 20.0  # seconds for a process to end, or for a last answer to be written
 
 
@@ -58,6 +59,15 @@ def _running(command: list[str], log: Path, environment: dict[str, str]) -> Iter
             process.wait()
 
 
+def _wait_for_listener(node: subprocess.Popen[bytes], folder: Path) -> None:
+    """Wait until the listener says that it misses nothing any more."""
+    end = time.monotonic() + START_PATIENCE
+    while not any(line.startswith('recording') for line in _lines(folder / 'record.log')):
+        if node.poll() is not None or time.monotonic() > end:
+            raise StavprError(f'the node did not start, see {folder / "node.log"}')
+        time.sleep(0.05)
+
+
 def _lines(path: Path) -> list[str]:
     return path.read_text().splitlines() if path.exists() else []
 
@@ -84,9 +94,10 @@ def run_live(
     if topic is not None:
         replay += ['--topic', topic]
     with (
-        _running(node, folder / 'node.log', environment),
+        _running(node, folder / 'node.log', environment) as process,
         _running([executable('record'), '--output', str(matches)], folder / 'record.log', environment),
     ):
+        _wait_for_listener(process, folder)
         code = subprocess.run(replay, env=environment, check=False).returncode
         if code != 0:
             raise StavprError(f'the replay ended with {code}; the node said what is in {folder / "node.log"}')

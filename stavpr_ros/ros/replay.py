@@ -3,28 +3,24 @@
 import array
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
-from rcl_interfaces.srv import GetParameters
-from rclpy.client import Client
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.task import Future
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError
+from stavpr_ros.ros.discovery import Introduction
 from stavpr_ros.sources.frame import ImageRecord
 
 SECOND = 1_000_000_000
 SLICE_SECONDS = 0.1
 """Longest time in one wait, so that Ctrl-C is heard."""
-
-SETTLE_SECONDS = 2.0
-"""How long a listener may take to show its parameter service; some tools have none."""
 
 
 class NobodyListensError(StavprError):
@@ -56,20 +52,6 @@ class ReplaySettings:
     timeout: float = 20.0
     wait: float | None = None
     tries: int = 3
-
-
-@dataclass
-class _Inquiry:
-    """A request to a listener: its answer proves that it has heard of our topics."""
-
-    client: Client
-    answer: Future | None = field(default=None)
-
-    def done(self) -> bool:
-        """Tell whether the answer is here, asking as soon as that is possible."""
-        if self.answer is None and self.client.service_is_ready():
-            self.answer = self.client.call_async(GetParameters.Request())
-        return self.answer is not None and self.answer.done()
 
 
 def image_message(record: ImageRecord) -> Image:
@@ -114,7 +96,7 @@ class Replayer:
         )
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._inquiries: dict[str, _Inquiry] = {}
+        self._introduction = Introduction(node, self._listeners, settings.timeout)
         self._outstanding: Header | None = None
         self._start: tuple[float, int] | None = None
 
@@ -167,8 +149,7 @@ class Replayer:
                     f'{self.settings.timeout:g} s: expected reliable subscribers to take them; is one stuck?'
                 )
         # best-effort subscribers acknowledge nothing: an answer to a request sent after the images tells
-        for inquiry in self._inquiries.values():
-            inquiry.answer = None
+        self._introduction.renew()
         self._settle()
 
     def close(self) -> None:
@@ -187,37 +168,16 @@ class Replayer:
         return ''
 
     def _settle(self) -> None:
-        """
-        Wait until the listeners know of us; that we know of them is not enough for a best-effort one.
-
-        DDS does not tell when a remote reader has found our writer. But discovery is told in order, and the
-        topics of a request come after those of the images and answers: a node that answers knows all. Nodes
-        serve parameter requests by themselves; one that shows no such service is given ``SETTLE_SECONDS``.
-        """
-        soon = time.monotonic() + SETTLE_SECONDS
-        late = time.monotonic() + max(SETTLE_SECONDS, self.settings.timeout)
-        while (now := time.monotonic()) < late:
-            names = self._listeners()
-            for name in names - self._inquiries.keys():
-                client = self.node.create_client(GetParameters, f'{name}/get_parameters')
-                self._inquiries[name] = _Inquiry(client)
-            open_ = [name for name in names if not self._inquiries[name].done()]
-            if names and not open_:
-                return
-            if now > soon and all(self._inquiries[name].answer is None for name in open_):
-                return
+        """Wait until the listeners know of us: a best-effort one loses what comes before."""
+        while not self._introduction.done():
             self._spin(SLICE_SECONDS)
 
-    def _listeners(self) -> set[str]:
-        """Full names of the nodes that subscribe to the images (or answer), as far as known by now."""
+    def _listeners(self) -> list[Any]:
+        """Endpoints of those who subscribe to the images, or answer."""
         found = self.node.get_subscriptions_info_by_topic(self.publisher.topic_name)
         if self.subscription is not None:
             found += self.node.get_publishers_info_by_topic(self.subscription.topic_name)
-        return {
-            f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-            for info in found
-            if not info.node_name.startswith('_NODE_NAME_UNKNOWN')
-        }
+        return found
 
     def _wait_until_due(self, time_ns: int) -> None:
         if self._start is None:
