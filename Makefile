@@ -11,6 +11,7 @@ EXTRAS ?=
 MAP ?=
 QUERY ?=
 ARGS ?=
+export MAP QUERY
 
 NO_PYTHON = `$(PYTHON)` is not on the PATH: install Python 3.11, 3.12 or 3.13, or name it with PYTHON=PROGRAM
 # -E: a sourced ROS puts its own packages on PYTHONPATH
@@ -39,7 +40,7 @@ build: ## setup, and build stavpr_msgs and stavpr_ros with colcon
 	@$(BOOTSTRAP) build $(READY) --with $(EXTRAS)
 
 demo: build ## build, and show the node recognising places over ROS (MAP=, QUERY=, ARGS=)
-	@$(RUN) $(EXECUTABLES)/demo $(if $(MAP),--map '$(MAP)') $(if $(QUERY),--query '$(QUERY)') $(ARGS)
+	@$(RUN) $(EXECUTABLES)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") $(ARGS)
 
 test: lint ## build, lint, and run the tests against the built package (ARGS=)
 	@ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN) pytest test/ $(ARGS)

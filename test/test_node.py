@@ -263,3 +263,18 @@ def test_a_second_interrupt_does_not_spoil_the_end(bench, node, route):
     node.popen.send_signal(signal.SIGINT)
     assert node.wait() == 0
     assert 'Traceback' not in node.output()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_images_stream(bench, node, route, number):
+    """The end comes in the middle of an image, and is clean all the same."""
+    images = [image_message(route[i % 60], 7000 + i) for i in range(300)]
+    for i, message in enumerate(images):
+        bench.publisher.publish(message)
+        bench.executor.spin_once(timeout_sec=0.002)
+        if i == 100:
+            node.popen.send_signal(number)
+    assert node.wait() == 0
+    assert 'Traceback' not in node.output()
+    assert 'Exception' not in node.output()
+    assert 'images received' in node.output()

@@ -27,6 +27,27 @@ def test_oldest_is_dropped_while_busy():
     assert seen == [0, 3, 4]
 
 
+def test_an_item_that_fails_does_not_end_the_thread():
+    seen = []
+
+    def process(item):
+        seen.append(1 / item)
+
+    worker = Worker(process, capacity=5)
+    for item in (1, 0, 2):
+        worker.put(item)
+    while len(seen) < 2:
+        assert worker.call(lambda: True).result(10)
+    worker.stop()
+    assert seen == [1, 0.5]
+
+
+def test_a_call_after_the_end_is_cancelled():
+    worker = Worker(lambda item: None, capacity=1)
+    worker.stop()
+    assert worker.call(lambda: 7).cancelled()
+
+
 def test_calls_return_and_raise():
     worker = Worker(lambda item: None, capacity=1)
     assert worker.call(lambda: 7).result(10) == 7

@@ -53,7 +53,10 @@ def holistic_distances(
     reference_weights: np.ndarray | torch.Tensor,
 ) -> torch.Tensor:
     """
-    Cosine distances of whole feature maps ("no alignment"), put together again from their strips.
+    Cosine distances without alignment, of the W strips of each image put together again.
+
+    That is the whole feature map where its width is a multiple of W. Where it is not, strips leave
+    columns out; a map made with W = 1 leaves none out.
 
     :param query: unit-norm local features, shape (W, d), float32.
     :param query_weights: norm of each strip over the norm of all, shape (W,).

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stavpr_ros.errors import ImageError, SettingsError, SourceError, StavprError
+from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
@@ -66,6 +67,8 @@ def _read_poses(path: str) -> 'np.ndarray':
     if {len(row) for row in rows} not in ({3}, {7}):
         raise SourceError(f'poses {path}: expected 3 or 7 numbers on every line')
     poses = np.array(rows)
+    if not np.isfinite(poses).all():
+        raise SourceError(f'poses {path}: expected finite numbers')
     if poses.shape[1] == 3:
         poses = np.hstack([poses, np.tile([0.0, 0.0, 0.0, 1.0], (len(poses), 1))])
     return poses
@@ -84,12 +87,21 @@ def _build(arguments: argparse.Namespace) -> 'PlaceMap':
 
     if arguments.every < 1:
         raise SettingsError(f'--every {arguments.every} must be at least 1')
+    if arguments.poses and arguments.skip_bad_images:
+        raise SettingsError('--poses and --skip-bad-images: a skipped image would shift the poses; give one')
     if not Path(arguments.output).absolute().parent.is_dir():
         raise SourceError(f'the folder of {arguments.output} does not exist: make it first')
     describer = make_describer(arguments)
     source = open_source(arguments.input, arguments.topic, skip if arguments.skip_bad_images else None)
     frames = source if arguments.every == 1 else islice(source, 0, None, arguments.every)
-    poses = _read_poses(arguments.poses) if arguments.poses else None
+    poses = None
+    if arguments.poses:
+        poses = _read_poses(arguments.poses)
+        if len(poses) != len(source):
+            raise SourceError(
+                f'poses {arguments.poses} has {len(poses)} lines for {len(source)} images: give one each'
+            )
+        poses = poses[:: arguments.every]
     place_map = build_map(frames, describer, poses, thumbnails=not arguments.no_thumbnails)
     save_map(place_map, arguments.output)
     if skipped:
@@ -115,6 +127,7 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
+    obey_signals()
     wait_passively()
     arguments = _parser().parse_args(args)
     try:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stavpr_ros.errors import InputError, SettingsError, StavprError
+from stavpr_ros.errors import InputError, SettingsError, SourceError, StavprError
+from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
     from stavpr_ros.evaluation.drive import DriveResult
     from stavpr_ros.evaluation.world import Drive
+    from stavpr_ros.features import Describer
     from stavpr_ros.mapping import PlaceMap
 
 TOPIC = '/camera/image_raw'
@@ -121,23 +123,24 @@ def _users_drives(arguments: argparse.Namespace) -> Drives:
     from stavpr_ros.sources import open_source
 
     _say(f'1. Your drives: {arguments.map} is the map, {arguments.query} the query')
+    places, images = (len(open_source(path, arguments.topic)) for path in (arguments.map, arguments.query))
+    if images < LENGTH:
+        raise SettingsError(f'{arguments.query} has {images} images: the window alone needs {LENGTH}')
     truth = None
     if arguments.truth == 'identity':
-        truth = np.arange(len(open_source(arguments.query, arguments.topic)))
+        if images > places:
+            raise SettingsError(f'--truth identity: {images} query images on a map of {places} places')
+        truth = np.arange(images)
     title = f'{Path(arguments.query).name} recognised on the map of {Path(arguments.map).name}'
     return Drives(arguments.map, arguments.query, arguments.topic, truth, title)
 
 
-def _make_map(drives: Drives, arguments: argparse.Namespace, path: Path) -> 'PlaceMap':
-    from stavpr_ros.commands.feature_options import make_describer
-    from stavpr_ros.mapping import build_map, save_map
+def _describe(path: str, topic: str | None, describer: 'Describer') -> 'PlaceMap':
+    """Describe a drive; images that cannot be read are said and skipped, as the replay does."""
+    from stavpr_ros.mapping import build_map
     from stavpr_ros.sources import open_source
 
-    _say(f'2. The map of the first drive: {path}')
-    describer = make_describer(arguments)
-    place_map = build_map(open_source(drives.reference, drives.topic), describer)
-    save_map(place_map, path)
-    return place_map
+    return build_map(open_source(path, topic, lambda error: _say(f'   skipped: {error}')), describer)
 
 
 def _choose_threshold(place_map: 'PlaceMap', given: float | None) -> float:
@@ -162,36 +165,47 @@ def _tell(result: 'DriveResult', folder: Path) -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     from stavpr_ros.commands.demo_pictures import draw_result
+    from stavpr_ros.commands.feature_options import make_describer
     from stavpr_ros.evaluation.drive import judge
-    from stavpr_ros.mapping import load_map
+    from stavpr_ros.mapping import save_map
     from stavpr_ros.ros.live import run_live
-    from stavpr_ros.sources import open_source
 
     began = time.monotonic()
     folder = Path(arguments.output)
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SourceError(f'folder {folder} cannot be made: {error}') from error
     drives = _users_drives(arguments) if arguments.map else _make_world(folder, arguments.world_seed)
+
     map_path = folder / 'map.stavpr'
-    place_map = _make_map(drives, arguments, map_path)
+    _say(f'2. The map of the first drive: {map_path}')
+    place_map = _describe(drives.reference, drives.topic, make_describer(arguments))
+    save_map(place_map, map_path)
     threshold = _choose_threshold(place_map, arguments.threshold)
-    _say(
-        '3. The second drive through the node, over ROS: node, replay and listener are processes of their own'
-    )
+
+    _say('3. The second drive through the node, over ROS, with replay and listener as processes of their own')
+    query = _describe(drives.query, drives.topic, place_map.describer())
+    if drives.truth is not None and len(query) != len(drives.truth):
+        raise SourceError('images were skipped: the truth of the others is not known; repair or remove them')
     parameters = {'map_path': map_path, 'threshold': threshold, 'sequence_length': LENGTH}
-    images = len(open_source(drives.query, drives.topic))
-    records = run_live(parameters, drives.query, images, folder, drives.topic)
+    records = run_live(parameters, drives.query, len(query), folder, drives.topic)
     result = judge(records, LENGTH, threshold, drives.truth, arguments.tolerance)
-    query = open_source(drives.query, drives.topic)
-    draw_result(result, query, load_map(map_path), threshold, drives.title, folder)
+    draw_result(result, query, place_map, threshold, drives.title, folder)
     _tell(result, folder)
     _say(f'   {time.monotonic() - began:.0f} s in all')
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
+    obey_signals()
     wait_passively()
     parser = _parser()
     arguments = parser.parse_args(args)
+    if arguments.threshold is not None and not arguments.threshold > 0:
+        parser.error(f'--threshold {arguments.threshold} must be above 0')
+    if arguments.tolerance < 0:
+        parser.error(f'--tolerance {arguments.tolerance} must be at least 0')
     if (arguments.map is None) != (arguments.query is None):
         parser.error('--map and --query go together')
     if arguments.truth and arguments.map is None:

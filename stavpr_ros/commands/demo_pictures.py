@@ -1,16 +1,16 @@
 """The pictures of a demonstration: chooses what is worth seeing and has it drawn."""
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
+from stavpr_ros.errors import InputError
 from stavpr_ros.evaluation import pictures
 from stavpr_ros.evaluation.drive import DriveResult
 from stavpr_ros.evaluation.pictures import MatchPair, Outcome
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping import PlaceMap, describe_frames
+from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import Recogniser, RecognitionSettings
 
 
@@ -47,17 +47,17 @@ def _caption(result: DriveResult, image: int) -> str:
     return f'image {image}: {where}, distance {distance:.3f}'
 
 
-def _pairs(result: DriveResult, images: dict[int, np.ndarray], place_map: PlaceMap) -> list[MatchPair]:
-    outcomes = outcomes_of(result)
-    pairs = []
-    for image, picture in images.items():
-        place = int(result.matched[image])
-        shown = place_map.thumbnail(place) if place >= 0 else None
-        if shown is not None:
-            size = (picture.shape[1], picture.shape[0])
-            shown = cv2.resize(shown, size, interpolation=cv2.INTER_CUBIC)
-        pairs.append(MatchPair(picture, shown, _caption(result, image), outcomes[image]))
-    return pairs
+def _pair(
+    result: DriveResult, image: int, outcome: Outcome, query: PlaceMap, place_map: PlaceMap
+) -> MatchPair:
+    picture = query.thumbnail(image)
+    if picture is None:
+        raise InputError('the query was described without thumbnails')
+    place = int(result.matched[image])
+    shown = place_map.thumbnail(place) if place >= 0 else None
+    if shown is not None:
+        shown = cv2.resize(shown, (picture.shape[1], picture.shape[0]), interpolation=cv2.INTER_CUBIC)
+    return MatchPair(picture, shown, _caption(result, image), outcome)
 
 
 def _matrix(features: LocalFeatures, place_map: PlaceMap) -> np.ndarray:
@@ -67,27 +67,17 @@ def _matrix(features: LocalFeatures, place_map: PlaceMap) -> np.ndarray:
 
 
 def draw_result(
-    result: DriveResult, query: Any, place_map: PlaceMap, threshold: float, title: str, folder: Path
+    result: DriveResult, query: PlaceMap, place_map: PlaceMap, threshold: float, title: str, folder: Path
 ) -> None:
     """
     Draw the page ``demo.png``, and its parts in pictures of their own.
 
-    :param query: the source of the query's images.
+    :param query: the described query, with thumbnails.
     """
     outcomes = outcomes_of(result)
-    wanted = worth_seeing(outcomes)
-    kept: dict[int, np.ndarray] = {}
-
-    def frames():  # type: ignore[no-untyped-def]
-        for i, frame in enumerate(query):
-            if i in wanted:
-                kept[i] = frame.image
-            yield frame
-
-    matrix = _matrix(describe_frames(frames(), place_map.describer()), place_map)
-    pairs = _pairs(result, kept, place_map)
-    truth = result.truth
-    best = result.answers.distances
+    matrix = _matrix(query.features, place_map)
+    pairs = [_pair(result, i, outcomes[i], query, place_map) for i in worth_seeing(outcomes)]
+    truth, best = result.truth, result.answers.distances
     pictures.demo_sheet(
         folder / 'demo.png',
         pairs,

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
+from stavpr_ros.devices import DEVICES, choose_device
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features.backbone import KINDS, settings_class
 
@@ -40,7 +41,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
         '--projection', type=int, metavar='D', help='random projection of each strip to D dimensions (none)'
     )
     group.add_argument('--seed', type=int, default=0, help='of the random projection (%(default)s)')
-    group.add_argument('--device', default='cpu', choices=('cpu', 'cuda'), help='where features are computed')
+    group.add_argument('--device', default='auto', choices=DEVICES, help='where features are computed')
     for kind in KINDS:
         group = parser.add_argument_group(f'features {kind}')
         for row in dataclasses.fields(settings_class(kind)):
@@ -69,7 +70,7 @@ def make_describer(arguments: argparse.Namespace) -> 'Describer':
         arguments.strips,
         arguments.projection,
         arguments.seed,
-        arguments.device,
+        choose_device(arguments.device),
     )
 
 

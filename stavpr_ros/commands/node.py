@@ -2,9 +2,8 @@
 
 import sys
 
-import rclpy
-
 from stavpr_ros.errors import StavprError
+from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
 HELP = """usage: node [--ros-args -p map_path:=FILE -p threshold:=VALUE [-p NAME:=VALUE ...]
@@ -39,29 +38,27 @@ def main(args: list[str] | None = None) -> int:
     if arguments[:1] in (['-h'], ['--help']):
         print(_help())
         return 0
+    obey_signals()
     wait_passively()
-    from stavpr_ros.ros.node import PlaceRecognitionNode
-    from stavpr_ros.ros.spin import ignore_interrupts, spin_until_shutdown
-
-    rclpy.init(args=args)
-    node = None
     try:
-        node = PlaceRecognitionNode()
-        spin_until_shutdown(node)
-    except KeyboardInterrupt:  # while the map was loading
-        pass
-    except (StavprError, rclpy.exceptions.ParameterException) as error:
-        rclpy.logging.get_logger('stavpr').fatal(f'cannot start: {error}')
+        return _run(args)
+    except KeyboardInterrupt:
+        return 0
+
+
+def _run(args: list[str] | None) -> int:
+    from rclpy.exceptions import ParameterException
+    from rclpy.logging import get_logger
+
+    from stavpr_ros.ros.node import PlaceRecognitionNode
+    from stavpr_ros.ros.process import ros_node, spin_until
+
+    try:
+        with ros_node(PlaceRecognitionNode, args) as node:
+            spin_until(node)
+    except (StavprError, ParameterException) as error:
+        get_logger('stavpr').fatal(f'cannot start: {error}')
         return 1
-    except Exception:  # of several types, when a signal has ended the context while the node was being made
-        if rclpy.ok():
-            raise
-    finally:
-        ignore_interrupts()
-        if node is not None:
-            node.close()
-            node.destroy_node()
-        rclpy.try_shutdown()
     return 0
 
 

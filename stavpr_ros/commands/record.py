@@ -4,16 +4,23 @@ import argparse
 import json
 import math
 import sys
-from typing import TYPE_CHECKING, Any
+import time
+from typing import TYPE_CHECKING, Any, TextIO
+
+from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.signals import obey_signals
 
 if TYPE_CHECKING:
     from stavpr_msgs.msg import PlaceMatch
 
+_VERDICTS = ('WARMING_UP', 'NO_MATCH', 'MATCH', 'INVALID_IMAGE', 'NOT_READY', 'DROPPED')
+
 LISTENING = 'recording {topic}'  # said when no message can be missed any more
 
 EPILOG = """
-The keys are the fields of stavpr_msgs/PlaceMatch; stamps are nanoseconds, numbers that are not there
-are null, the path is a list of [query_index, map_index], received is the time of arrival (ns, system clock).
+The keys are the fields of stavpr_msgs/PlaceMatch, the verdict by its name; stamps are
+nanoseconds, numbers that are not there are null, the path is a list of [query_index, map_index],
+received is the time of arrival (ns, system clock).
 
 exit codes: 0 done (--count reached, or stopped by a signal), 1 the file cannot be written, 2 usage
 """
@@ -28,7 +35,9 @@ def match_record(message: 'PlaceMatch') -> dict[str, Any]:
     record: dict[str, Any] = {'stamp': _stamp(message.header.stamp), 'frame_id': message.header.frame_id}
     for name, kind in message.get_fields_and_field_types().items():
         value = getattr(message, name)
-        if name == 'path':
+        if name == 'verdict':
+            record[name] = _VERDICTS[value]
+        elif name == 'path':
             record[name] = [[pair.query_index, pair.map_index] for pair in value]
         elif kind == 'builtin_interfaces/Time':
             record[name] = _stamp(value)
@@ -48,54 +57,57 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--output', required=True, metavar='FILE', help='the file to write (JSON lines)')
     parser.add_argument('--topic', default='/stavpr/match', help='topic of the matches (%(default)s)')
     parser.add_argument('--count', type=int, default=0, help='end after so many matches (0 = go on)')
-    import rclpy
-    from rclpy.utilities import remove_ros_args
+    from stavpr_ros.ros.process import own_arguments
 
-    arguments = parser.parse_args(remove_ros_args(args if args is not None else sys.argv)[args is None :])
+    given = sys.argv[1:] if args is None else args
+    obey_signals()
     try:
-        file = open(arguments.output, 'w')  # noqa: SIM115
-    except OSError as error:
+        arguments = parser.parse_args(own_arguments(given))
+        with open(arguments.output, 'w') as file:
+            written = _record(arguments, file, given)
+    except (OSError, StavprError) as error:
         print(f'record: {error}', file=sys.stderr)
-        return 1
+        return 2 if isinstance(error, SettingsError) else 1
+    print(f'{written} matches written to {arguments.output}')
+    return 0
+
+
+def _record(arguments: argparse.Namespace, file: TextIO, ros_arguments: list[str]) -> int:
+    """Write what is heard until a signal or the count; return how many."""
+    import rclpy
     from rclpy.qos import QoSProfile
 
     from stavpr_msgs.msg import PlaceMatch
     from stavpr_ros.ros.discovery import Introduction
-    from stavpr_ros.ros.spin import ignore_interrupts, spin_until_shutdown
+    from stavpr_ros.ros.process import ros_node, spin_until
 
-    rclpy.init(args=args)
-    node = rclpy.create_node('stavpr_record')
     written = 0
 
     def write(message: PlaceMatch) -> None:
         nonlocal written
-        record = match_record(message)
-        record['received'] = node.get_clock().now().nanoseconds
+        record = match_record(message) | {'received': time.time_ns()}
         file.write(json.dumps(record) + '\n')
         file.flush()
         written += 1
-
-    subscription = node.create_subscription(PlaceMatch, arguments.topic, write, QoSProfile(depth=1000))
-    topic = subscription.topic_name
-    introduction = Introduction(node, lambda: node.get_publishers_info_by_topic(topic), timeout=10.0)
 
     def complete() -> bool:
         return 0 < arguments.count <= written
 
     try:
-        print(f'waiting for a publisher of {topic}', flush=True)
-        spin_until_shutdown(node, lambda: subscription.get_publisher_count() > 0)
-        spin_until_shutdown(node, lambda: introduction.done() or complete())
-        if node.context.ok():
+        with ros_node(lambda: rclpy.create_node('stavpr_record'), ros_arguments) as node:
+            subscription = node.create_subscription(
+                PlaceMatch, arguments.topic, write, QoSProfile(depth=1000)
+            )
+            topic = subscription.topic_name
+            introduction = Introduction(node, lambda: node.get_publishers_info_by_topic(topic), timeout=10.0)
+            print(f'waiting for a publisher of {topic}', flush=True)
+            spin_until(node, lambda: subscription.get_publisher_count() > 0)
+            spin_until(node, lambda: introduction.done() or complete())
             print(LISTENING.format(topic=topic), flush=True)
-        spin_until_shutdown(node, complete)
-    finally:
-        ignore_interrupts()
-        file.close()
-        node.destroy_node()
-        rclpy.try_shutdown()
-    print(f'{written} matches written to {arguments.output}')
-    return 0
+            spin_until(node, complete)
+    except KeyboardInterrupt:
+        pass  # the usual end
+    return written
 
 
 if __name__ == '__main__':

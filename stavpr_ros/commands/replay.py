@@ -2,33 +2,25 @@
 
 import argparse
 import math
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 
 import rclpy
 from rclpy.exceptions import InvalidTopicNameException
-from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
 from tqdm import tqdm
 
-from stavpr_ros.errors import ImageError, StavprError
+from stavpr_ros.errors import ImageError, SettingsError, StavprError
+from stavpr_ros.ros.process import own_arguments, ros_node
 from stavpr_ros.ros.replay import NoAnswerError, NobodyListensError, Replayer, ReplaySettings
 from stavpr_ros.ros.transport import prepare_transport
+from stavpr_ros.signals import obey_signals
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord
 
 DONE, BAD_INPUT, BAD_USAGE, NOBODY_LISTENS, NO_ANSWER, INTERRUPTED = 0, 1, 2, 3, 4, 130
 FOLDER_RATE = 10.0
-
-BAD_ROS_ARGUMENTS = (
-    InvalidTopicNameException,
-    rclpy_implementation.UnknownROSArgsError,
-    rclpy_implementation.RCLInvalidROSArgsError,
-)
 
 EPILOG = """\
 examples:
@@ -59,14 +51,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :returns: exit code, see ``--help``.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
-    # SIGTERM takes Ctrl-C's way; rclpy's own handlers would pull the context away under us
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    obey_signals()
     try:
-        return _run(_parser().parse_args(remove_ros_args(given)), given)
+        return _run(_parser().parse_args(own_arguments(given)), given)
     except KeyboardInterrupt:
         print('replay: interrupted', file=sys.stderr)
         return INTERRUPTED
-    except BAD_ROS_ARGUMENTS as error:
+    except (InvalidTopicNameException, SettingsError) as error:
         print(f'replay: error: {error}', file=sys.stderr)
         return BAD_USAGE
     except StavprError as error:
@@ -115,19 +106,12 @@ def _play(
 ) -> str:
     """Replay over ROS and say in words what was done."""
     prepare_transport()
-    rclpy.init(args=ros_arguments, signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node = rclpy.create_node('stavpr_replay')
+    with ros_node(lambda: rclpy.create_node('stavpr_replay'), ros_arguments) as node:
+        replayer = Replayer(node, settings, notify)
         try:
-            replayer = Replayer(node, settings, notify)
-            try:
-                return _feed(replayer, records, count)
-            finally:
-                replayer.close()
+            return _feed(replayer, records, count)
         finally:
-            node.destroy_node()
-    finally:
-        rclpy.try_shutdown()
+            replayer.close()
 
 
 def _feed(replayer: Replayer, records: Iterator[ImageRecord], count: Callable[[], object]) -> str:

@@ -7,6 +7,8 @@ import numpy as np
 
 from stavpr_ros.evaluation.metrics import FrameAnswers, Score, WindowAnswer, frame_answers, score_at
 
+IN_WINDOW = ('WARMING_UP', 'NO_MATCH', 'MATCH')  # verdicts of images that the window holds
+
 
 @dataclass(frozen=True)
 class DriveResult:
@@ -44,7 +46,7 @@ class DriveResult:
         if self.score is not None:
             s = self.score
             line += f', precision {s.precision:.2f}, recall {s.recall:.2f}, F1 {s.f1:.2f}'
-        return f'{line}; {1 / self.seconds.mean():.0f} images per second'
+        return f'{line}; {1 / self.seconds.mean():.0f} images per second' if len(self.seconds) else line
 
     def summary(self) -> str:
         """Return the result in words, a line each."""
@@ -58,6 +60,8 @@ class DriveResult:
                 lines.append(
                     f'{wrong} of {np.count_nonzero(unseen)} images of unseen places matched all the same'
                 )
+        if not len(self.seconds):
+            return '\n'.join(lines)
         median, slow = np.percentile(self.seconds, [50, 99]) * 1e3
         lines.append(
             f'{1 / self.seconds.mean():.1f} images per second, one after the other; from image to answer '
@@ -73,6 +77,16 @@ def window_answer(record: dict[str, Any]) -> WindowAnswer | None:
     return WindowAnswer(record['sequence_middle'], record['distance'], np.array(record['path'], np.int32))
 
 
+def _answers(records: list[dict[str, Any]], length: int) -> FrameAnswers:
+    """Assign windows to images; an image that was in no window (invalid, dropped) has no answer."""
+    taken = np.array([record['verdict'] in IN_WINDOW for record in records], bool)
+    windows = [window_answer(record) for record in records if record['verdict'] in IN_WINDOW]
+    among_taken = frame_answers(windows, length)
+    places, distances = np.full(len(records), -1, np.int64), np.full(len(records), np.inf)
+    places[taken], distances[taken] = among_taken.places, among_taken.distances
+    return FrameAnswers(places, distances)
+
+
 def judge(
     records: list[dict[str, Any]], length: int, threshold: float, truth: np.ndarray | None, tolerance: int
 ) -> DriveResult:
@@ -84,7 +98,7 @@ def judge(
     :param truth: true place of each image, -1 = not in the map; None = unknown.
     :param tolerance: places.
     """
-    answers = frame_answers([window_answer(record) for record in records], length)
+    answers = _answers(records, length)
     score = None
     if truth is not None:
         score = score_at(threshold, answers.distances, answers.within(truth, tolerance), truth >= 0)

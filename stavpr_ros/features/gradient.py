@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d, pad
 
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features.backbone import setting
-from stavpr_ros.features.resize import resize_square
+from stavpr_ros.features.resize import check_method, resize_square
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,13 @@ class GradientSettings:
     """Settings of the oriented-gradient features."""
 
     size: int = setting(224, help='images are resized to size x size pixels first')
+    resize: str = setting('area', help='how images are resized: bilinear, or area (averages, no aliasing)')
     cell: int = setting(16, help='side of a cell in pixels; size must be a multiple of it')
     orientations: int = setting(8, help='number of orientation bins')
     signed: bool = setting(True, help='tell dark-to-bright from bright-to-dark')
 
     def __post_init__(self) -> None:
+        check_method(self.resize)
         if self.cell < 2 or self.size < 2 * self.cell or self.size % self.cell:
             raise SettingsError(
                 f'size {self.size} and cell {self.cell}: size must be a multiple of cell, at least twice it'
@@ -61,7 +63,9 @@ class Gradient:
         return self._normalise(self._histograms(grey.to(self._device)))
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
-        return resize_square(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), self.settings.size)
+        return resize_square(
+            cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), self.settings.size, self.settings.resize
+        )
 
     def _histograms(self, grey: torch.Tensor) -> torch.Tensor:
         """Pool the gradients by orientation over cells that overlap by half, (n, bins, cells, cells)."""

@@ -16,7 +16,7 @@ import torch
 
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
 from stavpr_ros.features.backbone import setting
-from stavpr_ros.features.resize import resize_square
+from stavpr_ros.features.resize import check_method, resize_square
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,9 @@ class OnnxSettings:
     model: str = setting(help='the ONNX file', identity=False)
     layer: str = setting(help='name of the inner output (tensor) to use, a map of shape (n, C, H, W)')
     size: int = setting(224, help='images are resized to size x size pixels')
+    resize: str = setting(
+        'bilinear', help='how images are resized: bilinear, or area (averages, no aliasing)'
+    )
     channels: str = setting('rgb', help='order of the input channels, rgb or bgr')
     scale: float = setting(1 / 255, help='factor on the pixel values 0..255, before the mean')
     mean: tuple[float, ...] = setting((0.485, 0.456, 0.406), help='subtracted, in the order of the channels')
@@ -33,6 +36,7 @@ class OnnxSettings:
     sha256: str = setting('', help='expected hash of the file; empty = take the file as it is')
 
     def __post_init__(self) -> None:
+        check_method(self.resize)
         object.__setattr__(self, 'mean', tuple(float(v) for v in self.mean))
         object.__setattr__(self, 'std', tuple(float(v) for v in self.std))
         if self.channels not in ('rgb', 'bgr'):
@@ -80,7 +84,12 @@ class Onnx:
             providers.insert(0, 'CUDAExecutionProvider')
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
-        self._session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=providers)
+        try:
+            self._session = onnxruntime.InferenceSession(
+                model.SerializeToString(), options, providers=providers
+            )
+        except Exception as error:  # onnxruntime raises types of its own
+            raise UnavailableError(f'{path} cannot be run by onnxruntime: {error}') from error
         self._input = self._session.get_inputs()[0]
         self._dtype = np.float16 if self._input.type == 'tensor(float16)' else np.float32
 
@@ -113,10 +122,15 @@ class Onnx:
 
         :param images: RGB, each (h, w, 3) uint8, of any size; resized without keeping the aspect.
         :returns: shape (n, C, H, Wf), float32.
-        :raises SettingsError: the layer is no map with four axes.
+        :raises SettingsError: the network does not take this size, or the layer is no map with four axes.
         """
         batch = np.stack([self._prepare(image) for image in images]).astype(self._dtype)
-        maps = self._session.run([self.settings.layer], {self._input.name: batch})[0]
+        try:
+            maps = self._session.run([self.settings.layer], {self._input.name: batch})[0]
+        except Exception as error:  # onnxruntime raises types of its own
+            raise SettingsError(
+                f'{self.settings.model} does not take images of size {self.settings.size}: {error}'
+            ) from error
         if maps.ndim != 4:
             raise SettingsError(
                 f'layer {self.settings.layer!r} has shape {maps.shape}: expected a map (n, C, H, W); '
@@ -126,7 +140,7 @@ class Onnx:
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         """Resize, order the channels, scale and shift: (3, size, size), float32."""
-        resized = resize_square(image, self.settings.size)
+        resized = resize_square(image, self.settings.size, self.settings.resize)
         if self.settings.channels == 'bgr':
             resized = resized[:, :, ::-1]
         values: np.ndarray = resized.astype(np.float32) * self.settings.scale

@@ -38,6 +38,8 @@ class PlaceMap:
             )
         if self.poses is not None and self.poses.shape != (n, 7):
             raise InputError(f'poses have shape {self.poses.shape}: expected ({n}, 7)')
+        if self.poses is not None and not np.isfinite(self.poses).all():
+            raise InputError('poses hold NaN or infinite numbers: expected metres and quaternions')
         if len(self.thumbnails) not in (0, n):
             raise InputError(f'{len(self.thumbnails)} thumbnails for {n} places: expected all or none')
         identity = self.projection.identity if self.projection else None

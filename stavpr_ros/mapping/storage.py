@@ -115,6 +115,8 @@ def load_map(path: str | Path) -> PlaceMap:
         raise
     except FileNotFoundError as error:
         raise MapFileError(f'map {path} does not exist: make one with build_map') from error
+    except (IsADirectoryError, PermissionError) as error:
+        raise MapFileError(f'map {path} cannot be read ({error.strerror}): name a map file') from error
     except (
         OSError,
         EOFError,

@@ -5,14 +5,14 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import torch
 
 from stavpr_ros.alignment.path import aligned_index
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.similarity import holistic_distances, strip_distances
 from stavpr_ros.alignment.spatial import image_distances
 from stavpr_ros.alignment.temporal import SequenceMatch, best_match, match_padded, trace_sequence
-from stavpr_ros.errors import InputError, SettingsError, UnavailableError
+from stavpr_ros.devices import choose_device
+from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.window import DistanceWindow
@@ -92,10 +92,7 @@ class Recogniser:
     """
 
     def __init__(self, place_map: PlaceMap, settings: RecognitionSettings, device: str = 'cpu') -> None:
-        if device == 'cuda' and not torch.cuda.is_available():
-            raise UnavailableError(
-                "device 'cuda' was asked for, but torch sees no CUDA device: take 'cpu' or 'auto'"
-            )
+        device = choose_device(device)
         settings.spatial.band(place_map.settings.strips)
         self._features = place_map.features.to(device)
         self._settings = settings

@@ -46,6 +46,11 @@ class Engine:
         self.invalid = 0
 
     @property
+    def threshold(self) -> float | None:
+        """The threshold in force, None = not set."""
+        return self._threshold
+
+    @property
     def missing(self) -> str:
         """Why there can be no match yet, in words; empty when everything is there."""
         if self._map is None:

@@ -1,12 +1,13 @@
 """The node, a replay and a listener, each a process of its own: recognition as a robot would have it."""
 
 import json
+import math
 import os
 import random
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -43,10 +44,15 @@ def private_domain() -> dict[str, str]:
 
 
 @contextmanager
-def _running(command: list[str], log: Path, environment: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a process with its output in a file; end it gently, and in any case, at the end."""
-    with log.open('w') as output:
-        process = subprocess.Popen(command, env=environment, stdout=output, stderr=subprocess.STDOUT)
+def _running(
+    command: list[str], log: Path | None, environment: dict[str, str]
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a process, its output in a file or shown; end it gently, and in any case, at the end."""
+    if log is None:
+        process = subprocess.Popen(command, env=environment)
+    else:
+        with log.open('w') as output:
+            process = subprocess.Popen(command, env=environment, stdout=output, stderr=subprocess.STDOUT)
     try:
         yield process
     finally:
@@ -59,13 +65,27 @@ def _running(command: list[str], log: Path, environment: dict[str, str]) -> Iter
             process.wait()
 
 
-def _wait_for_listener(node: subprocess.Popen[bytes], folder: Path) -> None:
-    """Wait until the listener says that it misses nothing any more."""
-    end = time.monotonic() + START_PATIENCE
-    while not any(line.startswith('recording') for line in _lines(folder / 'record.log')):
-        if node.poll() is not None or time.monotonic() > end:
-            raise StavprError(f'the node did not start, see {folder / "node.log"}')
+def _wait_until(
+    done: Callable[[], bool],
+    processes: dict[str, subprocess.Popen[bytes]],
+    folder: Path,
+    seconds: float,
+    what: str,
+) -> None:
+    """Wait for something while the processes live."""
+    end = time.monotonic() + seconds
+    while not done():
+        for name, process in processes.items():
+            if process.poll() is not None:
+                raise StavprError(f'{name} ended with {process.returncode}, see {folder / name}.log')
+        if time.monotonic() > end:
+            raise StavprError(f'{what} did not come in {seconds:g} s, see the logs in {folder}')
         time.sleep(0.05)
+
+
+def _is_recording(folder: Path) -> bool:
+    """Tell whether the listener has said that it misses nothing any more."""
+    return any(line.startswith('recording') for line in _lines(folder / 'record.log'))
 
 
 def _lines(path: Path) -> list[str]:
@@ -93,17 +113,20 @@ def run_live(
     replay = [executable('replay'), query, '--lossless', '--wait', '120']
     if topic is not None:
         replay += ['--topic', topic]
+    record = [executable('record'), '--output', str(matches)]
     with (
-        _running(node, folder / 'node.log', environment) as process,
-        _running([executable('record'), '--output', str(matches)], folder / 'record.log', environment),
+        _running(node, folder / 'node.log', environment) as node_process,
+        _running(record, folder / 'record.log', environment) as record_process,
     ):
-        _wait_for_listener(process, folder)
-        code = subprocess.run(replay, env=environment, check=False).returncode
-        if code != 0:
-            raise StavprError(f'the replay ended with {code}; the node said what is in {folder / "node.log"}')
-        end = time.monotonic() + PATIENCE
-        while len(_lines(matches)) < images and time.monotonic() < end:
-            time.sleep(0.05)
+        both = {'node': node_process, 'record': record_process}
+        _wait_until(lambda: _is_recording(folder), both, folder, START_PATIENCE, 'the node')
+        with _running(replay, None, environment) as replay_process:
+            _wait_until(lambda: replay_process.poll() is not None, both, folder, math.inf, 'the end')
+        if replay_process.returncode != 0:
+            raise StavprError(
+                f'the replay ended with {replay_process.returncode}, see also {folder}/node.log'
+            )
+        _wait_until(lambda: len(_lines(matches)) >= images, both, folder, PATIENCE, 'the last answer')
     records = [json.loads(line) for line in _lines(matches)]
     if len(records) != images:
         raise StavprError(f'{len(records)} answers to {images} images were heard, see the logs in {folder}')

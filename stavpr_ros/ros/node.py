@@ -3,7 +3,6 @@
 import traceback
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
@@ -13,8 +12,8 @@ from std_msgs.msg import Float32, Int32
 
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
-from stavpr_ros.errors import StavprError
-from stavpr_ros.ros.devices import choose_device
+from stavpr_ros.devices import choose_device
+from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.ros.engine import Engine, EngineOptions
 from stavpr_ros.ros.messages import blank_match, map_info_message
 from stavpr_ros.ros.parameters import declare_parameters
@@ -66,6 +65,7 @@ class PlaceRecognitionNode(Node):
 
     def _start(self, map_path: str, threshold: float) -> None:
         """Take over the two parameters that may come later; say what is missing."""
+        self._check_threshold(threshold)
         if threshold > 0:
             self._worker.call(lambda: self._engine.set_threshold(threshold)).result()
         if map_path:
@@ -75,6 +75,11 @@ class PlaceRecognitionNode(Node):
                 self.get_logger().error(str(error))
         if self._engine.missing:
             self.get_logger().warning(f'waiting, no match is published: {self._engine.missing}')
+
+    @staticmethod
+    def _check_threshold(threshold: float) -> None:
+        if threshold == 0:
+            raise SettingsError('threshold = 0 would match nothing: set it above 0, or negative = not set')
 
     def _load(self, path: str) -> None:
         place_map = self._worker.call(lambda: self._engine.load(path)).result()
@@ -89,10 +94,8 @@ class PlaceRecognitionNode(Node):
         changes = {parameter.name: parameter.value for parameter in parameters}
         try:
             threshold = changes.get('threshold')
-            if threshold is not None and 0 <= threshold < 1e-9:
-                raise StavprError(
-                    f'threshold = {threshold} must be above 0 (nothing is nearer), or negative = not set'
-                )
+            if threshold is not None:
+                self._check_threshold(threshold)
             if 'map_path' in changes:
                 if not changes['map_path']:
                     raise StavprError(
@@ -113,21 +116,23 @@ class PlaceRecognitionNode(Node):
         if dropped is not None:
             self._dropped += 1
             reason = 'newer images came before its turn'
-            self._match.publish(blank_match(dropped.header, PlaceMatch.DROPPED, reason, None))
+            self._match.publish(
+                blank_match(dropped.header, PlaceMatch.DROPPED, reason, self._engine.threshold)
+            )
             self.get_logger().warning(
                 f'images come faster than they can be matched: {self._dropped} of {self._received} dropped',
                 throttle_duration_sec=REPORT_PERIOD,
             )
 
     def _answer(self, message: Image) -> None:
-        """Answer one image, on the worker's thread; nothing that one image does may end it."""
+        """Answer one image, on the worker's thread."""
         try:
             answer = self._engine.process(message)
         except Exception as error:
             self._engine.invalid += 1
             self.get_logger().error(f'an image could not be matched: {traceback.format_exc()}')
             reason = f'internal error: {type(error).__name__}: {error}'
-            answer = blank_match(message.header, PlaceMatch.INVALID_IMAGE, reason, None)
+            answer = blank_match(message.header, PlaceMatch.INVALID_IMAGE, reason, self._engine.threshold)
         self._publish(answer)
 
     def _publish(self, answer: PlaceMatch) -> None:
@@ -146,10 +151,10 @@ class PlaceRecognitionNode(Node):
             )
         self._match.publish(answer)
 
-    def close(self) -> None:
-        """End the worker and say what was done; before ``destroy_node``."""
+    def destroy_node(self) -> None:
+        """End the worker, say what was done, and take the node down."""
         self._worker.stop()
-        # not the node's own logger: after a signal its context is gone, and with it /rosout
-        get_logger('stavpr_ros').info(
+        self.get_logger().info(
             f'{self._received} images received, {self._dropped} dropped, {self._engine.invalid} invalid'
         )
+        super().destroy_node()

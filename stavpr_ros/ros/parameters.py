@@ -8,7 +8,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 
 from stavpr_ros.alignment.settings import STRATEGIES
-from stavpr_ros.ros.devices import DEVICES
+from stavpr_ros.devices import DEVICES
 
 TABLE_HEAD = '| parameter | default | unit | live | what it does |'
 

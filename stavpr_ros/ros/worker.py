@@ -1,10 +1,13 @@
 """One thread does the heavy work; callbacks only hand over."""
 
 import threading
+import traceback
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
+
+from rclpy.logging import get_logger
 
 PATIENCE = 10.0  # seconds for the item in work when the thread is stopped
 
@@ -39,11 +42,14 @@ class Worker:
         return dropped
 
     def call(self, function: Callable[[], Any]) -> Future[Any]:
-        """Have the thread call a function; the future holds its result or its exception."""
+        """Have the thread call a function; the future holds what came of it, cancelled after the end."""
         future: Future[Any] = Future()
         with self._changed:
-            self._calls.append((future, function))
-            self._changed.notify()
+            if self._stopping:
+                future.cancel()
+            else:
+                self._calls.append((future, function))
+                self._changed.notify()
         return future
 
     def stop(self) -> None:
@@ -64,10 +70,17 @@ class Worker:
                 call = self._calls.popleft() if self._calls else None
                 item = None if call else self._items.popleft()
             if call is None:
-                self._process(item)
+                self._process_safely(item)
                 continue
             future, function = call
             try:
                 future.set_result(function())
             except Exception as error:  # handed to whoever asked
                 future.set_exception(error)
+
+    def _process_safely(self, item: Any) -> None:
+        """Nothing that one item does may end the thread, which would end all that come after."""
+        try:
+            self._process(item)
+        except Exception:
+            get_logger('stavpr_worker').error(f'an item was lost: {traceback.format_exc()}')

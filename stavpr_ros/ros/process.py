@@ -1,0 +1,80 @@
+"""How our processes begin, spin and end: the same for every executable with a ROS node."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TypeVar
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.signals import ignore_signals
+
+LONGEST_WAIT = 0.2  # seconds until a signal is noticed
+
+AnyNode = TypeVar('AnyNode', bound=Node)
+
+
+@contextmanager
+def _ros_arguments_checked() -> Iterator[None]:
+    try:
+        yield
+    except (
+        rclpy_implementation.RCLError,
+        rclpy_implementation.RCLInvalidROSArgsError,
+        rclpy_implementation.UnknownROSArgsError,
+    ) as error:
+        raise SettingsError(f'the arguments after --ros-args do not do: {error}') from error
+
+
+def own_arguments(arguments: Sequence[str]) -> list[str]:
+    """
+    Return the arguments that are not for ROS.
+
+    :raises SettingsError: those after ``--ros-args`` do not do.
+    """
+    with _ros_arguments_checked():
+        return list(remove_ros_args(arguments))
+
+
+@contextmanager
+def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> Iterator[AnyNode]:
+    """
+    Make a node, in ROS, and take both down again.
+
+    rclpy's own signal handlers stay out: they end the context at any moment, under a worker that is
+    publishing, and ``rclpy.spin`` was seen to sleep through one of them.
+
+    :param make: makes the node.
+    :param arguments: without the program's name; the process's own if None.
+    :raises SettingsError: the arguments after ``--ros-args`` do not do.
+    """
+    with _ros_arguments_checked():
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = make()
+        try:
+            yield node
+        finally:
+            ignore_signals()
+            node.destroy_node()
+    finally:
+        ignore_signals()
+        rclpy.try_shutdown()
+
+
+def spin_until(node: Node, done: Callable[[], bool] = lambda: False) -> None:
+    """Spin until ``done`` says so, or the context is shut down; a signal raises KeyboardInterrupt."""
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    try:
+        while node.context.ok() and not done():
+            executor.spin_once(timeout_sec=LONGEST_WAIT)
+    except ExternalShutdownException:
+        pass
+    finally:
+        executor.shutdown()

@@ -1,0 +1,157 @@
+"""The executables as a user runs them: exit codes, messages, files."""
+
+import json
+import signal
+import subprocess
+import time
+
+import cv2
+import numpy as np
+import pytest
+from conftest import route_images
+from processes import PATIENCE, Process, executable
+
+from stavpr_ros.evaluation.drive import judge
+from stavpr_ros.mapping import load_map
+
+
+def run(name, *arguments):
+    command = [executable(name), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+
+
+def write_images(folder, images):
+    folder.mkdir()
+    for i, image in enumerate(images):
+        cv2.imwrite(str(folder / f'{i}.png'), image[:, :, ::-1])
+    return folder
+
+
+@pytest.fixture(scope='module')
+def drive(tmp_path_factory):
+    return write_images(tmp_path_factory.mktemp('drive') / 'images', route_images(24))
+
+
+@pytest.mark.parametrize('name', ['node', 'build_map', 'replay', 'record', 'demo'])
+def test_help(name):
+    result = run(name, '--help')
+    assert result.returncode == 0
+    assert 'usage:' in result.stdout
+    assert 'exit codes' in result.stdout
+
+
+def test_build_map(drive, tmp_path):
+    poses = tmp_path / 'poses.csv'
+    poses.write_text('# x, y, z\n' + ''.join(f'{i}, 0, 0\n' for i in range(24)))
+    output = tmp_path / 'map.stavpr'
+    options = ['--every', 2, '--poses', poses, '--projection', 32, '--strips', 5]
+    result = run('build_map', '--input', drive, '--output', output, *options)
+    assert result.returncode == 0, result.stderr
+    assert '12 places, 5 strips of 32 dimensions' in result.stdout
+    place_map = load_map(output)
+    assert place_map.ids[3] == '6.png'
+    assert place_map.poses[3].tolist() == [6, 0, 0, 0, 0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ('options', 'code', 'word'),
+    [
+        (['--every', '0'], 2, '--every'),
+        (['--onnx-layer', 'fire'], 2, '--features onnx'),
+        (['--features', 'onnx'], 2, '--onnx-model'),
+        (['--strips', '99'], 1, 'Wf = 14'),
+        (['--gradient-cell', '7'], 0, ''),
+        (['--gradient-cell', '9'], 2, 'multiple'),
+        (['--poses', '/missing.csv'], 1, '/missing.csv'),
+    ],
+)
+def test_build_map_says_what_is_wrong(drive, tmp_path, options, code, word):
+    result = run('build_map', '--input', drive, '--output', tmp_path / 'map.stavpr', *options)
+    assert result.returncode == code
+    assert word in result.stderr
+    assert 'Traceback' not in result.stderr
+    assert (tmp_path / 'map.stavpr').exists() is (code == 0)
+
+
+def test_build_map_with_a_bad_image(drive, tmp_path):
+    images = write_images(tmp_path / 'images', route_images(3))
+    (images / '1.png').write_bytes(b'no picture')
+    arguments = ['--input', images, '--output', tmp_path / 'map.stavpr']
+    result = run('build_map', *arguments)
+    assert result.returncode == 1
+    assert '1.png' in result.stderr
+    result = run('build_map', *arguments, '--skip-bad-images')
+    assert result.returncode == 0
+    assert load_map(tmp_path / 'map.stavpr').ids == ('0.png', '2.png')
+
+
+@pytest.mark.parametrize('name', ['node', 'record', 'replay'])
+def test_wrong_ros_arguments(name, drive, tmp_path):
+    own = {'node': [], 'record': ['--output', tmp_path / 'x'], 'replay': [drive]}[name]
+    for wrong in (['--bogus'], ['--params-file', '/missing.yaml']):
+        result = run(name, *own, '--ros-args', *wrong)
+        assert result.returncode in (1, 2)
+        assert '--ros-args' in result.stderr
+        assert 'Traceback' not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ('options', 'word'),
+    [
+        (['--map', 'x'], 'go together'),
+        (['--truth', 'identity'], '--truth'),
+        (['--threshold', '-1'], '--threshold'),
+        (['--tolerance', '-4'], '--tolerance'),
+    ],
+)
+def test_demo_usage(options, word):
+    result = run('demo', *options)
+    assert result.returncode == 2
+    assert word in result.stderr
+
+
+def test_demo_on_two_folders(drive, tmp_path):
+    """The whole way, with a bad image in the query that is said and skipped."""
+    dim = [(image * 0.6).astype(np.uint8) for image in route_images(24)]
+    query = write_images(tmp_path / 'query', dim)
+    (query / '24.png').write_bytes(b'no picture')
+    output = tmp_path / 'output'
+    result = run('demo', '--map', drive, '--query', query, '--threshold', 0.3, '--output', output)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert '24.png' in result.stdout
+    assert '24 of 24 images matched' in result.stdout
+    records = [json.loads(line) for line in (output / 'matches.jsonl').read_text().splitlines()]
+    assert [record['verdict'] for record in records] == ['WARMING_UP'] * 19 + ['MATCH'] * 5
+    assert records[-1]['newest_index'] == 23
+    for name in ('demo.png', 'matches.png', 'distance_matrix.png', 'distance_over_time.png'):
+        assert cv2.imread(str(output / name)).std() > 5
+    assert 'Traceback' not in (output / 'node.log').read_text()
+
+
+def test_demo_that_is_ended_leaves_nobody_behind(drive, tmp_path):
+    output = tmp_path / 'output'
+    arguments = ['--map', str(drive), '--query', str(drive), '--threshold', '0.3', '--output', str(output)]
+    demo = Process(tmp_path / 'demo.log', 'demo', *arguments)
+    end = time.monotonic() + PATIENCE
+    while not (output / 'record.log').exists():
+        assert time.monotonic() < end
+        assert demo.popen.poll() is None, demo.output()
+        time.sleep(0.01)
+    assert demo.stop(signal.SIGTERM) == 130
+    running = subprocess.run(['ps', '-eo', 'args'], capture_output=True, text=True, check=True).stdout
+    assert str(output) not in running
+
+
+def record(verdict, place=-1):
+    path = [[0, place - 1], [1, place], [2, place + 1]] if place >= 0 else []
+    return {'verdict': verdict, 'sequence_middle': place, 'distance': 0.1, 'path': path, 'received': 0}
+
+
+def test_an_invalid_image_does_not_shift_the_judgement():
+    """Windows of 3; image 3 is in none, so the window that ends with image 4 holds images 1, 2 and 4."""
+    records = [record('WARMING_UP'), record('WARMING_UP'), record('MATCH', 1), record('INVALID_IMAGE')]
+    records += [record('MATCH', 2), record('MATCH', 4)]
+    result = judge(records, 3, 0.5, np.array([0, 1, 2, 3, 4, 5]), 0)
+    assert result.answers.places.tolist() == [0, 1, 2, -1, 4, 5]
+    assert result.score.true_positives == 5
+    assert result.score.false_negatives == 1
