@@ -3,7 +3,7 @@
 import sys
 
 from stavpr_ros.errors import StavprError
-from stavpr_ros.signals import obey_signals
+from stavpr_ros.signals import interrupted, obey_signals
 from stavpr_ros.threads import wait_passively
 
 HELP = """usage: node [--ros-args -p map_path:=FILE -p threshold:=VALUE [-p NAME:=VALUE ...]
@@ -44,6 +44,10 @@ def main(args: list[str] | None = None) -> int:
         return _run(args)
     except KeyboardInterrupt:
         return 0
+    except Exception:  # an interrupt in the middle of a foreign library comes out as another exception
+        if interrupted():
+            return 0
+        raise
 
 
 def _run(args: list[str] | None) -> int:

@@ -14,7 +14,7 @@ from stavpr_ros.errors import ImageError, SettingsError, StavprError
 from stavpr_ros.ros.process import own_arguments, ros_node
 from stavpr_ros.ros.replay import NoAnswerError, NobodyListensError, Replayer, ReplaySettings
 from stavpr_ros.ros.transport import prepare_transport
-from stavpr_ros.signals import obey_signals
+from stavpr_ros.signals import interrupted, obey_signals
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord
@@ -63,6 +63,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except StavprError as error:
         print(f'replay: error: {error}', file=sys.stderr)
         return _exit_code(error)
+    except Exception:  # an interrupt in the middle of a foreign library comes out as another exception
+        if interrupted():
+            return INTERRUPTED
+        raise
 
 
 def _exit_code(error: StavprError) -> int:

@@ -12,7 +12,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.signals import ignore_signals
+from stavpr_ros.signals import signals_deferred
 
 LONGEST_WAIT = 0.2  # seconds until a signal is noticed
 
@@ -60,10 +60,8 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
         try:
             yield node
         finally:
-            ignore_signals()
             node.destroy_node()
     finally:
-        ignore_signals()
         rclpy.try_shutdown()
 
 
@@ -73,7 +71,8 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False) -> None:
     executor.add_node(node)
     try:
         while node.context.ok() and not done():
-            executor.spin_once(timeout_sec=LONGEST_WAIT)
+            with signals_deferred():
+                executor.spin_once(timeout_sec=LONGEST_WAIT)
     except ExternalShutdownException:
         pass
     finally:

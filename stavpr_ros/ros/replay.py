@@ -16,6 +16,7 @@ from std_msgs.msg import Header
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError
 from stavpr_ros.ros.discovery import Introduction
+from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord
 
 SECOND = 1_000_000_000
@@ -157,7 +158,8 @@ class Replayer:
         self._executor.shutdown()
 
     def _spin(self, seconds: float) -> None:
-        self._executor.spin_once(timeout_sec=max(0.0, min(seconds, SLICE_SECONDS)))
+        with signals_deferred():
+            self._executor.spin_once(timeout_sec=max(0.0, min(seconds, SLICE_SECONDS)))
 
     def _missing(self) -> str:
         """Name who is not there yet; empty if all are."""
