@@ -13,18 +13,21 @@ import signal
 import subprocess
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 
-def texture_route(count: int, height: int, width: int, step: int = 40) -> list[np.ndarray]:
-    """Views along one random texture, RGB uint8: images of the right size, no two alike."""
+def texture_route(count: int, height: int, width: int, step: int = 41) -> Iterator[np.ndarray]:
+    """Yield views along one random texture, RGB uint8."""
     rng = np.random.default_rng(0)
     coarse = rng.integers(0, 256, (height // 16, 4096 // 16, 3), np.uint8)
     texture = np.kron(coarse, np.ones((16, 16, 1), np.uint8))
     starts = [(i * step) % (texture.shape[1] - width) for i in range(count)]
-    return [np.ascontiguousarray(texture[:, s : s + width]) for s in starts]
+    return (np.ascontiguousarray(texture[:, s : s + width]) for s in starts)
 
 
 def make_map(path: Path, places: int, height: int, width: int) -> None:
@@ -45,74 +48,86 @@ def memory(pid: int) -> float:
     raise RuntimeError(f'no VmRSS of process {pid}')
 
 
-def soak(arguments: argparse.Namespace, node: subprocess.Popen) -> dict:
-    """Publish, listen, and return the figures."""
+class Listener:
+    """Hears the node's answers and remembers how late they were."""
+
+    def __init__(self) -> None:
+        self.sent: dict[int, float] = {}
+        self.latencies: list[float] = []
+        self.verdicts: Counter[int] = Counter()
+
+    def on_match(self, match: Any) -> None:
+        """Take in one answer."""
+        stamp = match.header.stamp.sec * 10**9 + match.header.stamp.nanosec
+        if stamp not in self.sent:
+            return
+        self.verdicts[match.verdict] += 1
+        if match.verdict != match.DROPPED:
+            self.latencies.append(time.monotonic() - self.sent[stamp])
+
+    def figures(self, published: int, dropped_verdict: int) -> dict[str, Any]:
+        """Return what came of so many published images."""
+        milliseconds = np.array(self.latencies) * 1e3
+        return {
+            'images_published': published,
+            'processed': len(self.latencies),
+            'dropped': self.verdicts[dropped_verdict],
+            'lost_in_transport': published - self.verdicts.total(),
+            'latency_ms_p50': float(np.percentile(milliseconds, 50)),
+            'latency_ms_p99': float(np.percentile(milliseconds, 99)),
+            'latency_ms_max': float(milliseconds.max()),
+        }
+
+
+def image_messages(height: int, width: int) -> list[Any]:
+    """Return thirty images as messages."""
+    from sensor_msgs.msg import Image
+
+    messages = []
+    for image in texture_route(30, height, width):
+        message = Image(height=height, width=width, encoding='rgb8', step=width * 3)
+        message.data = array.array('B', image.tobytes())
+        messages.append(message)
+    return messages
+
+
+def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
+    """Publish at the rate, listen, and return the figures."""
     import rclpy
-    from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import QoSProfile, qos_profile_sensor_data
     from sensor_msgs.msg import Image
 
     from stavpr_msgs.msg import PlaceMatch
+    from stavpr_ros.ros.discovery import Introduction
+    from stavpr_ros.ros.process import ros_node, spin_until
 
-    rclpy.init()
-    bench = rclpy.create_node('soak')
-    publisher = bench.create_publisher(Image, 'image', qos_profile_sensor_data)
-    sent: dict[int, float] = {}
-    latencies: list[float] = []
-    verdicts: dict[int, int] = {}
-
-    def on_match(match: PlaceMatch) -> None:
-        stamp = match.header.stamp.sec * 10**9 + match.header.stamp.nanosec
-        verdicts[match.verdict] = verdicts.get(match.verdict, 0) + 1
-        if match.verdict != PlaceMatch.DROPPED and stamp in sent:
-            latencies.append(time.monotonic() - sent[stamp])
-
-    bench.create_subscription(PlaceMatch, '/stavpr/match', on_match, QoSProfile(depth=1000))
-    executor = SingleThreadedExecutor()
-    executor.add_node(bench)
-    messages = []
-    for image in texture_route(30, arguments.height, arguments.width):
-        message = Image(height=image.shape[0], width=image.shape[1], encoding='rgb8', step=image.shape[1] * 3)
-        message.data = array.array('B', image.tobytes())
-        messages.append(message)
-    while not verdicts:  # until the node hears and is heard
-        publisher.publish(messages[0])
-        executor.spin_once(timeout_sec=0.5)
-    verdicts.clear()
-    executor.spin_once(timeout_sec=1.0)
-    verdicts.clear()
-    memory_start = memory(node.pid)
-    began = time.monotonic()
+    listener = Listener()
+    messages = image_messages(arguments.height, arguments.width)
     total = round(arguments.seconds * arguments.rate)
-    for index in range(total):
-        due = began + index / arguments.rate
-        while (left := due - time.monotonic()) > 0:
-            executor.spin_once(timeout_sec=left)
-        message = messages[index % len(messages)]
-        stamp = 10**9 + index * 1000
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-        sent[stamp] = time.monotonic()
-        publisher.publish(message)
-    took = time.monotonic() - began
-    end = time.monotonic() + 2
-    while time.monotonic() < end:
-        executor.spin_once(timeout_sec=0.1)
-    milliseconds = np.array(latencies) * 1e3
-    bench.destroy_node()
-    rclpy.shutdown()
-    return {
-        'images_published': total,
-        'rate_hz': total / took,
-        'answers': sum(verdicts.values()),
-        'processed': len(latencies),
-        'dropped': verdicts.get(PlaceMatch.DROPPED, 0),
-        'lost_in_transport': total - sum(verdicts.values()),
-        'latency_ms_p50': float(np.percentile(milliseconds, 50)),
-        'latency_ms_p99': float(np.percentile(milliseconds, 99)),
-        'latency_ms_max': float(milliseconds.max()),
-        'memory_mb_start': memory_start,
-        'memory_mb_end': memory(node.pid),
-    }
+    with ros_node(lambda: rclpy.create_node('soak'), []) as node:
+        publisher = node.create_publisher(Image, 'image', qos_profile_sensor_data)
+        node.create_subscription(PlaceMatch, '/stavpr/match', listener.on_match, QoSProfile(depth=1000))
+        spin_until(node, lambda: publisher.get_subscription_count() > 0)
+        introduction = Introduction(node, lambda: node.get_subscriptions_info_by_topic('/image'), 10.0)
+        spin_until(node, introduction.done)
+        memory_start, began = memory(pid), time.monotonic()
+
+        def publish(index: int) -> None:
+            message = messages[index % len(messages)]
+            stamp = 10**9 + index * 1000
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+            listener.sent[stamp] = time.monotonic()
+            publisher.publish(message)
+
+        published = iter(range(total))
+        timer = node.create_timer(1 / arguments.rate, lambda: publish(next(published)))
+        spin_until(node, lambda: len(listener.sent) == total)
+        rate = total / (time.monotonic() - began)
+        node.destroy_timer(timer)
+        end = time.monotonic() + 2
+        spin_until(node, lambda: listener.verdicts.total() == total or time.monotonic() > end)
+        figures = listener.figures(total, PlaceMatch.DROPPED)
+        return figures | {'rate_hz': rate, 'memory_mb_start': memory_start, 'memory_mb_end': memory(pid)}
 
 
 def main() -> None:
@@ -140,12 +155,14 @@ def main() -> None:
         command = [executable('node'), '--ros-args', '-p', f'map_path:={path}', '-p', 'threshold:=0.2']
         node = subprocess.Popen(command, env=environment)
         try:
-            figures = soak(arguments, node)
+            figures = soak(arguments, node.pid)
         finally:
             node.send_signal(signal.SIGINT)
             node.wait()
-    figures |= {'places': arguments.places, 'machine': platform.processor() or platform.machine()}
-    figures |= {'cores': os.cpu_count(), 'python': platform.python_version(), 'stavpr_ros': __version__}
+    git = ['git', 'rev-parse', '--short', 'HEAD']
+    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
+    figures |= {'places': arguments.places, 'machine': platform.machine(), 'cores': os.cpu_count()}
+    figures |= {'python': platform.python_version(), 'stavpr_ros': __version__, 'commit': commit}
     text = json.dumps(figures, indent=2)
     print(text)
     if arguments.output:
