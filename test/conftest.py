@@ -5,9 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
-# A machine-wide compile cache would leak between versions: numba's cache lies beside the modules.
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+# A shared machine may be slow at any moment, so time is no property of an example; and a landing must not
+# depend on luck: new examples are searched everywhere but in CI.
+settings.register_profile('stavpr', deadline=None, derandomize='CI' in os.environ)
+settings.load_profile('stavpr')
 
 
 @pytest.fixture(scope='session')
