@@ -1,8 +1,10 @@
-"""The choice of the device that the products are computed on."""
+"""The choice of the device for the features and of the backend for the matching."""
+
+import importlib.util
 
 from stavpr_ros.errors import SettingsError, UnavailableError
 
-DEVICES = ('auto', 'cpu', 'cuda')
+DEVICES = BACKENDS = ('auto', 'cpu', 'cuda')
 
 
 def choose_device(wish: str) -> str:
@@ -20,3 +22,30 @@ def choose_device(wish: str) -> str:
     if wish == 'cuda' and not available:
         raise UnavailableError("device 'cuda': torch sees no CUDA device here; take 'cpu' or 'auto'")
     return ('cuda' if available else 'cpu') if wish == 'auto' else wish
+
+
+def choose_backend(wish: str) -> str:
+    """
+    Turn ``auto`` into the backend of the matching, ``cuda`` or ``cpu``.
+
+    :raises SettingsError: no such backend.
+    :raises UnavailableError: ``cuda`` was asked for and its device or the package numba-cuda is not there.
+    """
+    if wish == 'auto':
+        return 'cpu' if why_no_cuda() else 'cuda'
+    if wish not in BACKENDS:
+        raise SettingsError(f'backend {wish!r} is unknown: take one of {", ".join(BACKENDS)}')
+    if wish == 'cuda' and why_no_cuda():
+        raise UnavailableError(f"backend 'cuda': {why_no_cuda()}; take 'cpu' or 'auto'")
+    return wish
+
+
+def why_no_cuda() -> str:
+    """Say what the ``cuda`` backend lacks here; empty when it has everything."""
+    import torch
+
+    if not torch.cuda.is_available():
+        return 'torch sees no CUDA device here'
+    if importlib.util.find_spec('numba_cuda') is None:
+        return "the package numba-cuda is not installed ('pip install numba-cuda')"
+    return ''

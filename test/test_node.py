@@ -244,7 +244,7 @@ def test_a_damaged_map_is_said_and_the_node_stays(bench, run, route, tmp_path):
         ({'strategy': 'teleport'}, 'teleport'),
         ({'sequence_length': 1}, 'sequence_length'),
         ({'threshold': 'low'}, 'threshold'),
-        ({'device': 'tpu'}, 'tpu'),
+        ({'backend': 'tpu'}, 'tpu'),
     ],
 )
 def test_parameters_that_do_not_do_end_the_node(tmp_path, parameters, word):

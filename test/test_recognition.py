@@ -45,7 +45,7 @@ def test_frame_by_frame_is_the_whole_matrix_at_once(small_map, strategy):
     """Exactly: the rolling buffer, whatever its turn, gives what the batch functions give."""
     one = recogniser(small_map, spatial=SpatialSettings(strategy))
     query = small_map.features[7:40]
-    D = np.stack([one.distances(query[i : i + 1]) for i in range(len(query))])
+    D = one.distances(query)
     answers = recognise_all(one, query)
     for end in range(4, len(query)):
         window = D[end - 4 : end + 1]
@@ -128,9 +128,9 @@ def test_settings_out_of_range(small_map):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason='there is a CUDA device')
-def test_a_device_that_is_not_there_is_an_error(small_map):
+def test_a_backend_that_is_not_there_is_an_error(small_map):
     with pytest.raises(UnavailableError, match='cuda'):
-        Recogniser(small_map, RecognitionSettings(0.1), device='cuda')
+        Recogniser(small_map, RecognitionSettings(0.1), backend='cuda')
 
 
 def test_reset_empties_the_window(small_map):

@@ -41,9 +41,30 @@ def strip_distances(query: np.ndarray | torch.Tensor, reference: np.ndarray | to
     """
     query, reference = _checked(query, reference)
     W, n, d = reference.shape
-    # weights on the right, as `linear` has them: the skinny product in its fastest orientation
-    similarity = torch.nn.functional.linear(query, reference.reshape(W * n, d))
-    return similarity.neg_().add_(1).view(W, W, n)
+    if reference.is_cuda:
+        similarity = torch.nn.functional.linear(query, reference.reshape(W * n, d))
+        return similarity.neg_().add_(1).view(W, W, n)
+    from stavpr_ros.alignment.kernels.cpu import products
+
+    rows = tiled(query[:, None])[0]
+    distances = np.empty((len(rows), W, n), np.float32)
+    products.strip_distances(reference.contiguous().numpy(), rows, distances)
+    return torch.from_numpy(distances[:W])
+
+
+def tiled(queries: torch.Tensor) -> np.ndarray:
+    """
+    Lay out the local features of Q images as the kernels of the CPU want them.
+
+    :param queries: shape (W, Q, d), float32.
+    :returns: shape (Q, R, d), R is W rounded up to whole tiles; zeros from row W on.
+    """
+    from stavpr_ros.alignment.kernels.cpu.products import TILE
+
+    W, Q, d = queries.shape
+    rows = np.zeros((Q, -(-W // TILE) * TILE, d), np.float32)
+    rows[:, :W] = queries.transpose(0, 1).cpu().numpy()
+    return rows
 
 
 def holistic_distances(

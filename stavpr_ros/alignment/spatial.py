@@ -10,7 +10,7 @@ from stavpr_ros.errors import InputError, SettingsError
 WINDOW = 4  # strips in the sliding window, as in the paper's comparison
 
 
-def _weights(W: int, settings: SpatialSettings, dtype: np.dtype) -> np.ndarray:
+def adaptive_weights(W: int, settings: SpatialSettings, dtype: np.dtype) -> np.ndarray:
     """Return a = sqrt(1 + sigma |I_c - c|) for |I_c - c| = 0 .. W-1, in the arithmetic of the kernel."""
     if settings.strategy != 'adaptive':
         return np.ones(W, dtype)
@@ -37,7 +37,8 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
     :raises InputError: wrong shape or type, NaN, fewer strips than the sliding window has.
     :raises SettingsError: xi > W, or the strategy ``none``.
     """
-    from stavpr_ros.alignment import cpu
+    from stavpr_ros.alignment.kernels.cpu import spatial
+    from stavpr_ros.alignment.kernels.cpu.vectors import LANES
 
     d = _checked(d, 3)
     W, _, n = d.shape
@@ -48,14 +49,14 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
         if W < WINDOW:
             raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')
         out = np.empty(n, d.dtype)
-        cpu.sliding_window(d, WINDOW, band, out)
+        spatial.sliding_window(d, WINDOW, band, out)
         return out
-    if n < cpu.LANES:
-        padded = np.zeros((W, W, cpu.LANES), d.dtype)
+    if n < LANES:
+        padded = np.zeros((W, W, LANES), d.dtype)
         padded[:, :, :n] = d
         d = padded
     out = np.empty(d.shape[2], d.dtype)
-    cpu.spatial_dtw(d, _weights(W, settings, d.dtype), band, out)
+    spatial.spatial_dtw(d, adaptive_weights(W, settings, d.dtype), band, out)
     return out[:n]
 
 
@@ -75,4 +76,4 @@ def align_images(d: np.ndarray, settings: SpatialSettings) -> Alignment:
     c = (W + 1) // 2 - 1  # the central strip, ceil(W / 2), 0-based
     low, high = max(0, c - band + 1), min(W, c + band)
     nearest = low + int(np.argmin(d[c, low:high]))
-    return trace(d, _weights(W, settings, d.dtype)[abs(nearest - c)], band)
+    return trace(d, adaptive_weights(W, settings, d.dtype)[abs(nearest - c)], band)

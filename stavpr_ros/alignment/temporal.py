@@ -64,9 +64,9 @@ class SequenceMatch:
 
 def padded_width(n: int, k: int) -> int:
     """Columns that the kernel wants for n starts: whole blocks of lanes, and the last start's k images."""
-    from stavpr_ros.alignment import cpu
+    from stavpr_ros.alignment.kernels.cpu.vectors import LANES
 
-    return -(-n // cpu.LANES) * cpu.LANES + k - 1
+    return -(-n // LANES) * LANES + k - 1
 
 
 def match_padded(window: np.ndarray, n: int, k: int) -> SequenceDistances:
@@ -75,11 +75,11 @@ def match_padded(window: np.ndarray, n: int, k: int) -> SequenceDistances:
 
     :param window: shape (l, padded_width(n, k)), C-contiguous, +inf in the columns from n on.
     """
-    from stavpr_ros.alignment import cpu
+    from stavpr_ros.alignment.kernels.cpu.temporal import lm_dtw
 
     starts = window.shape[1] - k + 1
     distances, lengths = np.empty(starts, window.dtype), np.empty(starts, np.int32)
-    cpu.lm_dtw(window, k, distances, lengths)
+    lm_dtw(window, k, distances, lengths)
     return SequenceDistances(distances[:n], lengths[:n])
 
 
@@ -135,6 +135,8 @@ def best_match(matches: SequenceDistances, neighbourhood: int) -> SequenceMatch 
 
     :param neighbourhood: the runner-up's midpoint is more than so many places from the nearest one's.
     """
+    from stavpr_ros.alignment.kernels.cpu.temporal import nearest_elsewhere
+
     distances = matches.distances
     if distances.size == 0:
         return None
@@ -142,13 +144,11 @@ def best_match(matches: SequenceDistances, neighbourhood: int) -> SequenceMatch 
     if not np.isfinite(distances[start]):
         return None
     middles = matches.middles
-    elsewhere = np.where(np.abs(middles - middles[start]) > neighbourhood, distances, np.inf)
-    second = int(np.argmin(elsewhere))
-    found = bool(np.isfinite(elsewhere[second]))
+    second = nearest_elsewhere(distances, matches.lengths, middles[start], neighbourhood)
     return SequenceMatch(
         first=start,
         last=start + int(matches.lengths[start]) - 1,
         distance=float(distances[start]),
-        runner_up_index=int(middles[second]) if found else -1,
-        runner_up_distance=float(elsewhere[second]) if found else float('nan'),
+        runner_up_index=int(middles[second]) if second >= 0 else -1,
+        runner_up_distance=float(distances[second]) if second >= 0 else float('nan'),
     )

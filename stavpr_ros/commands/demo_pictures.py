@@ -62,8 +62,7 @@ def _pair(
 
 def _matrix(features: LocalFeatures, place_map: PlaceMap) -> np.ndarray:
     """Distances of every query image to every place, shape (N, n)."""
-    recogniser = Recogniser(place_map, RecognitionSettings(threshold=1.0))
-    return np.stack([recogniser.distances(features[i : i + 1]) for i in range(len(features))])
+    return Recogniser(place_map, RecognitionSettings(threshold=1.0)).distances(features)
 
 
 def draw_result(

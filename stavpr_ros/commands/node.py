@@ -18,7 +18,7 @@ and publishes no match; both can be set later with `ros2 param set`.
 
 parameters:
 {parameters}
-exit codes: 0 stopped by a signal, 1 a parameter or the device does not do
+exit codes: 0 stopped by a signal, 1 a parameter or the backend does not do
 """
 
 

@@ -81,7 +81,7 @@ def suggest_threshold(
         pictures = [place_map.thumbnail(place) for place in range(start, start + l)]
         altered = [harder_look(picture, variant, rng) for picture in pictures if picture is not None]
         features = describer.describe(altered)
-        window = np.stack([recogniser.distances(features[i : i + 1]) for i in range(l)])
+        window = recogniser.distances(features)
         window[:, max(0, start - l) : start + 2 * l] = np.inf
         nearest = best_match(match_sequence(window, sequence), settings.neighbourhood)
         if nearest is not None:

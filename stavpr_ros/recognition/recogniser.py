@@ -5,19 +5,17 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
 
 from stavpr_ros.alignment.path import aligned_index
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
-from stavpr_ros.alignment.similarity import holistic_distances, strip_distances
-from stavpr_ros.alignment.spatial import image_distances
-from stavpr_ros.alignment.temporal import SequenceMatch, best_match, match_padded, trace_sequence
-from stavpr_ros.devices import choose_device
+from stavpr_ros.alignment.temporal import SequenceMatch
+from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition.window import DistanceWindow
-
-NO_PATH = np.empty((0, 2), np.int32)
+from stavpr_ros.recognition.cpu_matcher import NO_PATH
+from stavpr_ros.recognition.matcher import make_matcher
 
 
 class Verdict(enum.Enum):
@@ -84,19 +82,29 @@ class Recogniser:
     """
     Recognises places of one map, one image at a time.
 
-    :param place_map: the reference map; its features are kept on ``device``.
+    :param place_map: the reference map.
     :param settings: see :class:`RecognitionSettings`.
-    :param device: where the products are computed, ``cpu`` or ``cuda``.
-    :raises UnavailableError: no such device here.
+    :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``.
+    :param precision: how the map's features are kept, ``float32`` or ``float16``; see
+        :func:`stavpr_ros.recognition.matcher.make_matcher`.
+    :raises UnavailableError: no such backend here.
     :raises SettingsError: settings that do not fit the map (xi > W).
+    :raises InputError: features of the map are not finite.
     """
 
-    def __init__(self, place_map: PlaceMap, settings: RecognitionSettings, device: str = 'cpu') -> None:
-        device = choose_device(device)
-        settings.spatial.band(place_map.settings.strips)
-        self._features = place_map.features.to(device)
+    def __init__(
+        self,
+        place_map: PlaceMap,
+        settings: RecognitionSettings,
+        backend: str = 'cpu',
+        precision: str = 'float32',
+    ) -> None:
+        _require_finite(place_map.features, 'the map')
+        self._feature_settings = place_map.settings
         self._settings = settings
-        self.reset()
+        self._matcher = make_matcher(
+            place_map.features, settings.spatial, settings.sequence, choose_backend(backend), precision
+        )
 
     @property
     def settings(self) -> RecognitionSettings:
@@ -106,12 +114,12 @@ class Recogniser:
     @property
     def places(self) -> int:
         """Number of places n of the map."""
-        return len(self._features)
+        return self._matcher.places
 
     @property
     def window_fill(self) -> int:
         """Images in the window, up to l."""
-        return len(self._window)
+        return len(self._matcher)
 
     def set_threshold(self, threshold: float) -> None:
         """
@@ -123,35 +131,19 @@ class Recogniser:
 
     def reset(self) -> None:
         """Forget the images of the window."""
-        sequence = self._settings.sequence
-        self._window = DistanceWindow(sequence.length, self.places, sequence.k)
+        self._matcher.reset()
 
     def distances(self, features: LocalFeatures) -> np.ndarray:
         """
-        Distances of one image to every place.
+        Distances of images to every place.
 
-        :param features: those of one image, strips (W, 1, d), made with the settings of the map.
-        :returns: shape (n,), float32.
+        :param features: those of Q images, strips (W, Q, d), made with the settings of the map.
+        :returns: shape (Q, n), float32.
         :raises FeatureMismatchError: made with other settings.
-        :raises InputError: not one image, or features that are not finite.
+        :raises InputError: features that are not finite.
         """
-        features.require_same_settings(self._features.settings, 'the map')
-        if len(features) != 1:
-            raise InputError(f'features of {len(features)} images came: expected those of one')
-        query = features.strips[:, 0]
-        if self._settings.spatial.strategy == 'none':
-            row = holistic_distances(
-                query, features.weights[:, 0], self._features.strips, self._features.weights
-            )
-            distances = row.cpu().numpy()
-        else:
-            cosine = strip_distances(query, self._features.strips).cpu().numpy()
-            distances = image_distances(cosine, self._settings.spatial)
-        if not np.isfinite(distances).all():
-            raise InputError(
-                'image distances are not finite: the features of the image or of the map are damaged'
-            )
-        return distances
+        self._check(features)
+        return self._matcher.distance_matrix(features.strips, features.weights).cpu().numpy()
 
     def add(self, features: LocalFeatures) -> Recognition:
         """
@@ -163,21 +155,31 @@ class Recogniser:
         :raises FeatureMismatchError: made with other settings than the map's.
         :raises InputError: not one image, or features that are not finite.
         """
-        self._window.push(self.distances(features))
+        self._check(features)
+        if len(features) != 1:
+            raise InputError(f'features of {len(features)} images came: expected those of one')
+        self._matcher.push(self._matcher.distances(features.strips[:, 0], features.weights[:, 0]))
         return self._answer()
+
+    def _check(self, features: LocalFeatures) -> None:
+        features.require_same_settings(self._feature_settings, 'the map')
+        _require_finite(features, 'the image')
 
     def _answer(self) -> Recognition:
         threshold, sequence = self._settings.threshold, self._settings.sequence
-        if not self._window.full:
-            reason = f'{len(self._window)} of {sequence.length} images in the window'
+        if self.window_fill < sequence.length:
+            reason = f'{self.window_fill} of {sequence.length} images in the window'
             return Recognition(Verdict.WARMING_UP, reason, None, NO_PATH, threshold)
-        window = self._window.rows()
-        matches = match_padded(window, self.places, sequence.k)
-        nearest = best_match(matches, self._settings.neighbourhood)
+        nearest, path = self._matcher.match(self._settings.neighbourhood)
         if nearest is None:
             return Recognition(Verdict.NO_MATCH, 'the map is empty', None, NO_PATH, threshold)
-        path = trace_sequence(window[:, : self.places], nearest.first, sequence.k).path
         if nearest.distance < threshold:
             return Recognition(Verdict.MATCH, '', nearest, path, threshold)
         reason = f'nearest distance {nearest.distance:.4f} is not below the threshold {threshold:.4f}'
         return Recognition(Verdict.NO_MATCH, reason, nearest, path, threshold)
+
+
+def _require_finite(features: LocalFeatures, where: str) -> None:
+    """Refuse NaN and infinite numbers, which no sum of unit-norm features hides."""
+    if not bool(torch.isfinite(features.strips.sum())):
+        raise InputError(f'features of {where} are not finite: they are damaged')

@@ -24,7 +24,8 @@ class EngineOptions:
     spatial: SpatialSettings = field(default_factory=SpatialSettings)
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
     neighbourhood: int = 20
-    device: str = 'cpu'
+    backend: str = 'cpu'
+    precision: str = 'float32'
     model_path: str = ''
 
 
@@ -67,7 +68,7 @@ class Engine:
         """
         try:
             place_map = load_map(path)
-            describer = place_map.describer(self._options.device, self._options.model_path)
+            describer = place_map.describer(self._options.backend, self._options.model_path)
             self._warm_up(place_map, describer)
         except StavprError as error:
             if self._map is None:
@@ -94,7 +95,7 @@ class Engine:
     def _make_recogniser(self, place_map: PlaceMap, threshold: float) -> Recogniser:
         o = self._options
         settings = RecognitionSettings(threshold, o.spatial, o.sequence, o.neighbourhood)
-        return Recogniser(place_map, settings, o.device)
+        return Recogniser(place_map, settings, o.backend, o.precision)
 
     def _warm_up(self, place_map: PlaceMap, describer: Describer) -> None:
         """Compile and touch everything once, so that the first image is as fast as the rest."""

@@ -12,7 +12,7 @@ from std_msgs.msg import Float32, Int32
 
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
-from stavpr_ros.devices import choose_device
+from stavpr_ros.devices import choose_backend, why_no_cuda
 from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.ros.engine import Engine, EngineOptions
 from stavpr_ros.ros.messages import blank_match, map_info_message
@@ -27,20 +27,22 @@ class PlaceRecognitionNode(Node):
     """
     Recognises where images were taken; publishes one ``~/match`` for each image on ``image``.
 
-    :raises StavprError: parameters that cannot work together, or a device that is not here.
+    :raises StavprError: parameters that cannot work together, or a backend that is not here.
     """
 
     def __init__(self, **options: object) -> None:
         super().__init__('stavpr', **options)
         values = declare_parameters(self)
-        device = choose_device(values['device'])
-        self.get_logger().info(f'products are computed on {device}')
+        backend = choose_backend(values['backend'])
+        reason = why_no_cuda() if values['backend'] == 'auto' else 'as asked for'
+        self.get_logger().info(f'backend {backend} ({reason or "there is a device"})')
         self._engine = Engine(
             EngineOptions(
                 spatial=SpatialSettings(values['strategy'], values['sigma'], values['xi'] or None),
                 sequence=SequenceSettings(values['sequence_length'], values['beta']),
                 neighbourhood=values['neighbourhood'],
-                device=device,
+                backend=backend,
+                precision=values['precision'],
                 model_path=values['model_path'],
             )
         )

@@ -8,7 +8,8 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 
 from stavpr_ros.alignment.settings import STRATEGIES
-from stavpr_ros.devices import DEVICES
+from stavpr_ros.devices import BACKENDS
+from stavpr_ros.recognition.matcher import PRECISIONS
 
 TABLE_HEAD = '| parameter | default | unit | live | what it does |'
 
@@ -65,11 +66,18 @@ PARAMETERS = (
         live=True,
     ),
     NodeParameter(
-        'device',
+        'backend',
         'auto',
         '',
-        'Where products are computed; auto takes cuda if there is one and says what it took.',
-        choices=DEVICES,
+        'Where images are matched; auto takes cuda if it is there and says what it took.',
+        choices=BACKENDS,
+    ),
+    NodeParameter(
+        'precision',
+        'float32',
+        '',
+        "How the map's features are kept; float16 takes half the memory and, on large maps, half the time.",
+        choices=PRECISIONS,
     ),
     NodeParameter(
         'strategy',

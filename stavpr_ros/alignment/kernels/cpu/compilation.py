@@ -1,0 +1,14 @@
+"""How the kernels are compiled: cached on disk, without the interpreter's lock, numbers as IEEE has them."""
+
+import numba as nb
+
+# Of numba's threading layers, the default's fallback aborts the process when two threads meet in it.
+if nb.config.THREADING_LAYER == 'default':
+    nb.config.THREADING_LAYER = 'threadsafe'
+
+kernel = nb.njit(cache=True, nogil=True, error_model='numpy')
+parallel_kernel = nb.njit(cache=True, nogil=True, parallel=True, error_model='numpy')
+# Sums in any order, products fused into them: dot products over lanes. Infinities and NaN stay as they are.
+reassociating_kernel = nb.njit(
+    cache=True, nogil=True, error_model='numpy', fastmath={'reassoc', 'contract', 'nsz'}
+)

@@ -1,0 +1,88 @@
+"""The matcher of the CPU: one pass over the map for a frame, all cores."""
+
+import numpy as np
+import torch
+
+from stavpr_ros.alignment.kernels.cpu import products
+from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
+from stavpr_ros.alignment.similarity import tiled
+from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
+from stavpr_ros.alignment.temporal import SequenceMatch, best_match, match_padded, trace_sequence
+from stavpr_ros.features import LocalFeatures
+from stavpr_ros.recognition.window import DistanceWindow
+
+NO_PATH = np.empty((0, 2), np.int32)
+
+
+class CpuMatcher:
+    """
+    See :class:`stavpr_ros.recognition.matcher.Matcher`.
+
+    :param features: those of the map; the float32 ones are shared, not copied.
+    """
+
+    def __init__(
+        self,
+        features: LocalFeatures,
+        spatial: SpatialSettings,
+        sequence: SequenceSettings,
+        precision: str = 'float32',
+    ) -> None:
+        self._spatial, self._sequence = spatial, sequence
+        strips = features.strips.cpu().to(getattr(torch, precision)).contiguous()
+        self._map = (strips if precision == 'float32' else strips.view(torch.int16)).numpy()
+        self._weights = features.weights.cpu()
+        W = len(self._map)
+        self._band = spatial.band(W)
+        self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
+        self.reset()
+
+    @property
+    def places(self) -> int:
+        """Number of places n."""
+        return self._map.shape[1]
+
+    def __len__(self) -> int:
+        return len(self._window)
+
+    def reset(self) -> None:
+        """Empty the window."""
+        self._window = DistanceWindow(self._sequence.length, self.places, self._sequence.k)
+
+    def push(self, row: torch.Tensor) -> None:
+        """Take the newest row in."""
+        self._window.push(row.numpy())
+
+    def distances(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        """Distances of one image to every place, (n,)."""
+        return self.distance_matrix(strips[:, None], weights[:, None])[0]
+
+    def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        """Distances of Q images to every place, (Q, n)."""
+        queries = tiled(strips)
+        out = np.empty((len(queries), self.places), np.float32)
+        if self._spatial.strategy in ('adaptive', 'vanilla'):
+            products.image_distances(self._map, queries, self._a, self._band, out)
+        else:
+            for x, query in enumerate(queries):
+                out[x] = self._compared(query, weights[:, x])
+        return torch.from_numpy(out)
+
+    def _compared(self, query: np.ndarray, weights: torch.Tensor) -> np.ndarray:
+        """Distances of one image without DTW, (n,)."""
+        W, n, _ = self._map.shape
+        d = np.empty((len(query), W, n), np.float32)
+        products.strip_distances(self._map, query, d)
+        if self._spatial.strategy == 'sliding_window':
+            return image_distances(d[:W], self._spatial)
+        similarity = 1 - torch.from_numpy(d).diagonal()[:, :W]  # (n, W)
+        return (1 - (similarity * self._weights.T) @ weights).numpy()
+
+    def match(self, neighbourhood: int) -> tuple[SequenceMatch | None, np.ndarray]:
+        """Return the nearest sequence and its warping path."""
+        window = self._window.rows()
+        matches = match_padded(window, self.places, self._sequence.k)
+        nearest = best_match(matches, neighbourhood)
+        if nearest is None:
+            return None, NO_PATH
+        return nearest, trace_sequence(window[:, : self.places], nearest.first, self._sequence.k).path

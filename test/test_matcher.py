@@ -1,0 +1,175 @@
+"""The matcher of the CPU: fused kernels give what the separate functions give; half width is near enough."""
+
+import numpy as np
+import oracle
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stavpr_ros.alignment import (
+    SequenceSettings,
+    SpatialSettings,
+    align_sequence,
+    best_match,
+    holistic_distances,
+    image_distances,
+    match_sequence,
+    strip_distances,
+)
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.evaluation.offline import recognise_all
+from stavpr_ros.features import Describer, FeatureSettings, LocalFeatures
+from stavpr_ros.features.gradient import GradientSettings
+from stavpr_ros.mapping import build_map, describe_frames
+from stavpr_ros.recognition import Recogniser, RecognitionSettings
+from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+from stavpr_ros.recognition.matcher import make_matcher
+from stavpr_ros.sources import open_source
+
+ROUNDING = (
+    2.0**-11
+)  # of a number kept in float16, relative; so also of a product of unit-norm features, at most
+
+
+def random_features(W, n, d, seed=0):
+    """Unit-norm features of n images; those of one strip of the first image are zero."""
+    rng = np.random.default_rng(seed)
+    strips = rng.standard_normal((W, n, d))
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+    if n:
+        strips[0, 0] = 0
+    weights = rng.uniform(0.1, 1, (W, n))
+    weights /= np.linalg.norm(weights, axis=0)
+    settings = FeatureSettings('gradient', GradientSettings(), W)
+    return LocalFeatures(torch.from_numpy(strips).float(), torch.from_numpy(weights).float(), settings)
+
+
+def make(features, spatial=None, precision='float32', length=5):
+    return CpuMatcher(features, spatial or SpatialSettings(), SequenceSettings(length), precision)
+
+
+# ------------------------------------------------ distances
+
+
+@settings(max_examples=60)
+@given(
+    W=st.integers(1, 15),
+    n=st.sampled_from([0, 1, 2, 15, 16, 17, 255, 256, 257, 530]),
+    d=st.sampled_from([1, 5, 16, 100]),
+    strategy=st.sampled_from(['adaptive', 'vanilla']),
+    data=st.data(),
+)
+def test_fused_is_the_same_as_one_after_the_other(W, n, d, strategy, data):
+    """Bit for bit, in every shape: whole tiles of strips and blocks of images, and what is left over."""
+    xi = data.draw(st.one_of(st.none(), st.integers(1, W)))
+    features, queries = random_features(W, n, d), random_features(W, 3, d, seed=1)
+    spatial = SpatialSettings(strategy, 1.0, xi)
+    matrix = make(features, spatial).distance_matrix(queries.strips, queries.weights)
+    assert matrix.shape == (3, n)
+    for x in range(3):
+        separate = image_distances(strip_distances(queries.strips[:, x], features.strips).numpy(), spatial)
+        np.testing.assert_array_equal(matrix[x], separate)
+        row = make(features, spatial).distances(queries.strips[:, x], queries.weights[:, x])
+        np.testing.assert_array_equal(row, separate)
+
+
+def test_distances_against_the_oracle():
+    features, query = random_features(7, 33, 40), random_features(7, 1, 40, seed=1)
+    row = make(features).distances(query.strips[:, 0], query.weights[:, 0])
+    d = oracle.distances(query.strips[:, 0].double().numpy(), features.strips.double().numpy())
+    expected = oracle.image_distances(d)
+    np.testing.assert_allclose(row, expected, atol=2e-6)
+
+
+@pytest.mark.parametrize('W', [1, 4, 7, 9])
+def test_strategies_without_dtw(W):
+    features, query = random_features(W, 70, 24), random_features(W, 2, 24, seed=1)
+    for x in range(2):
+        strips, weights = query.strips[:, x], query.weights[:, x]
+        row = make(features, SpatialSettings('none')).distances(strips, weights)
+        expected = holistic_distances(strips, weights, features.strips, features.weights)
+        np.testing.assert_allclose(row, expected, atol=1e-6)
+        if W >= 4:
+            row = make(features, SpatialSettings('sliding_window')).distances(strips, weights)
+            d = strip_distances(strips, features.strips).numpy()
+            np.testing.assert_array_equal(row, image_distances(d, SpatialSettings('sliding_window')))
+
+
+def test_features_that_do_not_lie_in_one_piece():
+    features, query = random_features(7, 60, 32), random_features(7, 1, 32, seed=1)
+    part = make(features[11:40]).distances(query.strips[:, 0], query.weights[:, 0])
+    whole = make(features).distances(query.strips[:, 0], query.weights[:, 0])
+    np.testing.assert_array_equal(part, whole[11:40])
+
+
+# ------------------------------------------------ the window
+
+
+@pytest.mark.parametrize('n', [1, 7, 16, 100])
+def test_window_and_match(n):
+    """Whatever the ring's turn, the answer is that of the plain functions on the last l rows."""
+    matcher = make(random_features(7, n, 8))
+    rows = np.random.default_rng(0).random((23, n), np.float32)
+    for i, row in enumerate(rows):
+        matcher.push(torch.from_numpy(row))
+        assert len(matcher) == min(i + 1, 5)
+        if len(matcher) == 5:
+            nearest, path = matcher.match(3)
+            window = rows[i - 4 : i + 1]
+            expected = best_match(match_sequence(window, SequenceSettings(5)), 3)
+            assert repr(nearest) == repr(expected)  # a runner-up's distance may be NaN
+            aligned = align_sequence(window, expected.first, SequenceSettings(5))
+            np.testing.assert_array_equal(path, aligned.path)
+    matcher.reset()
+    assert len(matcher) == 0
+
+
+def test_no_places_no_match():
+    matcher = make(random_features(7, 0, 8))
+    for _ in range(5):
+        matcher.push(torch.empty(0))
+    nearest, path = matcher.match(3)
+    assert nearest is None
+    assert path.shape == (0, 2)
+
+
+# ------------------------------------------------ half width
+
+
+@pytest.mark.parametrize('d', [1, 16, 100, 512])
+def test_half_width_rounds_as_it_says(d):
+    """Strip distances move by 2^-11 at most (Cauchy-Schwarz), far less as a rule; W = 1 shows them bare."""
+    features, query = random_features(1, 300, d), random_features(1, 2, d, seed=1)
+    exact = make(features).distances(query.strips[:, 1], query.weights[:, 1])
+    half = make(features, precision='float16').distances(query.strips[:, 1], query.weights[:, 1])
+    error = (half - exact).abs()
+    assert error.max() <= ROUNDING * 1.001
+    assert error.max() > 0 or d == 1
+    if d == 512:
+        assert error.max() < 5e-5
+    rounded = LocalFeatures(features.strips.half().float(), features.weights, features.settings)
+    widened = make(rounded).distances(query.strips[:, 1], query.weights[:, 1])
+    np.testing.assert_array_equal(half, widened)  # the same sums of the rounded numbers
+
+
+def test_half_width_answers_on_real_images(data_folder):
+    """The same place, window for window, on a walk in the paper's configuration; distances within 1e-3."""
+    describer = Describer()
+    place_map = build_map(open_source(data_folder / 'gardens_point' / 'day_left'), describer, progress=False)
+    query = describe_frames(
+        open_source(data_folder / 'gardens_point' / 'day_right'), describer, progress=False
+    )
+    exact, half = (
+        recognise_all(Recogniser(place_map, RecognitionSettings(10.0), precision=p), query)[19:]
+        for p in ('float32', 'float16')
+    )
+    assert [a.nearest.middle for a in half] == [a.nearest.middle for a in exact]
+    moved = [abs(a.nearest.distance - b.nearest.distance) for a, b in zip(half, exact, strict=True)]
+    print(f'float16: {len(half)} windows, distances moved by {max(moved):.1e} at most')
+    assert max(moved) < 1e-3
+
+
+def test_no_such_precision():
+    with pytest.raises(SettingsError, match='float8'):
+        make_matcher(random_features(7, 4, 8), SpatialSettings(), SequenceSettings(), 'cpu', 'float8')
