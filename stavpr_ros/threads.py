@@ -15,13 +15,15 @@ def wait_passively() -> None:
 
 def limit_threads(count: int) -> None:
     """
-    Limit torch and numba to so many threads, for the thread that calls.
+    Limit torch, numba and OpenCV to so many threads; numba for the thread that calls.
 
     :param count: 0 = all cores.
     """
+    import cv2
     import numba
     import torch
 
     if count:
         torch.set_num_threads(count)
+        cv2.setNumThreads(count)
         numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))

@@ -27,9 +27,8 @@ from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.sources import open_source
 
-ROUNDING = (
-    2.0**-11
-)  # of a number kept in float16, relative; so also of a product of unit-norm features, at most
+# of a number kept in float16, relative; so also of a product of unit-norm features, at most
+ROUNDING = 2.0**-11
 
 
 def random_features(W, n, d, seed=0):

@@ -3,11 +3,13 @@ Oriented-gradient features: no weights, no training, the default.
 
 Histograms of gradient orientation on a regular grid of overlapping cells, each normalised by the four
 2 x 2 blocks it lies in (after Dalal and Triggs, "Histograms of Oriented Gradients for Human Detection",
-CVPR 2005; one channel an orientation, the mean over the four normalisations).
+CVPR 2005; one channel an orientation, the mean over the four normalisations). On a CPU they are computed
+picture by picture by a compiled kernel, elsewhere by torch for the whole batch.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -17,7 +19,11 @@ from torch.nn.functional import avg_pool2d, pad
 
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features.backbone import setting
+from stavpr_ros.features.gradient_kernel import describe_picture
 from stavpr_ros.features.resize import check_method, resize_square
+
+FLOOR = 1e-4  # squared gradient (intensities 0..1) below which a block counts as flat
+PER_THREAD = 8  # images at least: starting a thread takes as long as describing one or two
 
 
 @dataclass(frozen=True)
@@ -39,49 +45,98 @@ class GradientSettings:
         if self.orientations < 2:
             raise SettingsError(f'orientations = {self.orientations} must be at least 2')
 
+    @property
+    def cells(self) -> int:
+        """Cells along one side of a feature map: size / cell, one less if cell is odd (none is half)."""
+        return self.size // self.cell - self.cell % 2
+
 
 class Gradient:
-    """Feature maps of ``orientations`` channels, (size / cell) x (size / cell)."""
+    """Feature maps of ``orientations`` channels, ``cells`` x ``cells``."""
 
     Settings = GradientSettings
-    FLOOR = 1e-4  # squared gradient (intensities 0..1) below which a block counts as flat
 
     def __init__(self, settings: GradientSettings, device: str = 'cpu') -> None:
         self.settings = settings
         self._device = torch.device(device)
-        bins = torch.arange(settings.orientations, dtype=torch.float32, device=self._device)
-        self._bins = bins[None, :, None, None]
 
     def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
         """
-        Describe a batch of images.
+        Describe a batch of images, on a CPU as many at a time as torch may use threads.
 
         :param images: RGB, each (h, w, 3) uint8, of any size.
-        :returns: shape (n, orientations, size / cell, size / cell), float32, values >= 0.
+        :returns: shape (n, orientations, cells, cells), float32, values >= 0.
         """
-        grey = torch.from_numpy(np.stack([self._prepare(image) for image in images]))
-        return self._normalise(self._histograms(grey.to(self._device)))
+        return self._by_kernel(images) if self._device.type == 'cpu' else self._by_torch(images)
+
+    def _by_kernel(self, images: Sequence[np.ndarray]) -> torch.Tensor:
+        s = self.settings
+        maps = np.empty((len(images), s.orientations, s.cells, s.cells), np.float32)
+
+        def describe(i: int) -> None:
+            describe_picture(self._prepare(images[i]), s.cell, s.signed, FLOOR, maps[i])
+
+        _on_threads(describe, len(images))
+        return torch.from_numpy(maps)
+
+    def _by_torch(self, images: Sequence[np.ndarray]) -> torch.Tensor:
+        grey = np.empty((len(images), self.settings.size, self.settings.size), np.uint8)
+
+        def prepare(i: int) -> None:
+            grey[i] = self._prepare(images[i])
+
+        _on_threads(prepare, len(images))
+        return feature_maps_by_torch(torch.from_numpy(grey).to(self._device), self.settings)
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         return resize_square(
             cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), self.settings.size, self.settings.resize
         )
 
-    def _histograms(self, grey: torch.Tensor) -> torch.Tensor:
-        """Pool the gradients by orientation over cells that overlap by half, (n, bins, cells, cells)."""
-        padded = pad(grey[:, None].float() / 255, (1, 1, 1, 1), mode='replicate')
-        dx = padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]
-        dy = padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]
-        period = 2 * math.pi if self.settings.signed else math.pi
-        bins = self.settings.orientations
-        position = (torch.atan2(dy, dx) * (bins / period)).remainder_(bins)
-        offset = (position - self._bins).abs_()
-        share = torch.clamp_(1 - torch.minimum(offset, bins - offset), min=0)  # linear between two bins
-        cell = self.settings.cell
-        return avg_pool2d(share.mul_(torch.hypot(dx, dy)), 2 * cell, stride=cell, padding=cell // 2)
 
-    def _normalise(self, histograms: torch.Tensor) -> torch.Tensor:
-        """Multiply each cell by the mean of 1 / norm over the four 2 x 2 blocks that it is part of."""
-        energy = pad((histograms**2).sum(dim=1, keepdim=True), (1, 1, 1, 1), mode='replicate')
-        scale = torch.rsqrt(4 * avg_pool2d(energy, 2, stride=1) + self.FLOOR)
-        return histograms * avg_pool2d(scale, 2, stride=1)
+def _on_threads(work: Callable[[int], None], count: int) -> None:
+    """Call work(0) .. work(count - 1), which hardly needs the GIL, on at most as many threads as torch."""
+    threads = min(torch.get_num_threads(), count // PER_THREAD)
+    if threads < 2:
+        for i in range(count):
+            work(i)
+        return
+
+    def part(first: int) -> None:
+        for i in range(first, count, threads):
+            work(i)
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(part, range(threads)))  # the list raises what a thread raised
+
+
+def feature_maps_by_torch(grey: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
+    """
+    Compute the feature maps of square pictures with torch's operators, on whatever device they are on.
+
+    :param grey: shape (n, size, size), uint8.
+    :returns: shape (n, orientations, cells, cells), float32.
+    """
+    return _normalise(_histograms(grey, settings))
+
+
+def _histograms(grey: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
+    """Pool the gradients by orientation over cells that overlap by half, (n, bins, cells, cells)."""
+    padded = pad(grey[:, None].float() / 255, (1, 1, 1, 1), mode='replicate')
+    dx = padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]
+    dy = padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]
+    period = 2 * math.pi if settings.signed else math.pi
+    bins = settings.orientations
+    position = (torch.atan2(dy, dx) * (bins / period)).remainder_(bins)
+    centres = torch.arange(bins, dtype=torch.float32, device=grey.device)
+    offset = (position - centres[None, :, None, None]).abs_()
+    share = torch.clamp_(1 - torch.minimum(offset, bins - offset), min=0)  # linear between two bins
+    cell = settings.cell
+    return avg_pool2d(share.mul_(torch.hypot(dx, dy)), 2 * cell, stride=cell, padding=cell // 2)
+
+
+def _normalise(histograms: torch.Tensor) -> torch.Tensor:
+    """Multiply each cell by the mean of 1 / norm over the four 2 x 2 blocks that it is part of."""
+    energy = pad((histograms**2).sum(dim=1, keepdim=True), (1, 1, 1, 1), mode='replicate')
+    scale = torch.rsqrt(4 * avg_pool2d(energy, 2, stride=1) + FLOOR)
+    return histograms * avg_pool2d(scale, 2, stride=1)

@@ -12,10 +12,10 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic, overload
 
-from stavpr_ros.alignment.kernels.cpu.compilation import kernel, parallel_kernel, reassociating_kernel
 from stavpr_ros.alignment.kernels.cpu.spatial import align_lanes
 from stavpr_ros.alignment.kernels.cpu.steps import SLOT
 from stavpr_ros.alignment.kernels.cpu.vectors import LANES, store
+from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
 
 TILE = 7  # query strips whose sums stay in registers: all of them, with the paper's W
 IMAGES = 256  # map images a thread takes at a time; a multiple of LANES

@@ -3,9 +3,9 @@
 import numba as nb
 import numpy as np
 
-from stavpr_ros.alignment.kernels.cpu.compilation import kernel, parallel_kernel
 from stavpr_ros.alignment.kernels.cpu.steps import SLOT, open_edge, sweep_row
 from stavpr_ros.alignment.kernels.cpu.vectors import LANES, load, select, splat, store
+from stavpr_ros.compilation import kernel, parallel_kernel
 
 BLOCKS = 16  # vectors of map images that a thread takes at a time
 

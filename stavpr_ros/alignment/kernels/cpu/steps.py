@@ -9,8 +9,8 @@ No ``fastmath``: the answers are the oracle's bit for bit.
 
 import numpy as np
 
-from stavpr_ros.alignment.kernels.cpu.compilation import kernel
 from stavpr_ros.alignment.kernels.cpu.vectors import LANES, load, select, splat, store
+from stavpr_ros.compilation import kernel
 
 SLOT = 2 * LANES  # S, then C
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from stavpr_ros.alignment.kernels.cpu.compilation import kernel
+from stavpr_ros.compilation import kernel
 
 VERTICAL, HORIZONTAL, DIAGONAL = 0, 1, 2
 

@@ -1,0 +1,195 @@
+"""The gradient features against their definition in plain float64."""
+
+import threading
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stavpr_ros.features import Describer
+from stavpr_ros.features.gradient import (
+    FLOOR,
+    PER_THREAD,
+    Gradient,
+    GradientSettings,
+    _on_threads,
+    feature_maps_by_torch,
+)
+from stavpr_ros.features.gradient_kernel import _to_polar, describe_picture
+from stavpr_ros.features.resize import METHODS, resize_square
+from stavpr_ros.features.strips import cut_strips, normalise
+
+
+def reference_maps(grey: np.ndarray, settings: GradientSettings) -> np.ndarray:
+    """The features of one square picture as they are defined, float64, a cell after the other."""
+    s, pixels = settings, np.pad(grey / 255, 1, mode='edge')
+    dx, dy = pixels[1:-1, 2:] - pixels[1:-1, :-2], pixels[2:, 1:-1] - pixels[:-2, 1:-1]
+    position = np.arctan2(dy, dx) / (2 * np.pi if s.signed else np.pi) * s.orientations
+    # a pixel's share in an orientation falls linearly to 0 at the next one, round the circle
+    offset = np.abs(position - np.arange(s.orientations)[:, None, None]) % s.orientations
+    share = np.maximum(0, 1 - np.minimum(offset, s.orientations - offset))
+    lengths = np.pad(share * np.hypot(dx, dy), ((0, 0), (s.cell, s.cell), (s.cell, s.cell)))
+    starts = range(s.cell - s.cell // 2, s.size + s.cell // 2 - s.cell + 1, s.cell)  # a cell's first pixel
+    window = 2 * s.cell
+    cells = [[lengths[:, y : y + window, x : x + window].mean(axis=(1, 2)) for x in starts] for y in starts]
+    histograms = np.array(cells).transpose(2, 0, 1)
+    energy = np.pad((histograms**2).sum(axis=0), 1, mode='edge')
+    blocks = 1 / np.sqrt(energy[1:, 1:] + energy[1:, :-1] + energy[:-1, 1:] + energy[:-1, :-1] + FLOOR)
+    return histograms * (blocks[1:, 1:] + blocks[1:, :-1] + blocks[:-1, 1:] + blocks[:-1, :-1]) / 4
+
+
+def kernel_maps(grey: np.ndarray, settings: GradientSettings) -> np.ndarray:
+    """What the compiled kernel makes of a square picture."""
+    maps = np.full((settings.orientations, settings.cells, settings.cells), np.nan, np.float32)
+    describe_picture(grey, settings.cell, settings.signed, FLOOR, maps)
+    return maps
+
+
+def assert_same_features(maps, expected) -> None:
+    """The maps, and the unit-norm local features made of them, are the same to 1e-5."""
+    maps, expected = torch.as_tensor(maps), torch.as_tensor(expected)
+    assert maps.shape == expected.shape
+    batches = (m.reshape(-1, *m.shape[-3:]) for m in (maps, expected))
+    for a, b in zip(*(normalise(cut_strips(batch, 1)) for batch in batches), strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-5)
+    torch.testing.assert_close(maps.double(), expected.double(), rtol=0, atol=1e-5)
+
+
+@st.composite
+def gradient_settings(draw):
+    """Any settings, of pictures that are not too large."""
+    cell = draw(st.integers(2, 17))
+    cells = draw(st.integers(2, 64 // cell + 2))
+    bins, signed = draw(st.integers(2, 12)), draw(st.booleans())
+    return GradientSettings(cell * cells, draw(st.sampled_from(METHODS)), cell, bins, signed)
+
+
+def picture(seed: int, contrast: int, shape: tuple[int, int]) -> np.ndarray:
+    """Noise of a contrast, its left half smoothed: strong and weak gradients, and none."""
+    rng = np.random.default_rng(seed)
+    grey = (rng.integers(0, contrast + 1, shape) + (255 - contrast) // 2).astype(np.uint8)
+    half = (shape[1] + 1) // 2
+    grey[:, :half] = cv2.blur(grey[:, :half], (5, 5))
+    return grey
+
+
+pictures = {'seed': st.integers(0, 2**32 - 1), 'contrast': st.sampled_from([0, 1, 3, 60, 255])}
+
+
+@given(settings=gradient_settings(), **pictures)
+def test_the_kernel_is_the_definition(settings, seed, contrast):
+    grey = picture(seed, contrast, (settings.size, settings.size))
+    assert_same_features(kernel_maps(grey, settings), reference_maps(grey, settings))
+
+
+@given(settings=gradient_settings(), **pictures)
+def test_torch_operators_are_the_definition(settings, seed, contrast):
+    """What runs on a GPU, here on a CPU."""
+    grey = picture(seed, contrast, (settings.size, settings.size))
+    maps = feature_maps_by_torch(torch.from_numpy(grey[None]), settings)[0]
+    assert_same_features(maps, reference_maps(grey, settings))
+
+
+@given(settings=gradient_settings(), height=st.integers(1, 150), width=st.integers(1, 150), **pictures)
+def test_features_of_images_of_any_size(settings, height, width, seed, contrast):
+    """Colour, resizing, kernel: what OpenCV and the definition make of the same image."""
+    image = np.dstack([picture(seed + channel, contrast, (height, width)) for channel in range(3)])
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    averages = settings.resize == 'area' and min(height, width) >= settings.size
+    method = cv2.INTER_AREA if averages else cv2.INTER_LINEAR
+    square = cv2.resize(grey, (settings.size, settings.size), interpolation=method)
+    assert_same_features(Gradient(settings).feature_maps([image])[0], reference_maps(square, settings))
+
+
+@pytest.mark.parametrize('signed', [True, False])
+@pytest.mark.parametrize('bins', [2, 8, 9])
+def test_every_gradient_there_is(bins, signed):
+    """All 511 x 511 differences of grey levels: the angle to a millionth of a turn, the length exactly."""
+    dx = np.arange(-255, 256)
+    here = np.zeros(3 * dx.size, np.uint8)  # pixels 0 and 2 of each three make one difference
+    here[0::3], here[2::3] = np.maximum(0, -dx), np.maximum(0, dx)
+    period = 1.0 if signed else 0.5
+    position, magnitude = (np.empty(here.size - 2, np.float32) for _ in range(2))
+    for dy in range(-255, 256):
+        above, below = np.full_like(here, max(0, -dy)), np.full_like(here, max(0, dy))
+        _to_polar(above, here, below, np.float32(period), np.float32(bins / period), position, magnitude)
+        turns = position[::3].astype(float) / bins * period
+        wrong = (turns - np.arctan2(dy, dx) / (2 * np.pi)) / period
+        assert np.abs((wrong - np.round(wrong))[(dx != 0) | (dy != 0)]).max() < 1e-6
+        assert turns.min() >= 0
+        assert turns.max() <= period
+        np.testing.assert_array_equal(magnitude[::3], np.hypot(dx, dy).astype(np.float32))
+
+
+def test_odd_cells_leave_no_half_cell():
+    maps = Gradient(GradientSettings(size=21, cell=7)).feature_maps([np.zeros((30, 30, 3), np.uint8)])
+    assert maps.shape == (1, 8, 2, 2)
+
+
+def test_area_worked_by_hand():
+    """Three pixels to two: the first takes the first and half of the second."""
+    grey = np.array([[0, 90, 180], [45, 90, 135], [225, 0, 9]], np.uint8)
+    expected = [[(4 * 0 + 2 * 90 + 2 * 45 + 90) / 9, (4 * 180 + 2 * 90 + 2 * 135 + 90) / 9]]
+    expected += [[(4 * 225 + 2 * 45 + 2 * 0 + 90) / 9, (4 * 9 + 2 * 135 + 2 * 0 + 90) / 9]]
+    np.testing.assert_array_equal(resize_square(grey, 2, 'area'), np.round(expected))
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures('two_threads')
+@pytest.mark.parametrize('n', [0, 1, PER_THREAD, 2 * PER_THREAD, 2 * PER_THREAD + 3])
+def test_threads_share_a_batch(route, n):
+    gradient = Gradient(GradientSettings())
+    together = gradient.feature_maps(route[:n])
+    assert together.shape == (n, 8, 14, 14)
+    for i in range(n):
+        assert torch.equal(together[i], gradient.feature_maps([route[i]])[0])
+
+
+@pytest.mark.usefixtures('two_threads')
+@pytest.mark.parametrize(('count', 'threads'), [(PER_THREAD, 1), (2 * PER_THREAD, 2), (9 * PER_THREAD, 2)])
+def test_a_large_batch_goes_to_several_threads(count, threads):
+    """They meet at every image, which one thread alone could not."""
+    meeting, seen = threading.Barrier(threads), set()
+
+    def work(i: int) -> None:
+        meeting.wait(timeout=30)
+        seen.add((i, threading.get_ident()))
+
+    _on_threads(work, count)
+    assert sorted(i for i, _ in seen) == list(range(count))
+    assert len({thread for _, thread in seen}) == threads
+
+
+@pytest.mark.usefixtures('two_threads')
+@pytest.mark.parametrize('bad', range(4))
+def test_an_error_in_a_thread_is_not_lost(route, bad):
+    images = [*route[: 2 * PER_THREAD]]
+    images[bad] = np.empty((0, 5, 3), np.uint8)
+    with pytest.raises(cv2.error):
+        Gradient(GradientSettings()).feature_maps(images)
+
+
+def test_other_devices_than_cpu_take_torch_operators(route):
+    """On torch's device without numbers, since there may be no other; then the same way on the CPU."""
+    settings = GradientSettings(cell=7, orientations=5)
+    maps = Gradient(settings, 'meta').feature_maps(route[:3])
+    assert maps.shape == (3, 5, 31, 31)
+    assert maps.device.type == 'meta'
+    gradient = Gradient(settings)
+    assert_same_features(gradient._by_torch(route[:3]), gradient.feature_maps(route[:3]))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason='no GPU')
+def test_gpu_and_cpu_agree(route):
+    on_gpu, on_cpu = Describer(device='cuda').describe(route).to('cpu'), Describer().describe(route)
+    torch.testing.assert_close(on_gpu.strips, on_cpu.strips, rtol=0, atol=1e-5)
