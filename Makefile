@@ -21,17 +21,17 @@ RUN = $(BOOTSTRAP) run
 BUILT := build install log
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 
-.PHONY: help setup build demo test lint shell clean distclean ready-for-test
+.PHONY: help setup build demo test lint bench bench-quick shell clean distclean ready-for-test
 
 help: ## list the targets (this is the default)
 	@echo 'make TARGET [NAME=VALUE ...]'
-	@sed -n 's/^\([a-z]*\):[^#]*## \(.*\)/  \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
+	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/  \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
 	@echo 'Names and values:'
 	@echo '  PYTHON=python3.12          the Python to use, 3.11 to 3.13 (python3)'
 	@echo '  TORCH_INDEX=URL            take torch from this package index, for example one of CPU wheels'
-	@echo '  EXTRAS="onnx dev"          setup, build, demo, shell: install these as well'
+	@echo '  EXTRAS="onnx cuda dev"     setup, build, demo, shell: install these as well'
 	@echo '  MAP=PATH QUERY=PATH        demo: your own folders of images, or bags'
-	@echo '  ARGS="..."                 demo, test: options for the demonstration, for pytest'
+	@echo '  ARGS="..."                 demo, test, bench, bench-quick: options for the command, for pytest'
 
 setup: ## make .venv with the pinned Python packages and the ROS 2 Jazzy wheels
 	@$(BOOTSTRAP) setup $(READY) --with $(EXTRAS)
@@ -49,6 +49,12 @@ lint: ready-for-test ## check style and types: ruff, mypy
 	@$(RUN) ruff check $(addprefix --extend-exclude ,$(BUILT)) .
 	@$(RUN) mypy
 
+bench: build ## build, and measure the matching beside its floors and others (ARGS=; see benchmarks/README.md)
+	@$(RUN) python benchmarks/matching.py $(ARGS)
+
+bench-quick: build ## the same, sizes up to 20,000 places, in under two minutes (ARGS=)
+	@$(RUN) python benchmarks/matching.py --quick $(ARGS)
+
 shell: build ## build, and open a bash in which the built packages are found
 	@echo 'The executables are in $(EXECUTABLES)/; leave with exit.'
 	@$(RUN) env PS1='(stavpr_ros) \w\$$ ' bash --norc -i || true
@@ -56,8 +62,8 @@ shell: build ## build, and open a bash in which the built packages are found
 clean: ## remove what is built: build/ install/ log/
 	@rm -rf $(BUILT)
 
-distclean: clean ## remove .venv and the tools' caches as well
-	@rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis
+distclean: clean ## remove .venv, .venv-peers and the tools' caches as well
+	@rm -rf .venv .venv-peers .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 ready-for-test:

@@ -31,7 +31,7 @@ setup(
     ],
     python_requires='>=3.11',
     install_requires=['setuptools'],
-    extras_require={'onnx': ['onnx', 'onnxruntime'], 'test': ['pytest']},
+    extras_require={'cuda': ['numba-cuda>=0.30'], 'onnx': ['onnx', 'onnxruntime'], 'test': ['pytest']},
     zip_safe=True,
     entry_points={
         'console_scripts': [f'{name} = {NAME}.commands.{name}:main' for name in EXECUTABLES],

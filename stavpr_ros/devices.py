@@ -47,5 +47,8 @@ def why_no_cuda() -> str:
     if not torch.cuda.is_available():
         return 'torch sees no CUDA device here'
     if importlib.util.find_spec('numba_cuda') is None:
-        return "the package numba-cuda is not installed ('pip install numba-cuda')"
+        return (
+            'the package numba-cuda is not installed: pip install numba-cuda[cu13], '
+            'or numba-cuda[cu12] where the driver is one for CUDA 12'
+        )
     return ''

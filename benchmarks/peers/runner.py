@@ -1,0 +1,55 @@
+"""
+Runs inside the peers' own environment: does a sample of starts with one peer whenever it is told to.
+
+Standard input: a line of JSON for each run, ``{"peer": NAME, "window": FILE.npy, "starts": [...],
+"columns": k}``. Standard output: a line of JSON for each, ``{"seconds": ..., "ends": [...]}``, where
+``ends`` is the accumulated distance in cell (l, k) of each start. The first line out are the versions.
+"""
+
+import importlib.metadata
+import json
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+PEERS = ('librosa', 'tslearn')
+
+
+def aligner(peer: str) -> Callable[[np.ndarray], float]:
+    """Return the function that aligns one l x k matrix of costs and returns S of its last cell."""
+    if peer == 'librosa':
+        from librosa.sequence import dtw  # type: ignore[import-not-found]
+
+        return lambda costs: dtw(C=costs, backtrack=False)[-1, -1]
+    if peer == 'tslearn':
+        from tslearn.metrics import dtw_path_from_metric  # type: ignore[import-not-found]
+
+        return lambda costs: dtw_path_from_metric(costs, metric='precomputed')[1]
+    raise ValueError(f'peer {peer!r} is unknown: take one of {", ".join(PEERS)}')
+
+
+def run(request: dict[str, Any]) -> dict[str, Any]:
+    """Do one run."""
+    window = np.load(request['window'], mmap_mode='r')
+    width = request['columns']
+    # what is cut out of the window is made ready before the clock starts
+    costs = [np.array(window[:, start : start + width]) for start in request['starts']]
+    align = aligner(request['peer'])
+    began = time.perf_counter()
+    ends = [align(matrix) for matrix in costs]
+    seconds = time.perf_counter() - began
+    return {'seconds': seconds, 'ends': [float(end) for end in ends]}
+
+
+def main() -> None:
+    """Answer until standard input ends."""
+    print(json.dumps({peer: importlib.metadata.version(peer) for peer in PEERS}), flush=True)
+    for line in sys.stdin:
+        print(json.dumps(run(json.loads(line))), flush=True)
+
+
+if __name__ == '__main__':
+    main()

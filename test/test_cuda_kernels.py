@@ -1,0 +1,346 @@
+"""
+The CUDA kernels, bit for bit against the oracle.
+
+They run on a CUDA device where there is one, and in numba's simulator everywhere: numba reads
+NUMBA_ENABLE_CUDASIM when it is imported, so the simulator has a process of its own, which runs this file and
+test_cuda_matcher.py once more.
+"""
+
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import oracle
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stavpr_ros.alignment import SequenceDistances, best_match
+from stavpr_ros.errors import UnavailableError
+
+SIMULATOR = os.environ.get('NUMBA_ENABLE_CUDASIM') == '1'
+INF = math.inf
+FILES = ('test_cuda_kernels.py', 'test_cuda_matcher.py')
+
+
+@pytest.fixture(scope='module')
+def runtime():
+    """What kernels run on here; skips where there is nothing."""
+    from stavpr_ros.alignment.kernels.cuda import compilation
+
+    try:
+        return compilation.runtime()
+    except UnavailableError as error:
+        pytest.skip(f'{error}; the same test runs in the simulator (test_everything_in_the_simulator)')
+
+
+@pytest.mark.skipif(SIMULATOR, reason='this is the simulator')
+def test_everything_in_the_simulator():
+    root = Path(__file__).resolve().parents[1]
+    environment = os.environ | {'NUMBA_ENABLE_CUDASIM': '1'}
+    files = [str(Path(__file__).with_name(name)) for name in FILES]
+    command = [
+        sys.executable,
+        '-m',
+        'pytest',
+        '-q',
+        '-rs',
+        '-p',
+        'no:cacheprovider',
+        '-c',
+        root / 'pytest.ini',
+    ]
+    done = subprocess.run([*command, *files], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-2000:]
+    assert ' passed' in done.stdout
+
+
+def test_without_a_device_there_is_an_error_that_says_so():
+    if SIMULATOR or torch.cuda.is_available():
+        pytest.skip('there is something to run kernels on')
+    from stavpr_ros.alignment.kernels.cuda import compilation
+
+    with pytest.raises(UnavailableError, match='no CUDA device'):
+        compilation.runtime()
+
+
+def test_a_missing_numba_cuda_is_named(monkeypatch):
+    from stavpr_ros.alignment.kernels.cuda import compilation
+
+    monkeypatch.setattr(torch.cuda, 'is_available', lambda: True)
+    monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
+    with pytest.raises(UnavailableError, match='pip install numba-cuda'):
+        compilation.Device()
+
+
+@pytest.mark.skipif(SIMULATOR, reason='the simulator compiles nothing')
+def test_the_compiler_keeps_everything_in_registers():
+    from stavpr_ros.alignment.kernels.cuda import temporal
+
+    program = Path(__file__).resolve().parents[1] / 'benchmarks' / 'cuda_registers.py'
+    done = subprocess.run([sys.executable, str(program)], capture_output=True, text=True, check=False)
+    if done.returncode == 2:
+        pytest.skip(done.stderr.strip())
+    assert done.returncode == 0, done.stderr
+    kernels = json.loads(done.stdout)['kernels']
+    assert {'spatial_dtw W=7 xi=3', 'sliding_window W=7', 'lm_dtw l=20 k=40'} <= set(kernels)
+    for name, report in kernels.items():
+        assert report['fused_multiply_adds'] == 0, name
+        assert report['spill_store_bytes'] == report['spill_load_bytes'] == 0, name
+        rows = re.search(r'l=(\d+)', name)
+        long = rows is not None and int(rows[1]) > temporal.REGISTER_ROWS
+        assert (report['stack_bytes'] > 0) == long, name
+
+
+# ------------------------------------------------ the distance of two images
+
+
+def image_distances(runtime, products, strategy, sigma=1.0, xi=None, block=4):
+    """Run a spatial kernel on products (queries, W, W, places)."""
+    from stavpr_ros.alignment.kernels.cuda import spatial
+
+    queries, W, _, n = products.shape
+    band = W if xi is None else xi
+    if strategy == 'sliding_window':
+        function = spatial.sliding_window(W, 4, band)
+    else:
+        function = spatial.spatial_dtw(W, band)
+    device = runtime.torch_device
+    block_of_products = torch.from_numpy(products).reshape(queries * W, W, n).to(device)
+    # one row and two columns more than the kernel is to write
+    out = torch.full((queries + 1, n + 2), -7.0, device=device)
+    weight = np.float32(sigma if strategy == 'adaptive' else 0)
+    grid = (-(-n // block), queries)
+    runtime.launch(function, grid, block, runtime.array(block_of_products), weight, 1, 2, runtime.array(out))
+    out = out.cpu().numpy()
+    assert (out[0] == -7).all()
+    assert (out[:, :2] == -7).all()
+    return out[1:, 2:]
+
+
+def expected_images(products, strategy, sigma=1.0, xi=None):
+    d = np.float32(1) - products
+    return np.stack([oracle.image_distances(query, strategy, sigma, xi, np.float32) for query in d])
+
+
+def random_products(seed, queries, W, n, levels=None):
+    rng = np.random.default_rng(seed)
+    products = rng.random((queries, W, W, n), np.float32)
+    return products if levels is None else np.round(products * levels).astype(np.float32) / np.float32(levels)
+
+
+@pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'sliding_window'])
+@pytest.mark.parametrize(('W', 'xi', 'n'), [(7, None, 9), (7, 3, 5), (7, 1, 4), (4, 2, 1), (6, None, 3)])
+@pytest.mark.parametrize('levels', [None, 3])  # three levels: ties everywhere
+def test_image_distances_are_the_oracles(runtime, strategy, W, xi, n, levels):
+    products = random_products(W * 10 + n, 2, W, n, levels)
+    got = image_distances(runtime, products, strategy, 1.0, xi)
+    np.testing.assert_array_equal(got, expected_images(products, strategy, 1.0, xi))
+
+
+@pytest.mark.parametrize('W', [1, 2, 9])
+@pytest.mark.parametrize('sigma', [0.0, 0.3, 5.0])
+def test_other_numbers_of_strips_and_sigmas(runtime, W, sigma):
+    products = random_products(W, 1, W, 5)
+    got = image_distances(runtime, products, 'adaptive', sigma)
+    np.testing.assert_array_equal(got, expected_images(products, 'adaptive', sigma))
+
+
+def test_the_published_figure(runtime):
+    products = (1 - oracle.GOLDEN.astype(np.float32))[None, :, :, None]
+    assert image_distances(runtime, products, 'adaptive')[0, 0] == pytest.approx(0.28724851, abs=1e-6)
+    assert image_distances(runtime, products, 'vanilla')[0, 0] == pytest.approx(0.31888889, abs=1e-6)
+
+
+def test_cells_outside_the_band_are_not_read(runtime):
+    products = random_products(3, 1, 7, 5)
+    expected = expected_images(products, 'adaptive', 1.0, 3)
+    i, j = np.indices((7, 7))
+    products[:, abs(i - j) >= 3] = np.nan
+    np.testing.assert_array_equal(image_distances(runtime, products, 'adaptive', 1.0, 3), expected)
+
+
+def test_products_of_any_strides(runtime):
+    from stavpr_ros.alignment.kernels.cuda import spatial
+
+    products = random_products(5, 2, 5, 6)
+    by_strip = np.ascontiguousarray(products.reshape(10, 5, 6).transpose(1, 0, 2))
+    view = torch.from_numpy(by_strip).to(runtime.torch_device).permute(1, 0, 2)
+    out = torch.zeros((2, 6), device=runtime.torch_device)
+    arguments = runtime.array(view), np.float32(1), 0, 0, runtime.array(out)
+    runtime.launch(spatial.spatial_dtw(5, 5), (2, 2), 4, *arguments)
+    np.testing.assert_array_equal(out.cpu().numpy(), expected_images(products, 'adaptive'))
+
+
+# ------------------------------------------------ LM-DTW and the choice
+
+
+def run_sequences(runtime, D, k, apart, block=8, columns=None, first=0, launches=1):
+    """Run the kernel on a window D (l, n); return distances, lengths and the selection."""
+    from stavpr_ros.alignment.kernels.cuda import selection, temporal
+
+    l, n = D.shape
+    device = runtime.torch_device
+    blocks = -(-n // block)
+    rows = torch.full((first + l, temporal.row_pitch(n, k, block)), INF)
+    rows[:first] = -1  # rows that are not of the window
+    rows[first:, :n] = torch.from_numpy(D)
+    rows = rows.to(device)
+    distances, block_distances = torch.zeros(n, device=device), torch.zeros(blocks, device=device)
+    lengths, block_starts, finished = (
+        torch.zeros(count, dtype=torch.int32, device=device) for count in (n, blocks, 1)
+    )
+    buffer = selection.SelectionBuffer(runtime, l, k)
+    scratch = (distances, lengths, block_distances, block_starts, finished)
+    arrays = [runtime.array(tensor) for tensor in scratch]
+    function = temporal.lm_dtw(l, k, block, columns)
+    for _ in range(launches):
+        window = runtime.array(rows), first, apart
+        runtime.launch(function, (blocks, 1), block, *window, *arrays, *buffer.arguments)
+        found = buffer.fetch()
+    assert finished.item() == 0
+    return distances.cpu().numpy(), lengths.cpu().numpy(), found
+
+
+def check_sequences(runtime, D, beta, apart=3, **launch):
+    """Hold every start and the choice against the oracle, exactly."""
+    l, n = D.shape
+    k = oracle.frames_searched(l, beta)
+    distances, lengths, found = run_sequences(runtime, D, k, min(apart, n), **launch)
+    q, m = oracle.match_sequence(D, beta, np.float32)
+    finite = np.isfinite(q)
+    np.testing.assert_array_equal(distances, q)
+    np.testing.assert_array_equal(lengths, np.where(finite, m, 0))
+    answer = oracle.best_match(q, m, apart)
+    twin = best_match(SequenceDistances(distances, lengths), apart)
+    assert (answer is None) == (twin is None) == (found.start == -1)
+    if answer is None:
+        return
+    assert (found.start, found.length, found.distance) == (answer.start, answer.length, answer.distance)
+    if answer.runner_up_index == -1:
+        assert found.runner_up_start == twin.runner_up_index == -1
+    else:
+        middle = (2 * found.runner_up_start + found.runner_up_length - 1) // 2
+        assert middle == answer.runner_up_index == twin.runner_up_index
+        assert found.runner_up_distance == answer.runner_up_distance == twin.runner_up_distance
+    seen = D[:, found.start : found.start + k]
+    np.testing.assert_array_equal(found.cells[:, : seen.shape[1]], seen)
+    assert np.isinf(found.cells[:, seen.shape[1] :]).all()
+
+
+def random_window(seed, l, n, levels=None, banned=0.0):
+    rng = np.random.default_rng(seed)
+    D = rng.random((l, n), np.float32)
+    if levels is not None:
+        D = np.round(D * levels).astype(np.float32) / np.float32(levels)
+    D[rng.random(D.shape) < banned] = np.inf
+    return D
+
+
+@pytest.mark.parametrize(
+    ('l', 'n', 'beta'),
+    [
+        (5, 30, 2.0),  # several blocks, the last one not full
+        (5, 16, 2.0),  # whole blocks
+        (2, 9, 1.2),  # the shortest window, k = 3
+        (3, 1, 2.0),  # one place
+        (4, 5, 2.0),  # fewer places than a block has threads, and k > n
+        (7, 20, 1.3),  # odd k, not a multiple of l
+    ],
+)
+@pytest.mark.parametrize('columns', [None, 3, 0])  # staged at once, in pieces, not at all
+def test_sequences_are_the_oracles(runtime, l, n, beta, columns):
+    check_sequences(runtime, random_window(l * n, l, n), beta, columns=columns)
+
+
+@pytest.mark.parametrize('columns', [None, 0])
+def test_ties_and_bans(runtime, columns):
+    for seed, banned in ((1, 0.0), (2, 0.3), (3, 0.8)):
+        check_sequences(runtime, random_window(seed, 4, 21, levels=2, banned=banned), 2.0, columns=columns)
+
+
+def test_a_window_of_33_rows(runtime):
+    check_sequences(runtime, random_window(33, 33, 6), 1.2, block=4)
+
+
+def test_nothing_is_finite(runtime):
+    D = np.full((3, 12), np.inf, np.float32)
+    distances, lengths, found = run_sequences(runtime, D, 6, 2)
+    assert np.isinf(distances).all()
+    assert not lengths.any()
+    assert (found.start, found.runner_up_start) == (-1, -1)
+
+
+def test_the_lowest_start_wins_across_blocks(runtime):
+    D = np.full((3, 64), 0.5, np.float32)
+    found = run_sequences(runtime, D, 6, 4)[2]
+    # every start is as good as every other: a path down the first column has m = 1
+    assert (found.start, found.length) == (0, 1)
+    assert found.runner_up_start == 5
+
+
+@pytest.mark.parametrize('apart', [0, 1, 7, 8, 20, 39, 1000])
+def test_the_runner_up_lies_outside_the_neighbourhood(runtime, apart):
+    D = random_window(11, 3, 40, levels=4)
+    check_sequences(runtime, D, 2.0, apart=apart, block=4)
+
+
+def test_the_window_may_start_at_any_row_and_be_matched_again(runtime):
+    D = random_window(17, 4, 19)
+    k = 8
+    once = run_sequences(runtime, D, k, 2)
+    again = run_sequences(runtime, D, k, 2, first=3, launches=3)
+    for a, b in zip(once[:2], again[:2], strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert (once[2].start, once[2].runner_up_start) == (again[2].start, again[2].runner_up_start)
+
+
+@settings(max_examples=12)
+@given(
+    seed=st.integers(0, 2**20),
+    l=st.integers(2, 6),
+    n=st.integers(1, 20),
+    beta=st.sampled_from([1.01, 1.5, 2.0, 3.1]),
+    levels=st.sampled_from([1, 2, 5, 1000]),
+    banned=st.sampled_from([0.0, 0.2, 0.6]),
+    apart=st.integers(0, 12),
+    block=st.sampled_from([1, 2, 4, 8]),
+    columns=st.sampled_from([None, 0, 1, 2, 5]),
+)
+def test_any_window(runtime, seed, l, n, beta, levels, banned, apart, block, columns):
+    D = random_window(seed, l, n, levels, banned)
+    check_sequences(runtime, D, beta, apart=apart, block=block, columns=columns)
+
+
+def test_the_default_window_is_staged_at_once_and_long_ones_not_at_all():
+    from stavpr_ros.alignment.kernels.cuda import temporal
+
+    assert temporal.staged_columns(20, 40, temporal.BLOCK) == 40
+    for l in range(2, temporal.REGISTER_ROWS + 1):
+        columns = temporal.staged_columns(l, 2 * l, temporal.BLOCK)
+        assert columns >= 1
+        assert 4 * l * (temporal.BLOCK + columns - 1) + 8 * temporal.BLOCK <= 48 * 1024
+    assert temporal.staged_columns(1000, 2000, temporal.BLOCK) == 0
+
+
+@pytest.mark.skipif(SIMULATOR, reason='sizes of a real map take a real device')
+def test_many_places_on_the_device(runtime):
+    from stavpr_ros.alignment import SequenceSettings, match_sequence
+
+    for l, n, beta in ((20, 70_001, 2.0), (33, 5000, 1.7), (80, 3000, 1.5)):
+        D = random_window(l, l, n)
+        sequence = SequenceSettings(length=l, beta=beta)
+        expected = match_sequence(D, sequence)
+        from stavpr_ros.alignment.kernels.cuda import temporal
+
+        distances, lengths, found = run_sequences(runtime, D, sequence.k, 20, block=temporal.BLOCK)
+        np.testing.assert_array_equal(distances, expected.distances)
+        np.testing.assert_array_equal(lengths, expected.lengths)
+        assert found.start == best_match(expected, 20).first
+        assert found.runner_up_distance == best_match(expected, 20).runner_up_distance
