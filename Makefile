@@ -21,7 +21,7 @@ RUN = $(BOOTSTRAP) run
 BUILT := build install log
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 
-.PHONY: help setup build demo test lint bench bench-quick shell clean distclean ready-for-test
+.PHONY: help setup build demo evaluate test lint bench bench-quick shell clean distclean ready-for-test
 
 help: ## list the targets (this is the default)
 	@echo 'make TARGET [NAME=VALUE ...]'
@@ -29,9 +29,9 @@ help: ## list the targets (this is the default)
 	@echo 'Names and values:'
 	@echo '  PYTHON=python3.12          the Python to use, 3.11 to 3.13 (python3)'
 	@echo '  TORCH_INDEX=URL            take torch from this package index, for example one of CPU wheels'
-	@echo '  EXTRAS="onnx cuda dev"     setup, build, demo, shell: install these as well'
-	@echo '  MAP=PATH QUERY=PATH        demo: your own folders of images, or bags'
-	@echo '  ARGS="..."                 demo, test, bench, bench-quick: options for the command, for pytest'
+	@echo '  EXTRAS="onnx cuda dev"     setup, build, demo, evaluate, shell: install these as well'
+	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your own folders of images, or bags (or saved maps)'
+	@echo '  ARGS="..."                 demo, evaluate, test, bench, bench-quick: options for the command, for pytest'
 
 setup: ## make .venv with the pinned Python packages and the ROS 2 Jazzy wheels
 	@$(BOOTSTRAP) setup $(READY) --with $(EXTRAS)
@@ -41,6 +41,10 @@ build: ## setup, and build stavpr_msgs and stavpr_ros with colcon
 
 demo: build ## build, and show the node recognising places over ROS (MAP=, QUERY=, ARGS=)
 	@$(RUN) $(EXECUTABLES)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") $(ARGS)
+
+evaluate: override EXTRAS += evaluation
+evaluate: build ## build, and judge the recognition of QUERY= on MAP=: numbers, pictures, a page (ARGS=)
+	@$(RUN) $(EXECUTABLES)/evaluate $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") $(ARGS)
 
 test: lint ## build, lint, and run the tests against the built package (ARGS=)
 	@ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN) pytest test/ $(ARGS)
@@ -67,4 +71,4 @@ distclean: clean ## remove .venv, .venv-peers and the tools' caches as well
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 ready-for-test:
-	@$(BOOTSTRAP) build $(READY) --with onnx dev
+	@$(BOOTSTRAP) build $(READY) --with onnx evaluation dev

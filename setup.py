@@ -6,7 +6,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = 'stavpr_ros'
-EXECUTABLES = ('node', 'build_map', 'replay', 'demo', 'record')
+EXECUTABLES = ('node', 'build_map', 'replay', 'demo', 'record', 'evaluate', 'experiments')
 
 
 def files_in(folder: str) -> list[str]:
@@ -31,7 +31,12 @@ setup(
     ],
     python_requires='>=3.11',
     install_requires=['setuptools'],
-    extras_require={'cuda': ['numba-cuda>=0.30'], 'onnx': ['onnx', 'onnxruntime'], 'test': ['pytest']},
+    extras_require={
+        'cuda': ['numba-cuda>=0.30'],
+        'evaluation': ['scikit-learn'],
+        'onnx': ['onnx', 'onnxruntime'],
+        'test': ['pytest'],
+    },
     zip_safe=True,
     entry_points={
         'console_scripts': [f'{name} = {NAME}.commands.{name}:main' for name in EXECUTABLES],

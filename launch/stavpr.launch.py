@@ -18,7 +18,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 'threshold',
                 default_value='-1.0',
-                description='a match is nearer than this; negative = not set',
+                description='a match is nearer than this; negative: 1 in mode robust, not set in mode paper',
             ),
             DeclareLaunchArgument('image', default_value='image', description='topic of the images'),
             DeclareLaunchArgument(

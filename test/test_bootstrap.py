@@ -24,6 +24,7 @@ REQUIREMENTS = {
     'ros': 'r==1\n',
     'build': 'b==1\n',
     'onnx': 'o==1\n',
+    'evaluation': 'e==1\n',
     'dev': 'd==1\n',
     'constraints': 'c==1\n',
 }

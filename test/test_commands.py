@@ -32,7 +32,7 @@ def drive(tmp_path_factory):
     return write_images(tmp_path_factory.mktemp('drive') / 'images', route_images(24))
 
 
-@pytest.mark.parametrize('name', ['node', 'build_map', 'replay', 'record', 'demo'])
+@pytest.mark.parametrize('name', ['node', 'build_map', 'replay', 'record', 'demo', 'evaluate', 'experiments'])
 def test_help(name):
     result = run(name, '--help')
     assert result.returncode == 0

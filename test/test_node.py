@@ -56,7 +56,7 @@ def map_file(small_map, tmp_path_factory):
 
 
 def start(log, map_file=None, threshold=None, **parameters):
-    values = {'sequence_length': LENGTH, 'neighbourhood': 5} | parameters
+    values = {'sequence_length': LENGTH, 'neighbourhood': 5, 'mode': 'paper'} | parameters
     if map_file is not None:
         values['map_path'] = map_file
     if threshold is not None:
@@ -225,6 +225,29 @@ def test_what_is_missing_is_said_and_can_be_set_later(bench, run, map_file, rout
     assert not bench.set_parameter('beta', 3.0)[0]
     assert process.popen.poll() is None
     assert "parameter 'map_path' is not set" in process.output()
+
+
+def test_mode_robust_needs_no_threshold(bench, run, map_file, small_map, route):
+    """The default mode: answers are the core's, and 1 is the largest threshold there is."""
+    run(map_file, mode='robust')
+    settings = RecognitionSettings(1.0, sequence=SequenceSettings(LENGTH), neighbourhood=5, mode='robust')
+    images = route[10:30]
+    expected = recognise_all(Recogniser(small_map, settings), small_map.describer().describe(images))
+    for i, image in enumerate(images):
+        answer, core = bench.ask(image_message(image, 1 + i)), expected[i]
+        assert (answer.place_index, answer.newest_index) == (core.place, core.newest)
+        assert answer.threshold == 1
+        if core.nearest is not None:
+            assert answer.verdict == PlaceMatch.MATCH
+            assert answer.distance == pytest.approx(core.nearest.distance, abs=1e-4)
+            assert answer.sequence_middle == core.nearest.middle
+    done, reason = bench.set_parameter('threshold', 1.5)
+    assert not done
+    assert 'chance' in reason
+    assert bench.set_parameter('threshold', 0.8)[0]
+    assert bench.ask(image_message(route[30], 30)).threshold == pytest.approx(0.8)
+    assert bench.set_parameter('threshold', -1.0)[0]
+    assert bench.ask(image_message(route[31], 31)).threshold == 1
 
 
 def test_a_damaged_map_is_said_and_the_node_stays(bench, run, route, tmp_path):

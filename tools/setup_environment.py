@@ -11,7 +11,7 @@ from pathlib import Path
 from setup_report import StepFailedError, run_logged
 from setup_stamps import digest_of, is_current, read_stamp, remove_stamp, write_stamp
 
-GROUPS = ('runtime', 'ros', 'build', 'onnx', 'cuda', 'dev')  # requirements/NAME.txt
+GROUPS = ('runtime', 'ros', 'build', 'onnx', 'cuda', 'evaluation', 'dev')  # requirements/NAME.txt
 ALWAYS = ('runtime', 'ros', 'build')
 
 # Variables of another ROS, another Python or the make that called us; none of them may leak into ours.

@@ -35,6 +35,8 @@ class SequenceMatch:
     The nearest sequence of the map, indices 0-based.
 
     :param first, last: its first and last map image.
+    :param middle: the matched place: floor((first + last) / 2), or where a path says so itself, the place of
+        the window's middle image.
     :param distance: its q_m.
     :param runner_up_index: midpoint of the nearest sequence outside the neighbourhood; -1 if none.
     :param runner_up_distance: its distance; NaN if none.
@@ -42,6 +44,7 @@ class SequenceMatch:
 
     first: int
     last: int
+    middle: int
     distance: float
     runner_up_index: int
     runner_up_distance: float
@@ -55,11 +58,6 @@ class SequenceMatch:
     def length(self) -> int:
         """The number of map images m."""
         return self.last - self.first + 1
-
-    @property
-    def middle(self) -> int:
-        """The matched place: floor((first + last) / 2)."""
-        return (self.first + self.last) // 2
 
 
 def padded_width(n: int, k: int) -> int:
@@ -148,6 +146,7 @@ def best_match(matches: SequenceDistances, neighbourhood: int) -> SequenceMatch 
     return SequenceMatch(
         first=start,
         last=start + int(matches.lengths[start]) - 1,
+        middle=int(middles[start]),
         distance=float(distances[start]),
         runner_up_index=int(middles[second]) if second >= 0 else -1,
         runner_up_distance=float(distances[second]) if second >= 0 else float('nan'),

@@ -120,9 +120,9 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
     try:
         suggestion = suggest_threshold(place_map, progress=True)
     except InputError as error:
-        print(f'no threshold is suggested: {error}')
+        print(f'no threshold is suggested for mode paper: {error}')
         return
-    print(f'threshold to start with: {suggestion.threshold:.3f} (tune it with a second drive)')
+    print(f'threshold to start with in mode paper: {suggestion.threshold:.3f} (mode robust needs none)')
 
 
 def main(args: list[str] | None = None) -> int:

@@ -79,7 +79,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--tolerance', type=int, default=3, help='places that a right match may be off (%(default)s)'
     )
-    parser.add_argument('--threshold', type=float, help='of the node (found from the first drive alone)')
+    parser.add_argument('--mode', default='robust', choices=('paper', 'robust'), help='of the node (robust)')
+    parser.add_argument(
+        '--threshold',
+        type=float,
+        help='of the node (robust: 1; paper: found from the first drive alone)',
+    )
     parser.add_argument(
         '--world-seed', type=int, default=7, help='another number, another street (%(default)s)'
     )
@@ -143,11 +148,14 @@ def _describe(path: str, topic: str | None, describer: 'Describer') -> 'PlaceMap
     return build_map(open_source(path, topic, lambda error: _say(f'   skipped: {error}')), describer)
 
 
-def _choose_threshold(place_map: 'PlaceMap', given: float | None) -> float:
+def _choose_threshold(place_map: 'PlaceMap', mode: str, given: float | None) -> float:
     from stavpr_ros.evaluation.threshold import suggest_threshold
+    from stavpr_ros.recognition.cures import THRESHOLD
 
     if given is not None:
         return given
+    if mode == 'robust':
+        return THRESHOLD
     try:
         threshold = suggest_threshold(place_map, progress=True).threshold
     except InputError as error:
@@ -182,13 +190,18 @@ def _run(arguments: argparse.Namespace) -> None:
     _say(f'2. The map of the first drive: {map_path}')
     place_map = _describe(drives.reference, drives.topic, make_describer(arguments))
     save_map(place_map, map_path)
-    threshold = _choose_threshold(place_map, arguments.threshold)
+    threshold = _choose_threshold(place_map, arguments.mode, arguments.threshold)
 
     _say('3. The second drive through the node, over ROS, with replay and listener as processes of their own')
     query = _describe(drives.query, drives.topic, place_map.describer())
     if drives.truth is not None and len(query) != len(drives.truth):
         raise SourceError('images were skipped: the truth of the others is not known; repair or remove them')
-    parameters = {'map_path': map_path, 'threshold': threshold, 'sequence_length': LENGTH}
+    parameters = {
+        'map_path': map_path,
+        'mode': arguments.mode,
+        'threshold': threshold,
+        'sequence_length': LENGTH,
+    }
     records = run_live(parameters, drives.query, len(query), folder, drives.topic)
     result = judge(records, LENGTH, threshold, drives.truth, arguments.tolerance)
     draw_result(result, query, place_map, threshold, drives.title, folder)

@@ -88,7 +88,7 @@ def _backbone_settings(arguments: argparse.Namespace) -> Any:
                 values[row.name] = value
     for kind, values in given.items():
         if values and kind != arguments.features:
-            name = f'--{kind}-{next(iter(values))}'.replace('_', '-')
+            name = f'--{kind}-' + next(iter(values)).replace('_', '-')
             raise SettingsError(
                 f'{name} was given with --features {arguments.features}: give --features {kind}'
             )

@@ -13,8 +13,8 @@ Recognises where the images of the topic `image` (sensor_msgs/Image) were taken 
 and publishes one ~/match (stavpr_msgs/PlaceMatch) for every image received; for accepted matches also
 ~/place_index (std_msgs/Int32) and ~/distance (std_msgs/Float32). ~/map_info describes the map.
 
-Make the map with `build_map`. Without map_path or threshold the node stays up, says what is missing
-and publishes no match; both can be set later with `ros2 param set`.
+Make the map with `build_map`. Without map_path (in mode paper: or threshold) the node stays up, says
+what is missing and publishes no match; both can be set later with `ros2 param set`.
 
 parameters:
 {parameters}

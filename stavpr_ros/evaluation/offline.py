@@ -23,7 +23,4 @@ def recognise_all(
 
 def window_answers(recognitions: list[Recognition]) -> list[WindowAnswer | None]:
     """Reduce recognitions to what :func:`stavpr_ros.evaluation.metrics.frame_answers` wants."""
-    return [
-        WindowAnswer(r.nearest.middle, r.nearest.distance, r.path) if r.nearest else None
-        for r in recognitions
-    ]
+    return [WindowAnswer(r.nearest.middle, r.score, r.path) if r.nearest else None for r in recognitions]

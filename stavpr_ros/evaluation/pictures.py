@@ -65,7 +65,7 @@ class MatchPair:
 def match_overview(path: Path, pairs: Sequence[MatchPair], columns: int = 3) -> Path:
     """Draw queries beside the places that they were matched with; the frame's colour is the outcome."""
     rows = max(1, -(-len(pairs) // columns))
-    with _page(path, 10, 0.5 + 1.42 * rows) as figure:
+    with page(path, 10, 0.5 + 1.42 * rows) as figure:
         _draw_pairs(figure, pairs, columns)
     return path
 
@@ -83,7 +83,7 @@ def distance_matrix(
     """
     distances, matched, truth = _check_matrix(distances, matched, truth)
     queries, places = distances.shape
-    with _page(path, 7.5, float(np.clip(7.5 * queries / places, 4, 9))) as figure:
+    with page(path, 7.5, float(np.clip(7.5 * queries / places, 4, 9))) as figure:
         _draw_matrix(figure, figure.add_subplot(), distances, matched, truth, tolerance)
     return path
 
@@ -99,7 +99,7 @@ def distance_over_time(
     :param outcomes: one for each query.
     :param unseen: whether the map lacks the query's place, shape (queries,), bool.
     """
-    with _page(path, 10, 3.3) as figure:
+    with page(path, 10, 3.3) as figure:
         _draw_time(figure.add_subplot(), distances, threshold, outcomes, unseen)
     return path
 
@@ -114,7 +114,7 @@ def precision_recall(
     :param point: recall and precision at the threshold that was used.
     """
     shades = ('#1f3a5f', '#d99a1c', '#2e8b57', '#c8402f', '#8a8f98', '#7b5aa6')
-    with _page(path, 5.2, 4.8) as figure:
+    with page(path, 5.2, 4.8) as figure:
         axes = figure.add_subplot()
         for k, (name, (recall, precision)) in enumerate(curves.items()):
             shade = shades[k % len(shades)]
@@ -142,17 +142,17 @@ def warping_path(path: Path, distances: np.ndarray, pairs: np.ndarray, first: in
         raise InputError(f'distances of the window have shape {distances.shape}; expected (l, k), neither 0')
     pairs = np.asarray(pairs, int).reshape(-1, 2)
     l, k = distances.shape
-    with _page(path, 7.0, float(np.clip(1.4 + 5.3 * l / k, 2.6, 7))) as figure:
+    with page(path, 7.0, float(np.clip(1.4 + 5.3 * l / k, 2.6, 7))) as figure:
         axes = figure.add_subplot()
         extent = (first - 0.5, first + k - 0.5, l - 0.5, -0.5)
         picture = axes.imshow(distances, cmap=SCALE, extent=extent, aspect='auto')
         if len(pairs):
             axes.plot(pairs[:, 1] + first, pairs[:, 0], '-o', color=BRIGHT['right'], mec=INK, mew=0.5,
                       ms=4, lw=1.6, label='warping path')  # fmt: skip
-            _legend_above(axes, 1)
+            legend_above(axes, 1)
         axes.set(xlabel='place in the map', ylabel='image of the window')
         axes.locator_params(integer=True)
-        _colour_bar(figure, picture, axes)
+        colour_bar(figure, picture, axes)
     return path
 
 
@@ -184,7 +184,7 @@ def demo_sheet(
     rows = max(1, -(-len(pairs) // 3))
     head = 0.75 if title or note else 0.1
     above, below = 0.5 + 1.52 * rows, 4.2
-    with _page(path, 11, head + above + below) as figure:
+    with page(path, 11, head + above + below) as figure:
         parts = figure.add_gridspec(3, 2, height_ratios=(head, above, below), width_ratios=(1, 1.18))
         top = figure.add_subfigure(parts[0, :])
         top.text(0.012, 0.66, title, fontsize=15, weight='bold', va='center', color=INK)
@@ -198,7 +198,7 @@ def demo_sheet(
 
 
 @contextmanager
-def _page(path: Path, width: float, height: float) -> Iterator['Figure']:
+def page(path: Path, width: float, height: float) -> Iterator['Figure']:
     """Give an empty figure (inches) in our typography, and write it."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -269,8 +269,8 @@ def _draw_matrix(
         _draw_unseen(axes, truth < 0, places)
     axes.set(xlabel='place in the map', ylabel='query image')
     axes.set(xlim=(-0.5, places - 0.5), ylim=(queries - 0.5, -0.5))
-    _colour_bar(figure, picture, axes)
-    for handle in _legend_above(axes, 3).get_lines():
+    colour_bar(figure, picture, axes)
+    for handle in legend_above(axes, 3).get_lines():
         handle.set(linewidth=1.8, markersize=9)
 
 
@@ -325,10 +325,10 @@ def _draw_time(
         axes.axvspan(start - 0.5, stop - 0.5, color='#e9e9e4', lw=0, zorder=0, label=name)
     axes.set(xlabel='query image', ylabel='distance of the best answer', xlim=(-1, max(1, len(distances))))
     axes.grid(axis='y', color=GRID, lw=0.7)
-    _legend_above(axes, 3)
+    legend_above(axes, 3)
 
 
-def _legend_above(axes: 'Axes', columns: int) -> 'Legend':
+def legend_above(axes: 'Axes', columns: int) -> 'Legend':
     """Put the legend above the axes, where it hides nothing and does not widen the layout."""
     handles, labels = axes.get_legend_handles_labels()
     legend = axes.legend(handles, labels, loc='lower left', bbox_to_anchor=(0, 1.0), borderaxespad=0.2,
@@ -339,7 +339,7 @@ def _legend_above(axes: 'Axes', columns: int) -> 'Legend':
     return legend
 
 
-def _colour_bar(figure: 'Figure | SubFigure', picture: object, axes: 'Axes') -> None:
+def colour_bar(figure: 'Figure | SubFigure', picture: object, axes: 'Axes') -> None:
     bar = figure.colorbar(picture, ax=axes, fraction=0.04, pad=0.015, aspect=32)  # type: ignore[arg-type]
     bar.outline.set_visible(False)
     bar.set_label('distance')

@@ -15,6 +15,9 @@ from stavpr_ros.errors import SettingsError
 KINDS = {
     'gradient': 'stavpr_ros.features.gradient:Gradient',
     'onnx': 'stavpr_ros.features.onnx:Onnx',
+    'torchscript': 'stavpr_ros.features.torchscript:TorchScript',
+    'densenet161_places365': 'stavpr_ros.features.densenet:DenseNet161Places365',
+    'vgg16': 'stavpr_ros.features.vgg:VGG16Pool4',
 }
 
 

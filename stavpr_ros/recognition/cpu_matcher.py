@@ -7,12 +7,33 @@ from stavpr_ros.alignment.kernels.cpu import products
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.similarity import tiled
 from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
-from stavpr_ros.alignment.temporal import SequenceMatch, best_match, match_padded, trace_sequence
+from stavpr_ros.alignment.temporal import (
+    SequenceDistances,
+    SequenceMatch,
+    best_match,
+    match_padded,
+    trace_sequence,
+)
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.window import DistanceWindow
 
 CACHE_LINE = 64  # bytes; vectors across two of them are read at half the speed
 NO_PATH = np.empty((0, 2), np.int32)
+
+
+def nearest_places(distances: np.ndarray, places: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the nearest distinct places, nearest first (the lowest index on a tie).
+
+    :param distances: of each sequence, shape (m,); +inf where there is none.
+    :param places: its middle, shape (m,).
+    :returns: places and distances, at most ``count`` of each.
+    """
+    order = np.argsort(distances, kind='stable')
+    order = order[np.isfinite(distances[order])]
+    _, first = np.unique(places[order], return_index=True)
+    order = order[np.sort(first)[:count]]
+    return places[order].astype(np.int64), distances[order]
 
 
 class CpuMatcher:
@@ -37,6 +58,7 @@ class CpuMatcher:
         self._weights = features.weights.cpu()
         W = len(self._map)
         self._band = spatial.band(W)
+        self._matches = SequenceDistances(np.empty(0, np.float32), np.empty(0, np.int32))
         self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
         self.reset()
 
@@ -84,8 +106,12 @@ class CpuMatcher:
     def match(self, neighbourhood: int) -> tuple[SequenceMatch | None, np.ndarray]:
         """Return the nearest sequence and its warping path."""
         window = self._window.rows()
-        matches = match_padded(window, self.places, self._sequence.k)
+        self._matches = matches = match_padded(window, self.places, self._sequence.k)
         nearest = best_match(matches, neighbourhood)
         if nearest is None:
             return None, NO_PATH
         return nearest, trace_sequence(window[:, : self.places], nearest.first, self._sequence.k).path
+
+    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nearest places of the last match and their distances, nearest first."""
+        return nearest_places(self._matches.distances, self._matches.middles, count)

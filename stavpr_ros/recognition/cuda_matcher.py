@@ -9,9 +9,10 @@ from stavpr_ros.alignment.kernels.cuda.compilation import Runtime, runtime
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.similarity import holistic_distances
 from stavpr_ros.alignment.spatial import WINDOW
-from stavpr_ros.alignment.temporal import SequenceMatch, trace_sequence
+from stavpr_ros.alignment.temporal import SequenceDistances, SequenceMatch, trace_sequence
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.recognition.cpu_matcher import nearest_places
 
 BLOCK_WORDS = 2**26  # most words of products that lie in memory at a time: 256 MiB
 QUERIES = 32  # most images of a batch whose products are made at once
@@ -106,6 +107,10 @@ class CudaMatcher:
             (m, 2), int32.
         """
         return self._window.match(neighbourhood)
+
+    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nearest places of the last match and their distances, nearest first."""
+        return self._window.candidates(count)
 
 
 class _ImageDistances:
@@ -232,9 +237,11 @@ class _Window:
         slots = self._rows.view(2, l, pitch)
         self._slots = [slots[:, slot, :places] for slot in range(l)]
         self._window = runtime.array(self._rows)
+        self._distances = torch.full((max(1, places),), torch.inf, device=device)
+        self._lengths = torch.zeros(max(1, places), dtype=torch.int32, device=device)
         self._scratch = (
-            array(places, torch.float32),
-            array(places, torch.int32),
+            runtime.array(self._distances),
+            runtime.array(self._lengths),
             array(blocks, torch.float32),
             array(blocks, torch.int32),
             array(1, torch.int32),
@@ -282,7 +289,16 @@ class _Window:
         return SequenceMatch(
             first=found.start,
             last=found.start + found.length - 1,
+            middle=(2 * found.start + found.length - 1) // 2,
             distance=found.distance,
             runner_up_index=middle if runner_up else -1,
             runner_up_distance=found.runner_up_distance if runner_up else float('nan'),
         ), path
+
+    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nearest places of the last match: all distances are copied back for this."""
+        places = self._places
+        found = SequenceDistances(
+            self._distances[:places].cpu().numpy(), self._lengths[:places].cpu().numpy()
+        )
+        return nearest_places(found.distances, found.middles, count)

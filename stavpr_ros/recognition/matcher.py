@@ -60,6 +60,13 @@ class Matcher(Protocol):
             in the window, place.
         """
 
+    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return the nearest places of the last match, nearest first, each once.
+
+        :returns: places, int64, and distances, float32, at most ``count`` of each.
+        """
+
 
 def make_matcher(
     features: LocalFeatures,

@@ -3,6 +3,7 @@
 import enum
 import math
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -14,8 +15,13 @@ from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition.calibrated_window import CalibratedWindow
+from stavpr_ros.recognition.centring import Centring
 from stavpr_ros.recognition.cpu_matcher import NO_PATH
+from stavpr_ros.recognition.cures import Cures, Track, cures_of, evidence, relative_distance
 from stavpr_ros.recognition.matcher import make_matcher
+
+PLACES_TO_START_FROM = 100  # whose distances to the map start the calibration
 
 
 class Verdict(enum.Enum):
@@ -35,18 +41,31 @@ class RecognitionSettings:
     :param spatial: how two images are compared.
     :param sequence: how a window is matched.
     :param neighbourhood: the runner-up's midpoint is more than so many places from the nearest one's.
+    :param mode: ``paper``, or ``robust``, with all cures of :class:`stavpr_ros.recognition.cures.Cures`.
+    :param cures: another choice of cures than the mode's.
     """
 
     threshold: float
     spatial: SpatialSettings = field(default_factory=SpatialSettings)
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
     neighbourhood: int = 20
+    mode: str = 'paper'
+    cures: Cures | None = None
 
     def __post_init__(self) -> None:
         if not self.threshold > 0 or math.isnan(self.threshold):
             raise SettingsError(f'threshold = {self.threshold} must be above 0: nothing is nearer than 0')
         if self.neighbourhood < 0:
             raise SettingsError(f'neighbourhood = {self.neighbourhood} must be at least 0 places')
+        if cures_of(self.mode).contrast and self.cures is None and self.threshold > 1:
+            raise SettingsError(
+                f'threshold = {self.threshold}: distances of mode robust end at 1, which is chance'
+            )
+
+    @property
+    def applied_cures(self) -> Cures:
+        """The cures that are applied."""
+        return cures_of(self.mode) if self.cures is None else self.cures
 
 
 @dataclass(frozen=True)
@@ -59,6 +78,7 @@ class Recognition:
     :param nearest: the nearest sequence, accepted or not; None while warming up or if there is none.
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
     :param threshold: the one that was used.
+    :param relative: distances are relative to chance, 1 (:mod:`stavpr_ros.recognition.cures`).
     """
 
     verdict: Verdict
@@ -66,11 +86,19 @@ class Recognition:
     nearest: SequenceMatch | None
     path: np.ndarray
     threshold: float
+    relative: bool = False
 
     @property
     def place(self) -> int:
-        """The matched place, the midpoint of the matched sequence; -1 unless matched."""
+        """The matched place, the middle of the matched sequence; -1 unless matched."""
         return self.nearest.middle if self.nearest and self.verdict is Verdict.MATCH else -1
+
+    @property
+    def score(self) -> float:
+        """Distance of the nearest sequence; +inf without one, or if it is no nearer than chance."""
+        if self.nearest is None or (self.relative and self.nearest.distance >= 1):
+            return math.inf
+        return self.nearest.distance
 
     @property
     def newest(self) -> int:
@@ -84,7 +112,8 @@ class Recogniser:
 
     :param place_map: the reference map.
     :param settings: see :class:`RecognitionSettings`.
-    :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``.
+    :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``. With cures, image distances are
+        computed there and sequences on the CPU.
     :param precision: how the map's features are kept, ``float32`` or ``float16``; see
         :func:`stavpr_ros.recognition.matcher.make_matcher`.
     :raises UnavailableError: no such backend here.
@@ -99,12 +128,32 @@ class Recogniser:
         backend: str = 'cpu',
         precision: str = 'float32',
     ) -> None:
-        _require_finite(place_map.features, 'the map')
+        features, cures = place_map.features, settings.applied_cures
+        require_finite(features, 'the map')
         self._feature_settings = place_map.settings
         self._settings = settings
+        self._centring = Centring(features) if cures.centring else None
+        if self._centring is not None:
+            features = self._centring.places(features)
         self._matcher = make_matcher(
-            place_map.features, settings.spatial, settings.sequence, choose_backend(backend), precision
+            features, settings.spatial, settings.sequence, choose_backend(backend), precision
         )
+        self._window: Window = self._matcher
+        self._newest_row = torch.empty(0)
+        self._track = Track()
+        if cures.any:
+            self._window = window = CalibratedWindow(self.places, settings.sequence, cures)
+            window.calibration.start_from(self._distances_to_itself(features))
+
+    def _distances_to_itself(self, features: LocalFeatures) -> np.ndarray:
+        """Distances of some places to all but their neighbours, which are NaN, shape (m, n)."""
+        n = len(features)
+        some = np.unique(np.linspace(0, max(n - 1, 0), min(n, PLACES_TO_START_FROM)).astype(int))
+        if not n:
+            return np.empty((0, 0), np.float32)
+        rows = self._matcher.distance_matrix(features.strips[:, some], features.weights[:, some])
+        near = np.abs(np.arange(n) - some[:, None]) <= self._settings.neighbourhood
+        return np.where(near, np.float32(np.nan), rows.cpu().numpy())
 
     @property
     def settings(self) -> RecognitionSettings:
@@ -119,7 +168,7 @@ class Recogniser:
     @property
     def window_fill(self) -> int:
         """Images in the window, up to l."""
-        return len(self._matcher)
+        return len(self._window)
 
     def set_threshold(self, threshold: float) -> None:
         """
@@ -130,12 +179,15 @@ class Recogniser:
         self._settings = replace(self._settings, threshold=threshold)
 
     def reset(self) -> None:
-        """Forget the images of the window."""
-        self._matcher.reset()
+        """Forget the images of the window, and what was learned from them and those before."""
+        self._window.reset()
+        self._track = Track()
+        if self._centring is not None:
+            self._centring.reset()
 
     def distances(self, features: LocalFeatures) -> np.ndarray:
         """
-        Distances of images to every place.
+        Distances of images to every place; centred, if at all, by the map's mean.
 
         :param features: those of Q images, strips (W, Q, d), made with the settings of the map.
         :returns: shape (Q, n), float32.
@@ -143,6 +195,8 @@ class Recogniser:
         :raises InputError: features that are not finite.
         """
         self._check(features)
+        if self._centring is not None:
+            features = self._centring.places(features)
         return self._matcher.distance_matrix(features.strips, features.weights).cpu().numpy()
 
     def add(self, features: LocalFeatures) -> Recognition:
@@ -158,28 +212,75 @@ class Recogniser:
         self._check(features)
         if len(features) != 1:
             raise InputError(f'features of {len(features)} images came: expected those of one')
-        self._matcher.push(self._matcher.distances(features.strips[:, 0], features.weights[:, 0]))
-        return self._answer()
+        strips = features.strips[:, 0]
+        if self._centring is not None:
+            strips = self._centring.next_query(strips)
+        row = self._matcher.distances(strips, features.weights[:, 0])
+        if isinstance(self._window, CalibratedWindow):
+            self._window.push(row.cpu().numpy())
+        else:
+            self._newest_row = row
+            self._matcher.push(row)
+        return answer(self._window, self._settings, self._track)
+
+    def newest_row(self) -> np.ndarray:
+        """Distances of the newest image to every place as they are matched, shape (n,), float32."""
+        if isinstance(self._window, CalibratedWindow):
+            return self._window.newest_row()
+        return self._newest_row.cpu().numpy()
+
+    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return the nearest places of the window answered last, nearest first, each once.
+
+        :returns: places, int64, and the distances of their sequences, at most ``count`` of each.
+        """
+        return self._window.candidates(count)
 
     def _check(self, features: LocalFeatures) -> None:
         features.require_same_settings(self._feature_settings, 'the map')
-        _require_finite(features, 'the image')
-
-    def _answer(self) -> Recognition:
-        threshold, sequence = self._settings.threshold, self._settings.sequence
-        if self.window_fill < sequence.length:
-            reason = f'{self.window_fill} of {sequence.length} images in the window'
-            return Recognition(Verdict.WARMING_UP, reason, None, NO_PATH, threshold)
-        nearest, path = self._matcher.match(self._settings.neighbourhood)
-        if nearest is None:
-            return Recognition(Verdict.NO_MATCH, 'the map is empty', None, NO_PATH, threshold)
-        if nearest.distance < threshold:
-            return Recognition(Verdict.MATCH, '', nearest, path, threshold)
-        reason = f'nearest distance {nearest.distance:.4f} is not below the threshold {threshold:.4f}'
-        return Recognition(Verdict.NO_MATCH, reason, nearest, path, threshold)
+        require_finite(features, 'the image')
 
 
-def _require_finite(features: LocalFeatures, where: str) -> None:
+class Window(Protocol):
+    """What holds the last l images' distances and matches them: a matcher, or a calibrated window."""
+
+    def __len__(self) -> int: ...
+
+    def reset(self) -> None: ...
+
+    def match(self, neighbourhood: int) -> tuple[SequenceMatch | None, np.ndarray]: ...
+
+    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+def answer(window: Window, settings: RecognitionSettings, track: Track) -> Recognition:
+    """Match a window, if it is full, and give the verdict."""
+    threshold, length = settings.threshold, settings.sequence.length
+    if len(window) < length:
+        reason = f'{len(window)} of {length} images in the window'
+        return Recognition(Verdict.WARMING_UP, reason, None, NO_PATH, threshold)
+    nearest, path = window.match(settings.neighbourhood)
+    if nearest is None:
+        return Recognition(Verdict.NO_MATCH, 'the map is empty', None, NO_PATH, threshold)
+    relative = settings.applied_cures.contrast
+    if relative:
+        nearest = _relative_to_chance(nearest, track if settings.applied_cures.persistence else Track())
+    if nearest.distance < threshold:
+        return Recognition(Verdict.MATCH, '', nearest, path, threshold, relative)
+    reason = f'nearest distance {nearest.distance:.4f} is not below the threshold {threshold:.4f}'
+    return Recognition(Verdict.NO_MATCH, reason, nearest, path, threshold, relative)
+
+
+def _relative_to_chance(nearest: SequenceMatch, track: Track) -> SequenceMatch:
+    """Judge the sequence and its rival by their evidence instead of their costs."""
+    cost, other = nearest.distance, nearest.runner_up_distance
+    seen = track.follow(nearest.middle, evidence(cost, other))
+    rival = other if math.isnan(other) else relative_distance(evidence(other, cost))
+    return replace(nearest, distance=relative_distance(seen), runner_up_distance=rival)
+
+
+def require_finite(features: LocalFeatures, where: str) -> None:
     """Refuse NaN and infinite numbers, which no sum of unit-norm features hides."""
     if not bool(torch.isfinite(features.strips.sum())):
         raise InputError(f'features of {where} are not finite: they are damaged')

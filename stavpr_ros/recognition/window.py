@@ -17,7 +17,7 @@ class DistanceWindow:
     """
 
     def __init__(self, length: int, places: int, k: int) -> None:
-        self._length, self._places = length, places
+        self._length, self._places, self._k = length, places, k
         self._rows = np.full((2 * length, padded_width(places, k)), np.inf, np.float32)
         self._count = 0
 
@@ -30,13 +30,24 @@ class DistanceWindow:
         return self._count >= self._length
 
     def push(self, row: np.ndarray) -> None:
-        """Add the distances of the newest image, shape (n,), and drop the oldest."""
-        slot = self._count % self._length
-        self._rows[slot, : self._places] = row
-        self._rows[slot + self._length, : self._places] = row
+        """
+        Add the distances of the newest image and drop the oldest.
+
+        :param row: shape (m,), of the first m <= n places; +inf for the others.
+        """
+        for slot in (self._count % self._length, self._count % self._length + self._length):
+            self._rows[slot, : len(row)] = row
+            self._rows[slot, len(row) : self._places] = np.inf
         self._count += 1
 
     def rows(self) -> np.ndarray:
         """Return the window, shape (l, n + padding), float32, a view; +inf in the padding."""
         first = self._count % self._length
         return self._rows[first : first + self._length]
+
+    def widened(self, places: int) -> 'DistanceWindow':
+        """Return a window with the same rows for more places, +inf for those that are new."""
+        wider = DistanceWindow(self._length, places, self._k)
+        wider._rows[:, : self._places] = self._rows[:, : self._places]
+        wider._count = self._count
+        return wider

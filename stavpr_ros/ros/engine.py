@@ -9,10 +9,11 @@ from std_msgs.msg import Header
 
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
-from stavpr_ros.errors import StavprError
+from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.features import Describer
 from stavpr_ros.mapping import PlaceMap, load_map
 from stavpr_ros.recognition import Recogniser, RecognitionSettings
+from stavpr_ros.recognition.cures import THRESHOLD, cures_of
 from stavpr_ros.ros.messages import blank_match, match_message
 from stavpr_ros.sources.encodings import decode_message
 
@@ -24,6 +25,7 @@ class EngineOptions:
     spatial: SpatialSettings = field(default_factory=SpatialSettings)
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
     neighbourhood: int = 20
+    mode: str = 'robust'
     backend: str = 'cpu'
     precision: str = 'float32'
     model_path: str = ''
@@ -41,10 +43,26 @@ class Engine:
         self._map: PlaceMap | None = None
         self._describer: Describer | None = None
         self._recogniser: Recogniser | None = None
-        self._threshold: float | None = None
+        self._threshold = self._default_threshold
         self._problem = "parameter 'map_path' is not set: make a map with build_map and name its file"
         self._headers: deque[Header] = deque(maxlen=options.sequence.length)
         self.invalid = 0
+
+    @property
+    def _default_threshold(self) -> float | None:
+        """What is taken where none is set: distances of mode robust mean the same on every route."""
+        return THRESHOLD if cures_of(self._options.mode).contrast else None
+
+    def check_threshold(self, threshold: float) -> None:
+        """
+        Refuse a value of the parameter that cannot be meant; negative = not set.
+
+        :raises SettingsError: 0, or in mode robust above 1.
+        """
+        if threshold == 0:
+            raise SettingsError('threshold = 0 would match nothing: set it above 0, or negative = not set')
+        if threshold > 0:
+            RecognitionSettings(threshold, mode=self._options.mode)
 
     @property
     def threshold(self) -> float | None:
@@ -79,10 +97,10 @@ class Engine:
         return place_map
 
     def set_threshold(self, threshold: float | None) -> None:
-        """Change the threshold; None takes it away."""
-        self._threshold = threshold
-        if self._recogniser is not None and threshold is not None:
-            self._recogniser.set_threshold(threshold)
+        """Change the threshold; None takes it away (mode paper) or back to the default (mode robust)."""
+        self._threshold = self._default_threshold if threshold is None else threshold
+        if self._recogniser is not None and self._threshold is not None:
+            self._recogniser.set_threshold(self._threshold)
         else:
             self._restart()
 
@@ -94,7 +112,7 @@ class Engine:
 
     def _make_recogniser(self, place_map: PlaceMap, threshold: float) -> Recogniser:
         o = self._options
-        settings = RecognitionSettings(threshold, o.spatial, o.sequence, o.neighbourhood)
+        settings = RecognitionSettings(threshold, o.spatial, o.sequence, o.neighbourhood, o.mode)
         return Recogniser(place_map, settings, o.backend, o.precision)
 
     def _warm_up(self, place_map: PlaceMap, describer: Describer) -> None:

@@ -13,7 +13,7 @@ from std_msgs.msg import Float32, Int32
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.devices import choose_backend, why_no_cuda
-from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.errors import StavprError
 from stavpr_ros.ros.engine import Engine, EngineOptions
 from stavpr_ros.ros.messages import blank_match, map_info_message
 from stavpr_ros.ros.parameters import declare_parameters
@@ -41,6 +41,7 @@ class PlaceRecognitionNode(Node):
                 spatial=SpatialSettings(values['strategy'], values['sigma'], values['xi'] or None),
                 sequence=SequenceSettings(values['sequence_length'], values['beta']),
                 neighbourhood=values['neighbourhood'],
+                mode=values['mode'],
                 backend=backend,
                 precision=values['precision'],
                 model_path=values['model_path'],
@@ -67,7 +68,7 @@ class PlaceRecognitionNode(Node):
 
     def _start(self, map_path: str, threshold: float) -> None:
         """Take over the two parameters that may come later; say what is missing."""
-        self._check_threshold(threshold)
+        self._engine.check_threshold(threshold)
         if threshold > 0:
             self._worker.call(lambda: self._engine.set_threshold(threshold)).result()
         if map_path:
@@ -77,11 +78,6 @@ class PlaceRecognitionNode(Node):
                 self.get_logger().error(str(error))
         if self._engine.missing:
             self.get_logger().warning(f'waiting, no match is published: {self._engine.missing}')
-
-    @staticmethod
-    def _check_threshold(threshold: float) -> None:
-        if threshold == 0:
-            raise SettingsError('threshold = 0 would match nothing: set it above 0, or negative = not set')
 
     def _load(self, path: str) -> None:
         place_map = self._worker.call(lambda: self._engine.load(path)).result()
@@ -97,7 +93,7 @@ class PlaceRecognitionNode(Node):
         try:
             threshold = changes.get('threshold')
             if threshold is not None:
-                self._check_threshold(threshold)
+                self._engine.check_threshold(threshold)
             if 'map_path' in changes:
                 if not changes['map_path']:
                     raise StavprError(

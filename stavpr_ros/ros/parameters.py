@@ -9,6 +9,7 @@ from rclpy.node import Node
 
 from stavpr_ros.alignment.settings import STRATEGIES
 from stavpr_ros.devices import BACKENDS
+from stavpr_ros.recognition.cures import MODES
 from stavpr_ros.recognition.matcher import PRECISIONS
 
 TABLE_HEAD = '| parameter | default | unit | live | what it does |'
@@ -61,9 +62,17 @@ PARAMETERS = (
         'threshold',
         -1.0,
         'distance',
-        'A window is matched when its distance is below this; negative = not set, and the node waits.',
+        'A window is matched when its distance is below this; negative = 1 in mode robust, where 1 is as '
+        'near as unknown places come; in mode paper the node waits until it is set.',
         bounds=(-1.0, 1e6),
         live=True,
+    ),
+    NodeParameter(
+        'mode',
+        'robust',
+        '',
+        'How places are recognised: paper is STA-VPR as published; robust goes beyond it.',
+        choices=MODES,
     ),
     NodeParameter(
         'backend',
@@ -101,7 +110,7 @@ PARAMETERS = (
         'beta',
         2.0,
         '',
-        'Map images considered per query image, above 1: the slowest map speed covered.',
+        'Map images considered per query image, above 1 (mode paper).',
         (1.01, 20.0),
     ),
     NodeParameter(

@@ -95,9 +95,9 @@ def image_distances(features, queries, weights, xi, out):
     :param features: as in :func:`strip_distances`.
     :param queries: those of Q images, shape (Q, R, d), likewise.
     :param weights, xi: as in :func:`stavpr_ros.alignment.kernels.cpu.spatial.align_lanes`.
-    :param out: shape (Q, n), written.
+    :param out: shape (Q, m), written; m <= n: only so many map images are looked at.
     """
-    W, n, _ = features.shape
+    W, n = features.shape[0], out.shape[1]
     for block in nb.prange((n + IMAGES - 1) // IMAGES):
         first = block * IMAGES
         count = min(IMAGES, n - first)

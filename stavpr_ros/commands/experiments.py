@@ -1,0 +1,229 @@
+"""``ros2 run stavpr_ros experiments``: the paper's tables, on data sets that you have, beside its numbers."""
+
+import argparse
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stavpr_ros.errors import SettingsError, SourceError, StavprError
+from stavpr_ros.signals import obey_signals
+from stavpr_ros.threads import wait_passively
+
+if TYPE_CHECKING:
+    from stavpr_ros.evaluation.curves import Judgement
+    from stavpr_ros.evaluation.datasets import Dataset
+    from stavpr_ros.evaluation.experiments import Configuration
+
+METRICS = ('f1', 'average_precision', 'recall_at_1', 'recall_at_5', 'recall_at_100_precision')
+EMPTY = '-'
+
+DESCRIPTION = """
+Runs one of the paper's experiments on several data sets with several kinds of features and prints the table
+beside the published numbers (F1; the paper has no others).
+"""
+
+EPILOG = """
+experiments:
+  paper        SeqSLAM, no alignment, STA-VPR, STA-VPR with GRP and RA
+  ablation     no alignment, only spatial, only temporal, both
+  strategies   sliding window, vanilla DTW, adaptive DTW
+  fast         random projection (GRP) and restricted alignment (RA), off and on
+  cures        the paper, mode robust, and robust without each of its cures
+  sweep        one of l, beta, xi, sigma, W (--parameter), all others at their defaults
+
+data sets: nordland gardens_point gardens_point_night ua berlin_a100; synth_ before a name crops the images as
+synth-Nord is cropped
+
+examples:
+  experiments paper --data folder_of_all --datasets nordland synth_nordland gardens_point
+  experiments strategies --datasets gardens_point=data/gp --features onnx --onnx-model m.onnx --onnx-layer x
+  experiments ablation --data all --backbone 'small=--features gradient --gradient-cell 32' \\
+      --backbone 'net=--features onnx --onnx-model m.onnx --onnx-layer x'
+  experiments sweep --parameter sigma --values 0 0.5 1 2 --data all
+
+exit codes: 0 done, 1 something failed (the reason is printed), 2 usage, 130 interrupted
+"""
+
+
+def _parser() -> argparse.ArgumentParser:
+    from stavpr_ros.commands.feature_options import add_feature_options
+    from stavpr_ros.evaluation.experiments import PRESETS, SWEEPS
+
+    parser = argparse.ArgumentParser(
+        prog='experiments',
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument('experiment', choices=(*PRESETS, 'sweep'), help='see below')
+    parser.add_argument('--data', metavar='FOLDER', help='the folder that holds the data sets')
+    parser.add_argument(
+        '--datasets', nargs='+', metavar='NAME[=FOLDER]', help="those to run (the paper's that are in --data)"
+    )
+    parser.add_argument(
+        '--backbone', action='append', metavar='LABEL=OPTIONS',
+        help='features options, in quotes; may be given several times (those below)',
+    )  # fmt: skip
+    parser.add_argument('--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)')
+    parser.add_argument('--metric', choices=METRICS, default='f1', help='what is printed (%(default)s)')
+    parser.add_argument('--parameter', choices=tuple(SWEEPS), default='l', help='of sweep (%(default)s)')
+    parser.add_argument('--values', nargs='+', type=float, default=(), metavar='X', help='of sweep')
+    parser.add_argument('--json', metavar='FILE', help='write all numbers')
+    add_feature_options(parser)
+    return parser
+
+
+def _columns(arguments: argparse.Namespace) -> 'tuple[Configuration, ...]':
+    from stavpr_ros.evaluation.experiments import PRESETS, sweep_configurations
+
+    if arguments.experiment == 'sweep':
+        return sweep_configurations(arguments.parameter, arguments.values)
+    if arguments.values:
+        raise SettingsError('--values goes with the experiment sweep')
+    return PRESETS[arguments.experiment]
+
+
+def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset]':
+    """Open the data sets that are named, or all that are there."""
+    from stavpr_ros.evaluation.datasets import open_dataset
+    from stavpr_ros.evaluation.published import F1
+
+    found: dict[str, Dataset] = {}
+    if arguments.datasets:
+        for entry in arguments.datasets:
+            name, _, folder = entry.partition('=')
+            if not (folder or arguments.data):
+                raise SettingsError(f'data set {name}: give NAME=FOLDER, or --data')
+            found[name] = open_dataset(name, folder or arguments.data)
+        return found
+    if not arguments.data:
+        raise SettingsError('give --data FOLDER, or --datasets NAME=FOLDER')
+    for name in F1:
+        try:
+            found[name] = open_dataset(name, arguments.data)
+        except SourceError as error:
+            print(f'without {name}: {error}', file=sys.stderr)
+    if not found:
+        raise SourceError(f'none of the data sets {", ".join(F1)} is in {arguments.data}')
+    return found
+
+
+def _backbones(arguments: argparse.Namespace) -> dict[str, argparse.Namespace]:
+    """Return the features options of each row's backbone, by its label."""
+    from stavpr_ros.commands.feature_options import add_feature_options
+
+    if not arguments.backbone:
+        return {arguments.features: arguments}
+    parser = argparse.ArgumentParser(prog='experiments --backbone', add_help=False)
+    add_feature_options(parser)
+    found = {}
+    for entry in arguments.backbone:
+        label, separator, options = entry.partition('=')
+        if not separator:
+            raise SettingsError(f'--backbone {entry!r}: expected LABEL=OPTIONS')
+        found[label] = parser.parse_args(shlex.split(options))
+    return found
+
+
+def _run_row(
+    dataset: 'Dataset',
+    options: argparse.Namespace,
+    columns: 'tuple[Configuration, ...]',
+    mode: str,
+    name: str,
+) -> 'dict[str, Judgement | None]':
+    """Run all columns of a row; None where the data set is too short for one."""
+    from tqdm import tqdm
+
+    from stavpr_ros.commands.feature_options import make_describer
+    from stavpr_ros.devices import choose_device
+    from stavpr_ros.evaluation.experiments import Bench, W
+
+    if options.strips != W or options.projection is not None:
+        raise SettingsError('--strips and --projection: the experiment decides them; leave them out')
+    features = make_describer(options).settings
+    bench = Bench(dataset, features.kind, features.backbone, mode, choose_device(options.device))
+    found: dict[str, Judgement | None] = {}
+    for column in tqdm(columns, desc=name, unit='column', disable=None):
+        too_short = len(dataset.query) < column.sequence.length
+        found[column.name] = None if too_short else bench.judge(column)
+    return found
+
+
+def _published(dataset: str, columns: 'tuple[Configuration, ...]') -> dict[str, list[float | None]]:
+    """Return the published F1 for the columns, by backbone; none where the paper has nothing."""
+    from stavpr_ros.evaluation.published import DENSENET, VGG, published_f1
+
+    rows = {
+        backbone: [published_f1(dataset, backbone, column.name) for column in columns]
+        for backbone in (DENSENET, VGG)
+    }
+    return {backbone: row for backbone, row in rows.items() if any(value is not None for value in row)}
+
+
+def _table(rows: list[list[str]]) -> str:
+    """Align the cells of a table: text left, numbers right, a rule below the head."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = [
+        '  '.join(
+            cell.ljust(width) if i < 2 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+    return '\n'.join([lines[0], '-' * len(lines[0]), *lines[1:]])
+
+
+def _number(value: float | None) -> str:
+    return EMPTY if value is None else f'{value:.3f}'
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.evaluation.curves import import_sklearn
+    from stavpr_ros.evaluation.report_html import jsonable
+
+    import_sklearn()
+    columns, datasets, backbones = _columns(arguments), _datasets(arguments), _backbones(arguments)
+    rows = [['data set', 'features', *(column.title for column in columns)]]
+    results: list[dict[str, Any]] = []
+    for name, dataset in datasets.items():
+        for label, options in backbones.items():
+            judged = _run_row(dataset, options, columns, arguments.mode, f'{name}, {label}')
+            numbers = {key: None if found is None else found.to_json() for key, found in judged.items()}
+            cells = [None if row is None else row[arguments.metric] for row in numbers.values()]
+            rows.append([name, label, *map(_number, cells)])
+            results.append({'dataset': name, 'features': label, 'results': numbers})
+        if arguments.metric == 'f1':
+            for backbone, published in _published(name, columns).items():
+                rows.append(['', f'published, {backbone}', *map(_number, published)])
+                named = dict(zip([column.name for column in columns], published, strict=True))
+                results.append({'dataset': name, 'published': backbone, 'f1': named})
+    print(f'{arguments.experiment}, mode {arguments.mode}: {arguments.metric.replace("_", " ")}')
+    print(_table(rows))
+    if arguments.json:
+        try:
+            Path(arguments.json).write_text(json.dumps(jsonable(results), indent=2) + '\n', encoding='utf-8')
+        except OSError as error:
+            raise SourceError(f'{arguments.json} cannot be written: {error}') from error
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command."""
+    obey_signals()
+    wait_passively()
+    arguments = _parser().parse_args(args)
+    try:
+        _run(arguments)
+    except StavprError as error:
+        print(f'experiments: {error}', file=sys.stderr)
+        return 2 if isinstance(error, SettingsError) else 1
+    except KeyboardInterrupt:
+        print('experiments: interrupted', file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

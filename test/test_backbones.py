@@ -1,0 +1,246 @@
+"""The paper's two networks: parameters by name and shape, numbers against a second implementation."""
+
+import argparse
+
+import cv2
+import networks
+import numpy as np
+import pytest
+import torch
+from checkpoints import places365_file, random_parameters
+
+from stavpr_ros.commands.feature_options import add_feature_options, make_describer
+from stavpr_ros.errors import SettingsError, UnavailableError
+from stavpr_ros.features import Describer, FeatureSettings
+from stavpr_ros.features.backbone import backbone_class, settings_class
+from stavpr_ros.features.checkpoint import load_parameters
+from stavpr_ros.features.densenet import DenseNet161, DenseNet161Places365
+from stavpr_ros.features.vgg import VGG16, VGG16Pool4
+
+# Typed from the published files. The numbers of parameters are those that torchvision documents for its 1000
+# classes; a DenseNet161 for 365 has 635 rows of 2208 + 1 fewer.
+PUBLISHED = {
+    VGG16: (
+        138_357_544,
+        {
+            'features.0.weight': (64, 3, 3, 3),
+            'features.7.weight': (128, 128, 3, 3),
+            'features.21.weight': (512, 512, 3, 3),
+            'features.28.bias': (512,),
+            'classifier.0.weight': (4096, 25088),
+            'classifier.6.bias': (1000,),
+        },
+    ),
+    DenseNet161: (
+        28_681_000 - 635 * 2209,
+        {
+            'features.conv0.weight': (96, 3, 7, 7),
+            'features.denseblock1.denselayer1.conv1.weight': (192, 96, 1, 1),
+            'features.denseblock1.denselayer6.norm1.running_mean': (336,),
+            'features.transition1.conv.weight': (192, 384, 1, 1),
+            'features.transition2.conv.weight': (384, 768, 1, 1),
+            'features.denseblock3.denselayer36.conv1.weight': (192, 2064, 1, 1),
+            'features.transition3.conv.weight': (1056, 2112, 1, 1),
+            'features.denseblock4.denselayer10.norm1.weight': (1488,),
+            'features.denseblock4.denselayer24.conv2.weight': (48, 192, 3, 3),
+            'features.norm5.running_var': (2208,),
+            'classifier.weight': (365, 2208),
+        },
+    ),
+}
+SHAPES = {VGG16: networks.vgg16_shapes, DenseNet161: networks.densenet161_shapes}
+
+
+@pytest.mark.parametrize('network', [VGG16, DenseNet161])
+def test_every_parameter_has_its_published_name_and_shape(network):
+    with torch.device('meta'):
+        built = network()
+    ours = {name: tuple(value.shape) for name, value in built.state_dict().items() if value.ndim}
+    count, some = PUBLISHED[network]
+    assert ours == SHAPES[network]()
+    assert ours.items() >= some.items()
+    assert sum(value.numel() for value in built.parameters()) == count
+
+
+def test_nothing_after_the_layer_is_kept():
+    """VGG16: the first ten convolutions. DenseNet161: layer 10 of the last block only normalises."""
+    with torch.device('meta'):
+        vgg, dense = VGG16Pool4.up_to_layer(VGG16()), DenseNet161Places365.up_to_layer(DenseNet161())
+    shapes = networks.vgg16_shapes()
+    wanted = sum(np.prod(shapes[f'features.{i}.weight']) + shapes[f'features.{i}.weight'][0]
+                 for i in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21))  # fmt: skip
+    assert sum(value.numel() for value in vgg.parameters()) == wanted == 7_635_264
+    shapes = networks.densenet161_shapes()
+    late = [f'denseblock4.denselayer{i}.' for i in range(11, 25)] + ['norm5', 'classifier', 'running']
+    late += [f'denseblock4.denselayer10.{part}' for part in ('conv', 'norm2')]
+    wanted = sum(np.prod(s) for name, s in shapes.items() if not any(part in name for part in late))
+    assert sum(value.numel() for value in dense.parameters()) == wanted
+
+
+@pytest.fixture(scope='module', autouse=True)
+def one_thread():
+    """Threads that must share their cores with others' spend most of the time waiting for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def standardised(images: list[np.ndarray], size: int) -> torch.Tensor:
+    """Prepare images as the networks were trained, step by step in float64: (n, 3, size, size)."""
+    small = np.stack([cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR) for image in images])
+    values = (small / 255 - np.array([0.485, 0.456, 0.406])) / np.array([0.229, 0.224, 0.225])
+    return torch.from_numpy(values.transpose(0, 3, 1, 2))
+
+
+def assert_same(ours: torch.Tensor, oracle: torch.Tensor) -> None:
+    """Within what float32 may lose: one part in 10^5 of the largest value; and neither is trivial."""
+    assert ours.dtype == torch.float32
+    assert 0.05 < float((oracle > 0).double().mean()) < 0.95
+    assert float((ours - oracle).abs().max()) < 1e-5 * float(oracle.max())
+
+
+@pytest.fixture(scope='module')
+def densenet_parameters():
+    return random_parameters(networks.densenet161_shapes())
+
+
+@pytest.fixture(scope='module')
+def densenet_file(densenet_parameters, tmp_path_factory):
+    """The checkpoint as published: Python 2, old names, prefix, tensors of a GPU."""
+    path = tmp_path_factory.mktemp('weights') / 'densenet161_places365.pth.tar'
+    path.write_bytes(places365_file(densenet_parameters))
+    return path
+
+
+@pytest.fixture(scope='module')
+def vgg_parameters():
+    return random_parameters(networks.vgg16_shapes())
+
+
+@pytest.fixture(scope='module')
+def vgg_file(vgg_parameters, tmp_path_factory):
+    path = tmp_path_factory.mktemp('weights') / 'vgg16.pth'
+    torch.save(vgg_parameters, path)
+    return path
+
+
+def pictures(*sizes: tuple[int, int]) -> list[np.ndarray]:
+    """Smooth random pictures: neighbours alike, as in photographs, so that resizing keeps most of it."""
+    rng = np.random.default_rng(0)
+    coarse = [rng.integers(0, 256, (12, 12, 3), np.uint8) for _ in sizes]
+    return [
+        cv2.resize(c, (w, h), interpolation=cv2.INTER_CUBIC) for c, (h, w) in zip(coarse, sizes, strict=True)
+    ]
+
+
+def test_densenet161_as_a_second_implementation_has_it(densenet_file, densenet_parameters):
+    """The whole way at full size, from the published kind of file to 7 x 7 x 1488, in a batch of two."""
+    images = pictures((120, 160), (300, 200))
+    settings = settings_class('densenet161_places365')(model=str(densenet_file))
+    ours = backbone_class('densenet161_places365')(settings).feature_maps(images)
+    doubles = {name: value.double() for name, value in densenet_parameters.items()}
+    assert ours.shape == (2, 1488, 7, 7)
+    assert_same(ours, networks.densenet161_layer10(doubles, standardised(images, 224)))
+
+
+def test_vgg16_as_a_second_implementation_has_it(vgg_file, vgg_parameters):
+    """At 96 pixels, where nothing but the size of the maps differs from 224."""
+    images = pictures((120, 160), (96, 96), (50, 70))
+    settings = settings_class('vgg16')(model=str(vgg_file), size=96)
+    ours = backbone_class('vgg16')(settings).feature_maps(images)
+    doubles = {name: value.double() for name, value in vgg_parameters.items() if 'features' in name}
+    assert ours.shape == (3, 512, 6, 6)
+    assert_same(ours, networks.vgg16_pool4(doubles, standardised(images, 96)))
+
+
+def test_vgg16_strips_at_full_size(vgg_file):
+    """14 x 14 x 512 is cut into seven strips of two columns."""
+    describer = Describer('vgg16', settings_class('vgg16')(model=str(vgg_file)))
+    assert describer.describe(pictures((60, 80))).strips.shape == (7, 1, 14 * 2 * 512)
+
+
+def test_more_images_than_go_through_at_once(vgg_file, monkeypatch):
+    monkeypatch.setattr('stavpr_ros.features.published.PER_PASS', 2)
+    backbone = backbone_class('vgg16')(settings_class('vgg16')(model=str(vgg_file), size=32))
+    images = pictures((32, 32), (40, 40), (50, 32), (32, 50), (64, 64))
+    together = backbone.feature_maps(images)
+    assert together.shape == (5, 512, 2, 2)
+    for image, maps in zip(images, together, strict=True):
+        torch.testing.assert_close(backbone.feature_maps([image])[0], maps, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason='no CUDA device')
+@pytest.mark.parametrize('kind', ['vgg16', 'densenet161_places365'])
+def test_half_precision_on_a_gpu(kind, vgg_file, densenet_file):
+    path = vgg_file if kind == 'vgg16' else densenet_file
+    images = pictures((120, 160), (300, 200))
+    whole = backbone_class(kind)(settings_class(kind)(model=str(path)), 'cpu').feature_maps(images)
+    half = backbone_class(kind)(settings_class(kind)(model=str(path), half=True), 'cuda').feature_maps(images)
+    assert half.dtype == torch.float16
+    cosines = torch.cosine_similarity(whole.flatten(1), half.float().cpu().flatten(1))
+    assert float(cosines.min()) > 0.9999
+
+
+def test_half_is_no_part_of_the_identity_and_no_change_on_a_cpu(vgg_file):
+    """A robot's CPU may query a map that a GPU made in half precision."""
+    settings = settings_class('vgg16')(model=str(vgg_file), half=True, size=32)
+    backbone = backbone_class('vgg16')(settings)
+    assert backbone.feature_maps(pictures((32, 32))).dtype == torch.float32
+    assert backbone.settings == backbone_class('vgg16')(settings_class('vgg16')(str(vgg_file), 32)).settings
+
+
+def test_a_map_knows_the_weights_wherever_they_are(vgg_file, tmp_path):
+    settings = Describer('vgg16', settings_class('vgg16')(model=str(vgg_file), size=112)).settings
+    settings = FeatureSettings.from_json(settings.to_json().replace(str(vgg_file), '/gone/vgg16.pth'))
+    with pytest.raises(UnavailableError, match=r'/gone/vgg16\.pth.*cannot be read'):
+        Describer.from_settings(settings, None)
+    moved = tmp_path / 'moved.pth'
+    moved.hardlink_to(vgg_file)
+    assert Describer.from_settings(settings, None, model=str(moved)).settings == settings
+
+
+def test_other_networks_weights_are_refused(densenet_parameters):
+    """ImageNet's DenseNet161 has the same features' shapes, but they are other features."""
+
+    def load(**changes):
+        with torch.device('meta'):
+            network = DenseNet161()
+        parameters = {
+            name: value for name, value in (densenet_parameters | changes).items() if value is not None
+        }
+        load_parameters(network, parameters, 'a.pth')
+
+    load()
+    with pytest.raises(
+        UnavailableError, match=r'a\.pth is no .*DenseNet161: classifier\.weight .*1000, 2208'
+    ):
+        load(**{'classifier.weight': torch.zeros(1000, 2208)})
+    with pytest.raises(UnavailableError, match=r"lacks 'classifier\.bias' and 1 more"):
+        load(**{'classifier.weight': None, 'classifier.bias': None})
+    with pytest.raises(UnavailableError, match=r"has 'features\.conv9', which the network has not"):
+        load(**{'features.conv9': torch.zeros(1)})
+    with pytest.raises(UnavailableError, match='no plain floats'):
+        load(**{'classifier.bias': torch.zeros(365, dtype=torch.long)})
+    with pytest.raises(UnavailableError, match=r'damaged: classifier\.bias holds NaN'):
+        load(**{'classifier.bias': torch.full((365,), torch.nan)})
+
+
+@pytest.mark.parametrize(
+    'bad', [{'size': 31}, {'resize': 'cubic'}, {'sha256': '397923af'}, {'sha256': 'Z' * 64}]
+)
+def test_settings_out_of_range(bad):
+    for kind in ('vgg16', 'densenet161_places365'):
+        with pytest.raises(SettingsError):
+            settings_class(kind)(**bad)
+
+
+def test_options_of_the_command_line(vgg_file):
+    parser = argparse.ArgumentParser()
+    add_feature_options(parser)
+    words = ['--features', 'vgg16', '--vgg16-model', str(vgg_file), '--vgg16-size', '112', '--device', 'cpu']
+    describer = make_describer(parser.parse_args([*words, '--vgg16-half', 'true']))
+    assert (describer.settings.backbone.size, describer.settings.backbone.half) == (112, True)
+    words = ['--features', 'densenet161_places365', '--densenet161_places365-model', '/gone']
+    with pytest.raises(UnavailableError, match='/gone'):
+        make_describer(parser.parse_args([*words, '--device', 'cpu']))

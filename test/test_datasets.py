@@ -1,0 +1,165 @@
+"""The paper's data sets: found under the names that people give them, or not, and what was looked for."""
+
+import cv2
+import numpy as np
+import pytest
+
+from stavpr_ros.errors import InputError, SettingsError, SourceError
+from stavpr_ros.evaluation.datasets import NAMES, open_dataset
+
+
+def fill(folder, count, value=0):
+    folder.mkdir(parents=True)
+    for i in range(count):
+        cv2.imwrite(str(folder / f'Image{i}.png'), np.full((4, 10), value + i, np.uint8))
+
+
+def values(source):
+    return [int(frame.image[0, 0, 0]) for frame in source]
+
+
+@pytest.mark.parametrize(
+    ('name', 'map_folder', 'query_folder', 'tolerance'),
+    [
+        ('nordland', 'summer', 'winter', 3),
+        ('nordland', 'Nordland3584/Summer', 'Nordland3584/Winter', 3),
+        ('nordland', 'nordland_64x32/summer', 'nordland_64x32/winter', 3),
+        ('nordland', 'nordland/test/summer_images_test', 'nordland/test/winter_images_test', 3),
+        ('nordland', 'Summer_64x32', 'winter-640x360-1fps', 3),
+        ('nordland', 'nordland_summer_images', 'nordland_winter_images', 3),
+        ('gardens_point', 'Gardens Point/day_left', 'Gardens Point/day_right', 2),
+        ('gardens_point', 'images/GardensPoint/day_left', 'images/GardensPoint/day_right', 2),
+        ('gardens_point', 'GardensPointWalking/Day-Left', 'GardensPointWalking/DayRight', 2),
+        ('gardens_point', 'GardensPoint_day_left', 'gp-day-right', 2),
+        ('gardens_point_night', 'Garden/day_left', 'Garden/night_right', 2),
+        ('ua', 'UA/day', 'UA/evening', 3),
+        ('ua', 'UA_day', 'ua_evening_images', 3),
+    ],
+)
+def test_same_index(tmp_path, name, map_folder, query_folder, tolerance):
+    fill(tmp_path / map_folder, 12, 0)
+    fill(tmp_path / query_folder, 12, 100)
+    (tmp_path / 'notes').mkdir()
+    dataset = open_dataset(name, tmp_path)
+    assert values(dataset.map) == list(range(12))  # in natural order
+    assert values(dataset.query) == list(range(100, 112))
+    assert dataset.tolerance == tolerance
+    around = np.abs(np.subtract.outer(np.arange(12), np.arange(12)))
+    np.testing.assert_array_equal(dataset.truth.matrix(), around <= tolerance)
+    narrow = open_dataset(name, tmp_path, tolerance=0)
+    assert narrow.tolerance == 0
+    np.testing.assert_array_equal(narrow.truth.matrix(), around == 0)
+
+
+@pytest.mark.parametrize(
+    ('map_folder', 'query_folder', 'truth'),
+    [
+        ('BerlinA100/Reference', 'BerlinA100/Live', 'BerlinA100/GroundTruth.csv'),
+        ('berlin_A100/berlin_A100_2', 'berlin_A100/berlin_A100_1', 'berlin_A100/gt.txt'),
+        ('ref', 'query', 'ground_truth.csv'),
+    ],
+)
+def test_berlin_has_a_file(tmp_path, map_folder, query_folder, truth):
+    fill(tmp_path / map_folder, 5)
+    fill(tmp_path / query_folder, 3, 100)
+    with pytest.raises(
+        SourceError, match=r'3 query images for 5 places and no ground truth.*GroundTruth\.csv'
+    ):
+        open_dataset('berlin_a100', tmp_path)
+    (tmp_path / truth).write_text('Live,Reference\n0,0\n1,4\n')
+    dataset = open_dataset('berlin_a100', tmp_path, tolerance=1)
+    assert (values(dataset.map)[0], values(dataset.query)[0]) == (0, 100)
+    assert dataset.truth.pairs.tolist() == [[0, 0], [0, 1], [1, 3], [1, 4]]
+    assert open_dataset('berlin_a100', tmp_path).tolerance == 2
+
+
+def test_berlin_needs_its_file_even_with_equally_many_images(tmp_path):
+    fill(tmp_path / 'Reference', 3)
+    fill(tmp_path / 'Live', 3)
+    with pytest.raises(SourceError, match='no ground truth'):
+        open_dataset('berlin_a100', tmp_path)
+
+
+def test_text_before_arrays_and_objects_refused(tmp_path):
+    fill(tmp_path / 'ref', 3)
+    fill(tmp_path / 'query', 2)
+    rows = np.empty((1, 2), object)
+    rows[0] = [0, [1, 2]]
+    np.save(tmp_path / 'ground_truth_new.npy', rows, allow_pickle=True)
+    with pytest.raises(SourceError, match='holds Python objects'):
+        open_dataset('berlin_a100', tmp_path)
+    (tmp_path / 'ground_truth.csv').write_text('0,1\n1,2\n')
+    assert open_dataset('berlin_a100', tmp_path, 0).truth.pairs.tolist() == [[0, 1], [1, 2]]
+    (tmp_path / 'gt.csv').write_text('0,1\n')
+    with pytest.raises(SourceError, match=r'several ground truths: ground_truth\.csv, gt\.csv'):
+        open_dataset('berlin_a100', tmp_path)
+
+
+def test_unequal_drives_need_a_file(tmp_path):
+    fill(tmp_path / 'summer', 5)
+    fill(tmp_path / 'winter', 4)
+    with pytest.raises(SourceError, match='4 query images for 5 places'):
+        open_dataset('nordland', tmp_path)
+    (tmp_path / 'gt.csv').write_text('4,0\n')
+    with pytest.raises(InputError, match='query 4 with place 0'):
+        open_dataset('nordland', tmp_path)
+
+
+def test_synth_crops_both(tmp_path):
+    fill(tmp_path / 'summer', 5)
+    fill(tmp_path / 'winter', 5, 100)
+    for folder, first in (('summer', 0), ('winter', 100)):
+        ramp = np.broadcast_to(first + np.arange(10, dtype=np.uint8), (4, 10))
+        cv2.imwrite(str(tmp_path / folder / 'Image0.png'), ramp)
+    dataset = open_dataset('synth_nordland', tmp_path)
+    first_place, first_query = next(iter(dataset.map)), next(iter(dataset.query))
+    assert first_place.image[0, :, 0].tolist() == list(range(7))
+    assert first_query.image[0, :, 0].tolist() == list(range(101, 110))
+    assert len(dataset.map) == len(dataset.query) == dataset.truth.N == 5
+    assert dataset.tolerance == 3
+
+
+def test_not_there(tmp_path):
+    (tmp_path / 'Nordland' / 'spring').mkdir(parents=True)
+    (tmp_path / 'Nordland' / 'summer').mkdir()
+    with pytest.raises(SourceError, match=r"not in .*'summer', and the query, 'winter', and found .*spring"):
+        open_dataset('nordland', tmp_path)
+    with pytest.raises(SourceError, match='cannot be listed'):
+        open_dataset('nordland', tmp_path / 'missing')
+    (tmp_path / 'Nordland' / 'winter').mkdir()
+    with pytest.raises(SourceError, match='holds no images'):
+        open_dataset('nordland', tmp_path)
+    with pytest.raises(SettingsError, match='take one of nordland, gardens_point'):
+        open_dataset('alderley', tmp_path)
+
+
+def test_what_is_there_twice(tmp_path):
+    for folder in ('nordland', 'Nordland3584'):
+        fill(tmp_path / folder / 'summer', 1)
+        fill(tmp_path / folder / 'winter', 1)
+    with pytest.raises(SourceError, match=r'more than once.*name the one'):
+        open_dataset('nordland', tmp_path)
+    fill(tmp_path / 'nordland' / 'Winter_images', 1)
+    with pytest.raises(SourceError, match='several folders for one drive: Winter_images, winter'):
+        open_dataset('nordland', tmp_path / 'nordland')
+
+
+def test_short_names_only_as_they_stand(tmp_path):
+    """Many a folder begins with ua or gp."""
+    fill(tmp_path / 'uart' / 'day', 1)
+    fill(tmp_path / 'uart' / 'evening', 1)
+    with pytest.raises(SourceError, match='ua is not in'):
+        open_dataset('ua', tmp_path)
+
+
+def test_names():
+    assert {'nordland', 'synth_nordland', 'gardens_point_night', 'ua', 'berlin_a100'} <= set(NAMES)
+
+
+@pytest.mark.parametrize(('name', 'count'), [('gardens_point', 200), ('nordland', 1788)])
+def test_real_data(data_folder, name, count):
+    dataset = open_dataset(name, data_folder)
+    assert len(dataset.map) == len(dataset.query) == dataset.truth.N == dataset.truth.n == count
+    assert dataset.truth.accepts(np.arange(count)).all()
+    with pytest.raises(SourceError, match='nightright'):
+        open_dataset('gardens_point_night', data_folder)

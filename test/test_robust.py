@@ -1,0 +1,378 @@
+"""Mode robust: each cure by itself, and all of them on real drives that change in speed, season and view."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from stavpr_ros.alignment import SequenceSettings, SpatialSettings
+from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
+from stavpr_ros.evaluation.metrics import best_f1, frame_answers, score_at
+from stavpr_ros.evaluation.offline import recognise_all, window_answers
+from stavpr_ros.evaluation.truth import GroundTruth
+from stavpr_ros.evaluation.warp import warp_indices
+from stavpr_ros.features import Describer, FeatureSettings, LocalFeatures
+from stavpr_ros.mapping import build_map, describe_frames
+from stavpr_ros.recognition import Recogniser, RecognitionSettings, Verdict
+from stavpr_ros.recognition.calibration import MEMORY, PRIOR, Calibration
+from stavpr_ros.recognition.centring import Centring
+from stavpr_ros.recognition.cures import (
+    AHEAD,
+    CHANCE,
+    FADING,
+    PAPER,
+    ROBUST,
+    Cures,
+    Track,
+    cures_of,
+    evidence,
+    relative_distance,
+)
+from stavpr_ros.recognition.loop_closure import GROWTH, ROOM, LoopCloser
+from stavpr_ros.sources import open_source
+
+SHORT = SequenceSettings(length=5, beta=2.0)
+WARPS = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')
+
+
+def robust(place_map, **changes) -> Recogniser:
+    return Recogniser(place_map, RecognitionSettings(1.0, mode='robust', **changes))
+
+
+# ------------------------------------------------ the cures
+
+
+def test_choices_of_cures():
+    assert cures_of('robust') == ROBUST == Cures()
+    assert cures_of('paper') == PAPER
+    assert not PAPER.any
+    assert Cures.only('speeds') == Cures(False, False, False, True, False, False)
+    assert not ROBUST.without('centring', 'speeds').centring
+    assert ROBUST.without('centring').speeds
+    for wrong in (lambda: ROBUST.without('hope'), lambda: Cures.only('hope'), lambda: cures_of('hope')):
+        with pytest.raises(SettingsError, match='hope'):
+            wrong()
+    with pytest.raises(SettingsError, match='chance'):
+        RecognitionSettings(1.01, mode='robust')
+    with pytest.raises(SettingsError, match='hopeful'):
+        RecognitionSettings(0.5, mode='hopeful')
+
+
+def test_evidence_and_distance():
+    assert evidence(-2.0, -0.5) == -3.5
+    assert evidence(-2.0, math.nan) == -4.0
+    assert relative_distance(CHANCE) == relative_distance(5.0) == relative_distance(math.inf) == 1
+    assert relative_distance(CHANCE - 2) == pytest.approx(math.exp(-1))
+    assert 0 < relative_distance(-50) < 1e-9
+
+
+def test_a_track_fades_and_ends_where_the_place_jumps():
+    track = Track()
+    assert track.follow(10, -4.0) == -4.0
+    assert track.follow(11, 0.0) == pytest.approx(-4 + FADING)
+    assert track.follow(11 + AHEAD, 0.0) == pytest.approx(-4 + 2 * FADING)
+    assert track.follow(13 + AHEAD, -6.0) == -6.0
+    assert track.follow(14 + 2 * AHEAD, 0.5) == 0.5
+    assert track.follow(12 + 2 * AHEAD, 0.25) == 0.25  # two back
+
+
+def test_centring_takes_the_mean_off_and_leaves_zeros():
+    generator = torch.Generator().manual_seed(0)
+    strips = torch.rand((3, 40, 8), generator=generator)
+    strips /= strips.norm(dim=2, keepdim=True)
+    strips[1, 5] = 0
+    settings = FeatureSettings('gradient', None, 3)
+    centring = Centring(LocalFeatures(strips, torch.ones(3, 40), settings))
+    centred = centring.places(LocalFeatures(strips, torch.ones(3, 40), settings)).strips
+    mean = strips.mean(dim=1)
+    for j in range(3):
+        for y in (0, 5, 39):
+            expected = strips[j, y] - mean[j] if strips[j, y].any() else torch.zeros(8)
+            expected = expected / max(float(expected.norm()), 1e-12)
+            torch.testing.assert_close(centred[j, y], expected)
+    seen = strips[:, :2]
+    centring.next_query(seen[:, 0])
+    second = centring.next_query(seen[:, 1])
+    query_mean = (PRIOR * mean + seen[:, 0] + seen[:, 1]) / (PRIOR + 2)
+    expected = seen[:, 1] - query_mean
+    torch.testing.assert_close(second, expected / expected.norm(dim=1, keepdim=True))
+    centring.reset()
+    first = centring.next_query(seen[:, 1])
+    assert not torch.allclose(first, second)
+
+
+def test_calibration_is_the_running_mean_and_variance():
+    """Against a plain recursion: prior rows, then every row with weight 1 / count, at least 1 / MEMORY."""
+    rng = np.random.default_rng(0)
+    start, rows = rng.normal(3, 2, (6, 9)), rng.normal(1, 4, (MEMORY + 40, 9)).astype(np.float32)
+    start[2, 2:5] = np.nan
+    calibration = Calibration(9)
+    calibration.start_from(start)
+
+    normal = (start - np.nanmean(start, 1)[:, None]) / np.nanstd(start, 1)[:, None]
+    mean, variance = np.nanmean(normal, 0), np.nanvar(normal, 0)
+    count = float(PRIOR)
+    for came in rows:
+        row = (came.astype(float) - came.mean()) / came.std()
+        count = min(count + 1, MEMORY)
+        off = row - mean
+        mean = mean + off / count
+        variance = variance + (off * (row - mean) - variance) / count
+        found = calibration.normalised(rows[0])
+        calibration.observe(row.astype(np.float32))
+    np.testing.assert_allclose(found, (rows[0] - rows[0].mean()) / rows[0].std(), atol=1e-5)
+    shift, scale = calibration.shift_and_scale(9)
+    np.testing.assert_allclose(shift, mean, atol=1e-4)
+    np.testing.assert_allclose(scale, 1 / np.sqrt(variance), rtol=1e-4)
+    calibration.reset()
+    np.testing.assert_allclose(calibration.shift_and_scale(9)[0], np.nanmean(normal, 0), atol=1e-6)
+
+
+def test_calibration_of_maps_too_small_to_know_themselves():
+    calibration = Calibration(3)
+    calibration.start_from(np.full((3, 3), np.nan))
+    np.testing.assert_array_equal(calibration.shift_and_scale(3), ([0, 0, 0], [1, 1, 1]))
+    flat = calibration.normalised(np.full(3, 0.5, np.float32))
+    np.testing.assert_array_equal(flat, [0, 0, 0])
+
+
+# ------------------------------------------------ the recogniser with them
+
+
+def test_the_map_recognises_itself(small_map):
+    answers = recognise_all(robust(small_map, sequence=SHORT, neighbourhood=5), small_map.features)
+    for i, answer in enumerate(answers[4:], start=4):
+        assert answer.verdict is Verdict.MATCH
+        assert (answer.place, answer.newest) == (i - 2, i)
+        assert answer.path.tolist() == [[row, i - 4 + row] for row in range(5)]
+        assert 0 <= answer.nearest.distance < 0.5
+        assert answer.nearest.runner_up_distance > answer.nearest.distance
+
+
+def test_a_reset_recogniser_is_a_new_one(small_map):
+    one = robust(small_map, sequence=SHORT, neighbourhood=5)
+    first = [a.nearest for a in recognise_all(one, small_map.features[20:40])]
+    recognise_all(one, small_map.features[:30])
+    assert [a.nearest for a in recognise_all(one, small_map.features[20:40])] == first
+
+
+def test_what_is_no_nearer_than_chance_is_no_answer(small_map, route):
+    rng = np.random.default_rng(1)
+    elsewhere = [rng.integers(0, 256, (96, 128, 3), np.uint8) for _ in range(40)]
+    query = Describer(projection=64).describe(elsewhere)
+    answers = recognise_all(robust(small_map, sequence=SHORT, neighbourhood=5), query)[4:]
+    matched = [a for a in answers if a.verdict is Verdict.MATCH]
+    assert len(matched) <= len(answers) / 10
+    for answer in answers:
+        if answer.verdict is not Verdict.MATCH:
+            assert answer.nearest.distance == 1
+            assert math.isinf(answer.score)
+            assert answer.place == -1
+
+
+@pytest.mark.parametrize(
+    'without', ['', 'centring', 'row_normalisation', 'place_calibration', 'speeds', 'contrast']
+)
+@pytest.mark.parametrize('strategy', ['adaptive', 'none'])
+def test_every_choice_of_cures_works(small_map, without, strategy):
+    cures = ROBUST.without(without) if without else ROBUST
+    settings = RecognitionSettings(1e6, SpatialSettings(strategy), SHORT, 5, mode='robust', cures=cures)
+    one = Recogniser(small_map, settings)
+    answers = recognise_all(one, small_map.features[10:30])
+    middles = [a.nearest.middle for a in answers[4:]]
+    assert np.mean(np.abs(np.array(middles) - np.arange(12, 28)) <= 1) > 0.9
+    assert int(np.argmin(one.newest_row())) == 29
+    places, distances = one.candidates(7)
+    assert places[0] == answers[-1].nearest.middle
+    assert len(set(places.tolist())) == len(places) == 7
+    assert (np.diff(distances) >= 0).all()
+
+
+def test_candidates_in_mode_paper(small_map):
+    one = Recogniser(small_map, RecognitionSettings(1.0, sequence=SHORT))
+    answer = recognise_all(one, small_map.features[10:20])[-1]
+    places, distances = one.candidates(3)
+    assert (places[0], distances[0]) == (answer.nearest.middle, np.float32(answer.nearest.distance))
+    assert int(np.argmin(one.newest_row())) == 19
+
+
+# ------------------------------------------------ loop closure
+
+
+def features_of(strips):
+    return LocalFeatures(strips, torch.ones(strips.shape[:2]), FeatureSettings('gradient', None, 7))
+
+
+@pytest.fixture(scope='module')
+def laps():
+    """Two laps and a half of a round of 150 places, seen with noise."""
+    rng = np.random.default_rng(0)
+    places = rng.standard_normal((7, 150, 16))
+    strips = places[:, np.arange(375) % 150] + 0.4 * rng.standard_normal((7, 375, 16))
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+    return features_of(torch.from_numpy(strips).float())
+
+
+@pytest.mark.parametrize('mode', ['paper', 'robust'])
+def test_laps_are_closed(laps, mode):
+    """Beyond the first room for images, so that growing is seen as well."""
+    assert len(laps) > ROOM
+    settings = RecognitionSettings(1.0 if mode == 'robust' else 0.9, mode=mode)
+    closer = LoopCloser(settings, 30, laps.settings)
+    answers = [closer.add(laps[i : i + 1]) for i in range(len(laps))]
+    assert len(closer) == 375
+    first_lap = [a for a in answers[:150] if a.verdict is Verdict.MATCH]
+    assert not first_lap or mode == 'paper'
+    for i in range(180, 375):
+        assert (i - answers[i].newest) % 150 == 0
+        assert answers[i].newest < i - 30
+        assert answers[i].verdict is Verdict.MATCH
+
+
+def test_the_latest_images_are_no_places(laps):
+    closer = LoopCloser(RecognitionSettings(1.0, mode='robust'), 30, laps.settings)
+    still = features_of(laps.strips[:, :1].repeat(1, 60, 1))
+    for i in range(60):
+        answer = closer.add(still[i : i + 1])
+        if answer.nearest is not None:
+            assert answer.path[:, 1].max() < i - 29
+    assert len(closer.newest_row()) == 30
+
+
+def test_the_mean_that_is_taken_off_is_that_of_the_route_so_far(laps):
+    closer = LoopCloser(RecognitionSettings(1.0, mode='robust'), 10, laps.settings)
+    for i in range(100):
+        closer.add(laps[i : i + 1])
+    counts = [1]
+    while counts[-1] < 100:
+        counts.append(int(counts[-1] * GROWTH) + 1)
+    last = max(count for count in counts if count <= 100)
+    mean = laps.strips[:, :last].mean(dim=1, keepdim=True)
+    expected = laps.strips[:, :100] - mean
+    expected /= expected.norm(dim=2, keepdim=True)
+    torch.testing.assert_close(closer._centred[:, :100], expected, atol=1e-5, rtol=0)
+
+
+def test_what_a_loop_closer_refuses(laps, small_map):
+    settings = RecognitionSettings(1.0, mode='robust')
+    closer = LoopCloser(settings, 30, laps.settings)
+    with pytest.raises(SettingsError, match='exclude'):
+        LoopCloser(settings, 0, laps.settings)
+    with pytest.raises(SettingsError, match='none'):
+        LoopCloser(RecognitionSettings(1.0, SpatialSettings('none')), 30, laps.settings)
+    with pytest.raises(InputError, match='2 images'):
+        closer.add(laps[:2])
+    with pytest.raises(FeatureMismatchError):
+        closer.add(small_map.features[:1])
+    with pytest.raises(InputError, match='not finite'):
+        closer.add(features_of(torch.full((7, 1, 16), math.nan)))
+    assert len(closer) == closer.window_fill == 0
+
+
+# ------------------------------------------------ real drives: the numbers that the README states
+
+
+@pytest.fixture(scope='module')
+def drives(data_folder):
+    """The gradient features of every drive, by its folder."""
+    describer, known = Describer(), {}
+
+    def drive(name):
+        if name not in known:
+            known[name] = describe_frames(open_source(data_folder / name), describer, progress=False)
+        return known[name]
+
+    return drive
+
+
+def as_map(features):
+    n = len(features)
+    from stavpr_ros.mapping import PlaceMap
+
+    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
+
+
+def judged(reference, query, truth):
+    """Best F1, and the precision at the default threshold."""
+    answers = frame_answers(window_answers(recognise_all(robust(as_map(reference)), query)), 20)
+    correct = truth.accepts(answers.places)
+    return best_f1(answers.distances, correct).f1, score_at(1.0, answers.distances, correct).precision
+
+
+def taken(features, indices):
+    rows = torch.from_numpy(np.asarray(indices))
+    return LocalFeatures(features.strips[:, rows], features.weights[:, rows], features.settings)
+
+
+def test_gardens_point_at_every_speed(drives):
+    reference, query = drives('gardens_point/day_left'), drives('gardens_point/day_right')
+    truth = GroundTruth.identity(200, 200, 2)
+    f1, precision = judged(reference, query, truth)
+    print(f'Gardens Point, robust, gradient: F1 {f1:.4f}, precision {precision:.4f}')
+    assert f1 >= 0.99
+    assert precision >= 0.95
+    for kind in WARPS:
+        indices = warp_indices(200, kind)
+        f1, precision = judged(reference, taken(query, indices), truth.select(indices))
+        print(f'Gardens Point {kind}: F1 {f1:.4f}, precision {precision:.4f}')
+        assert f1 >= 0.95
+        assert precision >= 0.93
+
+
+def test_nordland_through_the_seasons(drives):
+    reference, query = drives('nordland_64x32/summer'), drives('nordland_64x32/winter')
+    f1, precision = judged(reference, query, GroundTruth.identity(1788, 1788, 3))
+    print(f'Nordland 64x32, robust, gradient: F1 {f1:.4f}, precision {precision:.4f}')
+    assert f1 >= 0.95
+    assert precision >= 0.95
+
+
+def test_a_corridor_that_looks_alike(drives, data_folder):
+    truth = GroundTruth.from_file(data_folder / 'corridor' / 'ground_truth.csv', 111, 111, 0)
+    f1, precision = judged(drives('corridor/ref'), drives('corridor/query'), truth)
+    print(f'corridor, robust, gradient: F1 {f1:.4f}, precision {precision:.4f}')
+    assert f1 >= 0.95
+    assert precision >= 0.95
+
+
+@pytest.mark.parametrize('route', ['gardens_point/day_left', 'nordland_64x32/summer', 'corridor/ref'])
+@pytest.mark.parametrize('query', ['gardens_point/day_right', 'nordland_64x32/winter', 'corridor/query'])
+def test_other_routes_are_not_matched(drives, route, query):
+    if route.split('/')[0] == query.split('/')[0]:
+        pytest.skip('the same route')
+    answers = recognise_all(robust(as_map(drives(route))), drives(query))[19:]
+    alarms = np.mean([answer.verdict is Verdict.MATCH for answer in answers])
+    print(f'{query} on the map of {route}: {alarms:.3f} false alarms')
+    assert alarms <= 0.05
+
+
+def test_the_hallway_is_closed(drives, data_folder):
+    features = drives('rtabmap_hallway_loop/samples')
+    truth = GroundTruth.from_file(data_folder / 'rtabmap_hallway_loop' / 'samples_GT.bmp', 84, 84, 0)
+    truth = truth.loop_closures(19)
+    assert truth.has_match.sum() == 44
+    closer = LoopCloser(RecognitionSettings(1.0, mode='robust'), 20, features.settings)
+    answers = [closer.add(features[i : i + 1]) for i in range(84)]
+    answered = frame_answers(window_answers(answers), 20)
+    score = score_at(1.0, answered.distances, truth.accepts(answered.places), truth.has_match)
+    print(f'hallway: precision {score.precision:.3f}, recall {score.recall:.3f}')
+    assert score.precision >= 0.95
+    assert score.recall >= 0.8
+
+
+@pytest.mark.parametrize('name', ['gardens_point', 'corridor'])
+def test_with_a_network(data_folder, squeezenet_settings, name):
+    describer = Describer('onnx', squeezenet_settings)
+    if name == 'corridor':
+        route, query = 'corridor/ref', 'corridor/query'
+        truth = GroundTruth.from_file(data_folder / 'corridor' / 'ground_truth.csv', 111, 111, 0)
+    else:
+        route, query = 'gardens_point/day_left', 'gardens_point/day_right'
+        truth = GroundTruth.identity(200, 200, 2)
+    place_map = build_map(open_source(data_folder / route), describer, progress=False)
+    found = describe_frames(open_source(data_folder / query), describer, progress=False)
+    f1, precision = judged(place_map.features, found, truth)
+    print(f'{name}, robust, SqueezeNet: F1 {f1:.4f}, precision {precision:.4f}')
+    assert f1 >= (0.99 if name == 'gardens_point' else 0.95)
+    assert precision >= 0.94

@@ -1,0 +1,209 @@
+"""SeqSLAM: every step by hand, the whole against plain loops, and what it is worth on real drives."""
+
+import numpy as np
+import pytest
+
+from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.evaluation.datasets import open_dataset
+from stavpr_ros.evaluation.metrics import best_f1
+from stavpr_ros.evaluation.seqslam import (
+    SeqSlamSettings,
+    describe,
+    differences,
+    enhance_contrast,
+    match_differences,
+    seqslam,
+)
+from stavpr_ros.sources.frame import Frame
+
+SMALL = SeqSlamSettings(width=4, height=2, patch=2)
+
+
+def test_patches_by_hand():
+    """Left patch 0 2 / 2 4: mean 2, deviation sqrt 2. The right one is flat."""
+    image = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8)
+    root = np.sqrt(2)
+    described = describe([image], SMALL)
+    assert described.dtype == np.float32
+    np.testing.assert_allclose(described.reshape(2, 4), [[-root, 0, 0, 0], [0, root, 0, 0]], atol=1e-6)
+
+
+def test_images_are_shrunk_by_areas_and_made_grey():
+    grey = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8)
+    large = np.kron(grey, np.ones((3, 3), np.uint8))
+    colour = np.stack([large] * 3, axis=2)
+    expected = describe([grey], SMALL)
+    np.testing.assert_array_equal(describe([large], SMALL), expected)
+    np.testing.assert_array_equal(describe([Frame(colour, 0, '')], SMALL), expected)
+
+
+def test_red_counts_more_than_blue():
+    grey = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8) * 40
+    colour = np.stack([grey, grey * 0, 200 - grey], axis=2)  # red as the grey image, blue against it
+    np.testing.assert_allclose(describe([colour], SMALL), describe([grey], SMALL), atol=0.05)
+
+
+def test_differences_by_hand():
+    queries = np.array([[0, 0, 0, 0], [1, 2, 3, 4]], np.float32)
+    places = np.array([[1, -1, 1, -1], [1, 2, 3, 4], [0, 0, 0, 2]], np.float32)
+    np.testing.assert_allclose(differences(queries, places), [[1, 2.5, 0.5], [2.5, 0, 2]])
+
+
+def test_contrast_by_hand():
+    """
+    Window 2, one place before and one after: 1 3 | 1 3 5 | 3 5 3 | 5 3.
+
+    Means 2, 3, 11/3, 4; deviations 1, sqrt(8/3), sqrt(8)/3, 1.
+    """
+    D = np.array([[1.0, 3, 5, 3], [7, 7, 7, 7]])
+    enhanced = enhance_contrast(D, 2)
+    np.testing.assert_allclose(enhanced, [[-1, 0, np.sqrt(2), -1], [0, 0, 0, 0]], atol=1e-12)
+    assert enhance_contrast(D.astype(np.float32), 2).dtype == np.float32
+
+
+def test_lines_by_hand():
+    """Speeds 0.5, 1 and 1.5 over five images, halves rounded up."""
+    settings = SeqSlamSettings(length=5, slowest=0.5, fastest=1.5, speed_step=0.5)
+    assert settings.lines.tolist() == [[0, 1, 1, 2, 2], [0, 1, 2, 3, 4], [0, 2, 3, 5, 6]]
+    assert len(SeqSlamSettings().lines) == 5  # 0.8, 0.9, 1.0, 1.1, 1.2
+    assert SeqSlamSettings().lines[:, -1].tolist() == [15, 17, 19, 21, 23]
+
+
+def test_search_by_hand():
+    """
+    Three queries, six places; the query drives twice as fast and begins at place 1.
+
+    In every row one difference is 0 and five are 6: mean 5, deviation sqrt 5 over the whole map, so 0
+    becomes -sqrt 5 and 6 becomes 1 / sqrt 5. The line 1, 3, 5 has -sqrt 5 on the mean.
+    """
+    settings = SeqSlamSettings(length=3, slowest=1, fastest=2, speed_step=1, contrast_window=12)
+    D = np.full((3, 6), 6.0)
+    D[[0, 1, 2], [1, 3, 5]] = 0
+    places, scores = match_differences(D, settings)
+    assert places.tolist() == [1, 3, 5]
+    np.testing.assert_allclose(scores, -np.sqrt(5))
+
+
+def test_ends_take_their_places_from_the_outer_windows():
+    """Seven queries, windows of 4: midpoint 1, so query 0 and queries 5 and 6 are in nobody's middle."""
+    settings = SeqSlamSettings(length=4, slowest=1, fastest=1)
+    D = np.ones((7, 20))
+    D[np.arange(7), np.arange(7) + 9] = 0
+    D[4:, :] = 0.9
+    D[[4, 5, 6], [13, 14, 15]] = 0.2
+    places, scores = match_differences(D, settings)
+    assert places.tolist() == list(range(9, 16))
+    assert scores[0] == scores[1]
+    assert scores[4] == scores[5] == scores[6]
+
+
+def naive(D, settings):
+    """The paper in plain loops."""
+    N, n = D.shape
+    half, middle = settings.contrast_window // 2, (settings.length - 1) // 2
+    enhanced = np.zeros((N, n))
+    for i in range(N):
+        for j in range(n):
+            around = D[i, max(0, j - half) : j + half + 1]
+            enhanced[i, j] = (D[i, j] - around.mean()) / around.std()
+    places, scores = [-1] * N, [np.inf] * N
+    count = round((settings.fastest - settings.slowest) / settings.speed_step) + 1
+    for first in range(N - settings.length + 1):
+        starts = {}
+        for start in range(n):
+            for v in range(count):
+                speed = settings.slowest + v * settings.speed_step
+                line = [start + int(speed * t + 0.5 + 1e-9) for t in range(settings.length)]
+                if line[-1] < n:
+                    total = sum(enhanced[first + t, place] for t, place in enumerate(line))
+                    if start not in starts or total < starts[start][0]:
+                        starts[start] = total, line[middle]
+        best, place = min(starts.values())
+        others = [total for total, at in starts.values() if abs(at - place) > half]
+        if settings.score == 'uniqueness':
+            best -= min(others, default=0)
+        places[first + middle], scores[first + middle] = place, best / settings.length
+    return places, scores
+
+
+@pytest.mark.parametrize('score', ['sum', 'uniqueness'])
+@pytest.mark.parametrize(('length', 'window', 'n'), [(2, 2, 9), (5, 4, 25), (6, 10, 40), (7, 60, 12)])
+def test_equals_plain_loops(score, length, window, n):
+    settings = SeqSlamSettings(
+        length=length, contrast_window=window, slowest=0.6, fastest=1.4, speed_step=0.2, score=score
+    )
+    D = np.random.default_rng(length).random((15, n))
+    expected_places, expected_scores = naive(D, settings)
+    middle = settings.middle
+    inner = slice(middle, middle + 15 - length + 1)
+    for array, tolerance in ((D, 1e-9), (D.astype(np.float32), 1e-4)):
+        places, scores = match_differences(array, settings)
+        np.testing.assert_array_equal(places[inner], expected_places[inner])
+        np.testing.assert_allclose(scores[inner], expected_scores[inner], atol=tolerance)
+
+
+def test_a_drive_finds_itself(route):
+    for score in ('sum', 'uniqueness'):
+        places, scores = seqslam(route, route[10:50], SeqSlamSettings(score=score))
+        assert places.tolist() == list(range(10, 50))
+        assert scores.max() < -0.5
+
+
+def test_without_a_window_or_a_line():
+    for D in (np.ones((19, 50)), np.ones((50, 15))):
+        places, scores = match_differences(D, SeqSlamSettings())
+        assert places.tolist() == [-1] * len(D)
+        assert np.isinf(scores).all()
+    rng = np.random.default_rng(0)
+    places, _ = match_differences(rng.random((20, 16)), SeqSlamSettings())  # the slowest line just fits
+    assert places.tolist() == SeqSlamSettings().lines[0].tolist()
+    places, scores = match_differences(np.ones((20, 40)), SeqSlamSettings())  # all lines alike: the first one
+    assert places.tolist() == SeqSlamSettings().lines[0].tolist()
+    assert scores.tolist() == [0] * 20
+
+
+@pytest.mark.parametrize(
+    'D', [np.zeros(3), np.zeros((2, 2), int), np.array([[np.nan]]), np.array([[np.inf]])]
+)
+def test_differences_that_are_wrong(D):
+    with pytest.raises(InputError, match='differences'):
+        match_differences(D, SeqSlamSettings())
+
+
+def test_images_that_are_wrong():
+    with pytest.raises(InputError, match='no images'):
+        seqslam([], [])
+    for image in (np.zeros((4, 4)), np.zeros((4, 4, 2), np.uint8)):
+        with pytest.raises(InputError, match='expected uint8'):
+            describe([image], SMALL)
+
+
+@pytest.mark.parametrize(
+    'wrong',
+    [
+        {'width': 60},
+        {'height': 30},
+        {'patch': 0},
+        {'contrast_window': 1},
+        {'length': 1},
+        {'slowest': 0},
+        {'fastest': 0.5},
+        {'speed_step': 0},
+        {'fastest': float('inf')},
+        {'score': 'ratio'},
+    ],
+)
+def test_settings_that_are_wrong(wrong):
+    with pytest.raises(SettingsError):
+        SeqSlamSettings(**wrong)
+
+
+@pytest.mark.parametrize(('name', 'known_f1'), [('gardens_point', 0.79), ('nordland', 0.95)])
+def test_real_drives(data_folder, name, known_f1, record_property):
+    """The F1 that is asserted is the one measured, a little below."""
+    dataset = open_dataset(name, data_folder)
+    places, scores = seqslam(dataset.map, dataset.query)
+    f1 = best_f1(scores, dataset.truth.accepts(places)).f1
+    record_property('f1', f1)
+    print(f'SeqSLAM, {name}: F1 {f1:.4f}')
+    assert f1 > known_f1

@@ -1,0 +1,193 @@
+"""Features from TorchScript files: their output, inner modules of traced and scripted networks, errors."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
+from stavpr_ros.features import Describer
+from stavpr_ros.features.backbone import backbone_class, settings_class
+
+pytestmark = pytest.mark.filterwarnings('ignore:.torch.jit:DeprecationWarning')
+
+
+class Block(nn.Module):
+    """Two convolutions that share a ReLU; ``unused`` is never called."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first, self.second = nn.Conv2d(3, 4, 3, padding=1), nn.Conv2d(4, 5, 3, stride=2, padding=1)
+        self.relu, self.unused = nn.ReLU(), nn.ReLU()
+
+    def forward(self, x, shift):
+        return self.relu(self.second(self.relu(self.first(x)))) + shift
+
+
+class Net(nn.Module):
+    """A block in a block, then layers for one size of images only."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.body = nn.ModuleDict({'block': Block(), 'last': nn.Conv2d(5, 6, 1)})
+        self.head = nn.Linear(6 * 8 * 8, 10)
+
+    def forward(self, x):
+        x = self.body['last'](self.body['block'](x, x.mean()))
+        return self.head(x.flatten(1))
+
+
+class Branch(nn.Module):
+    """Calls its layer only in a branch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Conv2d(3, 4, 1)
+
+    def forward(self, x):
+        if x.shape[0] > 0:
+            x = self.layer(x)
+        return x
+
+
+class Spoiled(nn.Module):
+    """Overwrites what its layer was given once the layer is done."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Identity()
+
+    def forward(self, x):
+        y = x + 1
+        return self.layer(y) + y.mul_(0)
+
+
+@pytest.fixture(scope='module')
+def net():
+    torch.manual_seed(0)
+    return Net().eval()
+
+
+@pytest.fixture(scope='module', params=['traced', 'scripted'])
+def file(request, net, tmp_path_factory):
+    path = tmp_path_factory.mktemp('script') / f'{request.param}.pt'
+    script = (
+        torch.jit.trace(net, torch.rand(1, 3, 16, 16)) if request.param == 'traced' else torch.jit.script(net)
+    )
+    torch.jit.save(script, path)
+    return path
+
+
+def settings(path, **changes):
+    options = {'size': 16, 'scale': 1.0, 'mean': (0, 0, 0), 'std': (1, 1, 1)} | changes
+    return settings_class('torchscript')(model=str(path), **options)
+
+
+def images(count: int, size: int = 16) -> list[np.ndarray]:
+    return list(np.random.default_rng(0).integers(0, 256, (count, size, size, 3), np.uint8))
+
+
+def expected(net, layer: str, batch: torch.Tensor) -> torch.Tensor:
+    """What the module gives in its last call, taken by a hook from the network in Python."""
+    kept = []
+    hook = net.get_submodule(layer).register_forward_hook(lambda _, __, output: kept.append(output))
+    with torch.no_grad():
+        net(batch)
+    hook.remove()
+    return kept[-1]
+
+
+@pytest.mark.parametrize('layer', ['body.block', 'body.last', 'body.block.second', 'body.block.relu'])
+def test_inner_layers(net, file, layer):
+    """The block also takes a second argument, and its ReLU is called twice: the last call counts."""
+    backbone = backbone_class('torchscript')(settings(file, layer=layer))
+    pictures = images(3)
+    batch = torch.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2).float()
+    for _ in range(3):  # torch compiles a program anew in its second run
+        torch.testing.assert_close(backbone.feature_maps(pictures), expected(net, layer, batch))
+
+
+def test_nothing_after_the_layer_runs(file):
+    """At 32 pixels the head does not fit: what comes before it does not mind."""
+    backbone = backbone_class('torchscript')(settings(file, layer='body.last', size=32))
+    assert backbone.feature_maps(images(2)).shape == (2, 6, 16, 16)
+    with pytest.raises(SettingsError, match='does not take 2 images of size 32'):
+        backbone_class('torchscript')(settings(file, layer='head', size=32)).feature_maps(images(2))
+
+
+def test_nothing_after_the_layer_changes_what_it_gives(tmp_path):
+    torch.jit.save(torch.jit.script(Spoiled()), tmp_path / 'spoiled.pt')
+    backbone = backbone_class('torchscript')(settings(tmp_path / 'spoiled.pt', layer='layer'))
+    assert (backbone.feature_maps([np.full((16, 16, 3), 7, np.uint8)]) == 8).all()
+
+
+def test_the_files_own_output(net, tmp_path):
+    """Worked by hand: the sum of four pixels; blue first, mean and deviation by channel; batch of two."""
+    conv = nn.Conv2d(3, 1, 2, stride=2, bias=False)
+    nn.init.constant_(conv.weight, 1)
+    torch.jit.save(torch.jit.script(conv), tmp_path / 'sum.pt')
+    image = np.zeros((16, 16, 3), np.uint8)
+    image[:, :, 0] = 100  # red
+    backbone = backbone_class('torchscript')(
+        settings(tmp_path / 'sum.pt', channels='bgr', mean=(0, 0, 20), std=(1, 1, 2), half=True)
+    )
+    maps = backbone.feature_maps([image, 2 * image])
+    assert (maps.shape, maps.dtype) == ((2, 1, 8, 8), torch.float32)
+    assert (maps[0] == 4 * (100 - 20) / 2).all()
+    assert (maps[1] == 4 * (200 - 20) / 2).all()
+
+
+def test_errors_say_what_to_do(file, tmp_path):
+    with pytest.raises(UnavailableError, match='cannot be read'):
+        Describer('torchscript', settings(tmp_path / 'missing.pt'))
+    (tmp_path / 'broken.pt').write_bytes(file.read_bytes()[:-200])
+    with pytest.raises(UnavailableError, match='no usable TorchScript file'):
+        Describer('torchscript', settings(tmp_path / 'broken.pt'))
+    with pytest.raises(SettingsError, match=r"no layer 'body\.fire'.*body, body\.block, body\.block\.first"):
+        Describer('torchscript', settings(file, layer='body.fire'))
+    with pytest.raises(SettingsError, match=r"the layer 'body\.block\.unused', but calls it .* not at all"):
+        Describer('torchscript', settings(file, layer='body.block.unused'))
+    with pytest.raises(SettingsError, match=r'gives \(1, 10\) for 1 images: expected a map'):
+        Describer('torchscript', settings(file)).describe(images(1))
+    with pytest.raises(SettingsError, match='must be'):
+        settings(file, channels='hsv')
+    with pytest.raises(SettingsError, match='sha256'):
+        settings(file, sha256='12')
+
+
+def test_a_layer_in_a_branch(tmp_path):
+    torch.jit.save(torch.jit.script(Branch()), tmp_path / 'branch.pt')
+    with pytest.raises(SettingsError, match='in a branch or loop'):
+        Describer('torchscript', settings(tmp_path / 'branch.pt', layer='layer'))
+    maps = backbone_class('torchscript')(settings(tmp_path / 'branch.pt')).feature_maps(images(2))
+    assert maps.shape == (2, 4, 16, 16)
+
+
+def test_a_program_without_modules(tmp_path, net):
+    frozen = torch.jit.freeze(torch.jit.script(net))
+    torch.jit.save(frozen, tmp_path / 'frozen.pt')
+    with pytest.raises(SettingsError, match='its layers are none'):
+        Describer('torchscript', settings(tmp_path / 'frozen.pt', layer='head'))
+
+
+def test_a_map_remembers_the_file_not_its_place(file, tmp_path):
+    made = Describer('torchscript', settings(file, layer='body.last')).settings
+    moved = tmp_path / 'moved.pt'
+    moved.write_bytes(file.read_bytes())
+    assert Describer.from_settings(made, None, model=str(moved)).settings == made
+    torch.jit.save(torch.jit.script(Net()), moved)
+    with pytest.raises(FeatureMismatchError, match='give the file that the map was built with'):
+        Describer.from_settings(made, None, model=str(moved))
+    with pytest.raises(FeatureMismatchError, match='sha256'):
+        Describer('torchscript', settings(file, sha256='0' * 64))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason='no CUDA device')
+def test_half_precision_on_a_gpu(file, net):
+    backbone = backbone_class('torchscript')(
+        settings(file, layer='body.last', half=True, scale=1 / 255), 'cuda'
+    )
+    batch = torch.from_numpy(np.stack(images(2))).permute(0, 3, 1, 2).float() / 255
+    maps = backbone.feature_maps(images(2))
+    assert maps.dtype == torch.float16
+    torch.testing.assert_close(maps.float().cpu(), expected(net, 'body.last', batch), rtol=1e-2, atol=1e-2)

@@ -1,0 +1,319 @@
+"""Files of weights: paths, cache, downloads from a server of our own, hashes, hostile and damaged files."""
+
+import hashlib
+import io
+import pickle
+import socket
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import numpy as np
+import pytest
+import torch
+from checkpoints import Call, Global, OldPickle
+from torch import nn
+
+from stavpr_ros.errors import FeatureMismatchError, UnavailableError
+from stavpr_ros.features.checkpoint import read_checkpoint
+from stavpr_ros.features.published import PublishedNetwork, PublishedSettings
+from stavpr_ros.features.weights import PublishedFile, cache_folder, download, promised_hash
+
+
+class Tiny(PublishedNetwork):
+    """One convolution and a rest that no one needs; the tests say where it is published."""
+
+    @staticmethod
+    def whole_network():
+        return nn.Sequential(nn.Conv2d(3, 2, 8, stride=8), nn.ReLU(), nn.BatchNorm2d(2))
+
+    @staticmethod
+    def up_to_layer(network):
+        return network[:2]
+
+
+def saved(content: object) -> bytes:
+    stream = io.BytesIO()
+    torch.save(content, stream)
+    return stream.getvalue()
+
+
+@pytest.fixture(scope='module')
+def content():
+    """A file of weights for Tiny, as torch writes it now."""
+    torch.manual_seed(0)
+    return saved(Tiny.whole_network().state_dict())
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    return tmp_path / 'cache' / 'stavpr_ros'
+
+
+class Server:
+    """Serves one answer under every address, and counts how often it was asked."""
+
+    def __init__(self) -> None:
+        self.status, self.body, self.announced, self.asked = 200, b'', None, 0
+        outer = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self):
+                outer.asked += 1
+                self.send_response(outer.status)
+                self.send_header('Content-Length', str(outer.announced or len(outer.body)))
+                self.end_headers()
+                self.wfile.write(outer.body)
+
+            def log_message(self, *_):
+                pass
+
+        self.http = ThreadingHTTPServer(('127.0.0.1', 0), Handler)
+        self.address = f'http://127.0.0.1:{self.http.server_port}/weights/tiny.pth'
+
+
+@pytest.fixture
+def server(content, monkeypatch):
+    monkeypatch.setenv('no_proxy', '*')
+    server = Server()
+    server.body = content
+    thread = threading.Thread(target=server.http.serve_forever, kwargs={'poll_interval': 0.01})
+    thread.start()
+    monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address), raising=False)
+    yield server
+    server.http.shutdown()
+    thread.join()
+    server.http.server_close()
+
+
+def describe(**settings) -> Tiny:
+    backbone = Tiny(PublishedSettings(**settings))
+    maps = backbone.feature_maps([np.full((40, 50, 3), 99, np.uint8)])
+    assert maps.shape == (1, 2, 28, 28)
+    return backbone
+
+
+def test_the_cache_is_where_the_desktop_wants_it(monkeypatch, tmp_path):
+    monkeypatch.setenv('XDG_CACHE_HOME', '/somewhere')
+    assert str(cache_folder()) == '/somewhere/stavpr_ros'
+    monkeypatch.setenv('XDG_CACHE_HOME', '')
+    monkeypatch.setenv('HOME', str(tmp_path))
+    assert cache_folder() == tmp_path / '.cache' / 'stavpr_ros'
+
+
+def test_the_official_files():
+    from stavpr_ros.features.densenet import DenseNet161Places365
+    from stavpr_ros.features.vgg import VGG16Pool4
+
+    assert DenseNet161Places365.published.name == 'densenet161_places365.pth.tar'
+    assert VGG16Pool4.published.name == f'vgg16-{VGG16Pool4.published.sha256}.pth'
+
+
+def test_nothing_is_downloaded_unasked(server, cache):
+    with pytest.raises(UnavailableError, match=rf"{cache}/tiny\.pth.*'download'.*{server.address}"):
+        Tiny(PublishedSettings())
+    assert server.asked == 0
+    assert not cache.exists()
+
+
+def test_download_once_then_from_the_cache(server, cache, content, capsys):
+    first = describe(model='download')
+    digest = hashlib.sha256(content).hexdigest()
+    assert first.settings.sha256 == digest
+    assert first.settings.model == 'cached'  # what a map remembers must not download elsewhere
+    assert sorted(path.name for path in cache.iterdir()) == ['tiny.pth', 'tiny.pth.sha256']
+    assert (cache / 'tiny.pth.sha256').read_text() == f'{digest}  tiny.pth\n'
+    assert digest in (said := capsys.readouterr().err)
+    assert 'trusted now' in said
+    server.http.shutdown()
+    for model in ('download', 'cached', str(cache / 'tiny.pth')):
+        assert describe(model=model).settings == first.settings
+    assert server.asked == 1
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'status': 404}, 'HTTP Error 404'),
+        ({'announced': 10**6}, 'of 1000000 bytes came'),
+        ({'body': b''}, 'cannot be read as a file of weights'),
+    ],
+)
+def test_a_download_that_fails_leaves_nothing_half(server, cache, changes, message):
+    for name, value in changes.items():
+        setattr(server, name, value)
+    with pytest.raises(UnavailableError, match=message):
+        Tiny(PublishedSettings(model='download'))
+    left = {path.name for path in cache.iterdir()}
+    assert left == ({'tiny.pth', 'tiny.pth.sha256'} if 'body' in changes else set())
+
+
+def test_no_network(cache, monkeypatch):
+    with socket.socket() as free:
+        free.bind(('127.0.0.1', 0))
+        address = f'http://127.0.0.1:{free.getsockname()[1]}/tiny.pth'
+    monkeypatch.setenv('no_proxy', '*')
+    with pytest.raises(UnavailableError, match=rf'{address} cannot be downloaded.*give its path'):
+        download(address, cache / 'tiny.pth')
+    assert list(cache.iterdir()) == []
+
+
+def test_an_interrupted_download_leaves_nothing(server, cache, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr('stavpr_ros.features.weights._fetch', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        download(server.address, cache / 'tiny.pth')
+    assert list(cache.iterdir()) == []
+
+
+def test_a_cache_that_cannot_be_written(server, tmp_path, monkeypatch):
+    (tmp_path / 'file').touch()
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'file'))
+    with pytest.raises(UnavailableError, match='cannot be'):
+        Tiny(PublishedSettings(model='download'))
+
+
+def test_a_published_hash_is_held_against_the_download(server, cache, content, monkeypatch, capsys):
+    monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address, sha256='0123abcd'))
+    with pytest.raises(UnavailableError, match=r'expected 0123abcd: it was changed or damaged'):
+        Tiny(PublishedSettings(model='download'))
+    assert list(cache.iterdir()) == []
+    digest = hashlib.sha256(content).hexdigest()
+    monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address, sha256=digest[:8]))
+    describe(model='download')
+    assert 'as published' in capsys.readouterr().err
+
+
+def test_the_first_download_is_held_against_later_ones(server, cache, content):
+    """A file that was deleted and got again must be that of the first time, while the note is there."""
+    describe(model='download')
+    (cache / 'tiny.pth').unlink()
+    server.body = content + b'\x00'
+    with pytest.raises(UnavailableError, match='changed or damaged'):
+        Tiny(PublishedSettings(model='download'))
+    assert not (cache / 'tiny.pth').exists()
+    server.body = content
+    describe(model='download')
+
+
+def test_the_users_hash_is_held_against_the_download(server, cache, content):
+    with pytest.raises(UnavailableError, match='expected 0000'):
+        Tiny(PublishedSettings(model='download', sha256='0' * 64))
+    assert list(cache.iterdir()) == []
+    describe(model='download', sha256=hashlib.sha256(content).hexdigest())
+
+
+def test_a_file_that_changed_since_its_download_is_noticed(server, cache, content):
+    describe(model='download')
+    (cache / 'tiny.pth').write_bytes(content[:-1] + b'\x01')
+    with pytest.raises(UnavailableError, match='is damaged or another file; delete it'):
+        Tiny(PublishedSettings())
+
+
+def test_parameters_of_a_file_that_was_saved_in_training(server, tmp_path):
+    torch.save(dict(Tiny.whole_network().half().named_parameters()), tmp_path / 'a.pth')
+    with pytest.raises(UnavailableError, match=r"lacks '2\.running_mean' and 1 more"):
+        Tiny(PublishedSettings(model=str(tmp_path / 'a.pth')))
+    network = Tiny.whole_network().half()
+    torch.save(network.state_dict() | dict(network.named_parameters()), tmp_path / 'b.pth')
+    maps = describe(model=str(tmp_path / 'b.pth')).feature_maps([np.zeros((9, 9, 3), np.uint8)])
+    assert (maps.dtype, maps.requires_grad) == (torch.float32, False)
+
+
+def test_another_file_than_the_maps(server, tmp_path, content):
+    path = tmp_path / 'mine.pth'
+    path.write_bytes(content)
+    with pytest.raises(FeatureMismatchError, match='give the file that the map was built with'):
+        Tiny(PublishedSettings(model=str(path), sha256='0' * 64))
+
+
+def test_hashes_that_are_known(tmp_path):
+    published = PublishedFile('http://a/b/net-89abcdef.pth', sha256='89abcdef')
+    assert promised_hash(tmp_path / 'net-89abcdef.pth', published) == '89abcdef'
+    assert promised_hash(tmp_path / 'other.pth', published) == ''
+    (tmp_path / 'other.pth.sha256').write_text('ABCD  other.pth\n')
+    assert promised_hash(tmp_path / 'other.pth', published) == 'abcd'
+    (tmp_path / 'other.pth.sha256').write_bytes(b'\xff')
+    with pytest.raises(UnavailableError, match='sha256 cannot be read'):
+        promised_hash(tmp_path / 'other.pth')
+
+
+def read(tmp_path, content: bytes) -> dict[str, torch.Tensor]:
+    path = tmp_path / 'some.pth'
+    path.write_bytes(content)
+    with path.open('rb') as file:
+        return read_checkpoint(file, 'some.pth')
+
+
+WEIGHT = torch.arange(6.0).reshape(2, 3)
+
+
+@pytest.mark.parametrize(
+    'content',
+    [
+        saved({'a.weight': WEIGHT}),
+        saved({'a.weight': nn.Parameter(WEIGHT)}),
+        saved({'epoch': 3, 'state_dict': {'module.a.weight': WEIGHT}, 'best_prec1': torch.tensor(1.0)}),
+        OldPickle().file({'epoch': 90, 'arch': 'x', 'state_dict': {'module.a.weight': WEIGHT}, 'best': None}),
+    ],
+    ids=['plain', 'parameters', 'with entries', 'Python 2'],
+)
+def test_kinds_of_checkpoints(tmp_path, content):
+    parameters = read(tmp_path, content)
+    assert list(parameters) == ['a.weight']
+    assert torch.equal(parameters['a.weight'], WEIGHT)
+
+
+class Hostile:
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return (open, (self.path, 'w'))
+
+
+@pytest.mark.filterwarnings('ignore:Detected pickle protocol')
+def test_nothing_in_a_file_is_executed(tmp_path):
+    mark = tmp_path / 'executed'
+    old = OldPickle().file({'state_dict': Call(Global('posix', 'mkdir'), (str(mark),))})
+    for hostile in (saved({'a.weight': Hostile(str(mark))}), old, pickle.dumps(Hostile(str(mark)))):
+        with pytest.raises(UnavailableError, match=r'some\.pth cannot be read as a file of weights'):
+            read(tmp_path, hostile)
+        assert not mark.exists()
+    with pytest.raises(UnavailableError, match=r'asks for posix\.mkdir, .* not executed'):
+        read(tmp_path, old)
+
+
+@pytest.mark.filterwarnings('ignore::DeprecationWarning', 'ignore:.*looks like a TorchScript archive')
+def test_files_that_are_no_weights(tmp_path, content):
+    stream = io.BytesIO()
+    torch.jit.save(torch.jit.script(nn.ReLU()), stream)
+    old = OldPickle().file({'a.weight': WEIGHT})
+    for bad in (b'', b'no model', b'<!DOCTYPE html>', content[:-100], old[:-4], stream.getvalue()):
+        with pytest.raises(UnavailableError, match=r'some\.pth cannot be read as a file of weights: .'):
+            read(tmp_path, bad)
+    for bad, what in (({}, 'nothing'), ([1], 'a list'), ({'state_dict': 3}, "a int as 'state_dict'")):
+        with pytest.raises(UnavailableError, match=f'holds {what}'):
+            read(tmp_path, saved(bad))
+
+
+@pytest.mark.filterwarnings('ignore:Detected pickle protocol')
+def test_every_byte_counts(tmp_path, content):
+    """Damage anywhere is an error of ours, or harmless; never one of torch's or Python's."""
+    rng = np.random.default_rng(0)
+    for file in (content, OldPickle().file({'a.weight': WEIGHT})):
+        for _ in range(150):
+            damaged = bytearray(file)
+            damaged[rng.integers(len(file))] ^= 1 << rng.integers(8)
+            try:
+                read(tmp_path, bytes(damaged))
+            except UnavailableError as error:
+                assert 'some.pth' in str(error)  # noqa: PT017
+
+
+def test_a_folder_or_nothing_instead_of_a_file(tmp_path, server):
+    for path in (tmp_path, tmp_path / 'gone.pth'):
+        with pytest.raises(UnavailableError, match='cannot be read'):
+            Tiny(PublishedSettings(model=str(path)))
