@@ -20,11 +20,14 @@ class SpatialSettings:
     :param sigma: how strongly the viewpoint change raises a = sqrt(1 + sigma |I_c - c|); >= 0.
     :param xi: restricted alignment: strips i and j with |i - j| >= xi are never aligned;
         1 <= xi <= W, None = no restriction.
+    :param vertical: the distance of two strips is that of their cells, aligned from top to bottom in the same
+        way (the paper's remark on drones), instead of their cosine distance; ``adaptive``, ``vanilla``.
     """
 
     strategy: str = 'adaptive'
     sigma: float = 1.0
     xi: int | None = None
+    vertical: bool = False
 
     def __post_init__(self) -> None:
         if self.strategy not in STRATEGIES:
@@ -33,6 +36,11 @@ class SpatialSettings:
             raise SettingsError(f'sigma = {self.sigma} must be a finite number >= 0')
         if self.xi is not None and not (self.xi >= 1 and float(self.xi).is_integer()):
             raise SettingsError(f'xi = {self.xi} must be a whole number >= 1, or None for no restriction')
+
+        if self.vertical and self.strategy not in ('adaptive', 'vanilla'):
+            raise SettingsError(
+                f'strategy {self.strategy!r} has no vertical alignment: take adaptive or vanilla'
+            )
 
     def band(self, W: int) -> int:
         """Return the half width of the allowed band, xi or W; refuse xi > W."""

@@ -108,6 +108,9 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     )
     method.add_argument('--sigma', type=float, default=1.0, help='of the adaptive weight (%(default)g)')
     method.add_argument('--xi', type=int, help='restricted alignment of strips (none)')
+    method.add_argument(
+        '--vertical', action='store_true', help='align the cells of two strips from top to bottom first'
+    )
     method.add_argument('--backend', choices=('auto', 'cpu', 'cuda'), default='cpu', help='(%(default)s)')
     method.add_argument(
         '--precision', choices=('float32', 'float16'), default='float32', help='of the map (%(default)s)'
@@ -148,7 +151,7 @@ def recognition_settings(arguments: argparse.Namespace) -> 'RecognitionSettings'
 
     return RecognitionSettings(
         threshold=1.0,
-        spatial=SpatialSettings(arguments.spatial, arguments.sigma, arguments.xi),
+        spatial=SpatialSettings(arguments.spatial, arguments.sigma, arguments.xi, arguments.vertical),
         sequence=SequenceSettings(arguments.length, arguments.beta),
         mode=arguments.mode,
     )

@@ -206,6 +206,7 @@ def _warped(drives: Drives, kind: str) -> Drives:
             features.strips[:, indices].contiguous(),
             features.weights[:, indices].contiguous(),
             features.settings,
+            features.cells,
         ),
         projection=query.projection,
         stamps=query.stamps[indices],

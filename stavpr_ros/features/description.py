@@ -62,21 +62,24 @@ class LocalFeatures:
     :param strips: unit-norm features, shape (W, n, d), float32, a zero feature all zeros.
     :param weights: norm of each strip over the norm of its image's strips, shape (W, n), float32.
     :param settings: how they were made.
+    :param cells: rows H and columns of a strip's cells: strips are (channels, H, columns), flattened; None
+        where that is not known, or no more so (random projection).
     """
 
     strips: torch.Tensor
     weights: torch.Tensor
     settings: FeatureSettings
+    cells: tuple[int, int] | None = None
 
     def __len__(self) -> int:
         return self.strips.shape[1]
 
     def __getitem__(self, images: slice) -> 'LocalFeatures':
-        return LocalFeatures(self.strips[:, images], self.weights[:, images], self.settings)
+        return dataclasses.replace(self, strips=self.strips[:, images], weights=self.weights[:, images])
 
     def to(self, device: str | torch.device) -> 'LocalFeatures':
         """Return the features on a device."""
-        return LocalFeatures(self.strips.to(device), self.weights.to(device), self.settings)
+        return dataclasses.replace(self, strips=self.strips.to(device), weights=self.weights.to(device))
 
     def require_same_settings(self, other: FeatureSettings, where: str) -> None:
         """
@@ -97,6 +100,7 @@ class LocalFeatures:
             torch.cat([part.strips for part in parts], dim=1).contiguous(),
             torch.cat([part.weights for part in parts], dim=1).contiguous(),
             parts[0].settings,
+            parts[0].cells,
         )
 
 
@@ -168,11 +172,13 @@ class Describer:
         :returns: local features of shape (W, len(images), d).
         :raises ImageError: the features are not finite.
         """
-        strips = cut_strips(self._backbone.feature_maps(images), self.settings.strips)
+        maps = self._backbone.feature_maps(images)
+        strips = cut_strips(maps, self.settings.strips)
+        cells: tuple[int, int] | None = (maps.shape[2], maps.shape[3] // self.settings.strips)
         if not bool(torch.isfinite(strips).all()):
             raise ImageError(
                 'the features of an image are not finite: the network or its input is out of range'
             )
         if self._projection is not None:
-            strips = self._projection.apply(strips)
-        return LocalFeatures(*normalise(strips), self.settings)
+            strips, cells = self._projection.apply(strips), None
+        return LocalFeatures(*normalise(strips), self.settings, cells)

@@ -69,6 +69,7 @@ def save_map(place_map: PlaceMap, path: str | Path) -> None:
         'version': VERSION,
         'settings': place_map.settings.to_json(),
         'projection': place_map.projection.name if place_map.projection else None,
+        'cells': place_map.features.cells,
         'ids': place_map.ids,
         'members': {name: hashlib.sha256(content).hexdigest() for name, content in members.items()},
     }
@@ -173,6 +174,12 @@ def _assemble(manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> PlaceM
             raise ValueError(f'strips {strips.shape} and weights {weights.shape} for W = {settings.strips}')
         if not np.isfinite(strips).all() or not np.isfinite(weights).all():
             raise ValueError('features are not finite')
+        cells = manifest.get('cells')
+        if cells is not None:
+            rows, columns = (int(number) for number in cells)
+            if rows < 1 or columns < 1 or strips.shape[2] % (rows * columns):
+                raise ValueError(f'cells {cells} for strips of {strips.shape[2]} dimensions')
+            cells = rows, columns
         projection = None
         if manifest['projection'] is not None:
             projection = Projection(arrays['projection'], manifest['projection'])
@@ -181,7 +188,7 @@ def _assemble(manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> PlaceM
             content, ends = arrays['thumbnails'].tobytes(), arrays['thumbnail_ends'].tolist()
             pictures = tuple(content[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True))
         return PlaceMap(
-            features=LocalFeatures(torch.from_numpy(strips), torch.from_numpy(weights), settings),
+            features=LocalFeatures(torch.from_numpy(strips), torch.from_numpy(weights), settings, cells),
             projection=projection,
             stamps=arrays['stamps'],
             ids=tuple(str(identifier) for identifier in manifest['ids']),

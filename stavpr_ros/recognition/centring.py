@@ -1,5 +1,7 @@
 """Features without what all images of a drive share."""
 
+from dataclasses import replace
+
 import torch
 
 from stavpr_ros.features import LocalFeatures
@@ -24,7 +26,7 @@ class Centring:
 
     def places(self, features: LocalFeatures) -> LocalFeatures:
         """Features of the map, or of a query of which nothing else is known, less the map's mean."""
-        return LocalFeatures(without_mean(features.strips, self._mean), features.weights, features.settings)
+        return replace(features, strips=without_mean(features.strips, self._mean))
 
     def next_query(self, strips: torch.Tensor) -> torch.Tensor:
         """

@@ -14,6 +14,7 @@ from stavpr_ros.alignment.temporal import (
     match_padded,
     trace_sequence,
 )
+from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.window import DistanceWindow
 
@@ -36,6 +37,21 @@ def nearest_places(distances: np.ndarray, places: np.ndarray, count: int) -> tup
     return places[order].astype(np.int64), distances[order]
 
 
+def cut_cells(strips: torch.Tensor, cells: tuple[int, int]) -> torch.Tensor:
+    """
+    Cut strips into their cells, unit norm each; zero cells stay zero.
+
+    :param strips: shape (W, n, d); each is (channels, H, columns), flattened.
+    :param cells: H and columns.
+    :returns: shape (W H, n, channels * columns), strip by strip, each from the top.
+    """
+    W, n, d = strips.shape
+    H, columns = cells
+    cut = strips.reshape(W, n, d // (H * columns), H, columns).permute(0, 3, 1, 2, 4)
+    cut = cut.reshape(W * H, n, d // H)
+    return cut / cut.norm(dim=2, keepdim=True).clamp_(min=1e-12)
+
+
 class CpuMatcher:
     """
     See :class:`stavpr_ros.recognition.matcher.Matcher`.
@@ -51,12 +67,21 @@ class CpuMatcher:
         precision: str = 'float32',
     ) -> None:
         self._spatial, self._sequence = spatial, sequence
-        strips = features.strips.cpu().to(getattr(torch, precision)).contiguous()
+        self._cells = features.cells if spatial.vertical else None
+        strips = features.strips.cpu()
+        if spatial.vertical:
+            if features.cells is None:
+                raise InputError(
+                    'vertical alignment needs the cells of the strips: make the map anew, without projection'
+                )
+            strips = cut_cells(strips, features.cells)
+            self._cell_a = adaptive_weights(features.cells[0], spatial, np.dtype(np.float32))
+        strips = strips.to(getattr(torch, precision)).contiguous()
         if strips.data_ptr() % CACHE_LINE:
             strips = strips.clone()
         self._map = (strips if precision == 'float32' else strips.view(torch.int16)).numpy()
         self._weights = features.weights.cpu()
-        W = len(self._map)
+        W = len(features.strips)
         self._band = spatial.band(W)
         self._matches = SequenceDistances(np.empty(0, np.float32), np.empty(0, np.int32))
         self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
@@ -84,9 +109,11 @@ class CpuMatcher:
 
     def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Distances of Q images to every place, (Q, n)."""
-        queries = tiled(strips)
+        queries = tiled(strips if self._cells is None else cut_cells(strips.cpu(), self._cells))
         out = np.empty((len(queries), self.places), np.float32)
-        if self._spatial.strategy in ('adaptive', 'vanilla'):
+        if self._cells is not None:
+            products.vertical_image_distances(self._map, queries, self._cell_a, self._a, self._band, out)
+        elif self._spatial.strategy in ('adaptive', 'vanilla'):
             products.image_distances(self._map, queries, self._a, self._band, out)
         else:
             for x, query in enumerate(queries):

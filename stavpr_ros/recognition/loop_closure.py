@@ -37,9 +37,10 @@ class LoopCloser:
     ) -> None:
         if exclude < 1:
             raise SettingsError(f'exclude = {exclude} must be at least 1 image')
-        if settings.spatial.strategy not in ('adaptive', 'vanilla'):
+        if settings.spatial.strategy not in ('adaptive', 'vanilla') or settings.spatial.vertical:
             raise SettingsError(
-                f'strategy {settings.spatial.strategy!r} does not do here: take adaptive or vanilla'
+                f'strategy {settings.spatial.strategy!r}, vertical {settings.spatial.vertical}: '
+                'take adaptive or vanilla, without vertical alignment'
             )
         W = feature_settings.strips
         self._settings, self._exclude, self._feature_settings = settings, exclude, feature_settings

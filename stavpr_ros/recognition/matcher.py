@@ -82,12 +82,15 @@ def make_matcher(
     :param precision: how the features are kept: ``float32``, or ``float16``, which takes half the memory
         and half the time to read it; sums are float32 in both. The query's features are rounded as well
         on ``cuda``.
-    :raises SettingsError: no such precision, or settings that do not fit the map (xi > W).
+    :raises SettingsError: no such precision, or settings that do not fit the map (xi > W) or the backend.
+    :raises InputError: vertical alignment of features whose cells are not known.
     :raises UnavailableError: the backend is not there.
     """
     if precision not in PRECISIONS:
         raise SettingsError(f'precision {precision!r} is unknown: take one of {", ".join(PRECISIONS)}')
     spatial.band(features.settings.strips)
+    if backend == 'cuda' and spatial.vertical:
+        raise SettingsError("vertical alignment is not there on backend 'cuda': take 'cpu'")
     if backend == 'cuda':
         from stavpr_ros.recognition.cuda_matcher import CudaMatcher
 

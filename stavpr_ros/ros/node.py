@@ -38,7 +38,9 @@ class PlaceRecognitionNode(Node):
         self.get_logger().info(f'backend {backend} ({reason or "there is a device"})')
         self._engine = Engine(
             EngineOptions(
-                spatial=SpatialSettings(values['strategy'], values['sigma'], values['xi'] or None),
+                spatial=SpatialSettings(
+                    values['strategy'], values['sigma'], values['xi'] or None, values['vertical']
+                ),
                 sequence=SequenceSettings(values['sequence_length'], values['beta']),
                 neighbourhood=values['neighbourhood'],
                 mode=values['mode'],

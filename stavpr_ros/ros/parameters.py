@@ -105,6 +105,12 @@ PARAMETERS = (
         'Restricted alignment: strips this far apart are never aligned; 0 = no restriction.',
         bounds=(0, 1000),
     ),
+    NodeParameter(
+        'vertical',
+        False,
+        '',
+        'Align the cells of two strips from top to bottom first, for cameras that rise and sink; slow.',
+    ),
     NodeParameter('sequence_length', 20, 'images', 'Images in the query window, l.', bounds=(2, 1000)),
     NodeParameter(
         'beta',

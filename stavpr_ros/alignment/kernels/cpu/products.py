@@ -19,6 +19,7 @@ from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
 
 TILE = 7  # query strips whose sums stay in registers: all of them, with the paper's W
 IMAGES = 256  # map images a thread takes at a time; a multiple of LANES
+FEW_IMAGES = 64  # likewise, where the distances of all cells are kept
 
 
 @intrinsic
@@ -109,4 +110,42 @@ def image_distances(features, queries, weights, xi, out):
             _block_distances(features, queries[x], first, count, d, sums)
             for at in range(0, count, LANES):
                 store(lanes, at, align_lanes(d.reshape(-1), at, W * IMAGES, IMAGES, weights, xi, edge))
+            out[x, first : first + count] = lanes[:count]
+
+
+@parallel_kernel
+def vertical_image_distances(features, queries, cell_weights, weights, xi, out):
+    """
+    Image distances where the distance of two strips is that of their cells, aligned from top to bottom.
+
+    :param features: unit-norm cells of the map, shape (W H, n, c), strip by strip, each from the top;
+        float32 or the bits of float16.
+    :param queries: those of Q images, shape (Q, R, c), float32; R is W H rounded up to whole TILEs.
+    :param cell_weights: a for each |I_c - c| of the H cells, shape (H,).
+    :param weights, xi: of the W strips, as in :func:`image_distances`.
+    :param out: shape (Q, n), written.
+    """
+    rows, n, _ = features.shape
+    H, W = cell_weights.shape[0], weights.shape[0]
+    for block in nb.prange((n + FEW_IMAGES - 1) // FEW_IMAGES):
+        first = block * FEW_IMAGES
+        count = min(FEW_IMAGES, n - first)
+        d = np.empty((queries.shape[1], rows, FEW_IMAGES), np.float32)
+        strips = np.empty((W, W, FEW_IMAGES), np.float32)
+        sums = np.empty(TILE, np.float32)
+        edge = np.empty((max(W, H) + 1) * SLOT, np.float32)
+        lanes = np.empty(FEW_IMAGES, np.float32)
+        cells, flat = d.reshape(-1), strips.reshape(-1)
+        for x in range(queries.shape[0]):
+            _block_distances(features, queries[x], first, count, d, sums)
+            for at in range(0, count, LANES):
+                for i in range(W):
+                    for j in range(max(0, i - xi + 1), min(W, i + xi)):
+                        corner = (i * H * rows + j * H) * FEW_IMAGES + at
+                        distance = align_lanes(
+                            cells, corner, rows * FEW_IMAGES, FEW_IMAGES, cell_weights, H, edge
+                        )
+                        store(flat, (i * W + j) * FEW_IMAGES + at, distance)
+                aligned = align_lanes(flat, at, W * FEW_IMAGES, FEW_IMAGES, weights, xi, edge)
+                store(lanes, at, aligned)
             out[x, first : first + count] = lanes[:count]

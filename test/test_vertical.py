@@ -1,0 +1,101 @@
+"""Vertical alignment, for cameras that rise and sink: cells of strips first, then strips."""
+
+import numpy as np
+import oracle
+import pytest
+import torch
+
+from stavpr_ros.alignment import SequenceSettings, SpatialSettings
+from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.features import Describer, FeatureSettings, LocalFeatures
+from stavpr_ros.features.gradient import GradientSettings
+from stavpr_ros.mapping import build_map, load_map, save_map
+from stavpr_ros.recognition import Recogniser, RecognitionSettings
+from stavpr_ros.recognition.cpu_matcher import CpuMatcher, cut_cells
+from stavpr_ros.recognition.matcher import make_matcher
+from stavpr_ros.sources import open_source
+from stavpr_ros.sources.frame import Frame
+
+SETTINGS = FeatureSettings('gradient', GradientSettings(), 5)
+
+
+def random_features(n, H=4, channels=3, columns=2, W=5, seed=0):
+    rng = np.random.default_rng(seed)
+    strips = rng.random((W, n, channels * H * columns))
+    strips[1, 0].reshape(channels, H, columns)[:, 2] = 0  # one cell of one strip is empty
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+    return LocalFeatures(torch.from_numpy(strips).float(), torch.ones(W, n), SETTINGS, (H, columns))
+
+
+def test_cells_are_those_of_the_feature_map():
+    features = random_features(3)
+    cells = cut_cells(features.strips, (4, 2))
+    assert cells.shape == (20, 3, 6)
+    for strip in range(5):
+        for image in range(3):
+            cube = features.strips[strip, image].numpy().reshape(3, 4, 2)
+            for row in range(4):
+                cell = cube[:, row].reshape(-1)
+                expected = cell / max(np.linalg.norm(cell), 1e-12)
+                np.testing.assert_allclose(cells[strip * 4 + row, image], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize('n', [1, 15, 64, 65, 130])
+@pytest.mark.parametrize(('strategy', 'xi'), [('adaptive', None), ('adaptive', 2), ('vanilla', None)])
+def test_against_the_oracle(n, strategy, xi):
+    """Cell by cell as the method says: the inner alignment has its own central cell and no band."""
+    reference, query = random_features(n), random_features(2, seed=1)
+    spatial = SpatialSettings(strategy, 1.0, xi, vertical=True)
+    matcher = CpuMatcher(reference, spatial, SequenceSettings())
+    found = matcher.distance_matrix(query.strips, query.weights).numpy()
+    x = cut_cells(query.strips, (4, 2)).double().numpy()
+    y = cut_cells(reference.strips, (4, 2)).double().numpy()
+    for image in sorted({0, n // 2, n - 1}):
+        d = np.empty((5, 5))
+        for i in range(5):
+            for j in range(5):
+                cells = 1 - x[4 * i : 4 * i + 4, 1] @ y[4 * j : 4 * j + 4, image].T
+                d[i, j] = oracle.align_images(cells, strategy).distance
+        expected = oracle.align_images(d, strategy, xi=xi).distance
+        assert found[1, image] == pytest.approx(expected, abs=2e-6)
+    np.testing.assert_array_equal(matcher.distances(query.strips[:, 1], query.weights[:, 1]), found[1])
+
+
+def test_a_map_remembers_its_cells(route, tmp_path):
+    place_map = build_map(
+        [Frame(image, i, '') for i, image in enumerate(route[:8])], Describer(), progress=False
+    )
+    assert place_map.features.cells == (14, 2)
+    save_map(place_map, tmp_path / 'map')
+    loaded = load_map(tmp_path / 'map')
+    assert loaded.features.cells == (14, 2)
+    assert loaded.features[2:5].cells == (14, 2)
+    spatial = SpatialSettings(vertical=True)
+    distances = Recogniser(loaded, RecognitionSettings(1.0, spatial)).distances(loaded.features)
+    np.testing.assert_allclose(np.diag(distances), 0, atol=1e-5)
+
+
+def test_what_is_refused(small_map):
+    spatial = SpatialSettings(vertical=True)
+    with pytest.raises(InputError, match='without projection'):
+        Recogniser(small_map, RecognitionSettings(1.0, spatial))
+    with pytest.raises(SettingsError, match='vertical'):
+        SpatialSettings('none', vertical=True)
+    with pytest.raises(SettingsError, match='cuda'):
+        make_matcher(random_features(3), spatial, SequenceSettings(), 'cuda', 'float32')
+
+
+def test_a_drone_that_flies_higher(data_folder):
+    """Nearest images of one drive, seen from higher up: a third of every query image cut off."""
+    frames = list(open_source(data_folder / 'gardens_point' / 'day_left'))[::2]
+    describer = Describer()
+    place_map = build_map(frames, describer, progress=False)
+    higher = describer.describe([np.ascontiguousarray(f.image[: -f.image.shape[0] // 3]) for f in frames])
+    lower = describer.describe([np.ascontiguousarray(f.image[f.image.shape[0] // 3 :]) for f in frames])
+    right = {}
+    for vertical in (False, True):
+        recogniser = Recogniser(place_map, RecognitionSettings(1.0, SpatialSettings(vertical=vertical)))
+        found = [recogniser.distances(query).argmin(axis=1) for query in (higher, lower)]
+        right[vertical] = np.mean([np.abs(places - np.arange(len(frames))) <= 1 for places in found])
+    print(f'shifted up and down: right {right[False]:.3f} without, {right[True]:.3f} with vertical alignment')
+    assert right[True] > right[False] + 0.05
