@@ -152,7 +152,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'map.stavpr'
         make_map(path, arguments.places, arguments.height, arguments.width)
-        command = [executable('node'), '--ros-args', '-p', f'map_path:={path}', '-p', 'threshold:=0.2']
+        command = [executable('node'), '--ros-args', '-p', f'map_path:={path}', '-p', 'threshold:=1.0']
         node = subprocess.Popen(command, env=environment)
         try:
             figures = soak(arguments, node.pid)
