@@ -261,6 +261,9 @@ def test_what_a_loop_closer_refuses(laps, small_map):
         LoopCloser(settings, 0, laps.settings)
     with pytest.raises(SettingsError, match='none'):
         LoopCloser(RecognitionSettings(1.0, SpatialSettings('none')), 30, laps.settings)
+    alone = RecognitionSettings(1.0, mode='robust', cures=ROBUST.without('row_normalisation'))
+    with pytest.raises(SettingsError, match='take both or neither'):
+        LoopCloser(alone, 30, laps.settings)
     with pytest.raises(InputError, match='2 images'):
         closer.add(laps[:2])
     with pytest.raises(FeatureMismatchError):

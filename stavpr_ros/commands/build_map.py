@@ -1,7 +1,6 @@
 """``ros2 run stavpr_ros build_map``: make a reference map from a folder of images or a bag."""
 
 import argparse
-import csv
 import sys
 from itertools import islice
 from pathlib import Path
@@ -12,8 +11,6 @@ from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from stavpr_ros.mapping import PlaceMap
 
 EPILOG = """
@@ -56,26 +53,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _read_poses(path: str) -> 'np.ndarray':
-    import numpy as np
-
-    try:
-        with open(path, newline='') as file:
-            rows = [[float(value) for value in row] for row in csv.reader(file) if row and row[0][0] != '#']
-    except (OSError, ValueError) as error:
-        raise SourceError(f'poses {path} cannot be read: {error}') from error
-    if {len(row) for row in rows} not in ({3}, {7}):
-        raise SourceError(f'poses {path}: expected 3 or 7 numbers on every line')
-    poses = np.array(rows)
-    if not np.isfinite(poses).all():
-        raise SourceError(f'poses {path}: expected finite numbers')
-    if poses.shape[1] == 3:
-        poses = np.hstack([poses, np.tile([0.0, 0.0, 0.0, 1.0], (len(poses), 1))])
-    return poses
-
-
 def _build(arguments: argparse.Namespace) -> 'PlaceMap':
     from stavpr_ros.commands.feature_options import make_describer
+    from stavpr_ros.evaluation.truth_files import read_poses
     from stavpr_ros.mapping import build_map, save_map
     from stavpr_ros.sources import open_source
 
@@ -96,7 +76,7 @@ def _build(arguments: argparse.Namespace) -> 'PlaceMap':
     frames = source if arguments.every == 1 else islice(source, 0, None, arguments.every)
     poses = None
     if arguments.poses:
-        poses = _read_poses(arguments.poses)
+        poses, _ = read_poses(Path(arguments.poses))
         if len(poses) != len(source):
             raise SourceError(
                 f'poses {arguments.poses} has {len(poses)} lines for {len(source)} images: give one each'

@@ -61,6 +61,8 @@ def read_poses(path: Path) -> tuple[np.ndarray, bool]:
     if {len(row) for row in rows} not in ({3}, {7}):
         raise SourceError(f'poses {path}: expected 3 or 7 numbers on every line')
     poses = np.array(rows)
+    if not np.isfinite(poses).all():
+        raise SourceError(f'poses {path}: expected finite numbers')
     oriented = poses.shape[1] == 7
     if not oriented:
         poses = np.hstack([poses, np.tile([0.0, 0.0, 0.0, 1.0], (len(poses), 1))])

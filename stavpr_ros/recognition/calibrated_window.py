@@ -1,6 +1,7 @@
 """The window of mode robust: rows of distances, calibrated when they are matched."""
 
 import numpy as np
+import torch
 
 from stavpr_ros.alignment.settings import SequenceSettings, SpeedSettings
 from stavpr_ros.alignment.speeds import best_speed_match, match_speeds, trace_speed
@@ -45,15 +46,15 @@ class CalibratedWindow:
         self._places = places
         self._window = self._window.widened(places)
 
-    def push(self, row: np.ndarray) -> None:
+    def push(self, row: torch.Tensor) -> None:
         """
         Take in the distances of the newest image.
 
         :param row: shape (m,), float32, of the first m <= n places; the others may not be matched with it.
         """
-        row = self.calibration.normalised(row)
-        self.calibration.observe(row)
-        self._window.push(row)
+        normalised = self.calibration.normalised(row.cpu().numpy())
+        self.calibration.observe(normalised)
+        self._window.push(normalised)
 
     def newest_row(self) -> np.ndarray:
         """Return the newest row as it is matched, shape (n,), float32; lower is nearer."""

@@ -42,6 +42,12 @@ class LoopCloser:
                 f'strategy {settings.spatial.strategy!r}, vertical {settings.spatial.vertical}: '
                 'take adaptive or vanilla, without vertical alignment'
             )
+        cures = settings.applied_cures
+        if cures.place_calibration and not cures.row_normalisation:
+            raise SettingsError(
+                'place_calibration without row_normalisation: a new place starts at mean 0 and deviation 1, '
+                'which says nothing of distances as they are; take both or neither'
+            )
         W = feature_settings.strips
         self._settings, self._exclude, self._feature_settings = settings, exclude, feature_settings
         self._band = settings.spatial.band(W)
@@ -75,7 +81,7 @@ class LoopCloser:
             raise InputError(f'features of {len(features)} images came: expected those of one')
         require_finite(features, 'the image')
         self._keep(features.strips.cpu())
-        self._window.push(self._distances())
+        self._window.push(torch.from_numpy(self._distances()))
         return answer(self._window, self._settings, self._track)
 
     def newest_row(self) -> np.ndarray:

@@ -215,12 +215,8 @@ class Recogniser:
         strips = features.strips[:, 0]
         if self._centring is not None:
             strips = self._centring.next_query(strips)
-        row = self._matcher.distances(strips, features.weights[:, 0])
-        if isinstance(self._window, CalibratedWindow):
-            self._window.push(row.cpu().numpy())
-        else:
-            self._newest_row = row
-            self._matcher.push(row)
+        self._newest_row = self._matcher.distances(strips, features.weights[:, 0])
+        self._window.push(self._newest_row)
         return answer(self._window, self._settings, self._track)
 
     def newest_row(self) -> np.ndarray:
@@ -248,6 +244,8 @@ class Window(Protocol):
     def __len__(self) -> int: ...
 
     def reset(self) -> None: ...
+
+    def push(self, row: torch.Tensor) -> None: ...
 
     def match(self, neighbourhood: int) -> tuple[SequenceMatch | None, np.ndarray]: ...
 
