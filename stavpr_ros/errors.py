@@ -22,7 +22,18 @@ class UnavailableError(StavprError):
 
 
 class ImageError(StavprError):
-    """One image cannot be decoded; the next one may be fine."""
+    """
+    One image cannot be decoded; the next one may be fine.
+
+    :param text: what came, what was expected and what to do.
+    :param kind: what is wrong in a word or two, to count by and to explain each kind only once: ``encoding``
+        (not read), ``depth`` (no picture at all), ``size``, ``step``, ``cut off``, ``damaged``,
+        ``too large``, ``unreadable`` (a file), ``features`` (not finite), or just ``image``.
+    """
+
+    def __init__(self, text: str, *, kind: str = 'image') -> None:
+        super().__init__(text)
+        self.kind = kind
 
 
 class SourceError(StavprError):

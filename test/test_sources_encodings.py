@@ -1,52 +1,26 @@
-"""Image messages and files to RGB: hand-made pixels, lying headers, garbage."""
+"""Raw image messages to RGB: hand-made pixels of every encoding, lying headers, garbage."""
 
 import array
-from unittest import mock
+import copy
+import pickle
+from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
+from raw_images import BAYER, CHANNELS, PAIRS, YUV, message
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_typestore
 
 from stavpr_ros.errors import ImageError
-from stavpr_ros.sources import encodings
-from stavpr_ros.sources.encodings import ENCODINGS, decode_compressed, decode_image
-
-# channel of the message at which red, green and blue lie
-CHANNELS = {
-    'rgb8': (0, 1, 2),
-    'bgr8': (2, 1, 0),
-    'rgba8': (0, 1, 2),
-    'bgra8': (2, 1, 0),
-    'mono8': (0, 0, 0),
-    'mono16': (0, 0, 0),
-    'rgb16': (0, 1, 2),
-    'bgr16': (2, 1, 0),
-    'rgba16': (0, 1, 2),
-    'bgra16': (2, 1, 0),
-    '8UC1': (0, 0, 0),
-    '8UC3': (2, 1, 0),
-    '8UC4': (2, 1, 0),
-}
-
-
-def message(encoding, height, width, big=False, padding=0):
-    """Random pixels as a message's (step, bytes), and the RGB that must come out."""
-    channels = max(4 if 'a' in encoding or encoding.endswith('4') else 0, max(CHANNELS[encoding]) + 1)
-    deep = encoding.endswith('16')
-    dtype = np.dtype(np.uint16 if deep else np.uint8).newbyteorder('>' if big else '<')
-    values = (
-        np.random.default_rng(1).integers(0, np.iinfo(dtype).max + 1, (height, width, channels)).astype(dtype)
-    )
-    expected = (values >> 8 if deep else values)[..., CHANNELS[encoding]].astype(np.uint8)
-    rows = values.reshape(height, -1).view(np.uint8)
-    padded = np.hstack([rows, np.full((height, padding), 99, np.uint8)])
-    return padded.shape[1], padded.tobytes(), expected
+from stavpr_ros.sources import files, open_source
+from stavpr_ros.sources.bag import RAW
+from stavpr_ros.sources.encodings import ENCODINGS, decode_image, decode_message
 
 
 def test_every_encoding_is_tested():
-    assert CHANNELS.keys() == ENCODINGS.keys()
+    assert {*CHANNELS, *BAYER, *YUV} == ENCODINGS.keys()
 
 
 @pytest.mark.parametrize('encoding', sorted(CHANNELS))
@@ -74,11 +48,18 @@ def test_pixels(encoding, big, height, width, padding):
         lambda b: np.repeat(np.frombuffer(b, np.uint8), 2)[::2],
     ],
 )
-def test_any_buffer_and_no_sharing(kind):
+def test_any_buffer(kind):
     step, data, expected = message('rgb8', 4, 5, padding=2)
-    image = decode_image(4, 5, 'rgb8', False, step, kind(data))
-    np.testing.assert_array_equal(image, expected)
-    assert image.base is None
+    np.testing.assert_array_equal(decode_image(4, 5, 'rgb8', False, step, kind(data)), expected)
+
+
+@pytest.mark.parametrize('encoding', sorted(ENCODINGS))
+def test_no_sharing(encoding):
+    data = np.random.default_rng(0).integers(0, 256, 600, np.uint8)
+    image = decode_image(4, 6, encoding, False, 48, data[:])
+    before = image.copy()
+    data[:] = 255 - data
+    np.testing.assert_array_equal(image, before)
 
 
 def test_the_last_rows_padding_may_be_missing():
@@ -89,20 +70,38 @@ def test_the_last_rows_padding_may_be_missing():
 
 
 @pytest.mark.parametrize(
-    ('change', 'text'),
+    ('change', 'kind', 'text'),
     [
-        ({'height': 0}, 'expected at least 1x1'),
-        ({'width': 0}, 'expected at least 1x1'),
-        ({'step': 11}, 'step of 11 bytes is too small'),
-        ({'data': b''}, '0 bytes of data'),
-        ({'height': 2**32 - 1}, 'cut off'),
-        ({'encoding': '16UC1'}, 'depth'),
-        ({'encoding': '32FC1'}, 'depth'),
-        ({'encoding': 'bayer_rggb9'}, "'bayer_rggb9' is not read: expected one of rgb8"),
-        ({'encoding': ''}, 'is not read'),
+        ({'height': 0}, 'size', 'expected at least 1x1'),
+        ({'width': 0}, 'size', 'expected at least 1x1'),
+        ({'step': 11}, 'step', 'step of 11 bytes is too small'),
+        ({'step': 0}, 'step', 'step of 0 bytes is too small'),
+        ({'data': b''}, 'cut off', '0 bytes of data'),
+        ({'height': 2**32 - 1}, 'cut off', 'cut off'),
+        ({'height': 2**32 - 1, 'width': 2**32 - 1, 'step': 2**34}, 'cut off', 'cut off'),
+        ({'step': 2**32 - 1}, 'cut off', 'cut off'),
+        ({'encoding': 'rgb16', 'step': 23}, 'step', 'expected 24'),
+        ({'encoding': 'rgb16', 'step': 24}, 'cut off', 'expected 72'),
+        (
+            {'encoding': 'uyvy', 'width': 3},
+            'size',
+            r'3x3 .*multiple of 2 and a height that is a multiple of 1',
+        ),
+        ({'encoding': 'yuyv', 'step': 7}, 'step', 'expected 8'),
+        ({'encoding': 'nv12'}, 'size', r'4x3 pixels: .*multiple of 2 and a height that is a multiple of 2'),
+        ({'encoding': 'nv21', 'height': 2, 'width': 3}, 'size', '3x2 pixels'),
+        ({'encoding': 'nv12', 'height': 4, 'step': 4, 'data': bytes(23)}, 'cut off', 'expected 24'),
+        ({'encoding': 'nv21', 'height': 4, 'step': 9, 'data': bytes(48)}, 'cut off', 'expected 49'),
+        ({'encoding': 'nv24', 'height': 2, 'step': 4, 'data': bytes(23)}, 'cut off', 'expected 24'),
+        ({'encoding': 'bayer_rggb16', 'step': 7}, 'step', 'expected 8'),
+        ({'encoding': '32FC1'}, 'depth', 'depth'),
+        ({'encoding': '32FC1x'}, 'encoding', "'32FC1x' is not read"),
+        ({'encoding': '8UC2'}, 'encoding', "'8UC2' is not read"),
+        ({'encoding': 'bayer_rggb9'}, 'encoding', "'bayer_rggb9' is not read: expected one of rgb8"),
+        ({'encoding': ''}, 'encoding', 'is not read'),
     ],
 )
-def test_lying_headers(change, text):
+def test_lying_headers(change, kind, text):
     fields = {
         'height': 3,
         'width': 4,
@@ -111,85 +110,112 @@ def test_lying_headers(change, text):
         'step': 12,
         'data': bytes(36),
     }
-    with pytest.raises(ImageError, match=text):
+    with pytest.raises(ImageError, match=text) as caught:
         decode_image(**(fields | change))
+    assert caught.value.kind == kind
+
+
+@pytest.mark.parametrize(
+    'encoding',
+    [f'{kind}C{n}' for kind in ('8S', '16S', '32S', '32F', '64F') for n in (1, 2, 3, 4)] + ['32FC', '32FC12'],
+)
+def test_measurements_are_refused(encoding):
+    with pytest.raises(ImageError, match=f'{encoding!r} holds depth or measurements') as caught:
+        decode_image(1, 1, encoding, False, 8, bytes(64))
+    assert caught.value.kind == 'depth'
+
+
+def test_an_image_too_large_is_refused(monkeypatch):
+    monkeypatch.setattr(files, 'MAX_PIXELS', 12)
+    assert decode_image(3, 4, 'mono8', False, 4, bytes(12)).shape == (3, 4, 3)
+    with pytest.raises(ImageError, match='13x1 pixels: expected at most 12') as caught:
+        decode_image(1, 13, 'mono8', False, 13, bytes(13))
+    assert caught.value.kind == 'too large'
+
+
+def test_messages_of_either_kind():
+    step, data, expected = message('mono16', 4, 5, big=True, padding=1)
+    raw = SimpleNamespace(height=4, width=5, encoding='mono16', is_bigendian=1, step=step, data=data)
+    np.testing.assert_array_equal(decode_message(raw), expected)
+    pgm = SimpleNamespace(format='pgm', data=b'P5 5 4 255 ' + expected[..., 0].tobytes())
+    np.testing.assert_array_equal(decode_message(pgm), expected)
+
+
+def test_a_bags_errors_keep_their_kind(tmp_path):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / 'bag', version=9) as writer:
+        topic = writer.add_connection('/image', RAW, typestore=store)
+        for i, (encoding, step) in enumerate([('rgb8', 5), ('nv12', 2)]):
+            stamp = store.types['builtin_interfaces/msg/Time'](sec=i, nanosec=0)
+            header = store.types['std_msgs/msg/Header'](stamp=stamp, frame_id='')
+            sent = store.types[RAW](header, 2, 2, encoding, 0, step, np.full(6, 128, np.uint8))
+            writer.write(topic, i, store.serialize_cdr(sent, RAW))
+        writer.write(topic, 2, b'no message')
+    errors = []
+    (frame,) = open_source(tmp_path / 'bag', on_error=errors.append)
+    np.testing.assert_array_equal(frame.image, np.full((2, 2, 3), 130))
+    assert [error.kind for error in errors] == ['step', 'damaged']
+
+
+def test_errors_have_a_kind():
+    assert ImageError('text').kind == 'image'
+    error = ImageError('text', kind='step')
+    for same in (error, copy.copy(error), pickle.loads(pickle.dumps(error))):
+        assert (str(same), same.kind) == ('text', 'step')
+
+
+def check(image, height, width, data):
+    assert (image.shape, image.dtype) == ((height, width, 3), np.uint8)
+    assert image.flags.c_contiguous
+    assert not np.shares_memory(image, np.frombuffer(data, np.uint8))
 
 
 @given(
     height=st.integers(0, 9) | st.integers(0, 2**32 - 1),
     width=st.integers(0, 9) | st.integers(0, 2**32 - 1),
-    encoding=st.sampled_from([*ENCODINGS, '32FC1', 'yuv422']) | st.text(max_size=6),
+    encoding=st.sampled_from([*ENCODINGS, '32FC1', '8UC2']) | st.text(max_size=12),
     big=st.booleans(),
     step=st.integers(0, 80) | st.integers(0, 2**32 - 1),
     data=st.binary(max_size=700),
 )
+@example(1, 2, 'mono8', False, 2**32 - 1, b'ab')
+@example(1, 2, 'bgr16', True, 2**32 - 1, bytes(12))
 def test_random_messages_decode_or_say_why(height, width, encoding, big, step, data):
     try:
         image = decode_image(height, width, encoding, big, step, data)
-    except ImageError:
-        return  # the one error that is allowed
-    assert (image.shape, image.dtype) == ((height, width, 3), np.uint8)
+    except ImageError as error:
+        image, kind = None, error.kind
+    if image is None:
+        assert kind in {'encoding', 'depth', 'size', 'step', 'cut off'}
+    else:
+        check(image, height, width, data)
 
 
-def encoded(suffix, image):
-    return cv2.imencode(suffix, image)[1].tobytes()
-
-
-@pytest.mark.parametrize('suffix', ['.png', '.bmp', '.tiff', '.ppm', '.webp'])
-def test_lossless_files(suffix):
-    rgb = np.random.default_rng(0).integers(0, 256, (11, 13, 3), np.uint8)
-    quality = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == '.webp' else []
-    data = cv2.imencode(suffix, rgb[..., ::-1].copy(), quality)[1]
-    image = decode_compressed(data)
-    np.testing.assert_array_equal(image, rgb)
-    assert image.flags.c_contiguous
-
-
-def test_jpeg_is_near():
-    rgb = np.full((16, 24, 3), (200, 100, 30), np.uint8)
-    assert np.abs(decode_compressed(encoded('.jpg', rgb[..., ::-1].copy())).astype(int) - rgb).max() <= 4
-
-
-@pytest.mark.parametrize('suffix', ['.png', '.pgm', '.tiff'])
-def test_sixteen_bits_lose_the_lower_byte(suffix):
-    grey = (np.arange(12, dtype=np.uint16) * 5000).reshape(3, 4)
-    np.testing.assert_array_equal(decode_compressed(encoded(suffix, grey)), np.dstack([grey >> 8] * 3))
-
-
-def test_transparency_is_dropped():
-    bgra = np.random.default_rng(0).integers(0, 256, (5, 6, 4), np.uint8)
-    np.testing.assert_array_equal(decode_compressed(encoded('.png', bgra)), bgra[..., 2::-1])
-
-
-def test_a_bomb_is_refused_before_it_is_decoded(monkeypatch):
-    data = encoded('.png', np.zeros((100, 101), np.uint8))
-    monkeypatch.setattr(encodings, 'MAX_PIXELS', 10_000)
-    monkeypatch.setattr(encodings.cv2, 'imdecode', lambda *_: pytest.fail('decoded'))
-    with pytest.raises(ImageError, match='101x100 pixels: expected at most 10000'):
-        decode_compressed(data)
-
-
-@pytest.mark.filterwarnings('ignore::UserWarning')  # Pillow's, on the way to the error
-@given(st.data())
-def test_damaged_files_decode_or_say_why(data):
-    suffix = data.draw(st.sampled_from(['.jpg', '.png', '.bmp', '.tiff', '.pgm', '.webp']))
-    file = bytearray(encoded(suffix, np.arange(96, dtype=np.uint8).reshape(8, 12)))
-    for _ in range(data.draw(st.integers(1, 8))):
-        file[data.draw(st.integers(0, len(file) - 1))] = data.draw(st.integers(0, 255))
-    del file[data.draw(st.integers(0, len(file))) :]
-    try:
-        # a damaged header may promise as many pixels as are allowed: a lower limit keeps this test short
-        with mock.patch.object(encodings, 'MAX_PIXELS', 10**6):
-            image = decode_compressed(bytes(file))
-    except ImageError:
-        return  # the one error that is allowed
-    assert image.ndim == 3
-    assert image.dtype == np.uint8
-
-
-@pytest.mark.parametrize(
-    'data', [b'', b'\xff', b'no image at all', b'\x89PNG\r\n\x1a\n', b'\xff\xd8\xff\xe0']
+@given(
+    encoding=st.sampled_from(sorted(ENCODINGS)),
+    height=st.integers(1, 7),
+    width=st.integers(1, 9),
+    big=st.booleans(),
+    padding=st.integers(-1, 5),
+    missing=st.integers(-3, 1),
 )
-def test_no_image(data):
-    with pytest.raises(ImageError, match=f'{len(data)} bytes are no image'):
-        decode_compressed(data)
+def test_only_what_must_be_refused_is_refused(encoding, height, width, big, padding, missing):
+    if encoding in CHANNELS:
+        row = len(message(encoding, 1, width)[1])
+    else:
+        row = width * (2 if encoding in PAIRS or encoding.endswith('16') else 1)
+    step = row + padding
+    rows = {'nv12': height * 3 // 2, 'nv21': height * 3 // 2, 'nv24': 3 * height}.get(encoding, height)
+    data = np.random.default_rng(5).integers(0, 256, (rows - 1) * step + row - missing, np.uint8).tobytes()
+    fits = padding >= 0 and missing <= 0
+    if encoding in BAYER:
+        fits &= min(height, width) > 1
+    if encoding in PAIRS:
+        fits &= width % 2 == 0
+    if encoding in {'nv12', 'nv21'}:
+        fits &= width % 2 == 0 and height % 2 == 0
+    if not fits:
+        with pytest.raises(ImageError):
+            decode_image(height, width, encoding, big, step, data)
+        return
+    check(decode_image(height, width, encoding, big, step, data), height, width, data)

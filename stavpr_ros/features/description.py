@@ -177,7 +177,8 @@ class Describer:
         cells: tuple[int, int] | None = (maps.shape[2], maps.shape[3] // self.settings.strips)
         if not bool(torch.isfinite(strips).all()):
             raise ImageError(
-                'the features of an image are not finite: the network or its input is out of range'
+                'the features of an image are not finite: the network or its input is out of range',
+                kind='features',
             )
         if self._projection is not None:
             strips, cells = self._projection.apply(strips), None

@@ -4,11 +4,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
 from stavpr_ros.errors import ImageError, SourceError
 from stavpr_ros.sources.bag_file import OpenBag, is_bag, message_type, open_bag, reading
-from stavpr_ros.sources.encodings import NOT_PICTURES, decode_compressed, decode_message
+from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.frame import Frame, ImageRecord
 
 __all__ = ['BagSource', 'ImageRecord', 'image_topics', 'is_bag']
@@ -74,19 +72,35 @@ class BagSource:
 
         :raises SourceError: the bag is damaged further on, or ends early.
         """
-        return self._each(lambda _, record: record)
+        return self._each(self._record)
 
-    def _frame(self, index: int, record: ImageRecord) -> Frame:
-        return Frame(decode_message(record), record.stamp_ns or record.time_ns, f'{self.topic}#{index}')
+    def _frame(self, index: int, time_ns: int, message: Any) -> Frame:
+        return Frame(decode_message(message), _stamp(message) or time_ns, f'{self.topic}#{index}')
 
-    def _each(self, finish: Callable[[int, ImageRecord], Item]) -> Iterator[Item]:
+    def _record(self, _: int, time_ns: int, message: Any) -> ImageRecord:
+        stamp_ns, frame_id = _stamp(message), message.header.frame_id
+        if self.message_type == COMPRESSED:
+            return ImageRecord.of_image(decode_message(message), time_ns, stamp_ns, frame_id)
+        return ImageRecord(
+            time_ns,
+            stamp_ns,
+            frame_id,
+            message.height,
+            message.width,
+            message.encoding,
+            bool(message.is_bigendian),
+            message.step,
+            message.data,
+        )
+
+    def _each(self, finish: Callable[[int, int, Any], Item]) -> Iterator[Item]:
         with open_bag(self.path) as bag:
             index = -1
             for index, (time_ns, raw) in enumerate(self._messages(bag)):
                 try:
-                    item = finish(index, self._record(bag, time_ns, raw))
+                    item = finish(index, time_ns, self._message(bag, raw))
                 except ImageError as error:
-                    named = ImageError(f'{self.path}, {self.topic}#{index}: {error}')
+                    named = ImageError(f'{self.path}, {self.topic}#{index}: {error}', kind=error.kind)
                     if self.on_error is None:
                         raise named from error
                     self.on_error(named)
@@ -104,37 +118,18 @@ class BagSource:
             for _, time_ns, raw in bag.reader.messages(wanted):
                 yield time_ns, raw
 
-    def _record(self, bag: OpenBag, time_ns: int, raw: bytes) -> ImageRecord:
+    def _message(self, bag: OpenBag, raw: bytes) -> Any:
         try:
-            message = bag.deserialize(raw, self.message_type)
+            return bag.deserialize(raw, self.message_type)
         except Exception as error:  # garbage makes a parser raise errors of many kinds
-            raise ImageError(f'{len(raw)} bytes are no {self.message_type}: {error}') from error
-        stamp = message.header.stamp
-        stamp_ns = stamp.sec * SECOND + stamp.nanosec
-        frame_id = message.header.frame_id
-        if self.message_type == COMPRESSED:
-            return ImageRecord.of_image(_decompress(message), time_ns, stamp_ns, frame_id)
-        return ImageRecord(
-            time_ns,
-            stamp_ns,
-            frame_id,
-            message.height,
-            message.width,
-            message.encoding,
-            bool(message.is_bigendian),
-            message.step,
-            message.data,
-        )
+            raise ImageError(
+                f'{len(raw)} bytes are no {self.message_type}: {error}', kind='damaged'
+            ) from error
 
 
-def _decompress(message: Any) -> np.ndarray:
-    original = message.format.partition(';')[0].strip()
-    if original in NOT_PICTURES:
-        raise ImageError(
-            f'compressed format {message.format!r} holds depth or measurements, not a picture: '
-            "choose the camera's colour or grey topic"
-        )
-    return decode_compressed(message.data)
+def _stamp(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec * SECOND + stamp.nanosec)
 
 
 def _topics(bag: OpenBag) -> dict[str, tuple[str, int]]:

@@ -1,25 +1,29 @@
-"""Messages' and files' bytes to one kind of image: RGB, uint8, shape (height, width, 3), C-contiguous."""
+"""Messages' bytes to one kind of image: RGB, uint8, shape (height, width, 3), C-contiguous."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from io import BytesIO
 from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image
 
 from stavpr_ros.errors import ImageError
+from stavpr_ros.sources.colour import convert, copy, demosaic, keep, nv24_to_rgb
+from stavpr_ros.sources.files import check_pixels, decode_compressed, decode_file, flat_bytes
 
-MAX_PIXELS = 64_000_000
-"""Largest compressed image that is decoded: a small file may claim a picture that fills the memory."""
+__all__ = [
+    'ENCODINGS',
+    'Encoding',
+    'decode_compressed',
+    'decode_compressed_message',
+    'decode_image',
+    'decode_message',
+]
 
-COMPRESSED_FORMATS = ('JPEG', 'PNG', 'BMP', 'TIFF', 'PPM', 'WEBP')
-"""What :func:`decode_compressed` reads, in Pillow's names."""
-
-NOT_PICTURES = frozenset({'16UC1', '16SC1', '32FC1', '32SC1', '64FC1', '32FC3'})
-"""Encodings of depth images and of measurements: there is no brightness in them."""
+_MEASUREMENTS = re.compile(r'(8S|16S|32[SUF]|64[SUF])C\d*')
+"""Encodings of depth images, vectors and other measurements: there is no brightness in them."""
 
 
 @dataclass(frozen=True)
@@ -29,35 +33,38 @@ class Encoding:
 
     :param channels: values per pixel.
     :param value_bytes: bytes per value, 1 or 2; of two only the more significant one is used.
-    :param to_rgb: takes the uint8 view (height, width, channels), gives a new RGB array (height, width, 3).
+    :param to_rgb: takes uint8 (rows, width, channels), a view of the message unless the values had two
+        bytes; gives a new RGB array (height, width, 3), C-contiguous.
+    :param block: (rows, columns) of the pixels that share a colour: the size is a multiple of it.
+    :param chroma_rows: rows of ``step`` bytes with colour below the picture, per row of the picture.
     """
 
     channels: int
     value_bytes: int
     to_rgb: Callable[[np.ndarray], np.ndarray]
+    block: tuple[int, int] = (1, 1)
+    chroma_rows: float = 0
 
 
-def _convert(code: int, pixels: np.ndarray) -> np.ndarray:
-    return np.asarray(cv2.cvtColor(pixels, code))
-
-
-def _copy(pixels: np.ndarray) -> np.ndarray:
-    return np.array(pixels, order='C')
-
-
-_FROM_BGR = partial(_convert, cv2.COLOR_BGR2RGB)
-_FROM_RGBA = partial(_convert, cv2.COLOR_RGBA2RGB)
-_FROM_BGRA = partial(_convert, cv2.COLOR_BGRA2RGB)
-_FROM_GREY = partial(_convert, cv2.COLOR_GRAY2RGB)
+_FROM_BGR = partial(convert, cv2.COLOR_BGR2RGB)
+_FROM_RGBA = partial(convert, cv2.COLOR_RGBA2RGB)
+_FROM_BGRA = partial(convert, cv2.COLOR_BGRA2RGB)
+_FROM_GREY = partial(convert, cv2.COLOR_GRAY2RGB)
+_FROM_RGGB = partial(demosaic, cv2.COLOR_BayerRGGB2RGB)
+_FROM_BGGR = partial(demosaic, cv2.COLOR_BayerBGGR2RGB)
+_FROM_GBRG = partial(demosaic, cv2.COLOR_BayerGBRG2RGB)
+_FROM_GRBG = partial(demosaic, cv2.COLOR_BayerGRBG2RGB)
+_FROM_UYVY = partial(convert, cv2.COLOR_YUV2RGB_UYVY)
+_FROM_YUYV = partial(convert, cv2.COLOR_YUV2RGB_YUYV)
 
 ENCODINGS: dict[str, Encoding] = {
-    'rgb8': Encoding(3, 1, _copy),
+    'rgb8': Encoding(3, 1, copy),
     'bgr8': Encoding(3, 1, _FROM_BGR),
     'rgba8': Encoding(4, 1, _FROM_RGBA),
     'bgra8': Encoding(4, 1, _FROM_BGRA),
     'mono8': Encoding(1, 1, _FROM_GREY),
     'mono16': Encoding(1, 2, _FROM_GREY),
-    'rgb16': Encoding(3, 2, _copy),
+    'rgb16': Encoding(3, 2, keep),
     'bgr16': Encoding(3, 2, _FROM_BGR),
     'rgba16': Encoding(4, 2, _FROM_RGBA),
     'bgra16': Encoding(4, 2, _FROM_BGRA),
@@ -65,6 +72,24 @@ ENCODINGS: dict[str, Encoding] = {
     '8UC1': Encoding(1, 1, _FROM_GREY),
     '8UC3': Encoding(3, 1, _FROM_BGR),
     '8UC4': Encoding(4, 1, _FROM_BGRA),
+    '16UC1': Encoding(1, 2, _FROM_GREY),  # industrial cameras mean grey by it; depth cameras do not
+    '16UC3': Encoding(3, 2, _FROM_BGR),
+    '16UC4': Encoding(4, 2, _FROM_BGRA),
+    'bayer_rggb8': Encoding(1, 1, _FROM_RGGB),
+    'bayer_bggr8': Encoding(1, 1, _FROM_BGGR),
+    'bayer_gbrg8': Encoding(1, 1, _FROM_GBRG),
+    'bayer_grbg8': Encoding(1, 1, _FROM_GRBG),
+    'bayer_rggb16': Encoding(1, 2, _FROM_RGGB),
+    'bayer_bggr16': Encoding(1, 2, _FROM_BGGR),
+    'bayer_gbrg16': Encoding(1, 2, _FROM_GBRG),
+    'bayer_grbg16': Encoding(1, 2, _FROM_GRBG),
+    'uyvy': Encoding(2, 1, _FROM_UYVY, block=(1, 2)),
+    'yuv422': Encoding(2, 1, _FROM_UYVY, block=(1, 2)),
+    'yuyv': Encoding(2, 1, _FROM_YUYV, block=(1, 2)),
+    'yuv422_yuy2': Encoding(2, 1, _FROM_YUYV, block=(1, 2)),
+    'nv12': Encoding(1, 1, partial(convert, cv2.COLOR_YUV2RGB_NV12), block=(2, 2), chroma_rows=0.5),
+    'nv21': Encoding(1, 1, partial(convert, cv2.COLOR_YUV2RGB_NV21), block=(2, 2), chroma_rows=0.5),
+    'nv24': Encoding(1, 1, nv24_to_rgb, chroma_rows=2),
 }
 """Every raw encoding that is read; a further one is a further row."""
 
@@ -80,53 +105,53 @@ def decode_image(
     """
     Decode the fields of a raw ``sensor_msgs/Image``.
 
-    The bytes are viewed in place, whatever ``step`` and the byte order are; the one copy made is the result,
-    so it stays valid when the message goes. Sixteen bits become eight by dropping the lower byte.
+    The bytes are viewed in place, whatever ``step`` is, and the result has memory of its own, so it stays
+    valid when the message goes. Sixteen bits become eight by dropping the lower byte. YUV is taken as BT.601
+    in the range of video, as cv_bridge does.
 
-    :param height: rows.
+    :param height: rows of the picture; NV12, NV21 and NV24 have rows of colour below them.
     :param width: pixels per row.
     :param encoding: a key of :data:`ENCODINGS`.
     :param is_bigendian: byte order of 16 bit values.
     :param step: bytes from one row to the next; rows may be padded.
     :param data: the bytes: anything with the buffer protocol. The last row's padding may be missing.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous, own memory.
-    :raises ImageError: header and data contradict each other, or the encoding is not read.
+    :raises ImageError: header and data contradict each other, the encoding is not read, or the image has
+        more than :data:`stavpr_ros.sources.files.MAX_PIXELS` pixels.
     """
     layout = _layout(encoding)
-    if height < 1 or width < 1:
-        raise ImageError(f'image of {width}x{height} pixels: expected at least 1x1; check the camera driver')
     row = width * layout.channels * layout.value_bytes
-    if step < row:
-        raise ImageError(
-            f'step of {step} bytes is too small for a row of {width} {encoding} pixels: expected {row} or '
-            'more; check the camera driver'
-        )
-    flat = _flat_bytes(data)
-    needed = (height - 1) * step + row
+    rows = height + int(height * layout.chroma_rows)
+    _check_header(height, width, encoding, step, row)
+    flat = flat_bytes(data)
+    needed = (rows - 1) * step + row
     if flat.size < needed:
         raise ImageError(
             f'{flat.size} bytes of data for {width}x{height} {encoding} with step {step}: expected {needed} '
-            'or more; the image is cut off'
+            'or more; the image is cut off',
+            kind='cut off',
         )
-    # of a 16 bit value only the more significant byte is viewed, which lies first if big-endian
-    offset = layout.value_bytes - 1 if not is_bigendian else 0
-    pixels: np.ndarray = np.ndarray(
-        (height, width, layout.channels),
-        np.uint8,
-        flat,
-        offset,
-        (step, layout.channels * layout.value_bytes, layout.value_bytes),
-    )
-    return layout.to_rgb(pixels)
+    check_pixels(width, height)  # after the data, which shows whether it is a lie
+    values = width * layout.channels
+    if layout.value_bytes == 1:
+        strides = (step, layout.channels, 1)
+        return layout.to_rgb(np.ndarray((rows, width, layout.channels), np.uint8, flat, 0, strides))
+    # the more significant byte lies first if big-endian
+    pairs: np.ndarray = np.ndarray((rows, values, 2), np.uint8, flat, 0, (step, 2, 1))
+    high = cv2.extractChannel(pairs, 0 if is_bigendian else 1)
+    return layout.to_rgb(np.asarray(high).reshape(rows, width, layout.channels))
 
 
 def decode_message(message: Any) -> np.ndarray:
     """
-    Decode an image message: a ``sensor_msgs/Image`` of rclpy or of rosbags, or anything with its fields.
+    Decode an image message, raw or compressed, of rclpy or of rosbags, or anything with its fields.
 
-    :returns: RGB, uint8, shape (height, width, 3).
-    :raises ImageError: see :func:`decode_image`.
+    :param message: a ``sensor_msgs/CompressedImage`` if it has a ``format``, else a ``sensor_msgs/Image``.
+    :returns: RGB, uint8, shape (height, width, 3), C-contiguous, own memory.
+    :raises ImageError: see :func:`decode_image` and :func:`decode_compressed_message`.
     """
+    if hasattr(message, 'format'):
+        return decode_compressed_message(message)
     return decode_image(
         message.height,
         message.width,
@@ -137,26 +162,43 @@ def decode_message(message: Any) -> np.ndarray:
     )
 
 
-def decode_compressed(data: Any) -> np.ndarray:
+def decode_compressed_message(message: Any) -> np.ndarray:
     """
-    Decode the bytes of an image file: JPEG, PNG, BMP, TIFF, PNM, WebP.
+    Decode a ``sensor_msgs/CompressedImage``.
 
-    Grey, 16 bit and transparent images come out as RGB uint8 too; a rotation that the camera noted (EXIF) is
-    applied.
+    The bytes decide which kind of file it is. What ``format`` says is needed twice: to refuse depth images,
+    and to find Bayer mosaics, which image_transport packs as they are into grey files.
 
-    :param data: the file's bytes: anything with the buffer protocol.
+    :param message: anything with ``format`` and ``data``.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
-    :raises ImageError: not such a file, damaged, cut off, or of more than :data:`MAX_PIXELS` pixels.
+    :raises ImageError: a depth image, or see :func:`decode_compressed`.
     """
-    flat = _flat_bytes(data)
-    _check_size(flat)
+    original = message.format.partition(';')[0].strip()
+    if 'compresseddepth' in message.format.lower() or _MEASUREMENTS.fullmatch(original):
+        raise ImageError(
+            f'compressed format {message.format!r} holds depth or measurements, not a picture: '
+            "choose the camera's colour or grey topic",
+            kind='depth',
+        )
     try:
-        image = cv2.imdecode(flat, cv2.IMREAD_COLOR)
-    except cv2.error as error:
-        raise ImageError(f'compressed image of {flat.size} bytes is damaged: {error}') from error
-    if image is None:
-        raise ImageError(f'compressed image of {flat.size} bytes is damaged or cut off: copy or record anew')
-    return _FROM_BGR(image)
+        return decode_file(flat_bytes(message.data), _demosaic_of(message.format))
+    except ImageError as error:
+        raise ImageError(f'format {message.format!r}: {error}', kind=error.kind) from error
+
+
+def _demosaic_of(transport: str) -> Callable[[np.ndarray], np.ndarray] | None:
+    """
+    Find the Bayer mosaic in a format such as ``bayer_rggb8; png compressed``.
+
+    After ``compressed`` comes what the image was converted to first: nothing or the same mosaic if it was
+    not, ``mono8`` or ``bgr8`` if there is no mosaic any more.
+    """
+    original, _, rest = transport.partition(';')
+    _, compressed, target = rest.partition('compressed')
+    layout = ENCODINGS.get(original.strip()) if original.startswith('bayer_') else None
+    if layout is None or not compressed or target.strip() not in {'', original.strip()}:
+        return None
+    return layout.to_rgb
 
 
 def _layout(encoding: str) -> Encoding:
@@ -164,34 +206,34 @@ def _layout(encoding: str) -> Encoding:
     if layout is not None:
         return layout
     known = ', '.join(ENCODINGS)
-    if encoding in NOT_PICTURES:
+    if _MEASUREMENTS.fullmatch(encoding):
         raise ImageError(
             f'encoding {encoding!r} holds depth or measurements, not a picture: expected one of {known}; '
-            "choose the camera's colour or grey topic"
+            "choose the camera's colour or grey topic",
+            kind='depth',
         )
     raise ImageError(
-        f'encoding {encoding!r} is not read: expected one of {known}; set the driver, or use image_proc'
+        f'encoding {encoding!r} is not read: expected one of {known}; set the driver, or use image_proc',
+        kind='encoding',
     )
 
 
-def _flat_bytes(data: Any) -> np.ndarray:
-    """View any buffer as bytes, shape (size,); an array that is not contiguous is copied."""
-    if isinstance(data, np.ndarray):
-        return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
-    view = memoryview(data)
-    return np.frombuffer(view, np.uint8) if view.nbytes else np.empty(0, np.uint8)
-
-
-def _check_size(flat: np.ndarray) -> None:
-    """Read the header only: the decoder would take the memory first and complain afterwards."""
-    try:
-        with Image.open(BytesIO(flat.data), formats=COMPRESSED_FORMATS) as header:
-            width, height = header.size
-    except Exception as error:  # a damaged header makes Pillow raise errors of many kinds
+def _check_header(height: int, width: int, encoding: str, step: int, row: int) -> None:
+    if height < 1 or width < 1:
         raise ImageError(
-            f'{flat.size} bytes are no image, or damaged: expected {", ".join(COMPRESSED_FORMATS)}: {error}',
-        ) from error
-    if width * height > MAX_PIXELS:
+            f'image of {width}x{height} pixels: expected at least 1x1; check the camera driver', kind='size'
+        )
+    rows, columns = ENCODINGS[encoding].block
+    if height % rows or width % columns:
         raise ImageError(
-            f'compressed image of {width}x{height} pixels: expected at most {MAX_PIXELS}; scale it down'
+            f'{encoding} image of {width}x{height} pixels: expected a width that is a multiple of {columns} '
+            f'and a height that is a multiple of {rows}, since so many pixels share a colour; check the '
+            'camera driver',
+            kind='size',
+        )
+    if step < row:
+        raise ImageError(
+            f'step of {step} bytes is too small for a row of {width} {encoding} pixels: expected {row} or '
+            'more; check the camera driver',
+            kind='step',
         )

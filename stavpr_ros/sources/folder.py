@@ -89,6 +89,8 @@ def _read(file: Path) -> np.ndarray:
     try:
         return decode_compressed(file.read_bytes())
     except OSError as error:
-        raise ImageError(f'{file} cannot be read: {error.strerror}; check its permissions') from error
+        raise ImageError(
+            f'{file} cannot be read: {error.strerror}; check its permissions', kind='unreadable'
+        ) from error
     except ImageError as error:
-        raise ImageError(f'{file}: {error}') from error
+        raise ImageError(f'{file}: {error}', kind=error.kind) from error

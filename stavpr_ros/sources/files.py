@@ -1,0 +1,112 @@
+"""Bytes of image files to one kind of image: RGB, uint8, shape (height, width, 3), C-contiguous."""
+
+from collections.abc import Callable
+from io import BytesIO
+from typing import Any
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from stavpr_ros.errors import ImageError
+from stavpr_ros.sources.colour import convert
+
+MAX_PIXELS = 64_000_000
+"""Largest image that is decoded: a small file may claim a picture that fills the memory."""
+
+COMPRESSED_FORMATS = ('JPEG', 'PNG', 'BMP', 'TIFF', 'PPM', 'WEBP')
+"""What :func:`decode_compressed` reads, in Pillow's names."""
+
+
+def decode_compressed(data: Any) -> np.ndarray:
+    """
+    Decode the bytes of an image file: JPEG, PNG, BMP, TIFF, PNM, WebP.
+
+    Grey, 16 bit and transparent images come out as RGB uint8 too; a rotation that the camera noted (EXIF) is
+    applied.
+
+    :param data: the file's bytes: anything with the buffer protocol.
+    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
+    :raises ImageError: not such a file, damaged, cut off, or of more than :data:`MAX_PIXELS` pixels.
+    """
+    return decode_file(flat_bytes(data))
+
+
+def decode_file(flat: np.ndarray, demosaic: Callable[[np.ndarray], np.ndarray] | None = None) -> np.ndarray:
+    """
+    Decode a file.
+
+    :param flat: the file's bytes, shape (size,), uint8.
+    :param demosaic: makes RGB of a grey image (height, width), which is a Bayer mosaic; not called if the
+        file has colour.
+    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
+    :raises ImageError: see :func:`decode_compressed`.
+    """
+    mode = _check_file(flat)
+    try:
+        # Pillow's modes of one channel: L of 8 bits, I or I;16 of more
+        if demosaic is not None and (mode == 'L' or mode.startswith('I')):
+            return demosaic(_unpack(flat, cv2.IMREAD_GRAYSCALE))
+        return convert(cv2.COLOR_BGR2RGB, _unpack(flat, cv2.IMREAD_COLOR))
+    except cv2.error as error:
+        raise ImageError(
+            f'compressed image of {flat.size} bytes is damaged: {error}', kind='damaged'
+        ) from error
+
+
+def _unpack(flat: np.ndarray, mode: int) -> np.ndarray:
+    image = cv2.imdecode(flat, mode)
+    if image is None:
+        raise ImageError(
+            f'compressed image of {flat.size} bytes is damaged or cut off: copy or record anew',
+            kind='damaged',
+        )
+    return np.asarray(image)
+
+
+def check_pixels(width: int, height: int) -> None:
+    """Refuse an image of more than :data:`MAX_PIXELS` pixels."""
+    if width * height > MAX_PIXELS:
+        raise ImageError(
+            f'image of {width}x{height} pixels: expected at most {MAX_PIXELS}; scale it down',
+            kind='too large',
+        )
+
+
+def _check_file(flat: np.ndarray) -> str:
+    """Read the header only, for the mode: the decoder would take the memory first and complain afterwards."""
+    try:
+        with Image.open(BytesIO(flat.data), formats=COMPRESSED_FORMATS) as header:
+            width, height = header.size
+            mode, kind = header.mode, header.format
+    except Image.DecompressionBombError as error:
+        raise ImageError(
+            f'{error}: expected at most {MAX_PIXELS}; scale it down', kind='too large'
+        ) from error
+    except Exception as error:  # a damaged header makes Pillow raise errors of many kinds
+        raise ImageError(
+            f'{flat.size} bytes are no image, or damaged: expected {", ".join(COMPRESSED_FORMATS)}: {error}',
+            kind='damaged',
+        ) from error
+    check_pixels(width, height)
+    if kind == 'JPEG':
+        _check_end_of_jpeg(flat.tobytes())
+    return mode
+
+
+def _check_end_of_jpeg(data: bytes) -> None:
+    """Refuse half a picture, whose rest OpenCV before version 5 makes up in grey."""
+    # neither marker can be part of the picture's own bytes, but a thumbnail has them too, further in front
+    if data.rfind(b'\xff\xd9') < data.rfind(b'\xff\xda'):
+        raise ImageError(
+            f'compressed image of {len(data)} bytes is cut off: expected the end of a JPEG; copy it anew',
+            kind='cut off',
+        )
+
+
+def flat_bytes(data: Any) -> np.ndarray:
+    """View any buffer as bytes, shape (size,); an array that is not contiguous is copied."""
+    if isinstance(data, np.ndarray):
+        return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
+    view = memoryview(data)
+    return np.frombuffer(view, np.uint8) if view.nbytes else np.empty(0, np.uint8)

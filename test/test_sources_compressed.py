@@ -1,0 +1,267 @@
+"""Image files and compressed image messages to RGB: every format, mosaics, depth, damage, garbage."""
+
+from types import SimpleNamespace
+from unittest import mock
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stavpr_ros.errors import ImageError
+from stavpr_ros.sources import files, open_source
+from stavpr_ros.sources.encodings import decode_compressed, decode_compressed_message, decode_message
+
+# the colour at each pixel of the top-left 2x2, in reading order
+PATTERNS = {'rggb': (0, 1, 1, 2), 'bggr': (2, 1, 1, 0), 'gbrg': (1, 2, 0, 1), 'grbg': (1, 0, 2, 1)}
+GARBAGE = ['', ';', 'jpeg', 'png', 'rgb8; jpeg compressed bgr8', 'bayer_rggb8; png compressed ', 'compressed']
+
+
+def encoded(suffix, image):
+    return cv2.imencode(suffix, image)[1].tobytes()
+
+
+@pytest.mark.parametrize('suffix', ['.png', '.bmp', '.tiff', '.ppm', '.webp'])
+def test_lossless_files(suffix):
+    rgb = np.random.default_rng(0).integers(0, 256, (11, 13, 3), np.uint8)
+    quality = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == '.webp' else []
+    data = cv2.imencode(suffix, rgb[..., ::-1].copy(), quality)[1]
+    image = decode_compressed(data)
+    np.testing.assert_array_equal(image, rgb)
+    assert image.flags.c_contiguous
+
+
+def test_jpeg_is_near():
+    rgb = np.full((16, 24, 3), (200, 100, 30), np.uint8)
+    assert np.abs(decode_compressed(encoded('.jpg', rgb[..., ::-1].copy())).astype(int) - rgb).max() <= 4
+
+
+@pytest.mark.parametrize('suffix', ['.png', '.pgm', '.tiff'])
+def test_sixteen_bits_lose_the_lower_byte(suffix):
+    grey = (np.arange(12, dtype=np.uint16) * 5000).reshape(3, 4)
+    np.testing.assert_array_equal(decode_compressed(encoded(suffix, grey)), np.dstack([grey >> 8] * 3))
+
+
+def test_transparency_is_dropped():
+    bgra = np.random.default_rng(0).integers(0, 256, (5, 6, 4), np.uint8)
+    np.testing.assert_array_equal(decode_compressed(encoded('.png', bgra)), bgra[..., 2::-1])
+
+
+def test_a_bomb_is_refused_before_it_is_decoded(monkeypatch):
+    data = encoded('.png', np.zeros((100, 101), np.uint8))
+    monkeypatch.setattr(files, 'MAX_PIXELS', 10_000)
+    monkeypatch.setattr(files.cv2, 'imdecode', lambda *_: pytest.fail('decoded'))
+    with pytest.raises(ImageError, match='101x100 pixels: expected at most 10000') as caught:
+        decode_compressed(data)
+    assert caught.value.kind == 'too large'
+    # from here on Pillow refuses by itself
+    monkeypatch.setattr(files.Image, 'MAX_IMAGE_PIXELS', 5000)
+    with pytest.raises(ImageError, match='expected at most 10000') as caught:
+        decode_compressed(data)
+    assert caught.value.kind == 'too large'
+
+
+@pytest.mark.filterwarnings('ignore::UserWarning')  # Pillow's, on the way to the error
+@given(st.data())
+def test_damaged_files_decode_or_say_why(data):
+    suffix = data.draw(st.sampled_from(['.jpg', '.png', '.bmp', '.tiff', '.pgm', '.webp']))
+    file = bytearray(encoded(suffix, np.arange(96, dtype=np.uint8).reshape(8, 12)))
+    for _ in range(data.draw(st.integers(1, 8))):
+        file[data.draw(st.integers(0, len(file) - 1))] = data.draw(st.integers(0, 255))
+    del file[data.draw(st.integers(0, len(file))) :]
+    try:
+        # a damaged header may promise as many pixels as are allowed: a lower limit keeps this test short
+        with mock.patch.object(files, 'MAX_PIXELS', 10**6):
+            image = decode_compressed(bytes(file))
+    except ImageError:
+        return  # the one error that is allowed
+    assert image.ndim == 3
+    assert image.dtype == np.uint8
+
+
+@pytest.mark.parametrize(
+    'data', [b'', b'\xff', b'no image at all', b'\x89PNG\r\n\x1a\n', b'\xff\xd8\xff\xe0']
+)
+def test_no_image(data):
+    with pytest.raises(ImageError, match=f'{len(data)} bytes are no image') as caught:
+        decode_compressed(data)
+    assert caught.value.kind == 'damaged'
+
+
+def test_a_file_that_is_cut_off():
+    data = encoded('.png', np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8))
+    with pytest.raises(ImageError, match='is damaged or cut off: copy or record anew') as caught:
+        decode_compressed(data[:-30])
+    assert caught.value.kind == 'damaged'
+
+
+def test_half_a_jpeg():
+    rgb = np.full((64, 64, 3), (200, 100, 30), np.uint8)
+    small = encoded('.jpg', rgb[:8, :8])
+    data = encoded('.jpg', rgb[..., ::-1].copy())
+    segment = b'\xff\xe1' + (len(small) + 2).to_bytes(2, 'big') + small  # where cameras put a thumbnail
+    data = data[:2] + segment + data[2:]
+    # cameras fill up with zeros
+    assert np.abs(decode_compressed(data + bytes(50)).astype(int) - rgb).max() <= 4
+    for missing in (1, 2, 20, 60):
+        with pytest.raises(ImageError, match='is cut off: expected the end of a JPEG') as caught:
+            decode_compressed(data[:-missing])
+        assert caught.value.kind == 'cut off'
+
+
+def test_what_opencv_refuses_with_an_error_of_its_own():
+    data = b'P5 2000000 1 255 ' + bytes(2_000_000)  # wider than it reads
+    with pytest.raises(ImageError, match=f'image of {len(data)} bytes is damaged: ') as caught:
+        decode_compressed(data)
+    assert caught.value.kind == 'damaged'
+
+
+def compressed(transport, data):
+    return SimpleNamespace(format=transport, data=data)
+
+
+@pytest.mark.parametrize(
+    'transport',
+    [
+        'jpeg',
+        'png',
+        '',
+        'rgb8; jpeg compressed bgr8',
+        'mono16; png compressed ',
+        '16UC1; png compressed ',
+        'h264',
+    ],
+)
+def test_the_bytes_decide(transport):
+    rgb = np.random.default_rng(0).integers(0, 256, (5, 6, 3), np.uint8)
+    image = decode_message(compressed(transport, encoded('.png', rgb[..., ::-1].copy())))
+    np.testing.assert_array_equal(image, rgb)
+
+
+@pytest.mark.parametrize(
+    'transport',
+    [
+        '16UC1; compressedDepth png',
+        '16UC1; compressedDepth rvl',
+        '32FC1; compressedDepth',
+        '; compressedDepth',
+        'compressedDepth',
+        'mono16; CompressedDepth',
+        '32FC1; tiff compressed ',
+        '32FC1',
+        ' 16SC1 ; png',
+    ],
+)
+def test_depth_is_refused_by_name(transport):
+    png = encoded('.png', np.zeros((4, 4), np.uint8))  # a picture, so that nothing but the name is wrong
+    with pytest.raises(ImageError, match='holds depth or measurements, not a picture') as caught:
+        decode_compressed_message(compressed(transport, png))
+    assert repr(transport) in str(caught.value)
+    assert caught.value.kind == 'depth'
+
+
+def scene_and_mosaic(pattern, deep):
+    scene = np.full((6, 8, 3), (220, 130, 30), np.uint8)
+    order = np.array(PATTERNS[pattern]).reshape(2, 2)
+    colours = np.tile(order, (3, 4))
+    seen = np.take_along_axis(scene, colours[..., None], 2)[..., 0]
+    return scene, seen.astype(np.uint16) * 256 + 77 if deep else seen
+
+
+@pytest.mark.parametrize('pattern', PATTERNS)
+@pytest.mark.parametrize('bits', [8, 16])
+@pytest.mark.parametrize('target', ['', 'itself'])
+@pytest.mark.parametrize('suffix', ['.png', '.tiff'])
+def test_mosaics_in_files(pattern, bits, target, suffix):
+    encoding = f'bayer_{pattern}{bits}'
+    scene, seen = scene_and_mosaic(pattern, bits == 16)
+    transport = f'{encoding}; {suffix[1:]} compressed {encoding if target else ""}'
+    image = decode_compressed_message(compressed(transport, encoded(suffix, seen)))
+    np.testing.assert_array_equal(image, scene)
+
+
+def test_a_mosaic_in_a_jpeg():
+    scene, seen = scene_and_mosaic('gbrg', False)
+    data = cv2.imencode('.jpg', seen, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    image = decode_compressed_message(compressed('bayer_gbrg8; jpeg compressed ', data))
+    assert np.abs(image.astype(int) - scene).max() <= 8
+
+
+@pytest.mark.parametrize(
+    'transport',
+    [
+        'bayer_rggb8; jpeg compressed mono8',
+        'bayer_rggb8; jpeg compressed bgr8',
+        'bayer_rggb8',
+        'bayer_rggb8; png',
+        'bayer_none8; png compressed ',
+        'mono8; png compressed ',
+        'rgb8; png compressed ',
+        'jpeg',
+    ],
+)
+def test_what_is_no_mosaic_any_more_is_left_alone(transport):
+    _, grey = scene_and_mosaic('rggb', False)
+    image = decode_compressed_message(compressed(transport, encoded('.png', grey)))
+    np.testing.assert_array_equal(image, np.dstack([grey] * 3))
+
+
+def test_colour_is_no_mosaic_whatever_the_format_says():
+    rgb = np.random.default_rng(0).integers(0, 256, (5, 6, 3), np.uint8)
+    message = compressed('bayer_rggb8; png compressed ', encoded('.png', rgb[..., ::-1].copy()))
+    np.testing.assert_array_equal(decode_compressed_message(message), rgb)
+
+
+def test_a_mosaic_too_small_is_an_error():
+    message = compressed('bayer_rggb8; png compressed ', encoded('.png', np.zeros((1, 5), np.uint8)))
+    with pytest.raises(ImageError, match='5x1 pixels: expected at least 2x2') as caught:
+        decode_compressed_message(message)
+    assert caught.value.kind == 'size'
+
+
+def test_video_is_named():
+    with pytest.raises(ImageError, match="format 'h264': 20 bytes are no image") as caught:
+        decode_compressed_message(compressed('h264', bytes([0, 0, 0, 1, 0x67] * 4)))
+    assert caught.value.kind == 'damaged'
+
+
+def test_a_folders_errors_keep_their_kind(tmp_path):
+    (tmp_path / '1.png').write_bytes(b'no image')
+    (tmp_path / '2.png').write_bytes(encoded('.png', np.zeros((4, 4), np.uint8)))
+    errors = []
+    assert len(list(open_source(tmp_path, on_error=errors.append))) == 1
+    assert [error.kind for error in errors] == ['damaged']
+
+
+def test_a_file_that_cannot_be_read(tmp_path):
+    (tmp_path / '1.png').write_bytes(b'gone before it is read')
+    source = open_source(tmp_path)
+    (tmp_path / '1.png').unlink()
+    with pytest.raises(ImageError, match='cannot be read') as caught:
+        list(source)
+    assert caught.value.kind == 'unreadable'
+
+
+@pytest.mark.filterwarnings('ignore::UserWarning')
+@given(
+    transport=st.sampled_from(GARBAGE) | st.text(max_size=20),
+    start=st.sampled_from(
+        [b'', b'\xff\xd8\xff', b'\x89PNG\r\n\x1a\n', b'BM', b'II*\x00', b'P5 3 2 255\n', b'RIFF']
+    ),
+    rest=st.binary(max_size=60),
+)
+def test_random_messages_decode_or_say_why(transport, start, rest):
+    data = start + rest
+    try:
+        with mock.patch.object(files, 'MAX_PIXELS', 10**6):
+            image = decode_compressed_message(compressed(transport, data))
+    except ImageError as error:
+        image, kind = None, error.kind
+    if image is None:
+        assert kind in {'cut off', 'damaged', 'depth', 'size', 'too large'}
+        return
+    assert image.dtype == np.uint8
+    assert image.shape[2:] == (3,)
+    assert image.flags.c_contiguous
+    assert not np.shares_memory(image, np.frombuffer(data, np.uint8))
