@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from conftest import route_images
 from processes import PATIENCE, Process, executable
+from test_trajectory import write_odometry
 
 from stavpr_ros.evaluation.drive import judge
 from stavpr_ros.mapping import load_map
+from stavpr_ros.sources.frame import ImageRecord
 
 
 def run(name, *arguments):
@@ -53,6 +55,53 @@ def test_build_map(drive, tmp_path):
     assert place_map.poses[3].tolist() == [6, 0, 0, 0, 0, 0, 1]
 
 
+def test_build_map_of_keyframes(drive, tmp_path):
+    """Every second image, two metres on; the rule of three metres leaves every fourth."""
+    poses = tmp_path / 'poses.csv'
+    poses.write_text(''.join(f'{i}, 0, 0\n' for i in range(24)))
+    output = tmp_path / 'map.stavpr'
+    options = ['--poses', poses, '--every', 2, '--keyframe-metres', 3, '--keyframe-change', 0.01]
+    result = run('build_map', '--input', drive, '--output', output, *options, '--thumbnail-width', 64)
+    assert result.returncode == 0, result.stderr
+    assert '6 of 12 images became places, 6 of them with a pose' in result.stdout
+    place_map = load_map(output)
+    assert place_map.ids == tuple(f'{i}.png' for i in range(0, 24, 4))
+    assert place_map.poses[:, 0].tolist() == list(range(0, 24, 4))
+    assert place_map.thumbnail(0).shape == (48, 64, 3)
+    result = run('build_map', '--input', drive, '--output', output, '--keyframe-change', 1.9)
+    assert result.returncode == 0, result.stderr
+    assert '1 of 24 images became places\n' in result.stdout
+
+
+def test_build_map_with_the_odometry_of_the_bag(tmp_path):
+    """Ten images, one a second from 100 s on; odometry from 102 s on, a metre a second."""
+    images = [ImageRecord.of_image(image, (100 + i) * 10**9) for i, image in enumerate(route_images(10))]
+    bag = write_odometry(tmp_path / 'bag', [(102 + i) * 10**9 for i in range(8)], images=images)
+    output = tmp_path / 'map.stavpr'
+    result = run('build_map', '--input', bag, '--output', output, '--odometry', '/odom')
+    assert result.returncode == 0, result.stderr
+    assert '10 of 10 images became places, 8 of them with a pose' in result.stdout
+    assert load_map(output).pose(1) is None
+    assert load_map(output).pose(5)[0] == 3
+    options = ['--odometry', '/odom', '--keyframe-metres', '1.5', '--keyframe-seconds', '2.5']
+    result = run('build_map', '--input', bag, '--output', output, *options)
+    assert result.returncode == 0, result.stderr
+    assert '3 of 10 images became places, 3 of them' in result.stdout
+    assert load_map(output).ids == ('/image#2', '/image#5', '/image#8')
+    result = run('build_map', '--input', bag, '--output', tmp_path / 'x', '--odometry', '/other')
+    assert result.returncode == 1
+    assert 'topics of that type are /odom' in result.stderr
+
+
+def test_build_map_with_odometry_of_another_clock(tmp_path):
+    images = [ImageRecord.of_image(image, (100 + i) * 10**9) for i, image in enumerate(route_images(3))]
+    bag = write_odometry(tmp_path / 'bag', [10**9, 2 * 10**9], images=images)
+    result = run('build_map', '--input', bag, '--output', tmp_path / 'map', '--odometry', '/odom')
+    assert result.returncode == 1
+    assert 'from one clock' in result.stderr
+    assert not (tmp_path / 'map').exists()
+
+
 @pytest.mark.parametrize(
     ('options', 'code', 'word'),
     [
@@ -63,6 +112,14 @@ def test_build_map(drive, tmp_path):
         (['--gradient-cell', '7'], 0, ''),
         (['--gradient-cell', '9'], 2, 'multiple'),
         (['--poses', '/missing.csv'], 1, '/missing.csv'),
+        (['--keyframe-metres', '1'], 2, 'need --odometry or --poses'),
+        (['--keyframe-degrees', '1'], 2, 'need --odometry or --poses'),
+        (['--keyframe-seconds', '1'], 2, 'have no times'),
+        (['--keyframe-change', '-1'], 2, 'change = -1'),
+        (['--odometry', '/odom'], 2, 'is no bag'),
+        (['--odometry', '/odom', '--poses', 'x.csv'], 2, 'give one'),
+        (['--no-thumbnails', '--thumbnail-width', '9'], 2, 'give one'),
+        (['--thumbnail-width', '0'], 2, 'width 0'),
     ],
 )
 def test_build_map_says_what_is_wrong(drive, tmp_path, options, code, word):

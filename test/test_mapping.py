@@ -1,18 +1,32 @@
-"""The map file: round trip, atomicity, and every way in which a file can be bad."""
+"""Maps: built of images or keyframes; the file: round trip, atomicity, every way in which it can be bad."""
 
+import dataclasses
 import json
 import os
 import pickle
+import threading
 import zipfile
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from stavpr_ros.errors import FeatureMismatchError, InputError, MapFileError
+from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, MapFileError, SettingsError
 from stavpr_ros.features import Describer
-from stavpr_ros.mapping import PlaceMap, build_map, load_map, save_map
+from stavpr_ros.mapping import (
+    KeyframeSettings,
+    PlaceMap,
+    Trajectory,
+    build_map,
+    encode_thumbnail,
+    load_map,
+    save_map,
+)
+from stavpr_ros.sources.frame import Frame
+
+SECOND = 10**9
 
 
 def assert_same(a: PlaceMap, b: PlaceMap) -> None:
@@ -44,8 +58,6 @@ def test_round_trip(small_map, saved, route):
 
 
 def test_map_without_extras(route, tmp_path):
-    from stavpr_ros.sources.frame import Frame
-
     plain = build_map([Frame(route[0], 0, '')], Describer(), thumbnails=False, progress=False)
     save_map(plain, tmp_path / 'plain.stavpr')
     loaded = load_map(tmp_path / 'plain.stavpr')
@@ -70,6 +82,147 @@ def test_projected_otherwise_is_refused(small_map, route):
 def test_empty_source_is_refused():
     with pytest.raises(InputError, match='no images'):
         build_map([], Describer(), progress=False)
+
+
+# ------------------------------------------------------------------------------------------ poses
+
+
+def partly_posed(small_map):
+    poses = small_map.poses.copy()
+    poses[[0, 7]] = np.nan
+    return dataclasses.replace(small_map, poses=poses)
+
+
+def test_poses_of_some_places(small_map, tmp_path):
+    save_map(partly_posed(small_map), tmp_path / 'map')
+    loaded = load_map(tmp_path / 'map')
+    assert_same(partly_posed(small_map), loaded)
+    assert loaded.has_poses
+    assert loaded.pose(0) is None
+    assert loaded.pose(7) is None
+    assert loaded.pose(8).tolist() == [8, 0, 0, 0, 0, 0, 1]
+
+
+def test_no_poses(small_map):
+    for poses in (None, np.full((60, 7), np.nan)):
+        without = dataclasses.replace(small_map, poses=poses)
+        assert not without.has_poses
+        assert without.pose(5) is None
+    assert small_map.has_poses
+
+
+def test_a_pose_is_known_whole_or_not_at_all(small_map):
+    for value in (np.nan, np.inf):
+        poses = small_map.poses.copy()
+        poses[3, 4] = value
+        with pytest.raises(InputError, match='place 3'):
+            dataclasses.replace(small_map, poses=poses)
+    with pytest.raises(InputError, match='place 3'):
+        dataclasses.replace(small_map, poses=np.where(np.arange(60)[:, None] == 3, np.inf, small_map.poses))
+
+
+def test_a_place_without_its_picture(small_map):
+    some = dataclasses.replace(small_map, thumbnails=(b'', *small_map.thumbnails[1:]))
+    assert some.thumbnail(0) is None
+    assert some.thumbnail(1) is not None
+
+
+# ------------------------------------------------------------------------------------------ keyframes
+
+
+def drive(images):
+    """Frames of a drive, a second and a metre each."""
+    return [Frame(image, (i + 1) * SECOND, f'{i}') for i, image in enumerate(images)]
+
+
+def straight(count):
+    poses = np.zeros((count, 7))
+    poses[:, 0], poses[:, 6] = np.arange(count), 1
+    return poses
+
+
+@pytest.mark.parametrize('known', ['array', 'trajectory'])
+def test_keyframes_in_space(route, known):
+    frames, poses = drive(route[:20]), straight(20)
+    poses[4] = np.nan
+    if known == 'trajectory':
+        trajectory = Trajectory(gap=1.5)
+        for frame, pose in zip(frames, poses, strict=True):
+            if not np.isnan(pose[0]):
+                trajectory.add(frame.stamp, pose)
+        poses = trajectory
+    built = build_map(frames, Describer(), poses, progress=False, keyframes=KeyframeSettings(metres=2))
+    assert built.ids == ('0', '2', *map(str, range(5, 20, 2)))  # of 4 nothing is known
+    assert built.poses[:, 0].tolist() == [0, 2, *range(5, 20, 2)]
+    every = build_map(frames, Describer(), poses, progress=False)
+    assert len(every) == 20
+    assert every.pose(4) is None
+    assert every.pose(5)[0] == 5
+
+
+def test_poses_that_do_not_fit(route):
+    frames, describer = drive(route[:20]), Describer()
+    for count in (19, 21):
+        with pytest.raises(InputError, match=f'{count} poses for 20 images'):
+            build_map(frames, describer, straight(count), progress=False)
+    with pytest.raises(InputError, match='shape'):
+        build_map(frames, describer, straight(20)[:, :6], progress=False)
+    with pytest.raises(SettingsError, match='without poses'):
+        build_map(frames, describer, progress=False, keyframes=KeyframeSettings(degrees=1))
+    nowhere = Trajectory()
+    with pytest.raises(InputError, match=r'none of 20 images became a place.*no odometry'):
+        build_map(frames, describer, nowhere, progress=False, keyframes=KeyframeSettings(metres=1))
+    assert build_map(frames, describer, nowhere, progress=False).poses is None
+
+
+def test_width_of_the_thumbnails(route):
+    image = cv2.resize(route[0], (640, 480))
+    built = build_map(drive([image]), Describer(), progress=False, thumbnail_width=320)
+    assert built.thumbnail(0).shape == (240, 320, 3)
+    assert built.thumbnails[0] == encode_thumbnail(image, 320)
+    assert build_map(drive([image]), Describer(), progress=False).thumbnail(0).shape == (144, 192, 3)
+    with pytest.raises(SettingsError, match='width 0'):
+        build_map(drive([image]), Describer(), progress=False, thumbnail_width=0)
+
+
+class Watched:
+    """A source that knows which threads used and closed it."""
+
+    def __init__(self, frames, fails_at=None):
+        self.frames, self.fails_at = frames, fails_at
+        self.used, self.closed = set(), []
+
+    def __iter__(self):
+        try:
+            for i, frame in enumerate(self.frames):
+                self.used.add(threading.get_ident())
+                if i == self.fails_at:
+                    raise ImageError('image 40 is damaged')
+                yield frame
+        finally:
+            self.closed.append(threading.get_ident())
+
+
+def test_images_are_decoded_by_one_thread_that_also_closes_the_source(route):
+    """What a bag needs; also when the images, or their features, fail."""
+    whole = Watched(drive(route))
+    assert len(build_map(whole, Describer(), progress=False)) == 60
+    damaged = Watched(drive(route), fails_at=40)
+    with pytest.raises(ImageError, match='40'):
+        build_map(damaged, Describer(), progress=False)
+    given_up = Watched(drive(route))
+    broken = Describer()
+    broken.describe = lambda images: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        build_map(given_up, broken, progress=False)
+    for source in (whole, damaged, given_up):
+        assert len(source.used) == 1
+        assert source.closed == list(source.used)
+        assert threading.get_ident() not in source.used
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith('decoding')]
+
+
+# ------------------------------------------------------------------------------------------ files
 
 
 def test_failed_save_leaves_the_old_file(small_map, saved, monkeypatch):

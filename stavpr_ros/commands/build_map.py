@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,12 +12,18 @@ from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
-    from stavpr_ros.mapping import PlaceMap
+    import numpy as np
+
+    from stavpr_ros.mapping import KeyframeSettings, PlaceMap, Trajectory
+    from stavpr_ros.sources.bag import BagSource
+    from stavpr_ros.sources.folder import FolderSource
+    from stavpr_ros.sources.frame import Frame
 
 EPILOG = """
 examples:
   build_map --input drive/ --output route.stavpr
   build_map --input drive.bag --topic /camera/image_raw --output route.stavpr
+  build_map --input drive.bag --output route.stavpr --odometry /odom --keyframe-metres 1 --keyframe-degrees 15
   build_map --input drive/ --output route.stavpr --projection 512 --features onnx \\
       --onnx-model squeezenet.onnx --onnx-layer fire6/concat_1
 
@@ -30,7 +37,7 @@ def _parser() -> argparse.ArgumentParser:
 
     parser = argparse.ArgumentParser(
         prog='build_map',
-        description='Make a reference map: one place for each image, in the order of the route.',
+        description='Make a reference map: one place for each image or keyframe, in the order of the route.',
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -45,18 +52,116 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--poses', metavar='CSV', help='one line an image: x,y,z or x,y,z,qx,qy,qz,qw (metres, quaternion)'
     )
+    parser.add_argument(
+        '--odometry', metavar='TOPIC', help='nav_msgs/Odometry of the same bag: where each place was seen'
+    )
     parser.add_argument('--no-thumbnails', action='store_true', help='keep no small pictures of the places')
+    parser.add_argument(
+        '--thumbnail-width',
+        type=int,
+        metavar='PX',
+        help='of these pictures; the geometric check of the node wants larger ones (192)',
+    )
     parser.add_argument(
         '--skip-bad-images', action='store_true', help='go on after an image that cannot be read'
     )
+    _add_keyframe_options(parser)
     add_feature_options(parser)
     return parser
 
 
+def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group(
+        'keyframes',
+        'Only images that differ enough from the last place become places. All rules given must agree, but '
+        'metres and degrees are one rule: moved so far or turned so much.',
+    )
+    for name, metavar, what in (
+        ('seconds', 'S', 'time since the last place; for bags'),
+        ('metres', 'M', 'way since the last place; needs --odometry or --poses'),
+        ('degrees', 'DEG', 'angle turned since the last place; likewise'),
+        ('change', 'C', 'change of the picture, 0 to 2; a standing camera stays below 0.004'),
+    ):
+        group.add_argument(
+            f'--keyframe-{name}', type=float, default=0.0, metavar=metavar, help=f'{what} (0: off)'
+        )
+
+
+class _Images:
+    """Every N-th image of a source; counts those that were read."""
+
+    def __init__(self, source: 'FolderSource | BagSource', every: int) -> None:
+        self._source, self._every = source, every
+        self.read = 0
+
+    def __len__(self) -> int:
+        return (len(self._source) + self._every - 1) // self._every
+
+    def __iter__(self) -> Iterator['Frame']:
+        for frame in islice(self._source, 0, None, self._every):
+            self.read += 1
+            yield frame
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Refuse options that contradict each other, before anything is read."""
+    from stavpr_ros.sources.bag_file import is_bag
+
+    moving = arguments.keyframe_metres or arguments.keyframe_degrees
+    bag = is_bag(Path(arguments.input))
+    if arguments.every < 1:
+        raise SettingsError(f'--every {arguments.every} must be at least 1')
+    if arguments.poses and arguments.skip_bad_images:
+        raise SettingsError('--poses and --skip-bad-images: a skipped image would shift the poses; give one')
+    if arguments.poses and arguments.odometry:
+        raise SettingsError('--poses and --odometry: both say where the places are; give one')
+    if moving and not (arguments.poses or arguments.odometry):
+        raise SettingsError('--keyframe-metres and --keyframe-degrees need --odometry or --poses')
+    if arguments.odometry and not bag:
+        raise SettingsError(f'--odometry: {arguments.input} is no bag; give --poses with a folder of images')
+    if arguments.keyframe_seconds and not bag:
+        raise SettingsError(f'--keyframe-seconds: {arguments.input} is no bag, its images have no times')
+    if arguments.thumbnail_width is not None and arguments.no_thumbnails:
+        raise SettingsError('--thumbnail-width and --no-thumbnails: give one')
+    if not Path(arguments.output).absolute().parent.is_dir():
+        raise SourceError(f'the folder of {arguments.output} does not exist: make it first')
+
+
+def _keyframes(arguments: argparse.Namespace) -> 'KeyframeSettings':
+    from stavpr_ros.mapping import KeyframeSettings
+
+    return KeyframeSettings(
+        arguments.keyframe_seconds,
+        arguments.keyframe_metres,
+        arguments.keyframe_degrees,
+        arguments.keyframe_change,
+    )
+
+
+def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajectory | None':
+    """Read the poses of all images of the source, or the odometry."""
+    from stavpr_ros.evaluation.truth_files import read_poses
+    from stavpr_ros.mapping import Trajectory
+    from stavpr_ros.sources.bag_odometry import read_odometry
+
+    if arguments.odometry:
+        return Trajectory.from_arrays(*read_odometry(arguments.input, arguments.odometry))
+    if not arguments.poses:
+        return None
+    poses, oriented = read_poses(Path(arguments.poses))
+    if len(poses) != images:
+        raise SourceError(
+            f'poses {arguments.poses} has {len(poses)} lines for {images} images: give one each'
+        )
+    if arguments.keyframe_degrees and not oriented:
+        raise SettingsError(f'--keyframe-degrees: {arguments.poses} has no orientations, leave it out')
+    return poses[:: arguments.every]
+
+
 def _build(arguments: argparse.Namespace) -> 'PlaceMap':
     from stavpr_ros.commands.feature_options import make_describer
-    from stavpr_ros.evaluation.truth_files import read_poses
     from stavpr_ros.mapping import build_map, save_map
+    from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
     from stavpr_ros.sources import open_source
 
     skipped = []
@@ -65,28 +170,35 @@ def _build(arguments: argparse.Namespace) -> 'PlaceMap':
         skipped.append(error)
         print(f'skipped: {error}', file=sys.stderr)
 
-    if arguments.every < 1:
-        raise SettingsError(f'--every {arguments.every} must be at least 1')
-    if arguments.poses and arguments.skip_bad_images:
-        raise SettingsError('--poses and --skip-bad-images: a skipped image would shift the poses; give one')
-    if not Path(arguments.output).absolute().parent.is_dir():
-        raise SourceError(f'the folder of {arguments.output} does not exist: make it first')
-    describer = make_describer(arguments)
+    _check(arguments)
+    keyframes, describer = _keyframes(arguments), make_describer(arguments)
     source = open_source(arguments.input, arguments.topic, skip if arguments.skip_bad_images else None)
-    frames = source if arguments.every == 1 else islice(source, 0, None, arguments.every)
-    poses = None
-    if arguments.poses:
-        poses, _ = read_poses(Path(arguments.poses))
-        if len(poses) != len(source):
-            raise SourceError(
-                f'poses {arguments.poses} has {len(poses)} lines for {len(source)} images: give one each'
-            )
-        poses = poses[:: arguments.every]
-    place_map = build_map(frames, describer, poses, thumbnails=not arguments.no_thumbnails)
+    images = _Images(source, arguments.every)
+    width = THUMBNAIL_WIDTH if arguments.thumbnail_width is None else arguments.thumbnail_width
+    place_map = build_map(
+        images,
+        describer,
+        _poses(arguments, len(source)),
+        thumbnails=not arguments.no_thumbnails,
+        keyframes=keyframes,
+        thumbnail_width=width,
+    )
+    if arguments.odometry and not place_map.has_poses:
+        raise SourceError(
+            f'--odometry {arguments.odometry}: no image was taken while it has poses; do the stamps of both '
+            'come from one clock?'
+        )
     save_map(place_map, arguments.output)
     if skipped:
         print(f'{len(skipped)} images skipped', file=sys.stderr)
+    print(f'{len(place_map)} of {images.read} images became places{_known_poses(place_map)}')
     return place_map
+
+
+def _known_poses(place_map: 'PlaceMap') -> str:
+    """Say of how many places the pose is known, if of any."""
+    known = sum(place_map.pose(place) is not None for place in range(len(place_map)))
+    return f', {known} of them with a pose' if known else ''
 
 
 def _report(place_map: 'PlaceMap', output: str) -> None:

@@ -9,6 +9,8 @@ import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import Describer, FeatureSettings, LocalFeatures, Projection
 
+THUMBNAIL_WIDTH = 192  # pixels: enough to look at
+
 
 @dataclass(frozen=True)
 class PlaceMap:
@@ -19,8 +21,10 @@ class PlaceMap:
     :param projection: the random projection of the features, if they have one.
     :param stamps: when each place was seen, ns, shape (n,), int64; 0 = unknown.
     :param ids: external identifiers, n strings; '' = none.
-    :param poses: x y z (metres) and quaternion x y z w of each place, shape (n, 7), float64, or None.
-    :param thumbnails: a small JPEG of each place, n byte strings; empty = none kept.
+    :param poses: x y z (metres) and quaternion x y z w of each place, shape (n, 7), float64; a row of NaN =
+        unknown for that place; None = unknown for all.
+    :param thumbnails: a small JPEG of each place, n byte strings, an empty one = none of that place; empty =
+        none kept.
     """
 
     features: LocalFeatures
@@ -38,13 +42,11 @@ class PlaceMap:
             )
         if self.poses is not None and self.poses.shape != (n, 7):
             raise InputError(f'poses have shape {self.poses.shape}: expected ({n}, 7)')
-        if self.poses is not None and not np.isfinite(self.poses).all():
-            raise InputError('poses hold NaN or infinite numbers: expected metres and quaternions')
+        if self.poses is not None:
+            _require_whole_rows(self.poses)
         if len(self.thumbnails) not in (0, n):
             raise InputError(f'{len(self.thumbnails)} thumbnails for {n} places: expected all or none')
-        identity = self.projection.identity if self.projection else None
-        if identity != self.settings.projection:
-            raise InputError(f'projection {identity} is not that of the features, {self.settings.projection}')
+        require_projection(self.projection, self.settings)
 
     def __len__(self) -> int:
         return len(self.features)
@@ -64,6 +66,17 @@ class PlaceMap:
         """Any place has an external identifier."""
         return any(self.ids)
 
+    @cached_property
+    def has_poses(self) -> bool:
+        """Any place has a pose."""
+        return self.poses is not None and not bool(np.isnan(self.poses[:, 0]).all())
+
+    def pose(self, place: int) -> np.ndarray | None:
+        """Return the pose of a place, shape (7,), or None where it is unknown."""
+        if self.poses is None or np.isnan(self.poses[place, 0]):
+            return None
+        return self.poses[place]
+
     def describer(self, device: str = 'cpu', model: str = '') -> Describer:
         """
         Make the describer for queries: the one that this map's features were made with.
@@ -75,13 +88,34 @@ class PlaceMap:
 
     def thumbnail(self, place: int) -> np.ndarray | None:
         """Return the small picture of a place, RGB (h, w, 3) uint8, or None."""
-        if not self.thumbnails:
+        if not self.thumbnails or not self.thumbnails[place]:
             return None
         picture = cv2.imdecode(np.frombuffer(self.thumbnails[place], np.uint8), cv2.IMREAD_COLOR)
         return None if picture is None else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
-def encode_thumbnail(image: np.ndarray, width: int = 192) -> bytes:
+def require_projection(projection: Projection | None, settings: FeatureSettings) -> None:
+    """
+    Refuse a projection that is not the one features were made with.
+
+    :raises InputError: names both.
+    """
+    identity = projection.identity if projection else None
+    if identity != settings.projection:
+        raise InputError(f'projection {identity} is not that of the features, {settings.projection}')
+
+
+def _require_whole_rows(poses: np.ndarray) -> None:
+    """Refuse poses of which a part is known."""
+    bad = np.flatnonzero(~(np.isfinite(poses).all(axis=1) | np.isnan(poses).all(axis=1)))
+    if len(bad):
+        raise InputError(
+            f'the pose of place {bad[0]} (and {len(bad) - 1} others) is {poses[bad[0]].tolist()}: expected 7 '
+            'finite numbers, or 7 times NaN where it is unknown'
+        )
+
+
+def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
     """
     Return a small JPEG of an image.
 

@@ -1,0 +1,295 @@
+"""Poses by their time: interpolation against plain formulas, clocks that jump, odometry of bags."""
+
+import math
+from threading import Thread
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_typestore
+
+from stavpr_ros.errors import InputError, SettingsError, SourceError
+from stavpr_ros.mapping import Trajectory, distance, rotation
+from stavpr_ros.sources.bag import RAW
+from stavpr_ros.sources.bag_odometry import ODOMETRY, read_odometry
+
+SECOND = 10**9
+
+
+def turned(degrees, x=0.0, axis=(0.0, 0.0, 1.0)):
+    """A pose at x, turned about an axis."""
+    half = math.radians(degrees) / 2
+    return np.array([x, 0, 0, *(math.sin(half) * part for part in axis), math.cos(half)])
+
+
+def quaternion_product(p, q):
+    (a, b, c, d), (e, f, g, h) = p, q
+    return np.array(
+        [
+            d * e + a * h + b * g - c * f,
+            d * f - a * g + b * h + c * e,
+            d * g + a * f - b * e + c * h,
+            d * h - a * e - b * f - c * g,
+        ]
+    )
+
+
+def same_rotation(p, q, tolerance):
+    return min(np.abs(p - q).max(), np.abs(p + q).max()) <= tolerance
+
+
+def test_between_two_poses():
+    trajectory = Trajectory()
+    trajectory.add(1 * SECOND, turned(0, x=2))
+    trajectory.add(2 * SECOND, turned(90, x=6))
+    np.testing.assert_allclose(trajectory.at(1_250_000_000), turned(22.5, x=3), atol=1e-12)
+    np.testing.assert_array_equal(trajectory.at(1 * SECOND), turned(0, x=2))
+    np.testing.assert_array_equal(trajectory.at(2 * SECOND), turned(90, x=6))
+
+
+def test_before_after_and_nothing():
+    trajectory = Trajectory(patience=0.5)
+    assert trajectory.at(SECOND) is None
+    trajectory.add(2 * SECOND, turned(0, x=1))
+    trajectory.add(3 * SECOND, turned(0, x=2))
+    assert trajectory.at(0) is None
+    assert trajectory.at(2 * SECOND - 1) is None
+    assert trajectory.at(3_500_000_000)[0] == 2
+    assert trajectory.at(3_500_000_001) is None
+
+
+def test_no_line_is_drawn_over_a_long_silence():
+    trajectory = Trajectory(patience=0.5, gap=2)
+    for second in (1, 3, 6):
+        trajectory.add(second * SECOND, turned(0, x=second))
+    assert trajectory.at(2 * SECOND)[0] == 2
+    assert trajectory.at(4 * SECOND) is None
+    assert trajectory.at(6 * SECOND)[0] == 6
+
+
+def test_an_answer_is_a_copy():
+    trajectory = Trajectory()
+    pose = turned(0, x=1)
+    trajectory.add(SECOND, pose)
+    pose[:] = 7
+    for stamp in (SECOND, SECOND + 1):
+        trajectory.at(stamp)[:] = 9
+    assert trajectory.at(SECOND)[0] == 1
+
+
+def test_late_poses_are_sorted_in_and_equal_stamps_replaced():
+    trajectory = Trajectory(patience=0.5)
+    for stamp, x in ((10, 0), (20, 10), (15, 8), (20, 12)):
+        trajectory.add(stamp * SECOND // 10, turned(0, x=x))
+    assert len(trajectory) == 3
+    assert trajectory.at(1_250_000_000)[0] == 4
+    assert trajectory.at(1_750_000_000)[0] == 10
+
+
+def test_a_clock_that_jumps_back_makes_it_forget():
+    trajectory = Trajectory(patience=0.5)
+    for stamp in (10 * SECOND, 11 * SECOND, 10_500_000_000):
+        trajectory.add(stamp, turned(0))
+    assert len(trajectory) == 3
+    trajectory.add(10_499_999_999, turned(0, x=5))
+    assert len(trajectory) == 1
+    assert trajectory.at(11 * SECOND) is None
+    assert trajectory.at(10_500_000_000)[0] == 5
+
+
+def test_bounded():
+    trajectory = Trajectory(capacity=16)
+    for i in range(1, 1001):
+        trajectory.add(i, turned(0, x=i))
+        assert len(trajectory) <= 16
+        assert len(trajectory) >= min(i, 14)
+        assert trajectory.at(i)[0] == i
+    assert trajectory.at(1000 - 17) is None
+    one = Trajectory(capacity=1)
+    one.add(1, turned(0))
+    one.add(2, turned(0, x=2))
+    assert (len(one), one.at(2)[0]) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ('pose', 'words'),
+    [
+        (np.zeros(6), 'shape'),
+        ([0, 0, math.nan, 0, 0, 0, 1], 'finite'),
+        ([0, math.inf, 0, 0, 0, 0, 1], 'finite'),
+        ([0, 0, 0, 0, 0, 0, math.nan], 'finite'),
+        (np.zeros(7), 'quaternion of zeros'),
+    ],
+)
+def test_no_pose(pose, words):
+    trajectory = Trajectory()
+    trajectory.add(2 * SECOND, turned(0))
+    with pytest.raises(InputError, match=words):
+        trajectory.add(1, np.array(pose))  # so early that it would have made it forget
+    assert len(trajectory) == 1
+    assert trajectory.at(2 * SECOND) is not None
+
+
+def test_no_stamp_and_no_settings():
+    with pytest.raises(InputError, match='stamp 0'):
+        Trajectory().add(0, turned(0))
+    for wrong in ({'patience': -1}, {'patience': math.nan}, {'capacity': 0}, {'gap': math.nan}):
+        with pytest.raises(SettingsError, match=next(iter(wrong))):
+            Trajectory(**wrong)
+
+
+def test_quaternions_are_normalised():
+    trajectory = Trajectory()
+    trajectory.add(1, np.array([0, 0, 0, 0, 0, 3.0, 4.0]))
+    np.testing.assert_allclose(trajectory.at(1)[3:], [0, 0, 0.6, 0.8])
+
+
+def test_distance_and_rotation():
+    a = np.array([1, 2, 3, 0, 0, 0, 1.0])
+    assert distance(a, np.array([1, 5, 7, 0, 0, 0, 1.0])) == 5
+    assert rotation(turned(10), turned(10)) == 0
+    assert rotation(turned(10), -turned(10)) == 0  # the same rotation
+    for angle in (1e-6, 0.5, 90, 179.999):
+        assert rotation(turned(20), turned(20 + angle)) == pytest.approx(angle, rel=1e-6)
+    assert rotation(turned(-100), turned(100)) == pytest.approx(160)
+
+
+@given(
+    first=st.floats(0, 360),
+    angle=st.floats(-179, 179),
+    part=st.floats(0, 1),
+    flip=st.booleans(),
+    axis=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda axis: sum(x * x for x in axis) > 0.01),
+)
+def test_rotations_turn_evenly_on_the_shorter_arc(first, angle, part, flip, axis):
+    """A pose turned by an angle about an axis of its own: after that part of the time, that part of it."""
+    axis = np.array(axis) / np.linalg.norm(axis)
+    start = turned(first, x=-4, axis=(0.6, 0, 0.8))
+
+    def after(degrees):
+        return quaternion_product(start[3:], turned(degrees, axis=axis)[3:])
+
+    end = np.array([6, 0, 0, *(-1 if flip else 1) * after(angle)])
+    trajectory = Trajectory()
+    trajectory.add(SECOND, start)
+    trajectory.add(2 * SECOND, end)
+    stamp = SECOND + round(part * SECOND)
+    part = (stamp - SECOND) / SECOND
+    pose = trajectory.at(stamp)
+    assert pose[0] == pytest.approx(-4 + 10 * part)
+    assert same_rotation(pose[3:], after(angle * part), 2e-6)  # nearly parallel ones go straight
+    assert np.linalg.norm(pose[3:]) == pytest.approx(1, abs=1e-12)
+    assert rotation(start, end) == pytest.approx(abs(angle), abs=1e-6)
+
+
+def test_one_thread_adds_while_another_asks():
+    trajectory, failures = Trajectory(capacity=64), []
+
+    def add():
+        for i in range(1, 20_000):
+            trajectory.add(i, turned(0, x=i))
+
+    def ask():
+        try:
+            while adding.is_alive():
+                stamp = 1 + len(trajectory)
+                for pose in (trajectory.at(stamp), trajectory.at(10_000)):
+                    assert pose is None or pose.shape == (7,)
+        except Exception as error:
+            failures.append(error)
+
+    adding = Thread(target=add)
+    asking = Thread(target=ask)
+    adding.start()
+    asking.start()
+    adding.join()
+    asking.join()
+    assert not failures
+    assert trajectory.at(19_999)[0] == 19_999
+
+
+# ------------------------------------------------------------------------------------------ bags
+
+
+def write_odometry(path, stamps, ros1=False, images=()):
+    """A bag with a pose at x = i for each stamp (ns), recorded at 100 s + i, a text, and image records."""
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
+    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
+    types, extra = store.types, {'seq': 0} if ros1 else {}
+    covariance = np.zeros(36)
+    with Ros1Writer(path) if ros1 else Ros2Writer(path, version=9) as writer:
+        connection = writer.add_connection('/odom', ODOMETRY, typestore=store)
+        text = writer.add_connection('/text', 'std_msgs/msg/String', typestore=store)
+        writer.write(
+            text, 99 * SECOND, serialize(types['std_msgs/msg/String'](data='x'), 'std_msgs/msg/String')
+        )
+        vector = types['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
+        twist = types['geometry_msgs/msg/Twist'](linear=vector, angular=vector)
+        for i, stamp in enumerate(stamps):
+            time = types['builtin_interfaces/msg/Time'](sec=stamp // SECOND, nanosec=stamp % SECOND)
+            pose = types['geometry_msgs/msg/Pose'](
+                position=types['geometry_msgs/msg/Point'](x=float(i), y=2.0, z=3.0),
+                orientation=types['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.6, w=0.8),
+            )
+            message = types[ODOMETRY](
+                header=types['std_msgs/msg/Header'](stamp=time, frame_id='odom', **extra),
+                child_frame_id='base_link',
+                pose=types['geometry_msgs/msg/PoseWithCovariance'](pose=pose, covariance=covariance),
+                twist=types['geometry_msgs/msg/TwistWithCovariance'](twist=twist, covariance=covariance),
+            )
+            writer.write(connection, (100 + i) * SECOND, serialize(message, ODOMETRY))
+        if images:
+            pictures = writer.add_connection('/image', RAW, typestore=store)
+        for record in images:
+            time = types['builtin_interfaces/msg/Time'](
+                sec=record.stamp_ns // SECOND, nanosec=record.stamp_ns % SECOND
+            )
+            message = types[RAW](
+                header=types['std_msgs/msg/Header'](stamp=time, frame_id='camera', **extra),
+                height=record.height,
+                width=record.width,
+                encoding=record.encoding,
+                is_bigendian=0,
+                step=record.step,
+                data=record.data,
+            )
+            writer.write(pictures, record.time_ns, serialize(message, RAW))
+    return path
+
+
+@pytest.mark.parametrize('ros1', [False, True])
+def test_odometry_of_a_bag(tmp_path, ros1):
+    # the third came late, the last has no stamp of its own
+    stamps = [5 * SECOND, 5 * SECOND + 7, 5 * SECOND + 3, 0]
+    path = write_odometry(tmp_path / 'drive.bag', stamps, ros1=ros1)
+    when, poses = read_odometry(path, 'odom')
+    assert when.tolist() == [5 * SECOND, 5 * SECOND + 3, 5 * SECOND + 7, 103 * SECOND]
+    assert poses.tolist() == [[i, 2, 3, 0, 0, 0.6, 0.8] for i in (0, 2, 1, 3)]
+    assert Trajectory.from_arrays(when, poses).at(5 * SECOND + 5)[0] == pytest.approx(1.5)
+
+
+def test_odometry_that_is_not_there(tmp_path):
+    path = write_odometry(tmp_path / 'bag', [SECOND])
+    with pytest.raises(SourceError, match=r"'/other' is not in .*: topics of that type are /odom"):
+        read_odometry(path, '/other')
+    with pytest.raises(SourceError, match=r'std_msgs/msg/String, not nav_msgs'):
+        read_odometry(path, '/text')
+    with pytest.raises(SourceError, match='no messages'):
+        read_odometry(write_odometry(tmp_path / 'empty', []), '/odom')
+    with pytest.raises(SourceError, match='does not exist'):
+        read_odometry(tmp_path / 'missing', '/odom')
+
+
+def test_odometry_whose_clock_jumps_back(tmp_path):
+    path = write_odometry(tmp_path / 'bag', [9 * SECOND, 10 * SECOND, 3 * SECOND, 4 * SECOND])
+    with pytest.raises(SourceError, match=r'back by 7\.0 s at message 2'):
+        read_odometry(path, '/odom')
+
+
+def test_recorded_poses_that_are_none_are_named():
+    poses = np.array([turned(0), np.zeros(7)])
+    with pytest.raises(InputError, match='pose number 1'):
+        Trajectory.from_arrays(np.array([1, 2]), poses)
