@@ -251,7 +251,7 @@ def test_the_mean_that_is_taken_off_is_that_of_the_route_so_far(laps):
     mean = laps.strips[:, :last].mean(dim=1, keepdim=True)
     expected = laps.strips[:, :100] - mean
     expected /= expected.norm(dim=2, keepdim=True)
-    torch.testing.assert_close(closer._centred[:, :100], expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(closer._route.strips[:, :100], expected, atol=1e-5, rtol=0)
 
 
 def test_what_a_loop_closer_refuses(laps, small_map):

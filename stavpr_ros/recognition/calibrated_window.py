@@ -1,13 +1,21 @@
 """The window of mode robust: rows of distances, calibrated when they are matched."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from stavpr_ros.alignment.settings import SequenceSettings, SpeedSettings
 from stavpr_ros.alignment.speeds import best_speed_match, match_speeds, trace_speed
-from stavpr_ros.alignment.temporal import SequenceMatch, best_match, match_padded, trace_sequence
+from stavpr_ros.alignment.temporal import (
+    SequenceMatch,
+    best_match,
+    match_padded,
+    padded_width,
+    trace_sequence,
+)
 from stavpr_ros.recognition.calibration import FLAT, Calibration
-from stavpr_ros.recognition.cpu_matcher import NO_PATH, nearest_places
+from stavpr_ros.recognition.cpu_matcher import NO_PATH
 from stavpr_ros.recognition.cures import Cures
 from stavpr_ros.recognition.window import DistanceWindow
 
@@ -16,7 +24,9 @@ class CalibratedWindow:
     """
     The last l rows of distances to n places, and their match.
 
-    :param places: most places there will be.
+    Places are numbered from the first one ever, also when the oldest have been forgotten.
+
+    :param places: most places there will be at a time.
     :param sequence: l, and k for LM-DTW.
     :param cures: which of them apply.
     :param speeds: for the cure of that name.
@@ -29,7 +39,8 @@ class CalibratedWindow:
         self._speeds = speeds or SpeedSettings()
         self.calibration = Calibration(places, cures.row_normalisation, cures.place_calibration)
         self._window = DistanceWindow(sequence.length, places, sequence.k)
-        self._places = places
+        self._places, self._first = places, 0
+        self._known = 0  # places that any row in the window knows
         self._answer: tuple[np.ndarray, np.ndarray] = (np.empty(0), np.empty(0, int))
 
     def __len__(self) -> int:
@@ -38,7 +49,17 @@ class CalibratedWindow:
     def reset(self) -> None:
         """Empty the window and forget what was learned from its rows."""
         self.calibration.reset()
+        self.clear()
+
+    def clear(self) -> None:
+        """Empty the window; what was learned of the places stays."""
         self._window = DistanceWindow(self._sequence.length, self._places, self._sequence.k)
+        self._known = 0
+
+    @property
+    def first(self) -> int:
+        """The first place that is not forgotten: as many are."""
+        return self._first
 
     def grow(self, places: int) -> None:
         """Make room for more places; the rows in the window do not know them."""
@@ -46,33 +67,48 @@ class CalibratedWindow:
         self._places = places
         self._window = self._window.widened(places)
 
+    def forget(self, count: int) -> None:
+        """Forget the oldest places; as many new ones have room then."""
+        self.calibration.forget(count)
+        self._window.forget(count)
+        self._known = max(0, self._known - count)
+        self._first += count
+
     def push(self, row: torch.Tensor) -> None:
         """
         Take in the distances of the newest image.
 
-        :param row: shape (m,), float32, of the first m <= n places; the others may not be matched with it.
+        :param row: shape (m,), float32, of the first m <= n places that are not forgotten; the others may not
+            be matched with it.
         """
         normalised = self.calibration.normalised(row.cpu().numpy())
+        self._known = max(self._known, len(normalised))
         self.calibration.observe(normalised)
         self._window.push(normalised)
 
     def newest_row(self) -> np.ndarray:
-        """Return the newest row as it is matched, shape (n,), float32; lower is nearer."""
+        """Return the newest row as it is matched, from place ``first``, shape (n,), float32; low is near."""
         shift, scale = self.calibration.shift_and_scale(self._places)
         return (self._window.rows()[-1, : self._places] - shift) * scale
 
     def match(self, neighbourhood: int) -> tuple[SequenceMatch | None, np.ndarray]:
         """Return the nearest sequence of a full window and its warping path; distances in deviations."""
-        n = self._places
-        shift, scale = self.calibration.shift_and_scale(n)
-        rows = self._window.rows()
-        if not self._cures.speeds:
-            return self._match_by_dtw(rows, shift, scale, neighbourhood)
+        by = self._match_at_speeds if self._cures.speeds else self._match_by_dtw
+        nearest, path = by(*self.calibration.shift_and_scale(self._known), neighbourhood)
+        if nearest is None or not self._first:
+            return nearest, path
+        path[:, 1] += self._first
+        return _moved(nearest, self._first), path
+
+    def _match_at_speeds(
+        self, shift: np.ndarray, scale: np.ndarray, neighbourhood: int
+    ) -> tuple[SequenceMatch | None, np.ndarray]:
+        rows = self._window.rows()[:, : self._known]
         if not (self._cures.row_normalisation or self._cures.place_calibration):
             known = rows[np.isfinite(rows)]  # the penalty is meant in deviations
             scale = scale / np.float32(max(known.std() if known.size else 0, FLAT))
-        matches = match_speeds(rows[:, :n], self._speeds, shift, scale)
-        self._answer = matches.distances, matches.middles
+        matches = match_speeds(rows, self._speeds, shift, scale)
+        self._answer = matches.distances, matches.middles + self._first
         nearest = best_speed_match(matches, neighbourhood)
         if nearest is None:
             return None, NO_PATH
@@ -89,18 +125,30 @@ class CalibratedWindow:
         return int(self._speeds.steps(l).sum(axis=1).max()) + l
 
     def _match_by_dtw(
-        self, rows: np.ndarray, shift: np.ndarray, scale: np.ndarray, neighbourhood: int
+        self, shift: np.ndarray, scale: np.ndarray, neighbourhood: int
     ) -> tuple[SequenceMatch | None, np.ndarray]:
-        n = self._places
-        costs = rows.copy()  # its padding with it
-        costs[:, :n] = (rows[:, :n] - shift) * scale
-        matches = match_padded(costs, n, self._sequence.k)
-        self._answer = matches.distances, matches.middles
+        n, k = self._known, self._sequence.k
+        costs = np.full((self._sequence.length, padded_width(n, k)), np.inf, np.float32)
+        costs[:, :n] = (self._window.rows()[:, :n] - shift) * scale
+        matches = match_padded(costs, n, k)
+        self._answer = matches.distances, matches.middles + self._first
         nearest = best_match(matches, neighbourhood)
         if nearest is None:
             return None, NO_PATH
-        return nearest, trace_sequence(costs[:, :n], nearest.first, self._sequence.k).path
+        return nearest, trace_sequence(costs[:, :n], nearest.first, k).path
 
-    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nearest places of the last match and their distances, nearest first."""
-        return nearest_places(*self._answer, count)
+    def sequences(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distances of all sequences matched last, +inf where there is none, and their places."""
+        return self._answer
+
+
+def _moved(match: SequenceMatch, by: int) -> SequenceMatch:
+    """Return the same sequence where places are numbered from another one."""
+    runner_up = match.runner_up_index
+    return replace(
+        match,
+        first=match.first + by,
+        last=match.last + by,
+        middle=match.middle + by,
+        runner_up_index=runner_up + by if runner_up >= 0 else -1,
+    )

@@ -7,6 +7,8 @@ distances to itself, so that a window can be brought to mean 0 and deviation 1 o
 Causal: only rows that have come count.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 PRIOR = 20  # rows that the start counts for
@@ -56,9 +58,17 @@ class Calibration:
     def grow(self, places: int) -> None:
         """Make room for more places, which start with mean 0 and deviation 1."""
         more = places - len(self._mean)
-        self._mean = np.append(self._mean, np.zeros(more, np.float32))
-        self._variance = np.append(self._variance, np.ones(more, np.float32))
-        self._count = np.append(self._count, np.full(more, PRIOR, np.float32))
+        self._change_each(lambda values, start: np.append(values, np.full(more, start, np.float32)))
+
+    def forget(self, count: int) -> None:
+        """Forget the first places; the others move up, and there is room for as many new ones behind them."""
+        self._change_each(lambda values, start: np.append(values[count:], np.full(count, start, np.float32)))
+
+    def _change_each(self, change: Callable[[np.ndarray, float], np.ndarray]) -> None:
+        """Change all that is kept of every place; each comes with what a new place starts with."""
+        self._start = change(self._start[0], 0), change(self._start[1], 1)
+        self._mean, self._variance = change(self._mean, 0), change(self._variance, 1)
+        self._count = change(self._count, PRIOR)
 
     def normalised(self, row: np.ndarray) -> np.ndarray:
         """Bring the known entries of a row to mean 0 and deviation 1, shape (n,), float32."""

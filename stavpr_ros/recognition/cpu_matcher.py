@@ -22,21 +22,6 @@ CACHE_LINE = 64  # bytes; vectors across two of them are read at half the speed
 NO_PATH = np.empty((0, 2), np.int32)
 
 
-def nearest_places(distances: np.ndarray, places: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return the nearest distinct places, nearest first (the lowest index on a tie).
-
-    :param distances: of each sequence, shape (m,); +inf where there is none.
-    :param places: its middle, shape (m,).
-    :returns: places and distances, at most ``count`` of each.
-    """
-    order = np.argsort(distances, kind='stable')
-    order = order[np.isfinite(distances[order])]
-    _, first = np.unique(places[order], return_index=True)
-    order = order[np.sort(first)[:count]]
-    return places[order].astype(np.int64), distances[order]
-
-
 def cut_cells(strips: torch.Tensor, cells: tuple[int, int]) -> torch.Tensor:
     """
     Cut strips into their cells, unit norm each; zero cells stay zero.
@@ -139,6 +124,6 @@ class CpuMatcher:
             return None, NO_PATH
         return nearest, trace_sequence(window[:, : self.places], nearest.first, self._sequence.k).path
 
-    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nearest places of the last match and their distances, nearest first."""
-        return nearest_places(self._matches.distances, self._matches.middles, count)
+    def sequences(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distances of the sequences matched last and their middle places."""
+        return self._matches.distances, self._matches.middles

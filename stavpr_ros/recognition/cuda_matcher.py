@@ -12,7 +12,6 @@ from stavpr_ros.alignment.spatial import WINDOW
 from stavpr_ros.alignment.temporal import SequenceDistances, SequenceMatch, trace_sequence
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.recognition.cpu_matcher import nearest_places
 
 BLOCK_WORDS = 2**26  # most words of products that lie in memory at a time: 256 MiB
 QUERIES = 32  # most images of a batch whose products are made at once
@@ -108,9 +107,9 @@ class CudaMatcher:
         """
         return self._window.match(neighbourhood)
 
-    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nearest places of the last match and their distances, nearest first."""
-        return self._window.candidates(count)
+    def sequences(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distances of the sequences matched last and their middle places."""
+        return self._window.sequences()
 
 
 class _ImageDistances:
@@ -295,10 +294,10 @@ class _Window:
             runner_up_distance=found.runner_up_distance if runner_up else float('nan'),
         ), path
 
-    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nearest places of the last match: all distances are copied back for this."""
+    def sequences(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return distances and middle places of the last match: all are copied back for this."""
         places = self._places
         found = SequenceDistances(
             self._distances[:places].cpu().numpy(), self._lengths[:places].cpu().numpy()
         )
-        return nearest_places(found.distances, found.middles, count)
+        return found.distances, found.middles

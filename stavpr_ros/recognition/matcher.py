@@ -60,11 +60,11 @@ class Matcher(Protocol):
             in the window, place.
         """
 
-    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def sequences(self) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return the nearest places of the last match, nearest first, each once.
+        Return the sequences matched last.
 
-        :returns: places, int64, and distances, float32, at most ``count`` of each.
+        :returns: distances, shape (n,), float32, +inf where there is none, and middle places, shape (n,).
         """
 
 

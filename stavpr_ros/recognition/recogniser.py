@@ -16,6 +16,7 @@ from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.calibrated_window import CalibratedWindow
+from stavpr_ros.recognition.candidates import Candidate, nearest_places, ranked_candidates
 from stavpr_ros.recognition.centring import Centring
 from stavpr_ros.recognition.cpu_matcher import NO_PATH
 from stavpr_ros.recognition.cures import Cures, Track, cures_of, evidence, relative_distance
@@ -141,6 +142,7 @@ class Recogniser:
         self._window: Window = self._matcher
         self._newest_row = torch.empty(0)
         self._track = Track()
+        self._nearest: SequenceMatch | None = None  # as it was answered last
         if cures.any:
             self._window = window = CalibratedWindow(self.places, settings.sequence, cures)
             window.calibration.start_from(self._distances_to_itself(features))
@@ -182,6 +184,7 @@ class Recogniser:
         """Forget the images of the window, and what was learned from them and those before."""
         self._window.reset()
         self._track = Track()
+        self._nearest = None
         if self._centring is not None:
             self._centring.reset()
 
@@ -217,7 +220,9 @@ class Recogniser:
             strips = self._centring.next_query(strips)
         self._newest_row = self._matcher.distances(strips, features.weights[:, 0])
         self._window.push(self._newest_row)
-        return answer(self._window, self._settings, self._track)
+        recognition = answer(self._window, self._settings, self._track)
+        self._nearest = recognition.nearest
+        return recognition
 
     def newest_row(self) -> np.ndarray:
         """Distances of the newest image to every place as they are matched, shape (n,), float32."""
@@ -231,7 +236,26 @@ class Recogniser:
 
         :returns: places, int64, and the distances of their sequences, at most ``count`` of each.
         """
-        return self._window.candidates(count)
+        return nearest_places(*self._window.sequences(), count)
+
+    def ranked(self, count: int) -> list[Candidate]:
+        """
+        Rank places for the window answered last, no two of them neighbours, nearest first.
+
+        The first is the answer's nearest place, matched or not, with its distance, the second its runner-up.
+
+        :param count: most candidates, at least 0.
+        :returns: none before the first full window.
+        :raises InputError: count below 0.
+        """
+        settings = self._settings
+        return ranked_candidates(
+            self._nearest,
+            self._window.sequences(),
+            count,
+            settings.neighbourhood,
+            settings.applied_cures.contrast,
+        )
 
     def _check(self, features: LocalFeatures) -> None:
         features.require_same_settings(self._feature_settings, 'the map')
@@ -249,7 +273,7 @@ class Window(Protocol):
 
     def match(self, neighbourhood: int) -> tuple[SequenceMatch | None, np.ndarray]: ...
 
-    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]: ...
+    def sequences(self) -> tuple[np.ndarray, np.ndarray]: ...
 
 
 def answer(window: Window, settings: RecognitionSettings, track: Track) -> Recognition:

@@ -45,6 +45,12 @@ class DistanceWindow:
         first = self._count % self._length
         return self._rows[first : first + self._length]
 
+    def forget(self, count: int) -> None:
+        """Take the first places out; the others move up, and there is room for as many new ones behind."""
+        kept = self._places - count
+        self._rows[:, :kept] = self._rows[:, count : self._places]
+        self._rows[:, kept : self._places] = np.inf
+
     def widened(self, places: int) -> 'DistanceWindow':
         """Return a window with the same rows for more places, +inf for those that are new."""
         wider = DistanceWindow(self._length, places, self._k)

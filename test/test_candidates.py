@@ -1,0 +1,134 @@
+"""Candidates: non-maximum suppression against a plain loop, and what a recogniser answers with them."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.alignment.temporal import SequenceMatch
+from stavpr_ros.errors import InputError
+from stavpr_ros.recognition import Candidate, Recogniser, RecognitionSettings
+from stavpr_ros.recognition.candidates import ranked_candidates
+from stavpr_ros.recognition.cures import ROBUST, evidence, relative_distance
+
+SHORT = SequenceSettings(length=5, beta=2.0)
+
+
+def plain(costs, places, count, neighbourhood):
+    """Return the indices of the sequences that are taken, one after the other."""
+    taken = []
+    for index in sorted(range(len(costs)), key=lambda i: (costs[i], i)):
+        apart = all(abs(places[index] - places[other]) > neighbourhood for other in taken)
+        if apart and len(taken) < count and math.isfinite(costs[index]):
+            taken.append(index)
+    return taken
+
+
+def nearest_of(costs, places, distance):
+    best = int(np.argmin(costs))
+    return SequenceMatch(best, best, int(places[best]), distance, -1, math.nan)
+
+
+cases = st.integers(1, 40).flatmap(
+    lambda n: st.tuples(
+        st.lists(st.sampled_from([-1.5, -1.0, 0.0, 0.25, 0.5, math.inf]), min_size=n, max_size=n),
+        st.lists(st.integers(0, 50), min_size=n, max_size=n),
+        st.integers(0, 12),
+        st.integers(0, 15),
+    )
+)
+
+
+@given(cases)
+def test_candidates_are_those_of_a_plain_loop(case):
+    """Few different costs: most of them are ties."""
+    costs, places, count, neighbourhood = case
+    costs, places = np.array(costs, np.float32), np.array(places, np.int32)
+    nearest = nearest_of(costs, places, float(costs.min())) if np.isfinite(costs).any() else None
+    before = costs.copy()
+    found = ranked_candidates(nearest, (costs, places), count, neighbourhood, relative=False)
+    expected = plain(costs.tolist(), places.tolist(), count, neighbourhood)
+    assert found == [Candidate(int(places[i]), float(costs[i])) for i in expected]
+    np.testing.assert_array_equal(costs, before)
+
+
+def test_an_example_by_hand():
+    costs = np.array([0.5, 0.1, 0.2, 0.3, 0.2, np.inf], np.float32)
+    places = np.array([0, 10, 12, 13, 14, 30])
+    nearest = nearest_of(costs, places, 0.05)
+    ranked = ranked_candidates(nearest, (costs, places), 9, 2, False)
+    # 12 is within two places of the nearest, and 13 of 14, which is nearer
+    assert ranked == [Candidate(10, 0.05), Candidate(14, float(np.float32(0.2))), Candidate(0, 0.5)]
+
+
+def test_relative_distances_are_evidence_against_the_nearest():
+    costs, places = np.array([-3.0, -1.0, -2.875], np.float32), np.array([0, 50, 100])
+    found = ranked_candidates(nearest_of(costs, places, 0.125), (costs, places), 3, 10, relative=True)
+    assert found == [
+        Candidate(0, 0.125),
+        Candidate(100, relative_distance(evidence(-2.875, -3.0))),
+        Candidate(50, relative_distance(evidence(-1.0, -3.0))),
+    ]
+    assert found[2].distance == 1 > found[1].distance > found[0].distance
+
+
+@pytest.mark.parametrize('mode', ['paper', 'robust', 'dtw'])
+def test_the_first_two_are_the_nearest_and_the_runner_up(small_map, mode):
+    settings = RecognitionSettings(
+        1.0,
+        sequence=SHORT,
+        neighbourhood=5,
+        mode='paper' if mode == 'paper' else 'robust',
+        cures=ROBUST.without('speeds') if mode == 'dtw' else None,
+    )
+    one = Recogniser(small_map, settings)
+    assert one.ranked(3) == []
+    for i in [*range(10, 30), *range(0, 12)]:
+        nearest = one.add(small_map.features[i : i + 1]).nearest
+        ranked = one.ranked(4)
+        if nearest is None:
+            assert ranked == []
+            continue
+        assert (ranked[0].place, ranked[0].distance) == (nearest.middle, nearest.distance)
+        assert (ranked[1].place, ranked[1].distance) == (nearest.runner_up_index, nearest.runner_up_distance)
+        assert len(ranked) == 4
+        places = sorted(c.place for c in ranked)
+        assert min(np.diff(places)) > 5
+        distances = [c.distance for c in ranked]
+        assert distances == sorted(distances)
+        assert one.ranked(1) == ranked[:1]
+        assert one.ranked(0) == []
+    one.reset()
+    assert one.ranked(3) == []
+
+
+def test_all_candidates_of_a_window(small_map):
+    """Against a plain loop over the places that the recogniser lists."""
+    one = Recogniser(small_map, RecognitionSettings(1.0, sequence=SHORT, neighbourhood=3))
+    for i in range(20, 30):
+        one.add(small_map.features[i : i + 1])
+    places, distances = one.candidates(60)
+    expected = plain(distances.tolist(), places.tolist(), 60, 3)
+    found = one.ranked(60)
+    assert [c.place for c in found] == [int(places[i]) for i in expected]
+    assert [c.distance for c in found] == [float(distances[i]) for i in expected]
+    assert 5 < len(found) < 20
+
+
+def test_an_empty_map_has_no_candidates(small_map):
+    from stavpr_ros.mapping import PlaceMap
+
+    like = small_map
+    empty = PlaceMap(like.features[0:0], like.projection, like.stamps[:0], (), None, ())
+    one = Recogniser(empty, RecognitionSettings(1.0, sequence=SHORT))
+    for i in range(6):
+        one.add(small_map.features[i : i + 1])
+    assert one.ranked(5) == []
+
+
+def test_a_negative_count_is_refused(small_map):
+    with pytest.raises(InputError, match='-1'):
+        Recogniser(small_map, RecognitionSettings(1.0, sequence=SHORT)).ranked(-1)

@@ -1,0 +1,416 @@
+"""Loop closure: bounded memory, exclusion by seconds, resets; against a plain loop that forgets nothing."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.alignment.settings import SpeedSettings
+from stavpr_ros.alignment.similarity import tiled
+from stavpr_ros.alignment.spatial import adaptive_weights
+from stavpr_ros.alignment.speeds import best_speed_match, match_speeds
+from stavpr_ros.alignment.temporal import best_match, match_sequence
+from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.recognition import RecognitionSettings, Verdict
+from stavpr_ros.recognition.calibration import FLAT, MEMORY, PRIOR
+from stavpr_ros.recognition.cures import PAPER, ROBUST, Track, evidence, relative_distance
+from stavpr_ros.recognition.loop_closure import FORGOTTEN, LEAST_PLACES, ROOM, LoopCloser
+
+SHORT = SequenceSettings(length=5, beta=2.0)
+SECOND = 10**9
+
+
+def features_of(strips):
+    return LocalFeatures(strips, torch.ones(strips.shape[:2]), FeatureSettings('gradient', None, 7))
+
+
+def laps_of(count, places, noise=0.4, seed=0):
+    """A round of so many places, driven again and again, seen with noise."""
+    rng = np.random.default_rng(seed)
+    known = rng.standard_normal((7, places, 16))
+    strips = known[:, np.arange(count) % places] + noise * rng.standard_normal((7, count, 16))
+    strips += rng.standard_normal((7, 1, 16))  # what all images share
+    strips[2, 3::17] = 0  # zero features
+    strips /= np.maximum(np.linalg.norm(strips, axis=2, keepdims=True), 1e-12)
+    return features_of(torch.from_numpy(strips).float())
+
+
+@pytest.fixture(scope='module')
+def laps():
+    """Beyond the first room for images, so that growing is seen as well."""
+    assert ROOM < 375
+    return laps_of(375, 60)
+
+
+def settings_of(cures, **changes):
+    mode = 'robust' if cures.contrast else 'paper'
+    return RecognitionSettings(1.0, sequence=SHORT, neighbourhood=5, mode=mode, cures=cures, **changes)
+
+
+def drive(closer, features, stamps=None):
+    stamps = [0] * len(features) if stamps is None else stamps
+    return [closer.add(features[i : i + 1], stamps[i]) for i in range(len(features))]
+
+
+def same(one, other):
+    assert (one.verdict, one.reason) == (other.verdict, other.reason)
+    assert repr(one.nearest) == repr(other.nearest)  # to the last bit, and NaN like NaN
+    np.testing.assert_array_equal(one.path, other.path)
+
+
+class PlainCloser:
+    """
+    Forgets nothing: every image stays, and places before ``first`` are banned wherever they occur.
+
+    Its rows have an entry for every image of the drive; it takes no mean off features.
+    """
+
+    def __init__(self, settings, exclude, features):
+        n = len(features)
+        W = len(features.strips)
+        self.settings, self.exclude, self.all = settings, exclude, features.strips.contiguous()
+        self.a = adaptive_weights(W, settings.spatial, np.dtype(np.float32))
+        self.mean, self.variance = np.zeros(n, np.float32), np.ones(n, np.float32)
+        self.seen = np.full(n, PRIOR, np.float32)
+        self.rows, self.track = [], Track()
+
+    def distances(self, image, last):
+        from stavpr_ros.alignment.kernels.cpu import products
+
+        out = np.empty((1, last), np.float32)
+        products.image_distances(
+            self.all[:, :last].contiguous().numpy(), tiled(self.all[:, image : image + 1]), self.a, 7, out
+        )
+        return out[0]
+
+    def add(self, image, first, last):
+        """Answer for an image that may be matched with places first..last-1: the sequence, and all costs."""
+        cures = self.settings.applied_cures
+        row = np.full(self.all.shape[1], np.inf, np.float32)
+        if last - first >= LEAST_PLACES:
+            live = self.distances(image, last)[first:]
+            if cures.row_normalisation:
+                live = (live - live.mean()) / np.float32(max(live.std(), FLAT))
+            row[first:last] = live
+            if cures.place_calibration:
+                self.learn(slice(first, last), live)
+        self.rows = [*self.rows, row][-self.settings.sequence.length :]
+        if len(self.rows) < self.settings.sequence.length:
+            return None
+        window = np.stack(self.rows)
+        window[:, :first] = np.inf
+        return self.match(window, cures)
+
+    def learn(self, live, row):
+        self.seen[live] = np.minimum(self.seen[live] + 1, MEMORY)
+        off = row - self.mean[live]
+        self.mean[live] += off / self.seen[live]
+        self.variance[live] += (off * (row - self.mean[live]) - self.variance[live]) / self.seen[live]
+
+    def match(self, window, cures):
+        scale = np.ones_like(self.mean)
+        if cures.place_calibration:
+            scale = 1 / np.sqrt(np.maximum(self.variance, 1e-6))
+        if not cures.speeds:
+            found = match_sequence((window - self.mean) * scale, self.settings.sequence)
+            return best_match(found, self.settings.neighbourhood)
+        if not (cures.row_normalisation or cures.place_calibration):
+            known = window[np.isfinite(window)]
+            scale = scale / np.float32(max(known.std() if known.size else 0, FLAT))
+        found = match_speeds(window, SpeedSettings(), self.mean, scale)
+        return best_speed_match(found, self.settings.neighbourhood)
+
+    def judged(self, nearest):
+        """The distances of an answer: those of the sequence and its rival."""
+        if nearest is None or not self.settings.applied_cures.contrast:
+            return nearest and (nearest.distance, nearest.runner_up_distance)
+        cost, other = nearest.distance, nearest.runner_up_distance
+        seen = evidence(cost, other)
+        if self.settings.applied_cures.persistence:
+            seen = self.track.follow(nearest.middle, seen)
+        rival = other if math.isnan(other) else relative_distance(evidence(other, cost))
+        return relative_distance(seen), rival
+
+
+CHOICES = {
+    'paper': PAPER,
+    'robust': ROBUST.without('centring'),
+    'lm_dtw': ROBUST.without('centring', 'speeds'),
+    'speeds alone': PAPER.only('speeds'),
+    'no track': ROBUST.without('centring', 'persistence'),
+}
+
+
+@pytest.mark.parametrize('choice', CHOICES)
+@pytest.mark.parametrize(
+    ('limit', 'exclude', 'sequence'),
+    [(41, 12, SHORT), (64, 12, SHORT), (100, 12, SHORT), (300, 12, SHORT), (48, 2, SequenceSettings())],
+)
+def test_forgetting_is_banning(laps, choice, limit, exclude, sequence):
+    """Exactly: what is answered after forgetting is what is answered with everything before banned."""
+    settings = replace(settings_of(CHOICES[choice]), sequence=sequence)
+    closer = LoopCloser(settings, exclude, laps.settings, limit=limit)
+    plain = PlainCloser(settings, exclude, laps)
+    answered = 0
+    for i in range(len(laps)):
+        answer = closer.add(laps[i : i + 1])
+        assert closer.first + len(closer) == i + 1
+        expected = plain.add(i, closer.first, max(closer.first, i + 1 - exclude))
+        if expected is None:
+            assert answer.nearest is None
+            continue
+        answered += 1
+        found = answer.nearest
+        assert (found.first, found.last, found.middle) == (expected.first, expected.last, expected.middle)
+        assert found.runner_up_index == expected.runner_up_index
+        np.testing.assert_array_equal([found.distance, found.runner_up_distance], plain.judged(expected))
+        assert answer.path[:, 1].min() == found.first >= closer.first
+        assert answer.path[-1].tolist() == [sequence.length - 1, found.last]
+        assert found.last < i + 1 - exclude
+    assert answered > 340
+    assert closer.first > 0
+
+
+@pytest.mark.parametrize('mode', ['paper', 'robust'])
+@pytest.mark.parametrize('limit', [376, 5000])
+def test_a_limit_that_is_never_reached_changes_nothing(laps, mode, limit):
+    settings = RecognitionSettings(1.0, sequence=SHORT, neighbourhood=5, mode=mode)
+    bounded, unbounded = (LoopCloser(settings, 12, laps.settings, limit=value) for value in (limit, None))
+    for i in range(len(laps)):
+        same(bounded.add(laps[i : i + 1]), unbounded.add(laps[i : i + 1]))
+        assert bounded.ranked(3) == unbounded.ranked(3)
+    np.testing.assert_array_equal(bounded.newest_row(), unbounded.newest_row())
+    assert bounded.first == unbounded.first == 0
+    assert (bounded.limit, unbounded.limit) == (limit, None)
+
+
+@pytest.mark.parametrize('limit', [100, 150, 264])
+def test_laps_are_closed_with_bounded_memory(laps, limit):
+    """With everything on: the place one lap back, by its number since the start."""
+    closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit)
+    answers = drive(closer, laps)
+    for i in range(90, 375):
+        assert answers[i].verdict is Verdict.MATCH
+        assert (i - answers[i].newest) % 60 == 0
+        assert answers[i].newest >= i - limit
+    assert np.mean([answer.verdict is Verdict.MATCH for answer in answers[:55]]) < 0.1
+
+
+def test_memory_is_bounded_and_an_eighth_is_forgotten_at_a_time(laps):
+    closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=80)
+    for i in range(len(laps)):
+        closer.add(laps[i : i + 1])
+        forgotten = max(0, -(-(i + 1 - 80) // (80 // FORGOTTEN))) * (80 // FORGOTTEN)
+        assert (closer.first, len(closer)) == (forgotten, i + 1 - forgotten)
+        assert len(closer) <= 80
+        assert len(closer.newest_row()) == max(0, len(closer) - 12)
+    assert closer._route.room == 80
+    assert closer._window._window.rows().shape[1] < 80 + 16 + SHORT.k
+
+
+@pytest.mark.parametrize('limit', [None, 90])
+def test_what_is_kept_is_what_came_less_its_mean(laps, limit):
+    """Without having been kept twice: also after the mean was moved and places were forgotten many times."""
+    closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit)
+    moved = 0
+    for i in range(len(laps)):
+        before = closer._route._mean
+        closer.add(laps[i : i + 1])
+        moved += closer._route._mean is not before
+        if limit and closer.first and closer._route._mean is not before:
+            # before the newest image was taken in
+            expected = laps.strips[:, closer.first : i].mean(dim=1)
+            torch.testing.assert_close(closer._route._mean, expected, atol=1e-6, rtol=0)
+    assert moved > 20
+    came = laps.strips[:, closer.first :]
+    expected = came - closer._route._mean[:, None]
+    expected /= expected.norm(dim=2, keepdim=True)
+    expected[(came == 0).all(dim=2)] = 0
+    assert (expected == 0).all(dim=2).any()
+    torch.testing.assert_close(closer._route.strips[:, : len(closer)], expected, atol=2e-6, rtol=0)
+
+
+def test_without_centring_features_are_kept_as_they_came(laps):
+    closer = LoopCloser(settings_of(ROBUST.without('centring')), 12, laps.settings, limit=83)
+    drive(closer, laps)
+    assert closer.first == 300
+    torch.testing.assert_close(closer._route.strips[:, :75], laps.strips[:, 300:], atol=0, rtol=0)
+
+
+def blurred(features, seed=0, noise=0.25):
+    noise = noise * torch.randn(features.strips.shape, generator=torch.Generator().manual_seed(seed))
+    return features_of(torch.nn.functional.normalize(features.strips + noise, dim=2))
+
+
+def test_a_track_goes_on_over_the_shift(laps):
+    """What was certain stays so for some images, also in the very image in which places are forgotten."""
+    persistent, alone = (
+        LoopCloser(settings_of(cures), 12, laps.settings, limit=160)
+        for cures in (ROBUST, ROBUST.without('persistence'))
+    )
+    drive(persistent, laps[:157])
+    drive(alone, laps[:157])
+    blur = blurred(laps[157:162])
+    for i in range(5):
+        assert persistent.first == (20 if i > 3 else 0)
+        one, other = persistent.add(blur[i : i + 1]), alone.add(blur[i : i + 1])
+    assert persistent.first == 20
+    assert one.nearest.middle == other.nearest.middle
+    assert one.nearest.distance < other.nearest.distance
+
+
+# ------------------------------------------------ seconds
+
+
+def test_places_younger_than_so_many_seconds_are_left_out(laps):
+    """At 2 Hz, 10 Hz and 0.5 Hz, with images whose stamps are unknown in between."""
+    rng = np.random.default_rng(1)
+    steps = np.repeat([0.5, 0.1, 2.0], 125) * rng.uniform(0.9, 1.1, 375)
+    stamps = (np.cumsum(steps) * SECOND).astype(np.int64) + 1
+    unknown = rng.random(375) < 0.1
+    stamps[unknown] = 0
+    closer = LoopCloser(settings_of(ROBUST), 7, laps.settings, exclude_seconds=9.5)
+    old = 0
+    for i in range(375):
+        closer.add(laps[i : i + 1], int(stamps[i]))
+        while old <= i and (not stamps[old] or (stamps[i] and stamps[i] - stamps[old] >= 9.5 * SECOND)):
+            old += 1
+        expected = min(i + 1 - 7, old) if stamps[i] else i + 1 - 7
+        assert len(closer.newest_row()) == max(0, expected)
+    assert 0 < len(closer._young) < 12
+
+
+def test_exactly_so_many_seconds_is_old_enough(laps):
+    closer = LoopCloser(settings_of(ROBUST), 1, laps.settings, exclude_seconds=3.0)
+    drive(closer, laps[:20], [1 + i * SECOND for i in range(20)])
+    assert len(closer.newest_row()) == 17
+
+
+def test_no_seconds_or_no_stamps_is_the_count_alone(laps):
+    plain = LoopCloser(settings_of(ROBUST), 12, laps.settings)
+    stamped = LoopCloser(settings_of(ROBUST), 12, laps.settings)
+    unknown = LoopCloser(settings_of(ROBUST), 12, laps.settings, exclude_seconds=5.0)
+    for i in range(150):
+        image = laps[i : i + 1]
+        answer = plain.add(image)
+        same(answer, stamped.add(image, 7 + i))
+        same(answer, unknown.add(image, 0))
+        assert len(stamped._young) == len(unknown._young) == 0
+
+
+def test_seconds_and_a_limit(laps):
+    """A standing clock keeps everything young: nothing is answered, and nothing grows without bound."""
+    closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=80, exclude_seconds=5.0)
+    answers = drive(closer, laps, [SECOND] * 375)
+    assert all(answer.nearest is None for answer in answers)
+    assert answers[-1].verdict is Verdict.NO_MATCH
+    assert 'old enough' in answers[-1].reason
+    assert len(closer._young) == len(closer) <= 80
+    closer.add(laps[:1], 6 * SECOND)
+    assert len(closer._young) == 1
+    assert len(closer.newest_row()) == len(closer) - 12
+
+
+# ------------------------------------------------ resets
+
+
+def test_a_reset_begins_a_new_window_and_keeps_the_route(laps):
+    closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, exclude_seconds=8.0)
+    stamps = [10_000 * SECOND + i * SECOND for i in range(150)]
+    for i in range(100):
+        closer.add(laps[i : i + 1], stamps[i])
+    shift, scale = closer._window.calibration.shift_and_scale(80)
+    assert closer.ranked(2)
+    closer.reset()
+    assert closer.window_fill == 0
+    assert closer.ranked(2) == []
+    assert len(closer) == 100
+    for after, kept in zip(closer._window.calibration.shift_and_scale(80), (shift, scale), strict=True):
+        np.testing.assert_array_equal(after, kept)
+    for i in range(100, 150):  # the clock jumped back
+        answer = closer.add(laps[i : i + 1], stamps[i] - 9_900 * SECOND)
+        young = min(i + 1 - 100, 8)
+        assert len(closer.newest_row()) == i + 1 - max(12, young)
+        if i < 104:
+            assert answer.verdict is Verdict.WARMING_UP
+        else:
+            assert answer.verdict is Verdict.MATCH
+            assert (i - answer.newest) % 60 == 0
+
+
+def test_a_reset_ends_the_track(laps):
+    one, other = (LoopCloser(settings_of(ROBUST), 12, laps.settings) for _ in range(2))
+    drive(one, laps[:100])
+    drive(other, laps[:100])
+    one.reset()
+    other._window.clear()  # the window alone
+    again = blurred(laps[96:101])  # one place ahead of the last window
+    fresh, tracked = drive(one, again)[-1], drive(other, again)[-1]
+    assert fresh.nearest.middle == tracked.nearest.middle == 38
+    assert fresh.nearest.distance > tracked.nearest.distance
+
+
+# ------------------------------------------------ candidates, errors
+
+
+@pytest.mark.parametrize('cures', [PAPER, ROBUST, ROBUST.without('speeds')])
+def test_candidates_are_numbered_from_the_start(laps, cures):
+    closer = LoopCloser(settings_of(cures), 12, laps.settings, limit=200)
+    assert closer.ranked(5) == []
+    for i in range(300):
+        nearest = closer.add(laps[i : i + 1]).nearest
+        ranked = closer.ranked(3)
+        if nearest is None:
+            assert ranked == []
+            continue
+        assert (ranked[0].place, ranked[0].distance) == (nearest.middle, nearest.distance)
+        assert closer.candidates(1)[0].tolist() == [nearest.middle]
+        if len(ranked) > 1:
+            assert ranked[1].place == nearest.runner_up_index
+            assert ranked[1].distance == nearest.runner_up_distance
+        if i > 220:
+            assert {i - 2 - c.place for c in ranked[:2]} < {60, 120, 180}
+            assert closer.first > 0
+
+
+def test_an_error_leaves_everything_as_it_was(laps):
+    one, other = (LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=70) for _ in range(2))
+    broken = features_of(torch.full((7, 1, 16), math.nan))
+    for i in range(200):
+        with pytest.raises(InputError):
+            other.add(broken, 5)
+        same(one.add(laps[i : i + 1]), other.add(laps[i : i + 1]))
+        assert (one.first, len(one)) == (other.first, len(other))
+
+
+def test_a_threshold_is_changed_while_driving(laps):
+    closer = LoopCloser(settings_of(ROBUST), 12, laps.settings)
+    assert drive(closer, laps[:120])[-1].verdict is Verdict.MATCH
+    closer.set_threshold(1e-9)
+    assert closer.add(laps[120:121]).verdict is Verdict.NO_MATCH
+    assert closer.settings.threshold == 1e-9
+
+
+@pytest.mark.parametrize('exclude', [1, 2, 12, 30])
+def test_the_smallest_limit_that_is_allowed_works(exclude):
+    features = laps_of(200, 9)
+    settings = settings_of(ROBUST.without('centring'))
+    with pytest.raises(SettingsError, match=r'limit = 0 .* take at least \d+') as refused:
+        LoopCloser(settings, exclude, features.settings, limit=0)
+    least = int(str(refused.value).split()[-1])
+    with pytest.raises(SettingsError, match=f'limit = {least - 1}'):
+        LoopCloser(settings, exclude, features.settings, limit=least - 1)
+    closer = LoopCloser(settings, exclude, features.settings, limit=least)
+    answers = drive(closer, features)
+    assert least <= exclude + 2 * SHORT.length + 8
+    assert all(answer.nearest is not None for answer in answers[60:])
+
+
+@pytest.mark.parametrize('seconds', [-1.0, math.nan, math.inf])
+def test_seconds_that_are_refused(laps, seconds):
+    with pytest.raises(SettingsError, match='exclude_seconds'):
+        LoopCloser(settings_of(ROBUST), 12, laps.settings, exclude_seconds=seconds)
