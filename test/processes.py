@@ -6,9 +6,13 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from ament_index_python.packages import get_package_prefix
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
@@ -60,8 +64,14 @@ class Process:
             self.popen.wait()
 
 
+def node_process(log: Path, **parameters: object) -> Process:
+    """Start the node with parameters."""
+    options = [option for name, value in parameters.items() for option in ('-p', f'{name}:={value}')]
+    return Process(log, 'node', '--ros-args', *options)
+
+
 class Bench:
-    """A node in the test's own process: publishes images, hears answers, sets parameters."""
+    """A node in the test's own process: publishes images, hears answers, calls services."""
 
     def __init__(self) -> None:
         self.context = rclpy.Context()
@@ -75,7 +85,8 @@ class Bench:
         self.node.create_subscription(
             PlaceMatch, '/stavpr/match', self.answers.append, QoSProfile(depth=1000)
         )
-        self.parameters = self.node.create_client(SetParameters, '/stavpr/set_parameters')
+        self.diagnostics: dict[str, DiagnosticStatus] = {}  # the latest, by part: input, map ...
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
     def until(self, condition: Callable[[], bool], what: str) -> None:
         end = time.monotonic() + PATIENCE
@@ -128,13 +139,48 @@ class Bench:
         self.until(answered, 'the answer to this image')
         return found[0]
 
+    def call(self, kind: type, name: str, **fields: object) -> Any:
+        """Call a service of the node, such as ``reset``, and return its response."""
+        client = self.node.create_client(kind, f'/stavpr/{name}')
+        self.until(client.service_is_ready, f'the service {name}')
+        future = client.call_async(kind.Request(**fields))
+        self.until(future.done, f'the answer of {name}')
+        self.node.destroy_client(client)
+        return future.result()
+
     def set_parameter(self, name: str, value: object) -> tuple[bool, str]:
-        self.until(self.parameters.service_is_ready, 'the parameter service')
-        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
-        future = self.parameters.call_async(request)
-        self.until(future.done, 'the parameter to be set')
-        result = future.result().results[0]
+        values = [Parameter(name, value=value).to_parameter_msg()]
+        result = self.call(SetParameters, 'set_parameters', parameters=values).results[0]
         return result.successful, result.reason
+
+    def state(self) -> str:
+        """Label of the node's life-cycle state."""
+        return str(self.call(GetState, 'get_state').current_state.label)
+
+    def transition(self, label: str) -> bool:
+        """Ask for a transition: configure, activate, deactivate, cleanup, shutdown."""
+        return bool(self.call(ChangeState, 'change_state', transition=Transition(label=label)).success)
+
+    def listen(self, kind: type, topic: str, qos: object = 50) -> list[Any]:
+        """Return a list that fills with the messages of a topic; see ``until``."""
+        heard: list[Any] = []
+        self.node.create_subscription(kind, topic, heard.append, qos)
+        return heard
+
+    def until_diagnosed(self, part: str, level: bytes, words: str = '') -> DiagnosticStatus:
+        """Wait until the diagnostics of a part (input, map, recognition, processing) say so."""
+
+        def said() -> bool:
+            status = self.diagnostics.get(part)
+            return status is not None and status.level == level and words in status.message
+
+        self.diagnostics.pop(part, None)
+        self.until(said, f'diagnostics of {part} at level {level!r} with {words!r}')
+        return self.diagnostics[part]
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.diagnostics[status.name.partition(': ')[2]] = status
 
     def close(self) -> None:
         self.executor.shutdown()

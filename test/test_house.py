@@ -16,9 +16,19 @@ MAY_IMPORT = {
     'features': set(),
     'mapping': {'features', 'alignment', 'sources'},
     'recognition': {'mapping', 'features', 'alignment'},
+    'operation': {'recognition', 'mapping', 'features', 'alignment', 'sources'},
     'evaluation': {'recognition', 'mapping', 'features', 'alignment', 'sources'},
-    'ros': {'evaluation', 'recognition', 'mapping', 'features', 'alignment', 'sources'},
-    'commands': {'ros', 'evaluation', 'recognition', 'mapping', 'features', 'alignment', 'sources'},
+    'ros': {'operation', 'evaluation', 'recognition', 'mapping', 'features', 'alignment', 'sources'},
+    'commands': {
+        'ros',
+        'operation',
+        'evaluation',
+        'recognition',
+        'mapping',
+        'features',
+        'alignment',
+        'sources',
+    },
 }
 
 

@@ -1,11 +1,12 @@
 """The node from the outside: a process of its own, images published to it, answers heard."""
 
-import array
 import signal
 
 import numpy as np
 import pytest
-from processes import Bench, Process
+from diagnostic_msgs.msg import DiagnosticStatus
+from image_messages import image_message
+from processes import Bench, node_process
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float32, Int32
@@ -17,28 +18,6 @@ from stavpr_ros.mapping import save_map
 from stavpr_ros.recognition import Recogniser, RecognitionSettings
 
 LENGTH, THRESHOLD = 5, 0.2
-
-
-def image_message(image: np.ndarray, stamp: int, encoding: str = 'rgb8', padding: int = 0) -> Image:
-    """An image message in one of the encodings, its rows padded by some bytes."""
-    if encoding == 'bgr8':
-        image = image[:, :, ::-1]
-    elif encoding in ('rgba8', 'bgra8'):
-        order = image if encoding == 'rgba8' else image[:, :, ::-1]
-        image = np.dstack([order, np.full(image.shape[:2], 255, np.uint8)])
-    elif encoding in ('mono8', 'mono16'):
-        image = image.astype(np.float64).mean(axis=2).astype(np.uint8)
-        if encoding == 'mono16':
-            image = (image.astype('>u2') << 8) + 7
-            image = image.astype('>u2')
-    rows = np.ascontiguousarray(image).view(np.uint8).reshape(image.shape[0], -1)
-    rows = np.hstack([rows, np.full((len(rows), padding), 99, np.uint8)])
-    message = Image(height=image.shape[0], width=image.shape[1], encoding=encoding, step=rows.shape[1])
-    message.is_bigendian = int(encoding == 'mono16')
-    message.header.frame_id = 'camera'
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-    message.data = array.array('B', rows.tobytes())
-    return message
 
 
 @pytest.fixture(scope='module')
@@ -61,8 +40,7 @@ def start(log, map_file=None, threshold=None, **parameters):
         values['map_path'] = map_file
     if threshold is not None:
         values['threshold'] = threshold
-    options = [option for name, value in values.items() for option in ('-p', f'{name}:={value}')]
-    return Process(log, 'node', '--ros-args', *options)
+    return node_process(log, **values)
 
 
 @pytest.fixture
@@ -70,9 +48,10 @@ def run(bench, tmp_path):
     """Start one node and wait for it; it is ended with the test."""
     started = []
 
-    def run(*arguments, **parameters):
+    def run(*arguments, wait=True, **parameters):
         started.append(start(tmp_path / 'node.log', *arguments, **parameters))
-        bench.wait_for_node()
+        if wait:
+            bench.wait_for_node()
         return started[0]
 
     yield run
@@ -148,7 +127,8 @@ def test_answers_are_the_cores_match_for_match(bench, node, small_map, route):
     assert infos[0].has_poses
     assert node.stop() == 0
     assert 'Traceback' not in node.output()
-    assert f'{len(images) + bench.probes} images received, 0 dropped, {bench.probes} invalid' in node.output()
+    assert f'{len(images) + bench.probes} images received, {len(images)} answered' in node.output()
+    assert f'{bench.probes} invalid: encoding' in node.output()
     for subscription in subscriptions:
         bench.node.destroy_subscription(subscription)
 
@@ -177,7 +157,9 @@ def test_broken_images_among_good_ones(bench, node, route):
         else:
             assert (answer.verdict, answer.newest_index) == (PlaceMatch.MATCH, i)
     assert node.stop(signal.SIGTERM) == 0
-    assert f'{4 + bench.probes} invalid' in node.output()
+    assert f'{2 + bench.probes} invalid: encoding' in node.output()
+    assert '1 invalid: depth' in node.output()
+    assert '1 invalid: cut off' in node.output()
     assert 'Traceback' not in node.output()
 
 
@@ -224,7 +206,7 @@ def test_what_is_missing_is_said_and_can_be_set_later(bench, run, map_file, rout
     assert answer.sequence_middle >= 0
     assert not bench.set_parameter('beta', 3.0)[0]
     assert process.popen.poll() is None
-    assert "parameter 'map_path' is not set" in process.output()
+    assert "no map: set parameter 'map_path'" in process.output()
 
 
 def test_mode_robust_needs_no_threshold(bench, run, map_file, small_map, route):
@@ -250,14 +232,18 @@ def test_mode_robust_needs_no_threshold(bench, run, map_file, small_map, route):
     assert bench.ask(image_message(route[31], 31)).threshold == 1
 
 
-def test_a_damaged_map_is_said_and_the_node_stays(bench, run, route, tmp_path):
+def test_a_damaged_map_is_said_and_a_good_one_starts_the_node(bench, run, map_file, route, tmp_path):
     bad = tmp_path / 'bad.stavpr'
     bad.write_bytes(b'no map')
-    process = run(bad, THRESHOLD)
-    answer = bench.ask(image_message(route[0], 1))
-    assert answer.verdict == PlaceMatch.NOT_READY
-    assert 'bad.stavpr' in answer.reason
-    assert process.popen.poll() is None
+    process = run(bad, THRESHOLD, wait=False)
+    bench.until_diagnosed('map', DiagnosticStatus.ERROR, 'bad.stavpr')
+    assert bench.state() == 'unconfigured'
+    assert 'cannot configure' in process.output()
+    assert bench.set_parameter('map_path', str(map_file)) == (True, '')
+    bench.wait_for_node()
+    for i in range(LENGTH):
+        answer = bench.ask(image_message(route[i], 3 + i))
+    assert (answer.verdict, answer.newest_index) == (PlaceMatch.MATCH, LENGTH - 1)
 
 
 @pytest.mark.parametrize(

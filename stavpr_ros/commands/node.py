@@ -59,7 +59,7 @@ def _run(args: list[str] | None) -> int:
 
     try:
         with ros_node(PlaceRecognitionNode, args) as node:
-            spin_until(node)
+            spin_until(node, threads=node.THREADS)
     except (StavprError, ParameterException) as error:
         get_logger('stavpr').fatal(f'cannot start: {error}')
         return 1

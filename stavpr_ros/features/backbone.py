@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import json
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -61,3 +62,25 @@ def backbone_class(kind: str) -> Any:
 def settings_class(kind: str) -> Any:
     """Return the frozen dataclass of a kind's settings."""
     return backbone_class(kind).Settings
+
+
+def settings_from_json(kind: str, text: str, model: str = '') -> Any:
+    """
+    Read a kind's settings from a JSON object; what it does not name is the default.
+
+    :param model: the network's file, for kinds that have one; '' = what the object says.
+    :raises SettingsError: no such kind, no such setting, one that is missing, or no JSON object.
+    """
+    cls = settings_class(kind)
+    try:
+        values = json.loads(text)
+        if not isinstance(values, dict):
+            raise TypeError('expected an object, {"name": value}')
+        if model and 'model' in {field.name for field in dataclasses.fields(cls)}:
+            values['model'] = model
+        return cls(**values)
+    except (ValueError, TypeError) as error:
+        names = ', '.join(field.name for field in dataclasses.fields(cls))
+        raise SettingsError(
+            f'settings {text!r} of features {kind} do not do ({error}): expected a JSON object with {names}'
+        ) from error

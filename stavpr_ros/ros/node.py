@@ -1,160 +1,305 @@
-"""The place-recognition node: subscribes, hands over, publishes."""
+"""The place-recognition node: its life cycle and its parameters."""
 
+import gc
+import threading
 import traceback
+from collections.abc import Callable
+from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.node import Node
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.duration import Duration
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
-from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import Image
-from std_msgs.msg import Float32, Int32
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.timer import Timer
 
-from stavpr_msgs.msg import MapInfo, PlaceMatch
-from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
-from stavpr_ros.devices import choose_backend, why_no_cuda
-from stavpr_ros.errors import StavprError
-from stavpr_ros.ros.engine import Engine, EngineOptions
-from stavpr_ros.ros.messages import blank_match, map_info_message
-from stavpr_ros.ros.parameters import declare_parameters
-from stavpr_ros.ros.worker import Worker
-from stavpr_ros.threads import limit_threads
+from stavpr_msgs.msg import MapInfo
+from stavpr_ros.devices import why_no_cuda
+from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.ros.parameter_table import declare_parameters
+from stavpr_ros.ros.parameters import BY_NAME, PARAMETERS
+from stavpr_ros.ros.reporter import Reporter
+from stavpr_ros.ros.runtime import Runtime
+from stavpr_ros.ros.services import Services
+from stavpr_ros.ros.settings import NodeSettings, node_settings, unknown_parameters
+from stavpr_ros.ros.statistics import Statistics
+from stavpr_ros.ros.worker import PATIENCE
 
-REPORT_PERIOD = 10.0  # seconds between repeated warnings
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-class PlaceRecognitionNode(Node):
+class PlaceRecognitionNode(LifecycleNode):
     """
     Recognises where images were taken; publishes one ``~/match`` for each image on ``image``.
+
+    A managed node: configuring loads the map and the model and compiles the kernels, activating subscribes,
+    deactivating stops, cleaning up frees. With parameter ``autostart`` it configures and activates itself
+    as soon as it spins. It wants an executor with several threads: see :data:`THREADS`.
 
     :raises StavprError: parameters that cannot work together, or a backend that is not here.
     """
 
-    def __init__(self, **options: object) -> None:
+    THREADS = 4  # images, odometry, services, life cycle and parameters: none waits for another
+
+    def __init__(self, **options: Any) -> None:
         super().__init__('stavpr', **options)
-        values = declare_parameters(self)
-        backend = choose_backend(values['backend'])
-        reason = why_no_cuda() if values['backend'] == 'auto' else 'as asked for'
-        self.get_logger().info(f'backend {backend} ({reason or "there is a device"})')
-        self._engine = Engine(
-            EngineOptions(
-                spatial=SpatialSettings(
-                    values['strategy'], values['sigma'], values['xi'] or None, values['vertical']
-                ),
-                sequence=SequenceSettings(values['sequence_length'], values['beta']),
-                neighbourhood=values['neighbourhood'],
-                mode=values['mode'],
-                backend=backend,
-                precision=values['precision'],
-                model_path=values['model_path'],
-            )
-        )
-        self._received = self._dropped = 0
-        answers = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._match = self.create_publisher(PlaceMatch, '~/match', answers)
-        self._place_index = self.create_publisher(Int32, '~/place_index', answers)
-        self._distance = self.create_publisher(Float32, '~/distance', answers)
-        self._map_info = self.create_publisher(MapInfo, '~/map_info', latched)
-        self._worker = Worker(self._answer, values['queue_size'])
-        self._worker.call(lambda: limit_threads(values['threads'])).result()
-        self._start(values['map_path'], values['threshold'])
+        for said in unknown_parameters(self._parameter_overrides):
+            self.get_logger().warning(said)
+        self._settings = node_settings(declare_parameters(self, PARAMETERS))
+        self._apply_verbosity(self._settings.verbosity)
+        self._lock = threading.RLock()  # one change at a time: transitions and parameters
+        self.ending = threading.Event()  # nobody waits for anything any more
+        self.left_behind = False  # something was still under way when the node was destroyed
+        self._runtime: Runtime | None = None
+        self.statistics = Statistics()
+        self.problem = ''  # why the last transition failed
+        self._map_info = self.create_publisher(MapInfo, '~/map_info', LATCHED)
+        self._told: MapInfo | None = None
+        self._telling = threading.Lock()  # what was published last is what was true last
+        self._refuse_impossible_transitions()
+        self._served = Services(self)
         self.add_on_set_parameters_callback(self._on_parameters)
-        self.create_subscription(
-            Image,
-            'image',
-            self._on_image,
-            qos_profile_sensor_data,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        self.add_post_set_parameters_callback(self._on_parameters_set)
+        backwards = JumpThreshold(
+            min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
         )
+        self._jumps = self.get_clock().create_jump_callback(backwards, post_callback=self._on_clock_jump)
+        self._reporter = Reporter(self, self._settings.diagnostics_period)
+        self._start: Timer | None = None
+        if self._settings.autostart:
+            self._start = self.create_timer(
+                0.0,
+                self._on_start,
+                callback_group=MutuallyExclusiveCallbackGroup(),
+                clock=Clock(clock_type=ClockType.STEADY_TIME),
+            )
 
-    def _start(self, map_path: str, threshold: float) -> None:
-        """Take over the two parameters that may come later; say what is missing."""
-        self._engine.check_threshold(threshold)
-        if threshold > 0:
-            self._worker.call(lambda: self._engine.set_threshold(threshold)).result()
-        if map_path:
+    @property
+    def state(self) -> str:
+        """Label of the life-cycle state."""
+        return str(self._state_machine.current_state[1])
+
+    @property
+    def settings(self) -> NodeSettings:
+        """The parameters in force."""
+        return self._settings
+
+    @property
+    def configured(self) -> Runtime | None:
+        """What the node has while it is configured, None while it is not."""
+        return self._runtime
+
+    @property
+    def runtime(self) -> Runtime:
+        """
+        What the node has while it is configured.
+
+        :raises StavprError: it is not.
+        """
+        if self._runtime is None:
+            because = f' ({self.problem})' if self.problem else ''
+            raise StavprError(
+                f'the node is {self.state}{because}: configure it first, `ros2 lifecycle set NODE configure`'
+            )
+        return self._runtime
+
+    # the life cycle
+
+    def _on_start(self) -> None:
+        """Configure and activate, once; again only when a parameter was changed after a failure."""
+        assert self._start is not None
+        self._start.cancel()
+        done = TransitionCallbackReturn.SUCCESS
+        try:
+            if self.state == 'unconfigured' and self.trigger_configure() == done and not self.ending.is_set():
+                self.trigger_activate()
+        except rclpy_implementation.RCLError as error:  # would end the process
+            self.get_logger().warning(f'autostart leaves off, something else changes the state: {error}')
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load map and model, warm the kernels, make the publishers."""
+        return self._transition('configure', self._configure, super().on_configure, state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Subscribe to images."""
+        # publishers first: an image may come, and be answered, as soon as there is a subscription
+        publishers = super().on_activate
+        return self._transition('activate', lambda: publishers(state), self._activate, state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Hear no images any more."""
+        return self._transition('deactivate', self._deactivate, super().on_deactivate, state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Free map, model and publishers."""
+        return self._transition('clean up', self._free, super().on_cleanup, state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Free everything, from any state."""
+        return self._transition('shut down', self._free, super().on_shutdown, state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Free everything, so that the node can be configured again."""
+        self._free()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _transition(
+        self,
+        name: str,
+        act: Callable[[], object],
+        then: Callable[[LifecycleState], TransitionCallbackReturn],
+        state: LifecycleState,
+    ) -> TransitionCallbackReturn:
+        """Do what a transition means; an error leads to the error state, with its reason."""
+        try:
+            with self._lock:
+                act()
+                result = then(state)
+        except StavprError as error:
+            if self.ending.is_set():
+                return TransitionCallbackReturn.ERROR
+            self.problem = f'cannot {name}: {error}'
+        except Exception as error:  # rclpy would swallow it
+            self.problem = f'cannot {name}: {type(error).__name__}: {error}'
+            self.get_logger().error(traceback.format_exc())
+        else:
+            self.problem = ''
+            return result
+        self.get_logger().error(self.problem)
+        return TransitionCallbackReturn.ERROR
+
+    def _configure(self) -> None:
+        settings = self._settings
+        backend, wish = settings.engine.backend, settings.backend
+        reason = (why_no_cuda() or 'there is a device') if wish == 'auto' else 'as asked for'
+        self.get_logger().info(f'backend {backend} ({reason})')
+        self._runtime = Runtime(self, settings, self.statistics)
+        self._runtime.on_loading = self.publish_map_info
+        if missing := self._runtime.engine.missing:
+            self.get_logger().warning(f'waiting, no match is published: {missing}')
+        self.publish_map_info()
+
+    def _activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.statistics.reset()
+        self.runtime.activate()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _deactivate(self) -> None:
+        self.runtime.deactivate()
+
+    def _free(self) -> None:
+        with self._lock:
+            runtime, self._runtime = self._runtime, None
+            if runtime is not None:
+                runtime.close()
+                del runtime
+                self._tell(MapInfo(operation=self._settings.operation, state='none'))
+        gc.collect()  # runtime and worker refer to each other: the map would stay until Python tidies up
+        if self._settings.engine.backend == 'cuda':
+            import torch
+
+            torch.cuda.empty_cache()
+
+    def _refuse_impossible_transitions(self) -> None:
+        """Answer a request for a transition that the state does not have; rclpy would end the process."""
+        service = self._service_change_state
+        change = service.callback
+
+        def change_or_refuse(request: Any, response: Any) -> Any:
             try:
-                self._load(map_path)
-            except StavprError as error:
-                self.get_logger().error(str(error))
-        if self._engine.missing:
-            self.get_logger().warning(f'waiting, no match is published: {self._engine.missing}')
+                return change(request, response)
+            except rclpy_implementation.RCLError as error:
+                wish = request.transition.label or request.transition.id
+                self.get_logger().error(f'no transition {wish!r} from state {self.state}: {error}')
+                response.success = False
+                return response
 
-    def _load(self, path: str) -> None:
-        place_map = self._worker.call(lambda: self._engine.load(path)).result()
-        self._map_info.publish(map_info_message(place_map, path, self.get_clock().now().to_msg()))
-        self.get_logger().info(
-            f'map {path}: {len(place_map)} places, features {place_map.settings.kind}, '
-            f'{place_map.settings.strips} strips of {place_map.features.strips.shape[2]} dimensions'
-        )
+        service.callback = change_or_refuse
+
+    # parameters
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Apply what may change while the node runs: the map and the threshold; all of it or nothing."""
-        changes = {parameter.name: parameter.value for parameter in parameters}
+        """Check all parameters together; apply what may change while the node runs; all of it or nothing."""
+        changes = {parameter.name: parameter.value for parameter in parameters if parameter.name in BY_NAME}
+        if not changes:
+            return SetParametersResult(successful=True)
         try:
-            threshold = changes.get('threshold')
-            if threshold is not None:
-                self._engine.check_threshold(threshold)
-            if 'map_path' in changes:
-                if not changes['map_path']:
-                    raise StavprError(
-                        "map_path = '' names no file: set the new map's, the old one stays until then"
-                    )
-                self._load(changes['map_path'])
-            if threshold is not None:
-                wish = threshold if threshold > 0 else None
-                self._worker.call(lambda: self._engine.set_threshold(wish)).result()
+            with self._lock:
+                self._change(changes)
         except StavprError as error:
             self.get_logger().error(str(error))
             return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:  # would end the process
+            self.get_logger().error(traceback.format_exc())
+            return SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
         return SetParametersResult(successful=True)
 
-    def _on_image(self, message: Image) -> None:
-        self._received += 1
-        dropped = self._worker.put(message)
-        if dropped is not None:
-            self._dropped += 1
-            reason = 'newer images came before its turn'
-            self._match.publish(
-                blank_match(dropped.header, PlaceMatch.DROPPED, reason, self._engine.threshold)
+    def _change(self, changes: dict[str, Any]) -> None:
+        old = self._settings
+        fixed = [n for n, value in changes.items() if BY_NAME[n].when != 'live' and value != old.values[n]]
+        if fixed and self._runtime is not None:
+            raise SettingsError(
+                f'{", ".join(fixed)} can be set only while the node is unconfigured, it is {self.state}: '
+                'clean it up first (`ros2 lifecycle set NODE deactivate`, then cleanup)'
             )
-            self.get_logger().warning(
-                f'images come faster than they can be matched: {self._dropped} of {self._received} dropped',
-                throttle_duration_sec=REPORT_PERIOD,
-            )
+        settings = node_settings({**old.values, **changes})
+        if self._runtime is not None:
+            if old.map_path and not settings.map_path:
+                raise SettingsError(
+                    "map_path = '' names no file: set the new map's, the old one stays until then"
+                )
+            self._runtime.change(settings)
+        self._settings = settings
+        self._apply_verbosity(settings.verbosity)
 
-    def _answer(self, message: Image) -> None:
-        """Answer one image, on the worker's thread."""
-        try:
-            answer = self._engine.process(message)
-        except Exception as error:
-            self._engine.invalid += 1
-            self.get_logger().error(f'an image could not be matched: {traceback.format_exc()}')
-            reason = f'internal error: {type(error).__name__}: {error}'
-            answer = blank_match(message.header, PlaceMatch.INVALID_IMAGE, reason, self._engine.threshold)
-        self._publish(answer)
+    def _on_parameters_set(self, parameters: list[Parameter]) -> None:
+        """Tell what has become of the map; try to start again where the last try failed."""
+        if self._runtime is not None:
+            self.publish_map_info()
+        elif self._start is not None and self.problem and self.state == 'unconfigured':
+            self._start.reset()
 
-    def _publish(self, answer: PlaceMatch) -> None:
-        if answer.verdict == PlaceMatch.MATCH:
-            self._place_index.publish(Int32(data=answer.place_index))
-            self._distance.publish(Float32(data=answer.distance))
-        elif answer.verdict == PlaceMatch.INVALID_IMAGE:
-            self.get_logger().warning(
-                f'image skipped ({self._engine.invalid} so far): {answer.reason}',
-                throttle_duration_sec=REPORT_PERIOD,
-            )
-        elif answer.verdict == PlaceMatch.NOT_READY:
-            self.get_logger().warning(
-                f'images arrive, but no match is published: {answer.reason}',
-                throttle_duration_sec=REPORT_PERIOD,
-            )
-        self._match.publish(answer)
+    def _apply_verbosity(self, verbosity: str) -> None:
+        self.get_logger().set_level(LoggingSeverity[verbosity.upper()])
+
+    # what is told
+
+    def _on_clock_jump(self, jump: Any) -> None:
+        runtime = self._runtime
+        if runtime is not None:
+            runtime.restart(f'the clock jumped back by {-jump.delta.nanoseconds / 1e9:.3f} s')
+
+    def publish_map_info(self) -> None:
+        """Publish ``~/map_info`` if it has changed."""
+        with self._telling:
+            runtime = self._runtime
+            if runtime is not None:
+                self._tell(runtime.map_info())
+
+    def _tell(self, info: MapInfo) -> None:
+        told, self._told = self._told, info
+        if told is not None:
+            told.header = info.header  # when it was told is no change
+        if told != info:
+            self._map_info.publish(info)
 
     def destroy_node(self) -> None:
         """End the worker, say what was done, and take the node down."""
-        self._worker.stop()
-        self.get_logger().info(
-            f'{self._received} images received, {self._dropped} dropped, {self._engine.invalid} invalid'
-        )
+        self._reporter.stop()
+        self.ending.set()
+        # who holds the lock may be reading a large map, or compiling: nobody waits for that at the end
+        if self._lock.acquire(timeout=PATIENCE + 1):
+            self._free()
+            self._lock.release()
+        else:
+            self.left_behind = True
+        if self.left_behind:
+            self.get_logger().warning('something is still being loaded or compiled: it is left to itself')
+        seen = self.statistics.snapshot()
+        drops = ''.join(f', {count} {cause}' for cause, count in sorted(seen.drops.items()))
+        self.get_logger().info(f'{seen.received} images received, {seen.answered} answered{drops}')
         super().destroy_node()

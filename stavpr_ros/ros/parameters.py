@@ -1,62 +1,44 @@
-"""The node's parameters: one table, from which declaration, documentation and configuration follow."""
+"""
+The node's parameters: one table, from which declaration, checks, documentation and configuration follow.
 
-from dataclasses import dataclass
+``python3 -m stavpr_ros.ros.parameters``, in a checkout, writes the configuration file and the README's table.
+"""
+
 from pathlib import Path
-from typing import Any
-
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.node import Node
 
 from stavpr_ros.alignment.settings import STRATEGIES
 from stavpr_ros.devices import BACKENDS
+from stavpr_ros.features.backbone import KINDS
+from stavpr_ros.operation.settings import OPERATIONS
 from stavpr_ros.recognition.cures import MODES
 from stavpr_ros.recognition.matcher import PRECISIONS
+from stavpr_ros.ros.parameter_table import (
+    TABLE_HEAD,
+    NodeParameter,
+    configuration_yaml,
+    documentation_markdown,
+)
 
-TABLE_HEAD = '| parameter | default | unit | live | what it does |'
+TRANSPORTS = ('raw', 'compressed')
+CHECKS = ('none', 'orb', 'sift')
+VERBOSITIES = ('debug', 'info', 'warn', 'error')
 
-
-@dataclass(frozen=True)
-class NodeParameter:
-    """
-    One row of the table.
-
-    :param default: its type is the parameter's type.
-    :param bounds: smallest and largest value, or None.
-    :param choices: the values allowed, for strings.
-    :param live: can be set while the node runs.
-    """
-
-    name: str
-    default: Any
-    unit: str
-    sentence: str
-    bounds: tuple[float, float] | None = None
-    choices: tuple[str, ...] = ()
-    live: bool = False
-
-    def descriptor(self) -> ParameterDescriptor:
-        """Return the row as ROS knows it."""
-        descriptor = ParameterDescriptor(
-            name=self.name,
-            description=self.sentence + (f' [{self.unit}]' if self.unit else ''),
-            read_only=not self.live,
-        )
-        if self.choices:
-            descriptor.additional_constraints = 'one of: ' + ', '.join(self.choices)
-        if self.bounds is not None:
-            low, high = self.bounds
-            if isinstance(self.default, int):
-                descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
-            else:
-                descriptor.floating_point_range = [
-                    FloatingPointRange(from_value=low, to_value=high, step=0.0)
-                ]
-        return descriptor
-
-
-PARAMETERS = (
+_WHAT = (
     NodeParameter(
-        'map_path', '', '', 'Map file made by build_map; the node waits until it is set.', live=True
+        'operation',
+        'localization',
+        '',
+        'What is done with images: localization on a fixed map, mapping (a map grows), or loop_closure '
+        '(places that the same route has passed before).',
+        'live',
+        choices=OPERATIONS,
+    ),
+    NodeParameter(
+        'map_path',
+        '',
+        '',
+        'Map file made by build_map or save_map; without one, localization waits, mapping begins a new map.',
+        'live',
     ),
     NodeParameter(
         'threshold',
@@ -64,8 +46,8 @@ PARAMETERS = (
         'distance',
         'A window is matched when its distance is below this; negative = 1 in mode robust, where 1 is as '
         'near as unknown places come; in mode paper the node waits until it is set.',
+        'live',
         bounds=(-1.0, 1e6),
-        live=True,
     ),
     NodeParameter(
         'mode',
@@ -75,19 +57,86 @@ PARAMETERS = (
         choices=MODES,
     ),
     NodeParameter(
-        'backend',
-        'auto',
+        'autostart', True, '', 'Configure and activate the node by itself; else a manager does it.', 'start'
+    ),
+)
+
+_INPUT = (
+    NodeParameter(
+        'image_transport',
+        'raw',
         '',
-        'Where images are matched; auto takes cuda if it is there and says what it took.',
-        choices=BACKENDS,
+        'raw: sensor_msgs/Image on the topic image; compressed: sensor_msgs/CompressedImage on '
+        'image/compressed.',
+        choices=TRANSPORTS,
     ),
     NodeParameter(
-        'precision',
-        'float32',
-        '',
-        "How the map's features are kept; float16 takes half the memory and, on large maps, half the time.",
-        choices=PRECISIONS,
+        'queue_size',
+        4,
+        'images',
+        'Images that may wait; when one more comes, the oldest is dropped.',
+        bounds=(1, 1000),
     ),
+    NodeParameter(
+        'max_rate',
+        0.0,
+        'Hz',
+        'Images that come faster than this are skipped; 0 = none are.',
+        'live',
+        (0.0, 1e4),
+    ),
+    NodeParameter(
+        'keyframe_seconds',
+        0.0,
+        's',
+        'An image counts only so long after the last that counted; 0 = at once.',
+        'live',
+        bounds=(0.0, 1e4),
+    ),
+    NodeParameter(
+        'keyframe_metres',
+        0.0,
+        'm',
+        'An image counts only when the camera has moved this far (or turned by keyframe_degrees) since the '
+        'last that counted, by nav_msgs/Odometry on the topic odom; 0 = not asked.',
+        'live',
+        bounds=(0.0, 1e4),
+    ),
+    NodeParameter(
+        'keyframe_degrees',
+        0.0,
+        'degrees',
+        'See keyframe_metres; 0 = turning does not count.',
+        'live',
+        bounds=(0.0, 180.0),
+    ),
+    NodeParameter(
+        'keyframe_change',
+        0.004,
+        '',
+        'An image counts only when it differs by this from the last that counted (1 - correlation of small '
+        'grey pictures), so that a robot that stands still does not fill the window; 0 = not asked.',
+        'live',
+        bounds=(0.0, 2.0),
+    ),
+    NodeParameter(
+        'max_gap',
+        2.0,
+        's',
+        'A longer time between the stamps of two images is counted as a gap in the diagnostics.',
+        'live',
+        bounds=(0.01, 1e6),
+    ),
+    NodeParameter(
+        'odometry_patience',
+        0.5,
+        's',
+        'The newest odometry is taken for an image that is this much newer.',
+        bounds=(0.0, 60.0),
+    ),
+)
+
+_METHOD = (
     NodeParameter(
         'strategy',
         'adaptive',
@@ -117,14 +166,40 @@ PARAMETERS = (
         2.0,
         '',
         'Map images considered per query image, above 1 (mode paper).',
-        (1.01, 20.0),
+        bounds=(1.01, 20.0),
     ),
     NodeParameter(
         'neighbourhood',
         20,
         'places',
-        'The runner-up is more than so many places from the nearest.',
+        'The runner-up, and every candidate, is more than so many places from those that are nearer.',
         bounds=(0, 1000000),
+    ),
+    NodeParameter('candidates', 10, 'places', 'Nearest places in ~/candidates.', 'live', (0, 1000)),
+    NodeParameter(
+        'geometric_check',
+        'none',
+        '',
+        'Check matches by keypoints and epipolar geometry, the newest image against its place.',
+        'live',
+        choices=CHECKS,
+    ),
+    NodeParameter(
+        'min_inliers',
+        30,
+        'keypoints',
+        'A match with fewer inliers is rejected by the geometric check; 20 will do for sift.',
+        'live',
+        bounds=(8, 100000),
+    ),
+)
+
+_GROWING = (
+    NodeParameter(
+        'features', 'gradient', '', 'Features of a map that is begun without map_path.', choices=tuple(KINDS)
+    ),
+    NodeParameter(
+        'feature_settings', '', '', 'Their settings as a JSON object; what it does not name is the default.'
     ),
     NodeParameter(
         'model_path',
@@ -133,53 +208,78 @@ PARAMETERS = (
         "File of the network, for maps made with one, if it is not where the map's maker had it.",
     ),
     NodeParameter(
-        'queue_size',
-        4,
-        'images',
-        'Images that may wait; when one more comes, the oldest is dropped.',
-        bounds=(1, 1000),
+        'exclude_places',
+        50,
+        'places',
+        'loop_closure: the latest places of the route, which are not compared.',
+        bounds=(1, 1000000),
+    ),
+    NodeParameter(
+        'exclude_seconds',
+        0.0,
+        's',
+        'loop_closure: nor are places younger than this.',
+        bounds=(0.0, 1e6),
+    ),
+    NodeParameter(
+        'max_places',
+        20000,
+        'places',
+        'Most places of a growing map: when it is full, mapping stops, and loop_closure forgets the oldest '
+        'eighth of its route.',
+        bounds=(100, 10000000),
+    ),
+    NodeParameter(
+        'thumbnail_width',
+        192,
+        'pixels',
+        'Width of the pictures of a growing map; 0 = none.',
+        bounds=(0, 4096),
+    ),
+)
+
+_OUTPUT = (
+    NodeParameter(
+        'save_path',
+        '',
+        '',
+        'File that a growing map is written to when the node is deactivated or ends, besides ~/save_map.',
+        'live',
+    ),
+    NodeParameter('map_frame', 'map', '', "Frame of the map's poses, for ~/pose."),
+    NodeParameter('diagnostics_period', 1.0, 's', 'Time between two diagnostics.', 'start', (0.1, 60.0)),
+    NodeParameter('verbosity', 'info', '', 'What the node logs.', 'live', choices=VERBOSITIES),
+)
+
+_MACHINE = (
+    NodeParameter(
+        'backend',
+        'auto',
+        '',
+        'Where images are matched; auto takes cuda if it is there and says what it took.',
+        choices=BACKENDS,
+    ),
+    NodeParameter(
+        'precision',
+        'float32',
+        '',
+        "How the map's features are kept; float16 takes half the memory and, on large maps, half the time.",
+        choices=PRECISIONS,
     ),
     NodeParameter('threads', 0, 'threads', 'Processor threads for the numerics; 0 = all.', bounds=(0, 1024)),
 )
 
-
-def declare_parameters(node: Node) -> dict[str, Any]:
-    """Declare the whole table on a node and return the values, name to value."""
-    return {
-        row.name: node.declare_parameter(row.name, row.default, row.descriptor()).value for row in PARAMETERS
-    }
-
-
-def configuration_yaml() -> str:
-    """Return the table as a parameter file for ``--params-file``, with the defaults."""
-    lines = ['# The parameters of the node with their defaults. Generated from stavpr_ros/ros/parameters.py;']
-    lines += ['# a test fails when they differ.', '/**:', '  ros__parameters:']
-    for row in PARAMETERS:
-        lines.append(f'    # {row.descriptor().description}')
-        default = f"'{row.default}'" if isinstance(row.default, str) else row.default
-        lines.append(f'    {row.name}: {default}')
-    return '\n'.join(lines) + '\n'
-
-
-def documentation_markdown() -> str:
-    """Return the table as Markdown for the README."""
-    lines = [TABLE_HEAD, '|---|---|---|---|---|']
-    for row in PARAMETERS:
-        default = f"`'{row.default}'`" if isinstance(row.default, str) else f'`{row.default}`'
-        sentence = row.sentence + (f' ({", ".join(row.choices)})' if row.choices else '')
-        lines.append(
-            f'| `{row.name}` | {default} | {row.unit} | {"yes" if row.live else "no"} | {sentence} |'
-        )
-    return '\n'.join(lines) + '\n'
+PARAMETERS = _WHAT + _INPUT + _METHOD + _GROWING + _OUTPUT + _MACHINE
+BY_NAME = {row.name: row for row in PARAMETERS}
 
 
 def _write_documentation() -> None:
     """Write the table into the configuration file and the README of the checkout in the current folder."""
-    Path('config/stavpr.yaml').write_text(configuration_yaml())
+    Path('config/stavpr.yaml').write_text(configuration_yaml(PARAMETERS))
     readme = Path('README.md')
     before, _, rest = readme.read_text().partition(TABLE_HEAD)
     after = rest.partition('\n\n')[2]
-    readme.write_text(f'{before}{documentation_markdown()}\n{after}')
+    readme.write_text(f'{before}{documentation_markdown(PARAMETERS)}\n{after}')
 
 
 if __name__ == '__main__':

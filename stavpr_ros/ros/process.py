@@ -1,18 +1,25 @@
 """How our processes begin, spin and end: the same for every executable with a ROS node."""
 
+import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import (
+    Executor,
+    ExternalShutdownException,
+    MultiThreadedExecutor,
+    SingleThreadedExecutor,
+)
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.signals import signals_deferred
+from stavpr_ros.signals import interrupted, signals_deferred
 
 LONGEST_WAIT = 0.2  # seconds until a signal is noticed
 
@@ -55,19 +62,33 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
     """
     with _ros_arguments_checked():
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    left_behind = False
     try:
         node = make()
         try:
             yield node
         finally:
             node.destroy_node()
+            left_behind = getattr(node, 'left_behind', False)
     finally:
         rclpy.try_shutdown()
+        if left_behind and interrupted():  # Python would wait for it, however long it takes
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(0)
 
 
-def spin_until(node: Node, done: Callable[[], bool] = lambda: False) -> None:
-    """Spin until ``done`` says so, or the context is shut down; a signal raises KeyboardInterrupt."""
-    executor = SingleThreadedExecutor(context=node.context)
+def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: int = 1) -> None:
+    """
+    Spin until ``done`` says so, or the context is shut down; a signal raises KeyboardInterrupt.
+
+    :param threads: that run callbacks.
+    """
+    executor: Executor = (
+        SingleThreadedExecutor(context=node.context)
+        if threads == 1
+        else MultiThreadedExecutor(threads, context=node.context)
+    )
     executor.add_node(node)
     try:
         while node.context.ok() and not done():

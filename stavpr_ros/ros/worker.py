@@ -9,14 +9,14 @@ from typing import Any
 
 from rclpy.logging import get_logger
 
-PATIENCE = 10.0  # seconds for the item in work when the thread is stopped
+PATIENCE = 3.0  # seconds for what is in work when the thread is stopped: `ros2 launch` loses its own after 5
 
 
 class Worker:
     """
     A thread that works on items, newest kept: when the slot is full, the oldest item is dropped.
 
-    Calls, such as loading a map, are run by the same thread, before the next item: whatever the thread
+    Calls, such as using a map, are run by the same thread, before the next item: whatever the thread
     owns needs no lock.
 
     :param process: called with each item.
@@ -28,10 +28,16 @@ class Worker:
         self._capacity = capacity
         self._items: deque[Any] = deque()
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
+        self._running: Future[Any] | None = None
         self._changed = threading.Condition()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name='recognition', daemon=True)
         self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """Items that wait."""
+        return len(self._items)
 
     def put(self, item: Any) -> Any | None:
         """Hand over an item; return the item that was dropped for it, if any."""
@@ -40,6 +46,11 @@ class Worker:
             self._items.append(item)
             self._changed.notify()
         return dropped
+
+    def clear(self) -> None:
+        """Drop the items that wait."""
+        with self._changed:
+            self._items.clear()
 
     def call(self, function: Callable[[], Any]) -> Future[Any]:
         """Have the thread call a function; the future holds what came of it, cancelled after the end."""
@@ -52,14 +63,22 @@ class Worker:
                 self._changed.notify()
         return future
 
-    def stop(self) -> None:
-        """Finish the item in work, drop the rest, end the thread (or leave it, if it takes too long)."""
+    def stop(self) -> bool:
+        """
+        Finish what is in work, drop the rest, end the thread; what takes too long is left to itself.
+
+        :returns: whether the thread has ended.
+        """
         with self._changed:
             self._stopping = True
             self._changed.notify()
-        self._thread.join(PATIENCE)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(PATIENCE)
         for future, _ in self._calls:
             future.cancel()
+        if self._thread.is_alive() and self._running is not None and not self._running.done():
+            self._running.set_exception(TimeoutError(f'the node ended; not done within {PATIENCE:g} s'))
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while True:
@@ -71,12 +90,22 @@ class Worker:
                 item = None if call else self._items.popleft()
             if call is None:
                 self._process_safely(item)
-                continue
-            future, function = call
-            try:
-                future.set_result(function())
-            except Exception as error:  # handed to whoever asked
-                future.set_exception(error)
+            else:
+                self._call(*call)
+
+    def _call(self, future: Future[Any], function: Callable[[], Any]) -> None:
+        self._running = future
+        try:
+            result, error = function(), None
+        except Exception as raised:  # handed to whoever asked
+            result, error = None, raised
+        self._running = None
+        if future.done():  # given up meanwhile
+            return
+        if error is None:
+            future.set_result(result)
+        else:
+            future.set_exception(error)
 
     def _process_safely(self, item: Any) -> None:
         """Nothing that one item does may end the thread, which would end all that come after."""

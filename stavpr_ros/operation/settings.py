@@ -1,0 +1,98 @@
+"""Settings of the engine."""
+
+from dataclasses import dataclass, field
+
+from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.features import Describer
+from stavpr_ros.features.backbone import KINDS, settings_from_json
+from stavpr_ros.mapping.keyframes import KeyframeSettings
+from stavpr_ros.recognition import RecognitionSettings
+from stavpr_ros.recognition.cures import THRESHOLD, cures_of
+from stavpr_ros.recognition.geometry import GeometricSettings
+from stavpr_ros.recognition.loop_closure import LoopCloser
+
+OPERATIONS = ('localization', 'mapping', 'loop_closure')
+
+
+@dataclass(frozen=True)
+class EngineSettings:
+    """
+    How images are turned into answers; the fields are the node's parameters of these names.
+
+    :param threshold: a window is matched when its distance is below it; None = the mode's default, which
+        mode paper does not have.
+    :param features: kind of the features of a route that is begun without a map.
+    :param feature_settings: settings of that kind as a JSON object, '' = its defaults.
+    :param exclude_places: the latest places that are not compared in operation loop_closure.
+    :param exclude_seconds: nor are places younger than this.
+    :param max_places: most places of a growing map. When it is full, mapping stops, and loop closure forgets
+        the oldest eighth of its route.
+    :param thumbnail_width: pixels of the pictures that growing maps keep, 0 = none.
+    :param candidates: nearest places that are told for every window.
+    :param geometric: the geometric check of matches, None = none.
+    :raises SettingsError: a value that cannot be meant, or values that do not go together.
+    """
+
+    threshold: float | None = None
+    spatial: SpatialSettings = field(default_factory=SpatialSettings)
+    sequence: SequenceSettings = field(default_factory=SequenceSettings)
+    neighbourhood: int = 20
+    mode: str = 'robust'
+    backend: str = 'cpu'
+    precision: str = 'float32'
+    model_path: str = ''
+    features: str = 'gradient'
+    feature_settings: str = ''
+    exclude_places: int = 50
+    exclude_seconds: float = 0.0
+    max_places: int = 20000
+    thumbnail_width: int = 192
+    candidates: int = 10
+    keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
+    geometric: GeometricSettings | None = None
+
+    def __post_init__(self) -> None:
+        if self.threshold == 0:
+            raise SettingsError('threshold = 0 would match nothing: set it above 0, or negative = not set')
+        if self.features not in KINDS:
+            raise SettingsError(f'features {self.features!r} are unknown: take one of {", ".join(KINDS)}')
+        if self.feature_settings:
+            settings_from_json(self.features, self.feature_settings)
+        self.recognition(self.applied_threshold or 1.0)
+
+    @property
+    def applied_threshold(self) -> float | None:
+        """The threshold in force; distances of mode robust mean the same on every route."""
+        if self.threshold is not None:
+            return self.threshold
+        return THRESHOLD if cures_of(self.mode).contrast else None
+
+    def recognition(self, threshold: float) -> RecognitionSettings:
+        """Return the recogniser's part."""
+        return RecognitionSettings(threshold, self.spatial, self.sequence, self.neighbourhood, self.mode)
+
+    def describer(self) -> Describer:
+        """
+        Make the describer of a route that is begun without a map.
+
+        :raises StavprError: the features' settings do not do, a model's file is not there.
+        """
+        backbone = None
+        if self.feature_settings or self.model_path:
+            backbone = settings_from_json(self.features, self.feature_settings or '{}', self.model_path)
+        return Describer(self.features, backbone, device=self.backend)
+
+    def loop_closer(self, describer: Describer, threshold: float) -> LoopCloser:
+        """
+        Make what closes loops, with an empty route.
+
+        :raises SettingsError: settings that it does not have.
+        """
+        return LoopCloser(
+            self.recognition(threshold),
+            self.exclude_places,
+            describer.settings,
+            limit=self.max_places,
+            exclude_seconds=self.exclude_seconds,
+        )

@@ -1,0 +1,352 @@
+"""From the node's health to diagnostics: what is wrong, in plain words, and what to do; no node in here."""
+
+import math
+import re
+from dataclasses import dataclass
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from std_msgs.msg import Header
+
+from stavpr_ros.ros.statistics import RATE_WINDOW, Snapshot
+
+SILENCE = 2.0
+"""Seconds without an image after which something is wrong with an active node's input."""
+
+BUSY = 0.8
+"""Below this share of its time at work the worker keeps up, and a full queue means a burst."""
+
+INPUT_CAUSES = ('invalid', 'lost in transport', 'no odometry')
+"""What the causes begin with that are shown with the input; the others are shown with the processing."""
+
+JUDGED = ('match', 'no match')
+UNDECODED = ('invalid image', 'dropped', 'not ready', 'skipped')
+"""Verdicts on images, the latter on those that need not have been decoded."""
+
+NEXT_TRANSITION = {'unconfigured': 'configure', 'inactive': 'activate'}
+
+Finding = tuple[bytes, str]  # level and message
+Value = str | int | float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Health:
+    """
+    Everything that diagnostics are made from.
+
+    :param snapshot: the counts.
+    :param state: label of the lifecycle state: unconfigured, inactive, active, finalized, configuring ...
+    :param topic: of the images, after remapping; ``publishers`` are on it now, whatever their QoS.
+    :param transport: raw, compressed ...
+    :param queue: images that wait, of at most ``queue_size``; ``window`` are in the window, of ``length``.
+    :param operation: localization, mapping or loop_closure; ``mode``: how places are recognised.
+    :param map_path: its file, empty = none; ``map_state``: none, loading, loaded, growing or full.
+    :param places: of the map, now; a growing map stops at ``max_places``.
+    :param features: kind of the local features.
+    :param backend: where images are matched, on which ``device``, in which ``precision``.
+    :param threshold: in force; None = not set.
+    :param problem: why the last transition failed, or the last map was not loaded; empty = nothing failed.
+    :param incompatible: publishers refused so far because of their QoS.
+    :param remedy: what to do about them, in words.
+    :param missing: what is missing before there can be a match, in words; empty = nothing.
+    :param odometry: fresh, stale or never; empty = no parameter needs it.
+    """
+
+    snapshot: Snapshot
+    state: str
+    topic: str
+    transport: str
+    publishers: int
+    queue: int
+    queue_size: int
+    window: int
+    length: int
+    operation: str
+    mode: str
+    map_path: str
+    map_state: str
+    places: int
+    max_places: int
+    features: str
+    backend: str
+    device: str
+    precision: str
+    threshold: float | None = None
+    problem: str = ''
+    incompatible: int = 0
+    remedy: str = ''
+    missing: str = ''
+    odometry: str = ''
+
+
+def diagnostic_array(health: Health, node: str, stamp: Time) -> DiagnosticArray:
+    """
+    Return the four statuses of a node: input, map, recognition, processing.
+
+    :param node: its full name, with which the statuses' names begin; a leading slash is left out.
+    :param stamp: of the array.
+    """
+    active = health.state == 'active'
+    idle = [] if active else [(DiagnosticStatus.OK, _inactive(health.state, node))]
+    parts = {
+        'input': (idle or _input(health), _input_values(health)),
+        'map': (_map(health), _map_values(health)),
+        'recognition': (idle or _recognition(health), _recognition_values(health)),
+        'processing': (idle or _processing(health), _processing_values(health)),
+    }
+    return DiagnosticArray(
+        header=Header(stamp=stamp),
+        status=[
+            DiagnosticStatus(
+                level=max(level for level, _ in findings),
+                name=f'{node.lstrip("/")}: {part}',
+                # The worst first: monitors cut long messages.
+                message='; '.join(text for _, text in sorted(findings, key=lambda f: f[0], reverse=True)),
+                hardware_id=health.device,
+                values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
+            )
+            for part, (findings, values) in parts.items()
+        ],
+    )
+
+
+def _inactive(state: str, node: str) -> str:
+    """
+    Return what is said of a node that is not active, which is no fault, so its level is OK.
+
+    Somebody brought the node into that state, or has not taken it further, on purpose; a warning that is
+    always on when a robot stands by is soon read by nobody. STALE means that nothing was heard from a node.
+    """
+    transition = NEXT_TRANSITION.get(state)
+    remedy = f"; 'ros2 lifecycle set {node} {transition}' takes it further" if transition else ''
+    return f'{state}: no image is processed{remedy}'
+
+
+def _input(health: Health) -> list[Finding]:
+    """What is to be said of the images that come to an active node."""
+    snapshot = health.snapshot
+    age = snapshot.uptime if snapshot.received_age is None else snapshot.received_age
+    findings = []
+    if age > SILENCE:
+        findings.append(_silence(health, age))
+    elif health.incompatible and health.publishers > 1 and snapshot.received:
+        # were there one publisher only, it would not be one that was refused: images come
+        text = f'{_of(health.incompatible, "publisher")} refused for QoS, while images of others come: '
+        findings.append((DiagnosticStatus.WARN, text + _qos_remedy(health)))
+    findings += _invalid(snapshot)
+    if lost := snapshot.recent_drops.get('lost in transport', 0):
+        remedy = "give the publisher a bigger shared-memory segment (README, 'If images are lost')"
+        text = f'{_of(lost, "image")} lost in transport in the last {RATE_WINDOW} s: {remedy}'
+        findings.append((DiagnosticStatus.WARN, text))
+    if health.odometry in ('stale', 'never'):
+        what = 'came never' if health.odometry == 'never' else 'comes no more'
+        text = f'odometry, which a parameter needs, {what}: start it, compare its topic and its stamps'
+        findings.append((DiagnosticStatus.WARN, text))
+    elif without := snapshot.recent_drops.get('no odometry', 0):
+        text = f'{_of(without, "image")} had no odometry of their time: compare the stamps of both'
+        findings.append((DiagnosticStatus.WARN, text))
+    if findings:
+        return findings
+    if snapshot.received_age is None:
+        return [(DiagnosticStatus.OK, f'waiting for the first image on {health.topic}')]
+    return [(DiagnosticStatus.OK, f'{snapshot.rate_in:.1f} images a second on {health.topic}')]
+
+
+def _silence(health: Health, age: float) -> Finding:
+    """Say that no image comes, and the likeliest reason."""
+    since = 'yet' if health.snapshot.received_age is None else f'for {age:.0f} s'
+    nothing = f'no image {since} on {health.topic}: '
+    if not health.publishers:
+        text = "no publisher; look for the camera's topic with 'ros2 topic list' and remap to it: "
+        return DiagnosticStatus.WARN, f'{nothing}{text}--ros-args -r image:=TOPIC'
+    if health.incompatible:
+        text = f'{_of(health.incompatible, "publisher")} refused for QoS: '
+        return DiagnosticStatus.ERROR, nothing + text + _qos_remedy(health)
+    text = f'{_of(health.publishers, "publisher")} there, but silent; is the bag paused, the camera off?'
+    return DiagnosticStatus.WARN, nothing + text
+
+
+def _qos_remedy(health: Health) -> str:
+    return health.remedy or f"compare 'ros2 topic info --verbose {health.topic}'"
+
+
+def _invalid(snapshot: Snapshot) -> list[Finding]:
+    """Say how many of the recent images could not be decoded."""
+    invalid = {cause: n for cause, n in snapshot.recent_drops.items() if cause.startswith('invalid')}
+    if not invalid:
+        return []
+    kinds = ', '.join(f'{cause.removeprefix("invalid").lstrip(": ")} {n}' for cause, n in invalid.items())
+    where = f'in the last {RATE_WINDOW} s were invalid ({kinds}): see the log'
+    # A keyframe was decoded once: images that are compared with one do not come from a broken camera.
+    valid = sum(n for verdict, n in snapshot.recent_verdicts.items() if verdict not in UNDECODED)
+    if valid or 'not a keyframe' in snapshot.recent_drops:
+        return [(DiagnosticStatus.WARN, f'{_of(sum(invalid.values()), "image")} {where}')]
+    return [(DiagnosticStatus.ERROR, f'all images {where} and compare the encoding with the README')]
+
+
+def _map(health: Health) -> list[Finding]:
+    """What is to be said of the map, in every state: a failed transition leaves the node not active."""
+    places = _of(health.places, 'place')
+    if health.problem:
+        in_use = f'; the map in use has {places}' if health.map_state in ('loaded', 'growing', 'full') else ''
+        return [(DiagnosticStatus.ERROR, health.problem + in_use)]
+    warning = DiagnosticStatus.WARN if health.state == 'active' else DiagnosticStatus.OK
+    if health.map_state == 'none':
+        return [(warning, 'no map: set map_path or call ~/load_map')]
+    if health.map_state == 'loading':
+        meanwhile = f'; until then the old one is used, of {places}' if health.places else ''
+        return [(DiagnosticStatus.OK, f'loading {health.map_path}{meanwhile}')]
+    if health.map_state == 'growing':
+        return [(DiagnosticStatus.OK, f'growing: {places} of at most {health.max_places}')]
+    if health.map_state == 'full':
+        remedy = 'save it with ~/save_map, then raise max_places'
+        return [(warning, f'full: mapping stopped at {places} (max_places); {remedy}')]
+    return [(DiagnosticStatus.OK, f'{places} of {health.map_path or "a map without a file"}')]
+
+
+def _recognition(health: Health) -> list[Finding]:
+    """What is to be said of the answers of an active node."""
+    if health.operation == 'mapping':
+        return [(DiagnosticStatus.OK, 'mapping: images become places, none is recognised')]
+    if health.map_state == 'loading' and not health.places:
+        return [(DiagnosticStatus.OK, 'waiting for the map')]
+    if health.missing:
+        return [(DiagnosticStatus.WARN, f'no match is possible: {health.missing}')]
+    if health.window < health.length:
+        return [(DiagnosticStatus.OK, f'warming up: {health.window} of {health.length} images')]
+    snapshot = health.snapshot
+    judged = sum(snapshot.recent_verdicts.get(verdict, 0) for verdict in JUDGED)
+    matched = snapshot.recent_verdicts.get('match', 0)
+    share = f'{matched} of {_of(judged, "image")} matched in the last {RATE_WINDOW} s'
+    return [(DiagnosticStatus.OK, '; '.join(filter(None, (share, _last_answer(snapshot)))))]
+
+
+def _last_answer(snapshot: Snapshot) -> str:
+    """Return the last answer in words; empty if there was none."""
+    if not snapshot.verdict:
+        return ''
+    place = f', place {snapshot.place}' if snapshot.place >= 0 else ''
+    distance = '' if math.isnan(snapshot.distance) else f', distance {snapshot.distance:.3f}'
+    reason = f' ({snapshot.reason})' if snapshot.reason else ''
+    return f'last answer: {snapshot.verdict}{place}{distance}{reason}'
+
+
+def _processing(health: Health) -> list[Finding]:
+    """What is to be said of the speed of an active node."""
+    snapshot = health.snapshot
+    if failed := snapshot.recent_drops.get('internal error', 0):
+        text = f'{_of(failed, "image")} failed in the last {RATE_WINDOW} s by an internal error: see the log'
+        return [(DiagnosticStatus.ERROR, text)]
+    if dropped := snapshot.recent_drops.get('queue full', 0):
+        lost = f'{_of(dropped, "image")} dropped in the last {RATE_WINDOW} s, since the queue was full: '
+        return [(DiagnosticStatus.WARN, lost + _why_full(health))]
+    if snapshot.work is None:
+        return [(DiagnosticStatus.OK, f'no image in the last {RATE_WINDOW} s')]
+    text = f'{snapshot.work.mean:.1f} ms an image, {snapshot.rate_out:.1f} answered a second'
+    return [(DiagnosticStatus.OK, text)]
+
+
+def _why_full(health: Health) -> str:
+    """Compare what comes with what can be done, and say what helps."""
+    snapshot = health.snapshot
+    comes = f'{snapshot.rate_in:.1f} come a second'
+    if snapshot.work is None:
+        return f'{comes}, and none was finished; is a map being loaded, the machine busy?'
+    takes = f'{comes}, and one takes {snapshot.work.mean:.1f} ms'
+    if snapshot.rate_in * snapshot.work.mean < BUSY * 1e3:
+        return f'{takes}, which is fast enough: they come in bursts; raise queue_size'
+    half = '' if health.precision == 'float16' else 'precision float16, '
+    remedy = f'set max_rate or keyframe_*, {half}a smaller map'
+    return f'{takes}, so {1e3 / snapshot.work.mean:.1f} can be done: {remedy}'
+
+
+def _input_values(health: Health) -> dict[str, Value]:
+    snapshot = health.snapshot
+    return {
+        'topic': health.topic,
+        'transport': health.transport,
+        'publishers': health.publishers,
+        'publishers_refused': health.incompatible,
+        'received': snapshot.received,
+        'rate_in_hz': snapshot.rate_in,
+        'last_image_age_s': snapshot.received_age,
+        'gaps': snapshot.gaps,
+        'longest_gap_s': snapshot.longest_gap,
+        'jumps_back': snapshot.jumps_back,
+        'longest_jump_back_s': snapshot.longest_jump_back,
+        'odometry': health.odometry or 'not needed',
+        **_drop_values(snapshot, from_input=True),
+    }
+
+
+def _map_values(health: Health) -> dict[str, Value]:
+    return {
+        'state': health.map_state,
+        'path': health.map_path or None,
+        'places': health.places,
+        'max_places': health.max_places,
+        'features': health.features,
+    }
+
+
+def _recognition_values(health: Health) -> dict[str, Value]:
+    snapshot = health.snapshot
+    return {
+        'operation': health.operation,
+        'mode': health.mode,
+        'threshold': health.threshold,
+        'window': health.window,
+        'length': health.length,
+        'last_verdict': snapshot.verdict or None,
+        'last_reason': snapshot.reason or None,
+        'last_place': snapshot.place if snapshot.place >= 0 else None,
+        'last_distance': snapshot.distance,
+        'last_answer_age_s': snapshot.answered_age,
+        **{_key('verdicts', verdict): count for verdict, count in snapshot.verdicts.items()},
+    }
+
+
+def _processing_values(health: Health) -> dict[str, Value]:
+    snapshot = health.snapshot
+    times = {'total': snapshot.total, 'work': snapshot.work, **snapshot.stages}
+    measured = {name: time for name, time in times.items() if time is not None}
+    return {
+        'state': health.state,
+        'uptime_s': snapshot.uptime,
+        'answered': snapshot.answered,
+        'rate_out_hz': snapshot.rate_out,
+        'queue': health.queue,
+        'queue_size': health.queue_size,
+        'backend': health.backend,
+        'device': health.device,
+        'precision': health.precision,
+        **_drop_values(snapshot, from_input=False),
+        **{_key(name, 'mean_ms'): time.mean for name, time in measured.items()},
+        **{_key(name, 'max_ms'): time.max for name, time in measured.items()},
+    }
+
+
+def _drop_values(snapshot: Snapshot, from_input: bool) -> dict[str, Value]:
+    """Return the drops by cause, since the start and recently."""
+    values: dict[str, Value] = {}
+    for cause, count in snapshot.drops.items():
+        if cause.startswith(INPUT_CAUSES) == from_input:
+            values[_key('dropped', cause)] = count
+            values[_key('dropped', cause, f'{RATE_WINDOW}s')] = snapshot.recent_drops.get(cause, 0)
+    return values
+
+
+def _key(*words: str) -> str:
+    """Return a key in snake case made of free words."""
+    return '_'.join(filter(None, re.split(r'\W+', ' '.join(words).lower())))
+
+
+def _of(count: int, noun: str) -> str:
+    return f'{count} {noun}{"" if count == 1 else "s"}'
+
+
+def _text(value: Value) -> str:
+    """Return a value as monitors show it; three decimals are enough for Hz, ms, s and distances."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return 'none'
+    return f'{value:.3f}' if isinstance(value, float) else str(value)
