@@ -69,6 +69,7 @@ class Listener:
         """Return what came of so many published images."""
         milliseconds = np.array(self.latencies) * 1e3
         return {
+            'verdicts': dict(self.verdicts),
             'images_published': published,
             'processed': len(self.latencies),
             'dropped': self.verdicts[dropped_verdict],
@@ -111,6 +112,8 @@ def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
         introduction = Introduction(node, lambda: node.get_subscriptions_info_by_topic('/image'), 10.0)
         spin_until(node, introduction.done)
         memory_start, began = memory(pid), time.monotonic()
+        by_minute = [memory_start]
+        minute = node.create_timer(60.0, lambda: by_minute.append(memory(pid)))
 
         def publish(index: int) -> None:
             message = messages[index % len(messages)]
@@ -124,10 +127,12 @@ def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
         spin_until(node, lambda: len(listener.sent) == total)
         rate = total / (time.monotonic() - began)
         node.destroy_timer(timer)
+        node.destroy_timer(minute)
         end = time.monotonic() + 2
         spin_until(node, lambda: listener.verdicts.total() == total or time.monotonic() > end)
         figures = listener.figures(total, PlaceMatch.DROPPED)
-        return figures | {'rate_hz': rate, 'memory_mb_start': memory_start, 'memory_mb_end': memory(pid)}
+        figures |= {'rate_hz': rate, 'memory_mb_start': memory_start, 'memory_mb_end': memory(pid)}
+        return figures | {'memory_mb_by_minute': [round(value, 1) for value in by_minute]}
 
 
 def main() -> None:
@@ -140,6 +145,13 @@ def main() -> None:
     parser.add_argument('--places', type=int, default=2000)
     parser.add_argument('--width', type=int, default=640)
     parser.add_argument('--height', type=int, default=480)
+    parser.add_argument(
+        '--parameter',
+        action='append',
+        default=[],
+        metavar='NAME:=VALUE',
+        help='of the node, besides map_path; as often as you like',
+    )
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
     from stavpr_ros import __version__
@@ -152,7 +164,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'map.stavpr'
         make_map(path, arguments.places, arguments.height, arguments.width)
-        command = [executable('node'), '--ros-args', '-p', f'map_path:={path}', '-p', 'threshold:=1.0']
+        parameters = [f'map_path:={path}', *arguments.parameter]
+        options = [word for parameter in parameters for word in ('-p', parameter)]
+        command = [executable('node'), '--ros-args', *options]
         node = subprocess.Popen(command, env=environment)
         try:
             figures = soak(arguments, node.pid)
@@ -161,7 +175,8 @@ def main() -> None:
             node.wait()
     git = ['git', 'rev-parse', '--short', 'HEAD']
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
-    figures |= {'places': arguments.places, 'machine': platform.machine(), 'cores': os.cpu_count()}
+    figures |= {'places': arguments.places, 'parameters': arguments.parameter}
+    figures |= {'machine': platform.machine(), 'cores': os.cpu_count()}
     figures |= {'python': platform.python_version(), 'stavpr_ros': __version__, 'commit': commit}
     text = json.dumps(figures, indent=2)
     print(text)

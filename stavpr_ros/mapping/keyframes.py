@@ -11,6 +11,7 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation
 
 SECOND = 1_000_000_000
+OVERTAKEN = SECOND // 10  # images less than this out of order overtook each other; the clock did not jump
 SIZE = (32, 24)  # width and height of the pictures compared: noise is averaged out, motion is not
 BLUR = 0.5  # pixels of the small picture
 FLAT = 1.0  # grey levels of deviation below which a picture shows nothing but noise
@@ -109,8 +110,8 @@ class KeyframeSelector:
         """
         Tell why an image is no keyframe, as far as time and motion say.
 
-        A moment or pose that is not known of the last keyframe cannot object; nor can a stamp earlier than
-        its stamp: the clock has jumped.
+        A moment or pose that is not known of the last keyframe cannot object; nor can a stamp 0.1 s
+        or more before its stamp: the clock has jumped.
 
         :param stamp: nanoseconds; 0 = unknown.
         :param pose: where it was taken, shape (7,), see :class:`PlaceMap`; None = unknown.
@@ -120,9 +121,9 @@ class KeyframeSelector:
         settings = self.settings
         if settings.needs_poses and pose is None:
             return 'no odometry for this image, and the rule of motion (metres, degrees) is on'
-        if settings.seconds and self._stamp:
+        if settings.seconds and stamp and self._stamp:
             passed = stamp - self._stamp
-            if 0 <= passed < round(settings.seconds * SECOND):
+            if -OVERTAKEN < passed < round(settings.seconds * SECOND):
                 return f'{passed / SECOND:.3f} s after the last keyframe: less than {settings.seconds:g} s'
         if settings.needs_poses and self._pose is not None and pose is not None:
             return self._not_moved(checked_pose(pose), self._pose)

@@ -48,6 +48,7 @@ class Health:
     :param problem: why the last transition failed, or the last map was not loaded; empty = nothing failed.
     :param incompatible: publishers refused so far because of their QoS.
     :param remedy: what to do about them, in words.
+    :param mistyped: what publishers on the topic send that is not the transport's type; empty = none does.
     :param missing: what is missing before there can be a match, in words; empty = nothing.
     :param odometry: fresh, stale or never; empty = no parameter needs it.
     """
@@ -75,6 +76,7 @@ class Health:
     problem: str = ''
     incompatible: int = 0
     remedy: str = ''
+    mistyped: str = ''
     missing: str = ''
     odometry: str = ''
 
@@ -162,6 +164,9 @@ def _silence(health: Health, age: float) -> Finding:
     if health.incompatible:
         text = f'{_of(health.incompatible, "publisher")} refused for QoS: '
         return DiagnosticStatus.ERROR, nothing + text + _qos_remedy(health)
+    if health.mistyped:
+        text = f'{health.mistyped} is published there: compare image_transport and the topic'
+        return DiagnosticStatus.ERROR, nothing + text
     text = f'{_of(health.publishers, "publisher")} there, but silent; is the bag paused, the camera off?'
     return DiagnosticStatus.WARN, nothing + text
 

@@ -111,6 +111,7 @@ class ImageInput:
         compressed = node.resolve_topic_name('image') + '/compressed'
         kinds = {'raw': (Image, 'image'), 'compressed': (CompressedImage, compressed)}
         message_type, name = kinds[transport]
+        self._type = f'sensor_msgs/msg/{message_type.__name__}'
         self.topic = node.resolve_topic_name(name)  # events, on another thread, may ask for it at once
         self._subscription = self._subscribe(message_type, name)
 
@@ -118,6 +119,12 @@ class ImageInput:
     def publishers(self) -> int:
         """Publishers of the topic, whether they are heard or not."""
         return self._node.count_publishers(self.topic)
+
+    @property
+    def mistyped(self) -> str:
+        """Other types than ours that are published on the topic; the middleware does not tell of them."""
+        infos = self._node.get_publishers_info_by_topic(self.topic)
+        return ', '.join(sorted({info.topic_type for info in infos} - {self._type}))
 
     def close(self) -> None:
         """Hear nothing more, not even what is on another thread now."""

@@ -10,8 +10,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
-from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -20,6 +19,7 @@ from rclpy.timer import Timer
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.devices import why_no_cuda
 from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.parameter_table import declare_parameters
 from stavpr_ros.ros.parameters import BY_NAME, PARAMETERS
 from stavpr_ros.ros.reporter import Reporter
@@ -32,7 +32,7 @@ from stavpr_ros.ros.worker import PATIENCE
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-class PlaceRecognitionNode(LifecycleNode):
+class PlaceRecognitionNode(ManagedNode):
     """
     Recognises where images were taken; publishes one ``~/match`` for each image on ``image``.
 
@@ -46,12 +46,12 @@ class PlaceRecognitionNode(LifecycleNode):
     THREADS = 4  # images, odometry, services, life cycle and parameters: none waits for another
 
     def __init__(self, **options: Any) -> None:
+        self._lock = threading.RLock()  # one change at a time: transitions and parameters
         super().__init__('stavpr', **options)
         for said in unknown_parameters(self._parameter_overrides):
             self.get_logger().warning(said)
         self._settings = node_settings(declare_parameters(self, PARAMETERS))
         self._apply_verbosity(self._settings.verbosity)
-        self._lock = threading.RLock()  # one change at a time: transitions and parameters
         self.ending = threading.Event()  # nobody waits for anything any more
         self.left_behind = False  # something was still under way when the node was destroyed
         self._runtime: Runtime | None = None
@@ -60,7 +60,6 @@ class PlaceRecognitionNode(LifecycleNode):
         self._map_info = self.create_publisher(MapInfo, '~/map_info', LATCHED)
         self._told: MapInfo | None = None
         self._telling = threading.Lock()  # what was published last is what was true last
-        self._refuse_impossible_transitions()
         self._served = Services(self)
         self.add_on_set_parameters_callback(self._on_parameters)
         self.add_post_set_parameters_callback(self._on_parameters_set)
@@ -77,11 +76,6 @@ class PlaceRecognitionNode(LifecycleNode):
                 callback_group=MutuallyExclusiveCallbackGroup(),
                 clock=Clock(clock_type=ClockType.STEADY_TIME),
             )
-
-    @property
-    def state(self) -> str:
-        """Label of the life-cycle state."""
-        return str(self._state_machine.current_state[1])
 
     @property
     def settings(self) -> NodeSettings:
@@ -102,9 +96,9 @@ class PlaceRecognitionNode(LifecycleNode):
         """
         if self._runtime is None:
             because = f' ({self.problem})' if self.problem else ''
-            raise StavprError(
-                f'the node is {self.state}{because}: configure it first, `ros2 lifecycle set NODE configure`'
-            )
+            ended = self.state == 'finalized'
+            remedy = 'start it anew' if ended else 'configure it first, `ros2 lifecycle set NODE configure`'
+            raise StavprError(f'the node is {self.state}{because}: {remedy}')
         return self._runtime
 
     # the life cycle
@@ -113,12 +107,10 @@ class PlaceRecognitionNode(LifecycleNode):
         """Configure and activate, once; again only when a parameter was changed after a failure."""
         assert self._start is not None
         self._start.cancel()
-        done = TransitionCallbackReturn.SUCCESS
-        try:
-            if self.state == 'unconfigured' and self.trigger_configure() == done and not self.ending.is_set():
-                self.trigger_activate()
-        except rclpy_implementation.RCLError as error:  # would end the process
-            self.get_logger().warning(f'autostart leaves off, something else changes the state: {error}')
+        if self.state != 'unconfigured' or not self.advance(self.trigger_configure):
+            return
+        if not self.ending.is_set():
+            self.advance(self.trigger_activate)
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load map and model, warm the kernels, make the publishers."""
@@ -204,23 +196,17 @@ class PlaceRecognitionNode(LifecycleNode):
 
             torch.cuda.empty_cache()
 
-    def _refuse_impossible_transitions(self) -> None:
-        """Answer a request for a transition that the state does not have; rclpy would end the process."""
-        service = self._service_change_state
-        change = service.callback
-
-        def change_or_refuse(request: Any, response: Any) -> Any:
-            try:
-                return change(request, response)
-            except rclpy_implementation.RCLError as error:
-                wish = request.transition.label or request.transition.id
-                self.get_logger().error(f'no transition {wish!r} from state {self.state}: {error}')
-                response.success = False
-                return response
-
-        service.callback = change_or_refuse
-
     # parameters
+
+    def set_parameters(self, parameters: list[Parameter]) -> list[SetParametersResult]:
+        """Set parameters, one thread at a time: what is stored is what is in force."""
+        with self._lock:
+            return list(super().set_parameters(parameters))
+
+    def set_parameters_atomically(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Set parameters, all or none, one thread at a time."""
+        with self._lock:
+            return super().set_parameters_atomically(parameters)
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Check all parameters together; apply what may change while the node runs; all of it or nothing."""
@@ -290,9 +276,10 @@ class PlaceRecognitionNode(LifecycleNode):
     def destroy_node(self) -> None:
         """End the worker, say what was done, and take the node down."""
         self._reporter.stop()
+        patience = 0.2 if self.ending.is_set() else PATIENCE + 1  # spin_until has waited before
         self.ending.set()
         # who holds the lock may be reading a large map, or compiling: nobody waits for that at the end
-        if self._lock.acquire(timeout=PATIENCE + 1):
+        if self._lock.acquire(timeout=patience):
             self._free()
             self._lock.release()
         else:

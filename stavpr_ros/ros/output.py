@@ -5,7 +5,6 @@ from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float32, Header, Int32
@@ -14,6 +13,7 @@ from stavpr_msgs.msg import Candidates, LoopClosure, PlaceMatch
 from stavpr_ros.evaluation.overlay import match_image
 from stavpr_ros.operation import Answer, Outcome
 from stavpr_ros.operation.outcome import place_picture
+from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.messages import (
     candidates_message,
     image_message,
@@ -34,7 +34,7 @@ class Output:
     :param map_frame: frame of the map's poses.
     """
 
-    def __init__(self, node: LifecycleNode, map_frame: str) -> None:
+    def __init__(self, node: ManagedNode, map_frame: str) -> None:
         self._node, self._frame = node, map_frame
         self.match = self._publisher(PlaceMatch, '~/match')
         self.place_index = self._publisher(Int32, '~/place_index')

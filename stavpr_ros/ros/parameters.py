@@ -66,8 +66,8 @@ _INPUT = (
         'image_transport',
         'raw',
         '',
-        'raw: sensor_msgs/Image on the topic image; compressed: sensor_msgs/CompressedImage on '
-        'image/compressed.',
+        'raw: sensor_msgs/Image on the topic image; compressed: sensor_msgs/CompressedImage on /compressed '
+        'below what image is remapped to.',
         choices=TRANSPORTS,
     ),
     NodeParameter(

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
@@ -22,6 +23,7 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.signals import interrupted, signals_deferred
 
 LONGEST_WAIT = 0.2  # seconds until a signal is noticed
+LONGEST_CALLBACK = 4.0  # seconds that callbacks may go on at the end; the node's worker takes 3 of them
 
 AnyNode = TypeVar('AnyNode', bound=Node)
 
@@ -97,4 +99,21 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
     except ExternalShutdownException:
         pass
     finally:
+        if threads > 1:
+            _let_callbacks_end(executor, node)
         executor.shutdown()
+
+
+def _let_callbacks_end(executor: Executor, node: Node) -> None:
+    """
+    Wait for the callbacks that have been handed to other threads.
+
+    rclpy's own shutdown waits for none, and takes from under them what they need.
+
+    :param node: one with an event ``ending`` is told by it.
+    """
+    if hasattr(node, 'ending'):
+        node.ending.set()
+    end = time.monotonic() + LONGEST_CALLBACK
+    while not all(task.done() for task in executor._futures) and time.monotonic() < end:
+        time.sleep(0.01)

@@ -101,6 +101,7 @@ def _of_runtime(runtime: Runtime) -> dict[str, Any]:
             'publishers': images.publishers,
             'remedy': images.remedy,
             'incompatible': images.incompatible,
+            'mistyped': images.mistyped,
         }
     return told
 

@@ -1,5 +1,6 @@
 """What the node has while it is configured: the engine on its worker, the publishers, the inputs."""
 
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -8,13 +9,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-from rclpy.lifecycle import LifecycleNode
-
 from stavpr_msgs.msg import Candidate, MapInfo, PlaceMatch
 from stavpr_ros.errors import StavprError
 from stavpr_ros.operation import Answer, Engine, Outcome
 from stavpr_ros.operation.engine import LoadedMap
 from stavpr_ros.ros.input import ImageInput, OdometryInput
+from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.messages import candidate_messages, map_info_message, match_message, nanoseconds
 from stavpr_ros.ros.output import Output
 from stavpr_ros.ros.settings import NodeSettings
@@ -47,7 +47,7 @@ class Runtime:
     :raises StavprError: the map, the model or the settings do not do.
     """
 
-    def __init__(self, node: LifecycleNode, settings: NodeSettings, statistics: Statistics) -> None:
+    def __init__(self, node: ManagedNode, settings: NodeSettings, statistics: Statistics) -> None:
         self._node, self._settings, self._statistics = node, settings, statistics
         self._images: ImageInput | None = None
         self._odometry: OdometryInput | None = None
@@ -55,6 +55,7 @@ class Runtime:
         self._explained: set[str] = set()
         self._last_match: PlaceMatch | None = None
         self.loading = ''  # the map that is being loaded
+        self._one_load = threading.Lock()
         self.on_loading: Callable[[], None] = lambda: None  # called when that has changed
         self._worker = Worker(self._answer, settings.queue_size)
         self._output = Output(node, settings.map_frame)
@@ -200,13 +201,14 @@ class Runtime:
     @contextmanager
     def _loading(self, path: str) -> Iterator[None]:
         """Tell that a map is being loaded, if one is."""
-        self.loading = path
-        self.on_loading()
-        try:
-            yield
-        finally:
-            self.loading = ''
+        with self._one_load:
+            self.loading = path
             self.on_loading()
+            try:
+                yield
+            finally:
+                self.loading = ''
+                self.on_loading()
 
     def _use(self, loaded: LoadedMap) -> None:
         self._on_worker(lambda: self.engine.use(loaded))
@@ -236,8 +238,9 @@ class Runtime:
         """Begin a new window with the images that come from now on."""
         self._node.get_logger().info(f'the window is emptied: {reason}')
         self._epoch += 1
-        if self._odometry is not None:
-            self._odometry.trajectory.clear()
+        odometry = self._odometry  # another thread may take it away
+        if odometry is not None:
+            odometry.trajectory.clear()
 
     def reset(self) -> None:
         """Empty the window now; images that wait belong to none any more."""
@@ -280,7 +283,8 @@ class Runtime:
         waited = time.monotonic() - item.arrival
         header = item.message.header
         stamp = nanoseconds(header.stamp)
-        pose = self._odometry.trajectory.at(stamp) if self._odometry is not None else None
+        odometry = self._odometry  # another thread may take it away
+        pose = odometry.trajectory.at(stamp) if odometry is not None else None
         self.engine.ranking = self._output.candidates.get_subscription_count() > 0
         try:
             outcome = self.engine.process(item.message, stamp, pose)

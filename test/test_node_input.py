@@ -1,0 +1,350 @@
+"""What the node hears, from outside: transports, encodings, broken images, keyframes, odometry, QoS."""
+
+import array
+from functools import partial
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from camera import LENGTH, SECOND, Camera, start_node
+from diagnostic_msgs.msg import DiagnosticStatus
+from image_messages import compressed_message, image_message
+from nav_msgs.msg import Odometry
+from processes import Bench
+from raw_images import BAYER, CHANNELS, YUV, is_deep, mosaic, packed_yuv
+from rcl_interfaces.srv import GetParameters
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Header
+
+from stavpr_msgs.msg import PlaceMatch
+from stavpr_ros.mapping import save_map
+from stavpr_ros.ros.parameters import BY_NAME
+
+WARN, ERROR = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+WARMING_UP, MATCH = PlaceMatch.WARMING_UP, PlaceMatch.MATCH
+INVALID, SKIPPED = PlaceMatch.INVALID_IMAGE, PlaceMatch.SKIPPED
+
+
+@pytest.fixture(scope='module')
+def bench():
+    bench = Bench()
+    yield bench
+    bench.close()
+
+
+@pytest.fixture(scope='module')
+def start(small_map, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('node')
+    save_map(small_map, folder / 'route.stavpr')
+    return partial(start_node, folder)
+
+
+def encoded(image, encoding):
+    """An image in a raw encoding, byte by byte as the encoding is defined; 16 bits little-endian."""
+    height, width = image.shape[:2]
+    if encoding in BAYER:
+        rows = mosaic(encoding, image)
+        step, data = rows.shape[1], rows.tobytes()
+    elif encoding in YUV:
+        red, green, blue = np.moveaxis(image.astype(float), 2, 0) / 255
+        luma = 0.299 * red + 0.587 * green + 0.114 * blue  # BT.601
+        planes = 16 + 219 * luma, 128 + 126.4 * (blue - luma), 128 + 159.8 * (red - luma)
+        step, data = packed_yuv(encoding, np.dstack(planes).round().astype(np.uint8))
+    else:
+        order = CHANNELS[encoding]
+        wide = 'a' in encoding or encoding.endswith('4')
+        values = np.full((height, width, 4 if wide else len(set(order))), 255, np.uint16)
+        for colour, channel in enumerate(order):
+            values[..., channel] = image[..., colour] if len(set(order)) > 1 else image.mean(axis=2)
+        rows = (values << 8).astype('<u2') if is_deep(encoding) else values.astype(np.uint8)
+        step, data = rows.nbytes // height, rows.tobytes()
+    message = Image(height=height, width=width, encoding=encoding, step=step)
+    message.data = array.array('B', data)
+    return message
+
+
+def broken_images(image):
+    """One of each kind of broken image, by the kind."""
+    kinds = {kind: image_message(image, 0) for kind in ('cut off', 'encoding', 'depth', 'size', 'step')}
+    kinds['cut off'].height = kinds['cut off'].step = 2**32 - 1
+    kinds['encoding'].encoding = 'teleport8'
+    kinds['depth'].encoding = '32FC1'
+    kinds['size'].width = 0
+    kinds['step'].step = 1
+    return kinds
+
+
+@pytest.fixture(scope='class')
+def process(bench, start):
+    process = start('-r', 'odom:=/wheels/odometry')
+    bench.wait_for_node()
+    yield process
+    process.end()
+    bench.wait_for_nobody()
+
+
+@pytest.fixture(scope='class')
+def stream(bench, process):
+    return Camera(bench, bench.publisher)
+
+
+@pytest.fixture
+def camera(stream):
+    stream.reset()
+    return stream
+
+
+class TestImages:
+    """One node with the defaults; what a test sets, it sets back."""
+
+    @pytest.mark.parametrize('encoding', [*CHANNELS, *BAYER, *YUV])
+    def test_every_raw_encoding_is_recognised(self, stream, route, encoding):
+        """Without a reset: after five images there are only these in the window."""
+        for image in route[30:35]:
+            answer = stream.show(encoded(image, encoding))
+        assert (answer.verdict, answer.newest_index) == (MATCH, 34)
+
+    def test_broken_images_are_counted_and_explained_once_a_kind(self, bench, process, camera, route):
+        before = camera.counts('input')
+        good = iter(range(20))
+        for _ in range(2):
+            for kind, message in broken_images(route[0]).items():
+                answer = camera.show(message)
+                assert answer.verdict == INVALID, kind
+                assert answer.reason, kind
+                assert answer.place_index == answer.newest_index == -1
+                i = next(good)
+                answer = camera.show(route[i])
+                assert answer.verdict == (WARMING_UP if i < LENGTH - 1 else MATCH)
+        assert answer.newest_index == 9
+        after = camera.counts('input')
+        for kind in broken_images(route[0]):
+            key = f'dropped_invalid_{kind.replace(" ", "_")}'
+            assert int(after[key]) == int(before.get(key, 0)) + 2, kind
+            assert process.output().count(f'said once; /diagnostics counts "invalid: {kind}"') == 1, kind
+        bench.until_diagnosed('input', WARN, 'cut off 2')
+        assert 'Traceback' not in process.output()
+
+    def test_a_robot_that_stands_still_does_not_fill_the_window(self, bench, camera, route):
+        rng, change = np.random.default_rng(0), BY_NAME['keyframe_change'].default
+        assert camera.show(route[20]).verdict == WARMING_UP
+        for _ in range(100):
+            noisy = np.clip(route[20] + rng.normal(0, 3, route[20].shape), 0, 255).astype(np.uint8)
+            answer = camera.show(noisy, SECOND // 10)
+            assert answer.verdict == SKIPPED
+            assert f'less than {change:g}' in answer.reason
+        assert camera.counts('recognition')['window'] == '1'
+        assert int(camera.counts('processing')['dropped_not_a_keyframe']) >= 100
+        assert camera.verdicts(route[21:25]) == 3 * [WARMING_UP] + [MATCH]
+        assert bench.answers[-1].newest_index == 24
+        camera.set(keyframe_change=0.0)
+        camera.reset()
+        assert camera.verdicts(4 * [route[20]]) == 4 * [WARMING_UP]
+        assert camera.counts('recognition')['window'] == '4'
+        camera.set(keyframe_change=change)
+
+    def test_keyframes_by_odometry(self, bench, camera, route):
+        camera.set(keyframe_metres=1.0)
+        answer = camera.show(route[0])
+        assert answer.verdict == SKIPPED
+        assert 'no odometry' in answer.reason
+        assert 'never' in bench.until_diagnosed('input', WARN, 'odometry').message
+        assert int(camera.counts('input')['dropped_no_odometry']) >= 1
+        wheels = bench.node.create_publisher(Odometry, '/wheels/odometry', 10)
+        bench.until(lambda: wheels.get_subscription_count() > 0, 'the subscriber of odometry')
+
+        def moved(metres, degrees=0.0):
+            """Show the next image of the route as taken there; poses hold for half a second only."""
+            camera.stamp += SECOND
+            odometry, half = Odometry(), np.radians(degrees) / 2
+            odometry.header.stamp = Time(sec=camera.stamp // SECOND, nanosec=camera.stamp % SECOND)
+            odometry.pose.pose.position.x = metres
+            odometry.pose.pose.orientation.z, odometry.pose.pose.orientation.w = np.sin(half), np.cos(half)
+            image = next(images)
+
+            def known():  # not at once where the image is faster, or the connection is not there yet
+                wheels.publish(odometry)
+                return 'no odometry' not in camera.show(image, 0).reason
+
+            bench.until(known, 'odometry')
+            return bench.answers[-1]
+
+        images = iter(route)
+        assert moved(5.0).verdict == WARMING_UP
+        assert moved(5.4).reason == 'moved 0.400 m of 1 m since the last keyframe'
+        assert moved(6.1).verdict == WARMING_UP
+        assert moved(6.1, degrees=170).verdict == SKIPPED
+        camera.set(keyframe_degrees=30.0)
+        assert moved(6.1, degrees=40).verdict == WARMING_UP
+        answer = moved(6.1, degrees=50)
+        assert answer.reason == 'moved 0.000 m of 1 m and turned 10.00 of 30 degrees since the last keyframe'
+        assert camera.counts('recognition')['window'] == '3'
+        assert 'no odometry' in camera.show(next(images), 3600 * SECOND).reason  # another clock
+
+        def compared():
+            wheels.publish(Odometry(header=Header(stamp=Time(sec=1))))
+            message = bench.diagnostics['input'].message
+            return 'had no odometry of their time: compare the stamps' in message
+
+        bench.until(compared, 'a word on the stamps')
+        bench.until_diagnosed('input', WARN, 'comes no more')
+        camera.set(keyframe_metres=0.0, keyframe_degrees=0.0)
+        assert camera.show(next(images)).verdict == WARMING_UP
+        bench.until(lambda: wheels.get_subscription_count() == 0, 'the end of the subscription')
+        assert camera.counts('input')['odometry'] == 'not needed'
+        bench.node.destroy_publisher(wheels)
+
+    def test_a_subscriber_that_asks_too_much_is_told(self, bench, process):
+        asks = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        bench.listen(PlaceMatch, '/stavpr/match', asks)
+        said = 'a subscriber of ~/match hears nothing: it asks for another durability'
+        bench.until(lambda: said in process.output(), 'the warning')
+
+    def test_a_flood_of_big_images(self, bench, camera, route):
+        """What the middleware loses it may tell; what came is answered, whatever was lost."""
+        before, answered = camera.counts('input'), len(bench.answers)
+        big = image_message(np.kron(route[0], np.ones((10, 10, 1), np.uint8)), camera.stamp)
+        for _ in range(60):
+            bench.publisher.publish(big)
+        bench.ask_until_answered(image_message(route[1], camera.stamp + 1))
+        after = camera.counts('input')
+        received = int(after['received']) - int(before['received'])
+        bench.until(lambda: len(bench.answers) - answered == received, 'an answer to every image')
+        lost = int(after.get('dropped_lost_in_transport', 0)) - int(
+            before.get('dropped_lost_in_transport', 0)
+        )
+        assert 0 <= lost <= 61 - received
+
+
+@pytest.fixture(scope='class')
+def compressed_process(start):
+    process = start('-r', 'image:=/front/image', '-p', 'image_transport:=compressed')
+    yield process
+    process.end()
+
+
+@pytest.fixture(scope='class')
+def packed(bench, compressed_process):
+    """Before there is one, or only one of raw images, and while it is silent, the node says so."""
+    topic = '/front/image/compressed'  # below what `image` is remapped to
+    message = bench.until_diagnosed('input', WARN, 'no publisher').message
+    assert topic in message
+    assert 'image:=TOPIC' in message
+    raw = bench.node.create_publisher(Image, topic, qos_profile_sensor_data)
+    bench.until_diagnosed('input', ERROR, 'sensor_msgs/msg/Image is published there: compare image_transport')
+    bench.node.destroy_publisher(raw)
+    publisher = bench.node.create_publisher(CompressedImage, topic, qos_profile_sensor_data)
+    bench.until_diagnosed('input', WARN, 'there, but silent')
+    camera = Camera(bench, publisher, CompressedImage)
+    camera.connect()
+    bench.until_diagnosed('input', ERROR, 'all images in the last 10 s were invalid')
+    return camera
+
+
+class TestCompressed:
+    @pytest.mark.parametrize('suffix', ['.png', '.jpeg'])
+    def test_pictures(self, packed, route, suffix):
+        packed.reset()
+        verdicts = packed.verdicts(compressed_message(image, 0, suffix) for image in route[40:46])
+        assert verdicts == 4 * [WARMING_UP] + 2 * [MATCH]
+        assert packed.bench.answers[-1].newest_index == 45
+
+    def test_what_is_no_picture(self, bench, packed, route):
+        packed.reset()
+        depth, short, text = (compressed_message(route[0], 0) for _ in range(3))
+        depth.format = '16UC1; compressedDepth png'
+        short.data = short.data[: len(short.data) // 2]
+        text.data = array.array('B', b'no picture at all')
+        for message, word in ((depth, 'compressedDepth'), (short, 'png'), (text, 'rgb8')):
+            answer = packed.show(message)
+            assert answer.verdict == INVALID
+            assert word in answer.reason
+        assert packed.show(compressed_message(route[0], 0)).verdict == WARMING_UP
+        bench.until_diagnosed('input', WARN, 'depth 1')
+
+
+@pytest.fixture(scope='class')
+def reliable_process(start):
+    process = start(
+        *('-p', 'qos_overrides./image.subscription.reliability:=reliable'),
+        *('-p', 'qos_overrides./image.subscription.depth:=7'),
+    )
+    yield process
+    process.end()
+
+
+@pytest.fixture(scope='class')
+def reliable(bench, reliable_process):
+    """Reliable; the bench's own is not, which the node does not hear, and says so."""
+    message = bench.until_diagnosed('input', ERROR, 'refused for QoS').message
+    remedy = 'set qos_overrides./image.subscription.reliability to best_effort, or make the publisher'
+    assert remedy in message
+    assert f'images are not heard: a publisher of /image offers another reliability: {remedy}' in (
+        reliable_process.output()
+    )
+    camera = Camera(bench, bench.node.create_publisher(Image, 'image', QoSProfile(depth=10)))
+    camera.connect()
+    yield camera
+    bench.node.destroy_publisher(camera.publisher)
+
+
+class TestQualityOfService:
+    def test_a_second_publisher_that_fits_is_heard(self, bench, reliable, route):
+        for image in route[:LENGTH]:
+            bench.publisher.publish(image_message(route[50], 1))  # not heard: there is one answer only
+            answer = reliable.show(image)
+        assert (answer.verdict, answer.newest_index) == (MATCH, LENGTH - 1)
+
+        def told():
+            reliable.show(route[LENGTH])
+            status = bench.diagnostics['input']
+            return status.level == WARN and '1 publisher refused for QoS, while images of' in status.message
+
+        bench.until(told, 'a warning')
+        counts = reliable.counts('input')
+        assert (counts['publishers'], counts['publishers_refused']) == ('2', '1')
+        depth = bench.call(GetParameters, 'get_parameters', names=['qos_overrides./image.subscription.depth'])
+        assert depth.values[0].integer_value == 7
+
+    def test_overrides_are_of_one_topic_and_outlive_a_pause(self, bench, reliable, route):
+        def offered(topic):
+            return [s.qos_profile.reliability for s in bench.node.get_subscriptions_info_by_topic(topic)]
+
+        assert bench.transition('deactivate')
+        assert bench.transition('activate')
+        reliable.connect()
+        assert reliable.show(route[0]).verdict == WARMING_UP
+        assert offered('/image') == [ReliabilityPolicy.RELIABLE]
+        reliable.set(keyframe_metres=1.0)
+        bench.until(lambda: bool(offered('/odom')), 'the subscriber of odometry')
+        assert offered('/odom') == [ReliabilityPolicy.BEST_EFFORT]
+
+
+def test_durability_can_be_overridden(bench, start):
+    process = start('-p', 'qos_overrides./image.subscription.durability:=transient_local')
+    try:
+        bench.until_diagnosed('input', ERROR, 'qos_overrides./image.subscription.durability to volatile, or')
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        camera = Camera(bench, bench.node.create_publisher(Image, 'image', latched))
+        camera.connect()
+        bench.node.destroy_publisher(camera.publisher)
+    finally:
+        process.end()
+
+
+def test_overrides_that_do_not_do(bench, start):
+    process = start('-p', 'qos_overrides./image.subscription.reliability:=certain')
+    try:
+        bench.until_diagnosed('map', ERROR, 'correct qos_overrides./image.subscription')
+        assert bench.state() == 'unconfigured'
+        assert 'certain' in process.output()
+        assert 'Traceback' not in process.output()
+    finally:
+        process.end()
+
+
+def test_compressed_depth_is_no_transport(start):
+    process = start('-p', 'image_transport:=compressedDepth')
+    assert process.wait() == 1
+    assert "image_transport = 'compressedDepth' is unknown: take one of raw, compressed" in process.output()

@@ -1,0 +1,205 @@
+"""Time, from outside: rates, gaps and jumps of stamps, simulated time, bags that loop or pause."""
+
+from functools import partial
+
+import pytest
+from builtin_interfaces.msg import Time
+from camera import LENGTH, SECOND, Camera, start_node
+from image_messages import image_message
+from processes import Bench
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+
+from stavpr_msgs.msg import PlaceMatch
+from stavpr_ros.mapping import save_map
+
+WARMING_UP, MATCH, SKIPPED = PlaceMatch.WARMING_UP, PlaceMatch.MATCH, PlaceMatch.SKIPPED
+
+
+@pytest.fixture(scope='module')
+def bench():
+    bench = Bench()
+    yield bench
+    bench.close()
+
+
+@pytest.fixture(scope='module')
+def start(small_map, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('node')
+    save_map(small_map, folder / 'route.stavpr')
+    return partial(start_node, folder)
+
+
+@pytest.fixture(scope='class')
+def process(bench, start, request):
+    """A node; a class may have options for it."""
+    process = start(*getattr(request.cls, 'OPTIONS', ()))
+    bench.wait_for_node()
+    yield process
+    process.end()
+    bench.wait_for_nobody()
+
+
+@pytest.fixture(scope='class')
+def stream(bench, process):
+    return Camera(bench, bench.publisher)
+
+
+@pytest.fixture
+def camera(stream):
+    stream.reset()
+    return stream
+
+
+class World:
+    """Publishes the time of a simulation, or of a bag."""
+
+    def __init__(self, bench, camera):
+        self.bench, self.arrays = bench, camera.diagnostics
+        self.publisher = bench.node.create_publisher(Clock, '/clock', QoSProfile(depth=1))
+        bench.until(lambda: self.publisher.get_subscription_count() > 0, 'a subscriber of /clock')
+
+    def set(self, seconds):
+        """Set the time until the node has it; from then on it stands still."""
+
+        def there():
+            self.publisher.publish(Clock(clock=Time(sec=seconds)))
+            return bool(self.arrays) and self.arrays[-1].header.stamp.sec == seconds
+
+        self.bench.until(there, f'{seconds} s')
+
+
+class TestRates:
+    def test_max_rate(self, bench, camera, route):
+        camera.set(max_rate=5.0)
+        before = camera.counts('processing')
+        verdicts = camera.verdicts((route[i % 60] for i in range(60)), SECOND // 30)
+        assert [i for i, verdict in enumerate(verdicts) if verdict != SKIPPED] == list(range(0, 60, 6))
+        assert 'max_rate = 5 Hz' in bench.answers[-1].reason
+        dropped = int(camera.counts('processing')['dropped_max_rate'])
+        assert dropped == int(before.get('dropped_max_rate', 0)) + 50
+        camera.show(route[0])
+        assert camera.show(route[1], -SECOND // 30).verdict == SKIPPED  # was overtaken on its way
+        assert camera.show(route[2], SECOND // 10).verdict == SKIPPED
+        assert camera.show(route[3], SECOND // 5).verdict != SKIPPED
+        camera.set(max_rate=0.0)
+        assert SKIPPED not in camera.verdicts(route[10:20], SECOND // 30)
+
+    def test_max_rate_goes_by_arrival_where_there_are_no_stamps(self, bench, camera, route):
+        camera.set(max_rate=0.01)
+        answers = [bench.ask(image_message(image, 0)) for image in route[:3]]
+        assert [answer.verdict for answer in answers] == [WARMING_UP, SKIPPED, SKIPPED]
+        camera.set(max_rate=5.0)
+        late = image_message(route[3], 0)
+        bench.until(lambda: bench.ask(late).verdict == WARMING_UP, 'an image that is late enough')
+        camera.set(max_rate=0.0)
+        assert bench.ask(image_message(route[4], 0)).verdict == WARMING_UP
+
+    def test_keyframes_by_time(self, bench, camera, route):
+        camera.set(keyframe_seconds=1.0)
+        verdicts = camera.verdicts(route[:9], SECOND // 4)
+        assert [i for i, verdict in enumerate(verdicts) if verdict == WARMING_UP] == [0, 4, 8]
+        assert camera.show(route[9], SECOND // 2).reason == '0.500 s after the last keyframe: less than 1 s'
+        camera.set(keyframe_seconds=0.0)
+        assert camera.show(route[10], 1).verdict == WARMING_UP
+        assert camera.counts('recognition')['window'] == '4'
+
+
+class TestStamps:
+    def test_a_bag_that_loops(self, bench, process, camera, route):
+        before = camera.counts('input')
+        assert camera.verdicts(route[:6]) == 4 * [WARMING_UP] + 2 * [MATCH]
+        assert camera.show(route[6], -60 * SECOND).verdict == WARMING_UP
+        assert camera.verdicts(route[7:11]) == 3 * [WARMING_UP] + [MATCH]
+        assert bench.answers[-1].newest_index == 10
+        first = bench.answers[-1].window_first
+        assert first.sec * SECOND + first.nanosec == camera.stamp - 4 * SECOND
+        after = camera.counts('input')
+        assert int(after['jumps_back']) == int(before['jumps_back']) + 1
+        assert after['longest_jump_back_s'] == '60.000'
+        said = 'the window is emptied: the stamps of the images jumped back by 60.000 s'
+        assert process.output().count(said) == 1
+
+    def test_images_that_overtake_each_other_are_no_jump(self, camera, route):
+        before = camera.counts('input')
+        camera.verdicts(route[:5])
+        assert camera.show(route[5], -SECOND // 20).verdict == MATCH
+        assert camera.show(route[6], SECOND // 10).verdict == MATCH
+        after = camera.counts('input')
+        assert after['jumps_back'] == before['jumps_back']
+
+    def test_gaps_are_counted_and_the_window_goes_on(self, camera, route):
+        camera.verdicts(route[:5])
+        before = int(camera.counts('input')['gaps'])
+        assert camera.show(route[5], 2 * SECOND).verdict == MATCH
+        assert camera.show(route[6], 3 * SECOND).verdict == MATCH
+        after = camera.counts('input')
+        assert int(after['gaps']) == before + 1
+        camera.set(max_gap=0.5)
+        assert camera.verdicts(route[7:9], SECOND) == 2 * [MATCH]
+        camera.show(route[9], SECOND // 2)
+        assert int(camera.counts('input')['gaps']) == before + 3
+        camera.set(max_gap=2.0)
+
+    def test_images_without_stamps(self, bench, camera, route):
+        before = camera.counts('input')
+        answers = [bench.ask(image_message(image, 0)) for image in route[20:26]]
+        assert [answer.verdict for answer in answers] == 4 * [WARMING_UP] + 2 * [MATCH]
+        assert answers[-1].newest_index == 25
+        assert answers[-1].window_first == answers[-1].window_last == Time()
+        assert camera.show(route[26]).verdict == MATCH
+        after = camera.counts('input')
+        assert (after['gaps'], after['jumps_back']) == (before['gaps'], before['jumps_back'])
+
+    def test_simulated_time_begins_and_ends_while_the_node_runs(self, bench, process, camera, route):
+        """Neither is a jump of the images."""
+        camera.verdicts(route[:LENGTH])
+        camera.set(use_sim_time=True)
+        world = World(bench, camera)
+        world.set(50)
+        assert camera.show(route[5]).verdict == MATCH
+        camera.set(use_sim_time=False)
+        assert camera.show(route[6]).verdict == MATCH
+        assert camera.counts('input')['rate_in_hz'] != '0.000'
+        assert 'the clock jumped' not in process.output()
+        bench.node.destroy_publisher(world.publisher)
+
+
+class TestSimulatedTime:
+    """With ``/clock``, from the start; it stands still wherever a test does not set it."""
+
+    OPTIONS = ('-p', 'use_sim_time:=true')
+
+    def test_diagnostics_go_on_without_a_clock_and_while_it_stands_still(self, bench, process, camera):
+        arrays = camera.diagnostics
+        bench.until(lambda: len(arrays) >= 3, 'diagnostics without a clock')
+        assert [array.header.stamp for array in arrays[:3]] == 3 * [Time()]
+        world = World(bench, camera)
+        world.set(100)
+        told = len(arrays)
+        bench.until(lambda: len(arrays) >= told + 5, 'diagnostics while the clock stands still')
+        assert {array.header.stamp.sec for array in arrays[told:]} == {100}
+        uptimes = [self.value(array, 'processing', 'uptime_s') for array in arrays[told:]]
+        assert uptimes == sorted(set(uptimes))
+        bench.node.destroy_publisher(world.publisher)
+
+    def test_a_clock_that_jumps_back_empties_the_window(self, bench, process, camera, route):
+        """The images' own stamps go on."""
+        world = World(bench, camera)
+        world.set(1000)
+        assert camera.verdicts(route[:6]) == 4 * [WARMING_UP] + 2 * [MATCH]
+        world.set(5000)
+        assert camera.show(route[6]).verdict == MATCH
+        world.set(4950)
+        assert 'the window is emptied: the clock jumped back by 50.000 s' in process.output()
+        assert camera.verdicts(route[7:12]) == 4 * [WARMING_UP] + [MATCH]
+        assert bench.answers[-1].newest_index == 11
+        world.set(4951)
+        assert camera.show(route[12]).verdict == MATCH
+        assert self.value(camera.diagnostics[-1], 'input', 'jumps_back') == 0
+        bench.node.destroy_publisher(world.publisher)
+
+    @staticmethod
+    def value(array, part, key):
+        found = [status for status in array.status if status.name.endswith(part)]
+        return next(float(pair.value) for pair in found[0].values if pair.key == key)

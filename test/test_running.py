@@ -1,0 +1,241 @@
+"""The node as users run it: renamed, with parameters changed under load, and ended at any moment."""
+
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from image_messages import image_message
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from processes import Bench, Process, node_process
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import Image
+
+from stavpr_msgs.msg import MapInfo, PlaceMatch
+from stavpr_msgs.srv import LoadMap
+from stavpr_ros.mapping import save_map
+
+IMAGES = QoSProfile(depth=1000)  # reliable, and the node takes them so: none is lost on its way
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+RELIABLE = {
+    'qos_overrides./image.subscription.reliability': 'reliable',
+    'qos_overrides./image.subscription.depth': 1000,
+}
+LONGEST_END = 8.0  # seconds; `ros2 launch` kills what is not gone 10 s after its SIGINT
+
+
+@pytest.fixture(scope='module')
+def bench():
+    bench = Bench()
+    bench.node.destroy_publisher(bench.publisher)
+    bench.publisher = bench.node.create_publisher(Image, 'image', IMAGES)
+    yield bench
+    bench.close()
+
+
+@pytest.fixture(scope='module')
+def map_file(small_map, tmp_path_factory):
+    path = tmp_path_factory.mktemp('running') / 'route.stavpr'
+    save_map(small_map, path)
+    return str(path)
+
+
+@pytest.fixture
+def run(bench, tmp_path):
+    """Start a node; it is ended with the test."""
+    started = []
+
+    def run(**parameters):
+        values = {'sequence_length': 5, 'neighbourhood': 5, 'keyframe_change': 0.0, 'diagnostics_period': 0.1}
+        started.append(node_process(tmp_path / 'node.log', **values | RELIABLE | parameters))
+        return started[0]
+
+    yield run
+    started[0].end()
+    bench.wait_for_nobody()
+
+
+def ends_well(process, number, longest=LONGEST_END):
+    """Send a signal; the end must be clean, and come soon."""
+    began = time.monotonic()
+    assert process.stop(number) == 0
+    assert time.monotonic() - began < longest
+    output = process.output()
+    assert 'images received' in output
+    for word in ('Traceback', 'Exception', 'exception', 'ERROR', 'terminate'):
+        assert word not in output, output
+    return True
+
+
+@pytest.mark.parametrize(
+    ('labels', 'number'),
+    [
+        ([], signal.SIGTERM),
+        (['configure'], signal.SIGINT),
+        (['configure', 'activate'], signal.SIGTERM),
+        (['shutdown'], signal.SIGINT),
+        (['configure', 'shutdown'], signal.SIGTERM),
+        (['configure', 'activate', 'shutdown'], signal.SIGINT),
+    ],
+)
+def test_a_signal_in_each_state(bench, run, map_file, labels, number):
+    """Also after a shutdown, which leads to finalized from every state, and from there nowhere."""
+    process = run(autostart=False, map_path=map_file)
+    states = {'configure': 'inactive', 'activate': 'active', 'shutdown': 'finalized'}
+    for label in labels:
+        assert bench.transition(label)
+        assert bench.state() == states[label]
+    if not labels:
+        assert bench.state() == 'unconfigured'
+    if labels[-1:] == ['shutdown']:
+        bench.wait_for_nobody()
+        bench.until_diagnosed('processing', DiagnosticStatus.OK, 'finalized: no image is processed')
+        answer = bench.call(LoadMap, 'load_map', path=map_file)
+        assert not answer.success
+        assert 'the node is finalized' in answer.message
+        assert process.popen.poll() is None
+    assert ends_well(process, number)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_in_the_middle_of_an_image(bench, run, map_file, route, number):
+    process = run(map_path=map_file, queue_size=1000)
+    bench.wait_for_node()
+    before, images = len(bench.answers), 400
+    for i in range(images):
+        bench.publisher.publish(image_message(route[i % 60], 7000 + i))
+    bench.until(lambda: len(bench.answers) > before + 2, 'some answers')
+    assert ends_well(process, number)
+    assert len(bench.answers) < before + images  # it was in the middle
+
+
+def test_a_signal_while_the_kernels_are_compiled(bench, run, map_file, tmp_path, monkeypatch):
+    """Compiling takes ten seconds and cannot be interrupted; the node does not wait for it."""
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'cache'))
+    process = run(autostart=False, map_path=map_file)
+    client = bench.node.create_client(ChangeState, '/stavpr/change_state')
+    bench.until(client.service_is_ready, 'the service')
+    request = ChangeState.Request(transition=Transition(label='configure'))
+    future = client.call_async(request)
+    bench.until(lambda: 'backend cpu' in process.output(), 'the configuration to begin')
+    assert not future.done()
+    assert ends_well(process, signal.SIGINT)
+    bench.node.destroy_client(client)
+
+
+@pytest.mark.parametrize('how', ['load_map', 'configure'])
+def test_a_signal_while_a_map_is_read(bench, run, map_file, tmp_path, how):
+    """The file is a pipe into which nobody writes: reading it takes for ever."""
+    pipe = tmp_path / 'pipe.stavpr'
+    os.mkfifo(pipe)
+    process = run(map_path=map_file if how == 'load_map' else pipe)
+    client = bench.node.create_client(LoadMap, '/stavpr/load_map')
+    if how == 'load_map':
+        bench.wait_for_node()
+        bench.until(client.service_is_ready, 'the service')
+        future = client.call_async(LoadMap.Request(path=str(pipe)))
+        bench.until_diagnosed('map', DiagnosticStatus.OK, f'loading {pipe}')
+        assert not future.done()
+        answer = bench.ask(image_message(np.zeros((96, 128, 3), np.uint8), 1))  # goes on meanwhile
+        assert answer.verdict == PlaceMatch.WARMING_UP
+    else:
+        bench.until_diagnosed('processing', DiagnosticStatus.OK, 'configuring')
+        assert bench.state() == 'configuring'  # asked for meanwhile
+        assert not bench.transition('cleanup')
+        assert 'another is under way' in process.output()
+    assert ends_well(process, signal.SIGINT)
+    bench.node.destroy_client(client)
+
+
+def test_parameters_change_under_load(bench, run, small_map, map_file, route, tmp_path):
+    """Every image of a stream is answered once, while all that may change at any time does."""
+    other = str(tmp_path / 'other.stavpr')
+    save_map(small_map, other)
+    run(map_path=map_file)
+    bench.wait_for_node()
+    before, images, futures = len(bench.answers), 150, []
+    client = bench.node.create_client(SetParameters, '/stavpr/set_parameters')
+    bench.until(client.service_is_ready, 'the service')
+    changes = [
+        ('threshold', (0.1, 0.3)),
+        ('max_rate', (10.0, 0.0)),
+        ('verbosity', ('warn', 'info')),
+        ('map_path', (other, map_file)),
+    ]
+
+    def stream():
+        i = len(futures)
+        if i < images:
+            bench.publisher.publish(image_message(route[i % 60], 10**9 + i * 10**9 // 30))
+            name, values = changes[i % 4]
+            value = Parameter(name, value=values[i // 4 % 2]).to_parameter_msg()
+            futures.append(client.call_async(SetParameters.Request(parameters=[value])))
+
+    clock = bench.node.create_timer(1 / 30, stream)
+
+    def done():
+        return len(futures) == images and all(future.done() for future in futures)
+
+    bench.until(done, 'all changes')
+    bench.until(lambda: len(bench.answers) >= before + images, 'all answers')
+    bench.node.destroy_timer(clock)
+    bench.node.destroy_client(client)
+    assert all(result.successful for future in futures for result in future.result().results)
+    assert bench.set_parameter('max_rate', 0.0)[0]
+    last = bench.ask(image_message(route[0], 100 * 10**9))  # behind it nothing is on its way any more
+    assert last is bench.answers[-1]
+    stamps = [answer.header.stamp.sec * 10**9 + answer.header.stamp.nanosec for answer in bench.answers]
+    assert sorted(stamps[before:-1]) == [10**9 + i * 10**9 // 30 for i in range(images)]
+    assert {PlaceMatch.WARMING_UP, PlaceMatch.SKIPPED} <= {a.verdict for a in bench.answers[before:]}
+
+
+def test_another_namespace_and_name(bench, map_file, route, tmp_path):
+    """Topics, services and diagnostics follow; a parameter that was misspelt is said, and what was meant."""
+    arguments = ('-r', '__ns:=/robot', '-r', '__node:=places', '-r', 'image:=front/camera')
+    values = ('-p', f'map_path:={map_file}', '-p', 'sequence_lenght:=5', '-p', 'diagnostics_period:=0.1')
+    heard, infos = (
+        bench.listen(PlaceMatch, '/robot/places/match'),
+        bench.listen(MapInfo, '/robot/places/map_info', LATCHED),
+    )
+    reports = bench.listen(DiagnosticArray, '/diagnostics')
+    publisher = bench.node.create_publisher(Image, '/robot/front/camera', IMAGES)
+    process = Process(tmp_path / 'robot.log', 'node', '--ros-args', *arguments, *values)
+    try:
+        bench.until(lambda: publisher.get_subscription_count() > 0, 'the subscription')
+
+        def answered():
+            publisher.publish(image_message(route[0], 1 + len(heard)))
+            return bool(heard)
+
+        bench.until(answered, 'an answer')
+        bench.until(lambda: infos and infos[-1].places == 60, 'the map')
+
+        def names():
+            return {status.name for report in reports for status in report.status}
+
+        parts = ('input', 'map', 'recognition', 'processing')
+        bench.until(lambda: names() >= {f'robot/places: {part}' for part in parts}, 'the diagnostics')
+
+        def topics():
+            return {
+                value.value
+                for report in reports
+                for status in report.status
+                for value in status.values
+                if (status.name, value.key) == ('robot/places: input', 'topic')
+            }
+
+        bench.until(lambda: '/robot/front/camera' in topics(), 'the topic in the diagnostics')
+        services = dict(bench.node.get_service_names_and_types())
+        assert {f'/robot/places/{name}' for name in ('load_map', 'reset', 'change_state')} <= set(services)
+        warning = "parameter 'sequence_lenght' is not one of this node: was sequence_length meant?"
+        assert warning in process.output()
+        assert ends_well(process, signal.SIGINT)
+    finally:
+        process.end()
+        bench.node.destroy_publisher(publisher)
