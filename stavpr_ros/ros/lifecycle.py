@@ -45,7 +45,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
 
     def _guarded(self, wish: str | int, change: Callable[[], bool]) -> bool:
         if not self._transit.acquire(blocking=False):
-            self.get_logger().error(f'transition {wish!r} refused: another is under way ({self.state})')
+            self.get_logger().warning(f'transition {wish!r} refused: another is under way ({self.state})')
             return False
         try:
             return change()

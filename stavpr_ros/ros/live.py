@@ -8,7 +8,8 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from stavpr_ros.errors import StavprError, UnavailableError
 
 START_PATIENCE = 180.0  # seconds for the node to load the map and to compile
 PATIENCE = 20.0  # seconds for a process to end, or for a last answer to be written
+MATCHES, CLOSURES = 'matches.jsonl', 'loop_closures.jsonl'
 
 
 def executable(name: str) -> str:
@@ -83,9 +85,9 @@ def _wait_until(
         time.sleep(0.05)
 
 
-def _is_recording(folder: Path) -> bool:
-    """Tell whether the listener has said that it misses nothing any more."""
-    return any(line.startswith('recording') for line in _lines(folder / 'record.log'))
+def _is_recording(log: Path) -> bool:
+    """Tell whether a listener has said that it misses nothing any more."""
+    return any(line.startswith('recording') for line in _lines(log))
 
 
 def _lines(path: Path) -> list[str]:
@@ -105,29 +107,77 @@ def run_live(
     :returns: one record an image, see the command ``record``.
     :raises StavprError: a process failed; names its log.
     """
+    matches = _replay_into_node(node_parameters, query, images, folder, topic, loops=False)
+    if len(matches) != images:
+        raise StavprError(f'{len(matches)} answers to {images} images were heard, see the logs in {folder}')
+    return matches
+
+
+def run_loop_closure(
+    node_parameters: dict[str, Any], drive: str, images: int, folder: Path, topic: str | None = None
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """
+    Replay a drive, losslessly, into a node that closes loops, and return what two listeners heard.
+
+    ``matches.jsonl`` and ``loop_closures.jsonl`` are written into the folder.
+
+    :returns: one answer an image, and the loop closures; see the command ``record``.
+    :raises StavprError: a process failed; names its log.
+
+    The others are as in :func:`run_live`.
+    """
+    parameters = node_parameters | {'operation': 'loop_closure'}
+    matches = _replay_into_node(parameters, drive, images, folder, topic, loops=True)
+    if len(matches) != images:
+        raise StavprError(f'{len(matches)} answers to {images} images were heard, see the logs in {folder}')
+    return matches, _records(folder / CLOSURES)
+
+
+def _replay_into_node(
+    node_parameters: dict[str, Any], query: str, images: int, folder: Path, topic: str | None, loops: bool
+) -> list[dict[str, Any]]:
+    """Run all the processes; return the answers."""
     environment = private_domain()
-    matches = folder / 'matches.jsonl'
-    matches.unlink(missing_ok=True)
     parameters = [word for name, value in node_parameters.items() for word in ('-p', f'{name}:={value}')]
     node = [executable('node'), '--ros-args', *parameters]
     replay = [executable('replay'), query, '--lossless', '--wait', '120']
     if topic is not None:
         replay += ['--topic', topic]
-    record = [executable('record'), '--output', str(matches)]
-    with (
-        _running(node, folder / 'node.log', environment) as node_process,
-        _running(record, folder / 'record.log', environment) as record_process,
-    ):
-        both = {'node': node_process, 'record': record_process}
-        _wait_until(lambda: _is_recording(folder), both, folder, START_PATIENCE, 'the node')
+    listeners: dict[str, tuple[str, list[str]]] = {'record': (MATCHES, [])}
+    if loops:
+        listeners['record_loop_closures'] = (CLOSURES, ['--loop-closures'])
+    with ExitStack() as stack:
+        processes = {'node': stack.enter_context(_running(node, folder / 'node.log', environment))}
+        for name, (file, options) in listeners.items():
+            (folder / file).unlink(missing_ok=True)
+            log = folder / f'{name}.log'
+            log.unlink(missing_ok=True)
+            record = [executable('record'), '--output', str(folder / file), *options]
+            processes[name] = stack.enter_context(_running(record, log, environment))
+        for name in listeners:
+            log = folder / f'{name}.log'
+            _wait_until(partial(_is_recording, log), processes, folder, START_PATIENCE, 'the node')
         with _running(replay, None, environment) as replay_process:
-            _wait_until(lambda: replay_process.poll() is not None, both, folder, math.inf, 'the end')
+            _wait_until(lambda: replay_process.poll() is not None, processes, folder, math.inf, 'the end')
         if replay_process.returncode != 0:
             raise StavprError(
                 f'the replay ended with {replay_process.returncode}, see also {folder}/node.log'
             )
-        _wait_until(lambda: len(_lines(matches)) >= images, both, folder, PATIENCE, 'the last answer')
-    records = [json.loads(line) for line in _lines(matches)]
-    if len(records) != images:
-        raise StavprError(f'{len(records)} answers to {images} images were heard, see the logs in {folder}')
-    return records
+        _wait_until(
+            partial(_all_heard, folder, images, loops), processes, folder, PATIENCE, 'the last answer'
+        )
+    return _records(folder / MATCHES)
+
+
+def _all_heard(folder: Path, images: int, loops: bool) -> bool:
+    """Tell whether every image is answered, and every match is there as a loop closure too."""
+    if len(_lines(folder / MATCHES)) < images:
+        return False
+    if not loops:
+        return True
+    matches = sum(record['verdict'] == 'MATCH' for record in _records(folder / MATCHES))
+    return len(_lines(folder / CLOSURES)) >= matches
+
+
+def _records(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in _lines(path)]

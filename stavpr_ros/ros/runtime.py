@@ -5,14 +5,15 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 from stavpr_msgs.msg import Candidate, MapInfo, PlaceMatch
 from stavpr_ros.errors import StavprError
+from stavpr_ros.mapping import save_map
 from stavpr_ros.operation import Answer, Engine, Outcome
-from stavpr_ros.operation.engine import LoadedMap
+from stavpr_ros.operation.begin import LoadedMap, read_map
 from stavpr_ros.ros.input import ImageInput, OdometryInput
 from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.messages import candidate_messages, map_info_message, match_message, nanoseconds
@@ -166,28 +167,16 @@ class Runtime:
 
         :raises StavprError: they do not do; everything stays as it was.
         """
-        old = self._settings
-        path = settings.map_path if settings.map_path != old.map_path else ''
-        with self._loading(path):
-            loaded = Engine.read(path, settings.engine) if path else None
-            self._take_over(settings, loaded)
+        path = settings.map_path if settings.map_path != self._settings.map_path else ''
+        with self._loading(path) if path else nullcontext():
+            loaded = read_map(path, settings.engine) if path else None
+            self._on_worker(lambda: self.engine.change(settings.engine, settings.operation, loaded))
+        self._settings = settings
+        if loaded is not None:
+            self._tell(loaded)
         if self._images is not None:
             self._images.max_rate, self._images.stamps.gap = settings.max_rate, settings.max_gap
             self._update_odometry()
-
-    def _take_over(self, settings: NodeSettings, loaded: LoadedMap | None) -> None:
-        old, self._settings = self._settings, settings
-        try:
-            self._on_worker(lambda: self.engine.change(settings.engine))
-            if settings.operation != old.operation:
-                self._on_worker(lambda: self.engine.set_operation(settings.operation))
-            if loaded is not None:
-                self._use(loaded)
-        except Exception:
-            self._settings = old
-            self._on_worker(lambda: self.engine.set_operation(old.operation))
-            self._on_worker(lambda: self.engine.change(old.engine))
-            raise
 
     def load(self, path: str) -> None:
         """
@@ -196,7 +185,9 @@ class Runtime:
         :raises StavprError: the file, the model or the settings do not do; the old map stays.
         """
         with self._loading(path):
-            self._use(Engine.read(path, self._settings.engine))
+            loaded = read_map(path, self._settings.engine)
+            self._on_worker(lambda: self.engine.use(loaded))
+        self._tell(loaded)
 
     @contextmanager
     def _loading(self, path: str) -> Iterator[None]:
@@ -210,8 +201,7 @@ class Runtime:
                 self.loading = ''
                 self.on_loading()
 
-    def _use(self, loaded: LoadedMap) -> None:
-        self._on_worker(lambda: self.engine.use(loaded))
+    def _tell(self, loaded: LoadedMap) -> None:
         places, features = loaded.places, loaded.places.features
         self._node.get_logger().info(
             f'map {loaded.path}: {len(places)} places, features {places.settings.kind}, '
@@ -219,8 +209,11 @@ class Runtime:
         )
 
     def save(self, path: str, overwrite: bool) -> int:
-        """Write the map; see :meth:`Engine.save`."""
-        return self._on_worker(lambda: self.engine.save(path, overwrite))
+        """Write the map; see :meth:`Engine.to_save`."""
+        place_map = self._on_worker(lambda: self.engine.to_save(path, overwrite))
+        save_map(place_map, path)  # on this thread: images go on meanwhile
+        self._on_worker(lambda: self.engine.saved(path, len(place_map)))
+        return len(place_map)
 
     def relocalize(self, count: int) -> tuple[PlaceMatch, list[Candidate]]:
         """Return the answer for the window as it is, and candidates; see :meth:`Engine.relocalize`."""

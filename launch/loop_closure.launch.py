@@ -1,0 +1,29 @@
+"""
+Close loops: ros2 launch stavpr_ros loop_closure.launch.py image:=/camera/image_raw odom:=/odom.
+
+With map_path, features are those of that map; its places are not compared.
+"""
+
+from launch import LaunchDescription
+from stavpr_ros.ros.launching import node_launch
+
+PARAMETERS = (
+    'map_path',
+    'threshold',
+    'mode',
+    'sequence_length',
+    'exclude_places',
+    'exclude_seconds',
+    'features',
+    'keyframe_seconds',
+    'keyframe_metres',
+    'keyframe_degrees',
+    'keyframe_change',
+    'max_places',
+    'geometric_check',
+)
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Describe the node in operation loop_closure."""
+    return node_launch(PARAMETERS, operation='loop_closure')

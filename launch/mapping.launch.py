@@ -1,0 +1,33 @@
+"""
+Make a map while driving: ros2 launch stavpr_ros mapping.launch.py image:=/camera/image_raw.
+
+With map_path, a map goes on growing. What has grown is written by the service save_map.
+"""
+
+from launch.actions import LogInfo
+from launch.substitutions import LaunchConfiguration
+
+from launch import LaunchDescription
+from stavpr_ros.ros.launching import node_launch
+
+PARAMETERS = (
+    'map_path',
+    'features',
+    'keyframe_seconds',
+    'keyframe_metres',
+    'keyframe_degrees',
+    'keyframe_change',
+    'max_places',
+)
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Describe the node in operation mapping."""
+    how_to_save = LogInfo(
+        msg=[
+            'to save the map, before this is ended: ros2 service call ',
+            LaunchConfiguration('namespace'),
+            '/stavpr/save_map stavpr_msgs/srv/SaveMap "{path: FILE}"',
+        ]
+    )
+    return node_launch(PARAMETERS, how_to_save, operation='mapping')

@@ -1,0 +1,66 @@
+"""Engines for made-up routes, and images shown to them."""
+
+from contextlib import contextmanager
+
+import cv2
+import numba
+import numpy as np
+import torch
+
+from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.operation import Engine, EngineSettings, read_map
+from stavpr_ros.sources.frame import ImageRecord
+from stavpr_ros.threads import limit_threads
+
+LENGTH, EXCLUDED = 5, 10
+SECOND = 10**9
+IDENTITY = [0.0, 0.0, 0.0, 1.0]
+
+
+def settings_of(**changes):
+    short = {'sequence': SequenceSettings(LENGTH), 'neighbourhood': 5, 'exclude_places': EXCLUDED}
+    return EngineSettings(**short | changes)
+
+
+def message(image):
+    return ImageRecord.of_image(image, 0)
+
+
+def at(i):
+    return np.array([float(i), 0, 0, *IDENTITY])
+
+
+def show(engine, images, first=0, poses=False):
+    """Image i of all is stamped i + 1 seconds and, if at all, taken at x = i."""
+    return [
+        engine.process(message(image), (i + 1) * SECOND, at(i) if poses else None)
+        for i, image in enumerate(images, first)
+    ]
+
+
+def answers(outcomes):
+    return [outcome.answer for outcome in outcomes]
+
+
+def stamps_of(place_map):
+    return [] if place_map is None else [int(stamp) // SECOND for stamp in place_map.stamps]
+
+
+@contextmanager
+def one_thread():
+    """Threads that wait for each other spin, 100 ms an image where others want the cores as well."""
+    before = torch.get_num_threads(), cv2.getNumThreads(), numba.get_num_threads()
+    limit_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
+        numba.set_num_threads(before[2])
+
+
+def localizing(map_file, **changes):
+    """An engine that localizes on a map's file."""
+    engine = Engine(settings_of(**changes))
+    engine.use(read_map(map_file, engine.settings))
+    return engine

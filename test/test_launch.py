@@ -1,0 +1,237 @@
+"""
+The launch files: what they offer, and what they start.
+
+``launch`` is no package that pip can install, so a stand-in that records takes its place; where it is
+installed, it runs one of the files as well.
+"""
+
+import ast
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import cv2
+import pytest
+from ament_index_python.packages import get_package_share_directory
+from conftest import route_images
+from processes import DOMAIN, executable
+
+from stavpr_ros.ros.parameters import BY_NAME
+
+ROOT = Path(__file__).resolve().parents[1]
+FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
+NAMES = [path.name.partition('.')[0] for path in FILES]
+OPERATIONS = {'stavpr': None, 'replay': None, 'mapping': 'mapping', 'loop_closure': 'loop_closure'}
+
+
+class Recorded:
+    """An action or substitution that knows what it was made with."""
+
+    def __init__(self, *positional, **named):
+        self.positional = positional
+        self.__dict__.update(named)
+
+    def perform(self, context):
+        return context[self.positional[0]]
+
+
+class LaunchDescription:
+    def __init__(self, entities):
+        self.entities = entities
+
+
+class DeclareLaunchArgument(Recorded):
+    @property
+    def name(self):
+        return self.positional[0]
+
+
+class OpaqueFunction(Recorded):
+    pass
+
+
+class Node(Recorded):
+    pass
+
+
+class LaunchConfiguration(Recorded):
+    pass
+
+
+class ParameterValue(Recorded):
+    pass
+
+
+STAND_INS = {
+    'launch': {'LaunchDescription': LaunchDescription, 'LaunchContext': dict},
+    'launch.actions': {
+        'DeclareLaunchArgument': DeclareLaunchArgument,
+        'OpaqueFunction': OpaqueFunction,
+        'LogInfo': type('LogInfo', (Recorded,), {}),
+        'Shutdown': type('Shutdown', (Recorded,), {}),
+    },
+    'launch.substitutions': {
+        'LaunchConfiguration': LaunchConfiguration,
+        'PathJoinSubstitution': type('PathJoinSubstitution', (Recorded,), {}),
+    },
+    'launch_ros': {},
+    'launch_ros.actions': {'Node': Node},
+    'launch_ros.parameter_descriptions': {'ParameterValue': ParameterValue},
+    'launch_ros.substitutions': {'FindPackageShare': type('FindPackageShare', (Recorded,), {})},
+}
+
+
+def describe(path):
+    spec = importlib.util.spec_from_file_location('launch_file', path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.generate_launch_description()
+
+
+@pytest.fixture
+def load(monkeypatch):
+    """Return what a launch file describes, by the stand-in."""
+    for name, content in STAND_INS.items():
+        module = ModuleType(name)
+        module.__dict__.update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.delitem(sys.modules, 'stavpr_ros.ros.launching', raising=False)
+
+    def load_by_name(name):
+        entities = describe(ROOT / 'launch' / f'{name}.launch.py').entities
+        arguments = {e.name: e for e in entities if isinstance(e, DeclareLaunchArgument)}
+        assert len(arguments) == sum(isinstance(e, DeclareLaunchArgument) for e in entities)
+
+        def start(**given):
+            context = {n: getattr(a, 'default_value', None) for n, a in arguments.items()} | given
+            functions = [e for e in entities if isinstance(e, OpaqueFunction)]
+            return [node for e in functions for node in e.function(context)]
+
+        return SimpleNamespace(arguments=arguments, start=start, entities=entities)
+
+    yield load_by_name
+    sys.modules.pop('stavpr_ros.ros.launching', None)
+
+
+def words(value):
+    """Spell a text with substitutions as `${name}`."""
+    if isinstance(value, list):
+        return ''.join(map(words, value))
+    return f'${{{value.positional[0]}}}' if isinstance(value, LaunchConfiguration) else value
+
+
+def test_every_launch_file_is_installed():
+    assert sorted(OPERATIONS) == NAMES
+    folder = Path(get_package_share_directory('stavpr_ros')) / 'launch'
+    for path in FILES:
+        assert (folder / path.name).read_text() == path.read_text()
+
+
+def test_the_helper_is_light():
+    """It is imported by the Python of ``ros2 launch``, which may have neither torch nor numba."""
+    tree = ast.parse((ROOT / 'stavpr_ros' / 'ros' / 'launching.py').read_text())
+    modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
+    modules |= {alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names}
+    assert {name.partition('.')[0] for name in modules} == {'collections', 'typing', 'launch', 'launch_ros'}
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_every_argument_is_described(load, name):
+    arguments = load(name).arguments
+    assert {'image', 'odom', 'namespace', 'params_file', 'use_sim_time', 'map_path'} <= set(arguments)
+    for argument in arguments.values():
+        assert len(argument.description) > 10
+        assert hasattr(argument, 'default_value') or argument.name == 'bag'
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_every_parameter_is_in_the_table(load, name):
+    """Everything is given at once: names and types are those of the node's table."""
+    launch = load(name)
+    given = dict.fromkeys(launch.arguments, 'true')
+    parameters = launch.start(**given)[0].parameters[1]
+    own = {'image', 'odom', 'namespace', 'params_file', 'bag', 'topic', 'rate', 'lossless', 'shutdown'}
+    assert set(launch.arguments) - own <= set(parameters)
+    for parameter, value in parameters.items():
+        if parameter == 'use_sim_time':
+            assert value.value_type is bool
+        elif isinstance(value, ParameterValue):
+            assert value.value_type is type(BY_NAME[parameter].default)
+            assert words(value.positional[0]) == f'${{{parameter}}}'
+        else:
+            assert value in BY_NAME[parameter].choices
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_what_is_not_given_is_left_to_the_parameter_file(load, name):
+    node = load(name).start()[0]
+    fixed = {} if OPERATIONS[name] is None else {'operation': OPERATIONS[name]}
+    assert words(node.parameters[0]) == '${params_file}'
+    assert node.parameters[1:] == [fixed]
+    assert Path(executable(node.executable)).exists()
+    assert (node.package, node.name, words(node.namespace)) == ('stavpr_ros', 'stavpr', '${namespace}')
+    topics = {topic: words(to) for topic, to in node.remappings}
+    expected = {'image': '${image}', 'image/compressed': '${image}/compressed', 'odom': '${odom}'}
+    assert topics == expected
+
+
+@pytest.mark.parametrize('operation', ['mapping', 'loop_closure'])
+def test_the_operation_of_the_file_stays(load, operation):
+    launch = load(operation)
+    assert 'operation' not in launch.arguments
+    assert launch.start(map_path='x')[0].parameters[1]['operation'] == operation
+
+
+def test_mapping_says_how_to_save(load):
+    logs = [words(e.msg) for e in load('mapping').entities if type(e).__name__ == 'LogInfo']
+    assert len(logs) == 1
+    assert '${namespace}/stavpr/save_map stavpr_msgs/srv/SaveMap' in logs[0]
+
+
+def test_replay(load):
+    launch = load('replay')
+    _, replay = launch.start(bag='drive')
+    assert [words(word) for word in replay.arguments] == ['${bag}']
+    assert replay.on_exit is None
+    assert dict(replay.remappings)['image'].positional == ('image',)
+    assert Path(executable(replay.executable)).exists()
+    _, replay = launch.start(bag='drive', topic='/camera', lossless='true', shutdown='true')
+    assert [words(word) for word in replay.arguments] == ['${bag}', '--topic', '${topic}', '--lossless']
+    assert type(replay.on_exit[0]).__name__ == 'Shutdown'
+    _, replay = launch.start(bag='drive', rate='2')
+    assert [words(word) for word in replay.arguments] == ['${bag}', '--rate', '${rate}']
+
+
+RUN = """
+import sys
+from launch import LaunchDescription, LaunchService
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+
+arguments = [word.split(':=') for word in sys.argv[2:]]
+included = IncludeLaunchDescription(PythonLaunchDescriptionSource(sys.argv[1]), launch_arguments=arguments)
+service = LaunchService()
+service.include_launch_description(LaunchDescription([included]))
+sys.exit(service.run())
+"""
+
+
+def test_with_launch_itself(tmp_path):
+    """A folder is replayed into the node, in a namespace; the launch ends with the replay."""
+    pytest.importorskip('launch_ros', reason='launch is not installed')
+    for i, image in enumerate(route_images(24)):
+        cv2.imwrite(str(tmp_path / f'{i}.png'), image)
+    given = ['namespace:=robot', 'image:=/camera', 'lossless:=true', 'shutdown:=true', 'operation:=mapping']
+    command = [sys.executable, '-c', RUN, str(ROOT / 'launch' / 'replay.launch.py'), f'bag:={tmp_path}']
+    environment = os.environ | {'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    done = subprocess.run(
+        [*command, *given], env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+    said = done.stdout + done.stderr
+    assert done.returncode == 0, said
+    assert '24 images published on /camera' in said
+    assert 'robot.stavpr]: 24 images received, 24 answered' in said
+    assert 'Traceback' not in said
