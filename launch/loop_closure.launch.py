@@ -20,6 +20,7 @@ PARAMETERS = (
     'keyframe_degrees',
     'keyframe_change',
     'max_places',
+    'save_path',
     'geometric_check',
 )
 

@@ -1,7 +1,7 @@
 """
 Make a map while driving: ros2 launch stavpr_ros mapping.launch.py image:=/camera/image_raw.
 
-With map_path, a map goes on growing. What has grown is written by the service save_map.
+With map_path, a map goes on growing. What has grown is written to save_path at the end, or by the service save_map.
 """
 
 from launch.actions import LogInfo
@@ -18,6 +18,7 @@ PARAMETERS = (
     'keyframe_degrees',
     'keyframe_change',
     'max_places',
+    'save_path',
 )
 
 
@@ -25,7 +26,7 @@ def generate_launch_description() -> LaunchDescription:
     """Describe the node in operation mapping."""
     how_to_save = LogInfo(
         msg=[
-            'to save the map, before this is ended: ros2 service call ',
+            'to save the map before the end (at the end, save_path does): ros2 service call ',
             LaunchConfiguration('namespace'),
             '/stavpr/save_map stavpr_msgs/srv/SaveMap "{path: FILE}"',
         ]

@@ -127,7 +127,7 @@ def test_mapping_continues_a_map(map_file, small_map, route):
 def test_loop_closure_is_the_loop_closer(route, exclude_seconds):
     engine = Engine(settings_of(exclude_seconds=exclude_seconds), 'loop_closure')
     images = route[:40] * 2
-    core = engine.settings.loop_closer(engine.describer, 1.0)
+    core = engine.settings.loop_closer(engine.describer, 0.8)
     for i, outcome in enumerate(show(engine, images, poses=True)):
         recognition = core.add(engine.describer.describe([images[i]]), (i + 1) * SECOND)
         assert outcome.recognition.verdict is recognition.verdict

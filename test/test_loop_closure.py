@@ -116,12 +116,12 @@ class PlainCloser:
         if cures.place_calibration:
             scale = 1 / np.sqrt(np.maximum(self.variance, 1e-6))
         if not cures.speeds:
-            found = match_sequence((window - self.mean) * scale, self.settings.sequence)
+            self.found = found = match_sequence((window - self.mean) * scale, self.settings.sequence)
             return best_match(found, self.settings.neighbourhood)
         if not (cures.row_normalisation or cures.place_calibration):
             known = window[np.isfinite(window)]
             scale = scale / np.float32(max(known.std() if known.size else 0, FLAT))
-        found = match_speeds(window, SpeedSettings(), self.mean, scale)
+        self.found = found = match_speeds(window, SpeedSettings(), self.mean, scale)
         return best_speed_match(found, self.settings.neighbourhood)
 
     def judged(self, nearest):
@@ -129,7 +129,15 @@ class PlainCloser:
         if nearest is None or not self.settings.applied_cures.contrast:
             return nearest and (nearest.distance, nearest.runner_up_distance)
         cost, other = nearest.distance, nearest.runner_up_distance
+        far = [
+            abs(int(middle) - nearest.middle) > self.settings.neighbourhood
+            for distance, middle in zip(self.found.distances, self.found.middles, strict=True)
+            if distance < math.inf
+        ]
+        if sum(far) < 20:
+            other = -0.8 if math.isnan(other) else min(other, -0.8)
         seen = evidence(cost, other)
+        other = nearest.runner_up_distance
         if self.settings.applied_cures.persistence:
             seen = self.track.follow(nearest.middle, seen)
         rival = other if math.isnan(other) else relative_distance(evidence(other, cost))

@@ -85,7 +85,7 @@ def drive(bench, images, settings, x_of=None):
     With the rule of motion, an image whose pose has not arrived yet is skipped: both are sent once more.
     """
     describer = Describer()
-    closer = settings.loop_closer(describer, settings.applied_threshold)
+    closer = settings.loop_closer(describer, settings.applied_threshold('loop_closure'))
     answers, core = [], []
     for i, image in enumerate(images):
         message = image_message(image, (i + 1) * SECOND)

@@ -12,6 +12,7 @@ from stavpr_ros.evaluation.metrics import best_f1, frame_answers, score_at
 from stavpr_ros.evaluation.offline import recognise_all, window_answers
 from stavpr_ros.evaluation.truth import GroundTruth
 from stavpr_ros.evaluation.warp import warp_indices
+from stavpr_ros.evaluation.world import World, first_drive
 from stavpr_ros.features import Describer, FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import build_map, describe_frames
 from stavpr_ros.recognition import Recogniser, RecognitionSettings, Verdict
@@ -21,12 +22,14 @@ from stavpr_ros.recognition.cures import (
     AHEAD,
     CHANCE,
     FADING,
+    LOOP_THRESHOLD,
     PAPER,
     ROBUST,
     Cures,
     Track,
     cures_of,
     evidence,
+    likely_rival,
     relative_distance,
 )
 from stavpr_ros.recognition.loop_closure import GROWTH, ROOM, LoopCloser
@@ -379,3 +382,22 @@ def test_with_a_network(data_folder, squeezenet_settings, name):
     print(f'{name}, robust, SqueezeNet: F1 {f1:.4f}, precision {precision:.4f}')
     assert f1 >= (0.99 if name == 'gardens_point' else 0.95)
     assert precision >= 0.94
+
+
+@pytest.mark.parametrize(
+    ('other', 'rivals', 'expected'),
+    [(-0.3, 20, -0.3), (-0.3, 19, -0.8), (-1.4, 3, -1.4), (math.nan, 0, -0.8)],
+)
+def test_few_rivals_give_no_lead(other, rivals, expected):
+    assert likely_rival(other, rivals) == expected
+
+
+def test_a_route_that_has_just_begun_closes_no_loops_by_chance():
+    """Three streets of the made-up world, driven once: nothing can be right, and chance had a lead before."""
+    describer = Describer()
+    for seed in (3, 7, 11):
+        images = [frame.image for frame, _ in zip(first_drive(World(seed)), range(130), strict=False)]
+        features = describer.describe(images)
+        closer = LoopCloser(RecognitionSettings(LOOP_THRESHOLD, mode='robust'), 50, features.settings)
+        found = [closer.add(features[i : i + 1]).place for i in range(len(images))]
+        assert sum(place >= 0 for place in found) <= 2

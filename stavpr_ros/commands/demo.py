@@ -244,6 +244,7 @@ def _two_drives(arguments: argparse.Namespace, folder: Path) -> None:
         'mode': arguments.mode,
         'threshold': threshold,
         'sequence_length': arguments.sequence_length,
+        'keyframe_change': 0.0,  # every image is judged
     }
     records = run_live(parameters, drives.query, len(query), folder, drives.topic)
     result = judge(records, arguments.sequence_length, threshold, drives.truth, arguments.tolerance)

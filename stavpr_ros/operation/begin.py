@@ -44,7 +44,7 @@ def begin(
     """
     if name not in OPERATIONS:
         raise SettingsError(f'operation {name!r} is unknown: take one of {", ".join(OPERATIONS)}')
-    threshold = settings.applied_threshold
+    threshold = settings.applied_threshold(name)
     if name == 'localization':
         if place_map is None or describer is None or threshold is None:
             return None

@@ -68,6 +68,11 @@ class Engine:
         return self._name
 
     @property
+    def threshold(self) -> float | None:
+        """The threshold in force, None = not set."""
+        return self._settings.applied_threshold(self._name)
+
+    @property
     def places(self) -> PlaceMap | GrowingMap | None:
         """The map, or the route so far."""
         operation = self._operation  # once: others may look while the worker changes it
@@ -98,7 +103,7 @@ class Engine:
         """Why there can be no match yet, in words; empty when everything is there."""
         if self._name == 'localization' and self._map is None:
             return NO_MAP
-        if self._name != 'mapping' and self._settings.applied_threshold is None:
+        if self._name != 'mapping' and self.threshold is None:
             return NO_THRESHOLD
         return ''
 
@@ -134,12 +139,13 @@ class Engine:
         :raises StavprError: no such operation, or settings that do not do.
         """
         settings, name = settings or self._settings, operation or self._name
-        lost = (settings.applied_threshold is None) != (self._settings.applied_threshold is None)
+        threshold = settings.applied_threshold(name)
+        lost = (threshold is None) != (self.threshold is None)
         if loaded is not None or name != self._name or (lost and name != 'mapping'):
             self._refuse_loss(name, loaded)
             self._begin(name, settings, loaded)
-        elif self._operation is not None and settings.applied_threshold is not None:
-            self._operation.set_threshold(settings.applied_threshold)
+        elif self._operation is not None and threshold is not None:
+            self._operation.set_threshold(threshold)
         self._settings = settings
         self._keyframes.settings = settings.keyframes
         self._check = GeometricCheck(settings.geometric) if settings.geometric else None
@@ -237,7 +243,7 @@ class Engine:
         :param pose: of the camera, from odometry, shape (7,), or None.
         :raises InputError: a pose that is none; nothing is changed then.
         """
-        threshold = self._settings.applied_threshold
+        threshold = self.threshold
         pose = None if pose is None else checked_pose(pose)
         if self._operation is None or self.missing:
             return Outcome(Answer.NOT_READY, self.missing, threshold, cause='not ready')
@@ -286,7 +292,7 @@ class Engine:
         return Outcome(
             _ANSWERS[recognition.verdict],
             recognition.reason,
-            self._settings.applied_threshold,
+            self.threshold,
             recognition,
             window=tuple(self._window),
             first_image=newest - len(self._window) + 1 if newest >= 0 else -1,

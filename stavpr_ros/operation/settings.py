@@ -8,7 +8,7 @@ from stavpr_ros.features import Describer
 from stavpr_ros.features.backbone import KINDS, settings_from_json
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.recognition import RecognitionSettings
-from stavpr_ros.recognition.cures import THRESHOLD, cures_of
+from stavpr_ros.recognition.cures import LOOP_THRESHOLD, THRESHOLD, cures_of
 from stavpr_ros.recognition.geometry import GeometricSettings
 from stavpr_ros.recognition.loop_closure import LoopCloser
 
@@ -59,14 +59,15 @@ class EngineSettings:
             raise SettingsError(f'features {self.features!r} are unknown: take one of {", ".join(KINDS)}')
         if self.feature_settings:
             settings_from_json(self.features, self.feature_settings)
-        self.recognition(self.applied_threshold or 1.0)
+        self.recognition(self.threshold or THRESHOLD)
 
-    @property
-    def applied_threshold(self) -> float | None:
-        """The threshold in force; distances of mode robust mean the same on every route."""
+    def applied_threshold(self, operation: str) -> float | None:
+        """Return the threshold in force; distances of mode robust mean the same on every route."""
         if self.threshold is not None:
             return self.threshold
-        return THRESHOLD if cures_of(self.mode).contrast else None
+        if not cures_of(self.mode).contrast:
+            return None
+        return LOOP_THRESHOLD if operation == 'loop_closure' else THRESHOLD
 
     def recognition(self, threshold: float) -> RecognitionSettings:
         """Return the recogniser's part."""

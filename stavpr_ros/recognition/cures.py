@@ -71,6 +71,11 @@ ROBUST = Cures()
 # show more on every pair of data sets that was tried.
 CHANCE = -2.2
 THRESHOLD = 1.0  # of mode robust; smaller is stricter
+LOOP_THRESHOLD = 0.8  # for loop closure, where every image is a question and a wrong answer bends a map
+# The best of few rivals is far: on a short map, or when a route has just begun, chance would have a lead over
+# it. It is taken for as near, at least, as the best of many is in windows from unknown places.
+FEW_RIVALS = 20
+USUAL_RIVAL = -0.8
 FADING = 0.05  # deviations that evidence loses an image
 BACK, AHEAD = 1, 3  # places that the matched place may move an image, while a track goes on
 
@@ -83,6 +88,18 @@ def evidence(cost: float, other: float) -> float:
     :param other: that of the nearest sequence elsewhere; NaN if there is none.
     """
     return 2 * cost - (0.0 if math.isnan(other) else other)
+
+
+def likely_rival(other: float, rivals: int) -> float:
+    """
+    Return the cost that a rival should be expected to have.
+
+    :param other: that of the nearest sequence elsewhere; NaN if there is none.
+    :param rivals: how many sequences there are elsewhere.
+    """
+    if rivals >= FEW_RIVALS:
+        return other
+    return USUAL_RIVAL if math.isnan(other) else min(other, USUAL_RIVAL)
 
 
 def relative_distance(seen: float) -> float:

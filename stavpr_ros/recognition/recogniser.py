@@ -19,7 +19,7 @@ from stavpr_ros.recognition.calibrated_window import CalibratedWindow
 from stavpr_ros.recognition.candidates import Candidate, nearest_places, ranked_candidates
 from stavpr_ros.recognition.centring import Centring
 from stavpr_ros.recognition.cpu_matcher import NO_PATH
-from stavpr_ros.recognition.cures import Cures, Track, cures_of, evidence, relative_distance
+from stavpr_ros.recognition.cures import Cures, Track, cures_of, evidence, likely_rival, relative_distance
 from stavpr_ros.recognition.matcher import make_matcher
 
 PLACES_TO_START_FROM = 100  # whose distances to the map start the calibration
@@ -287,17 +287,26 @@ def answer(window: Window, settings: RecognitionSettings, track: Track) -> Recog
         return Recognition(Verdict.NO_MATCH, 'the map is empty', None, NO_PATH, threshold)
     relative = settings.applied_cures.contrast
     if relative:
-        nearest = _relative_to_chance(nearest, track if settings.applied_cures.persistence else Track())
+        rivals = _count_rivals(window, nearest, settings.neighbourhood)
+        nearest = _relative_to_chance(
+            nearest, rivals, track if settings.applied_cures.persistence else Track()
+        )
     if nearest.distance < threshold:
         return Recognition(Verdict.MATCH, '', nearest, path, threshold, relative)
     reason = f'nearest distance {nearest.distance:.4f} is not below the threshold {threshold:.4f}'
     return Recognition(Verdict.NO_MATCH, reason, nearest, path, threshold, relative)
 
 
-def _relative_to_chance(nearest: SequenceMatch, track: Track) -> SequenceMatch:
+def _count_rivals(window: Window, nearest: SequenceMatch, neighbourhood: int) -> int:
+    """Count the sequences outside the neighbourhood of the nearest."""
+    costs, places = window.sequences()
+    return int(np.count_nonzero(np.isfinite(costs) & (np.abs(places - nearest.middle) > neighbourhood)))
+
+
+def _relative_to_chance(nearest: SequenceMatch, rivals: int, track: Track) -> SequenceMatch:
     """Judge the sequence and its rival by their evidence instead of their costs."""
     cost, other = nearest.distance, nearest.runner_up_distance
-    seen = track.follow(nearest.middle, evidence(cost, other))
+    seen = track.follow(nearest.middle, evidence(cost, likely_rival(other, rivals)))
     rival = other if math.isnan(other) else relative_distance(evidence(other, cost))
     return replace(nearest, distance=relative_distance(seen), runner_up_distance=rival)
 

@@ -28,6 +28,7 @@ PARAMETERS: dict[str, tuple[type, str]] = {
     'keyframe_change': (float, 'an image counts only when it differs by this from the last that counted'),
     'features': (str, 'features of a map that is begun anew: gradient, onnx ...'),
     'max_places': (int, 'most places of a growing map'),
+    'save_path': (str, 'file that the map is written to when the node is deactivated or ends'),
     'exclude_places': (int, 'the latest places of the route, which are not compared'),
     'exclude_seconds': (float, 'nor are places younger than this, s'),
     'use_sim_time': (bool, 'take the time from the topic /clock'),

@@ -64,7 +64,7 @@ def health(node: 'PlaceRecognitionNode') -> Health:
         backend=settings.engine.backend,
         device=_device(settings.engine.backend),
         precision=settings.precision,
-        threshold=settings.engine.applied_threshold,
+        threshold=settings.engine.applied_threshold(settings.operation),
         **(_UNCONFIGURED if runtime is None else _of_runtime(runtime)),
     )
 

@@ -263,7 +263,7 @@ class Runtime:
     def _drop(self, message: Any, answer: Answer, reason: str, cause: str) -> None:
         """Answer an image that is not looked at."""
         self._statistics.dropped(cause)
-        self._output.publish(message.header, Outcome(answer, reason, self._settings.engine.applied_threshold))
+        self._output.publish(message.header, Outcome(answer, reason, self.engine.threshold))
 
     def _answer(self, item: _Item) -> None:
         """Answer one image, on the worker's thread."""
