@@ -1,7 +1,8 @@
 """
 Make a map while driving: ros2 launch stavpr_ros mapping.launch.py image:=/camera/image_raw.
 
-With map_path, a map goes on growing. What has grown is written to save_path at the end, or by the service save_map.
+With map_path, a map goes on growing. What has grown is written to save_path at the end,
+or by the service save_map.
 """
 
 from launch.actions import LogInfo

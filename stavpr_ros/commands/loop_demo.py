@@ -167,7 +167,7 @@ def close_loops(arguments: argparse.Namespace, folder: Path) -> None:
     """
     from stavpr_ros.commands.feature_options import make_describer
     from stavpr_ros.commands.loop_demo_pictures import draw_loops
-    from stavpr_ros.recognition.cures import THRESHOLD
+    from stavpr_ros.recognition.cures import LOOP_THRESHOLD
     from stavpr_ros.ros.live import run_loop_closure
     from stavpr_ros.sources import open_source
 
@@ -185,7 +185,7 @@ def close_loops(arguments: argparse.Namespace, folder: Path) -> None:
     _save_features(drive, describer, features)
 
     say('2. The drive through the node, over ROS, with replay and listeners as processes of their own')
-    threshold = arguments.threshold or THRESHOLD
+    threshold = arguments.threshold or LOOP_THRESHOLD
     parameters = {
         'map_path': features,
         'mode': arguments.mode,
