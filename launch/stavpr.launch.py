@@ -3,7 +3,18 @@
 from launch import LaunchDescription
 from stavpr_ros.ros.launching import node_launch
 
-PARAMETERS = ('operation', 'map_path', 'threshold', 'mode', 'sequence_length', 'geometric_check')
+PARAMETERS = (
+    'operation',
+    'map_path',
+    'threshold',
+    'mode',
+    'sequence_length',
+    'keyframe_seconds',
+    'keyframe_metres',
+    'keyframe_degrees',
+    'keyframe_change',
+    'geometric_check',
+)
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -8,7 +8,8 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.serialization import deserialize_message, serialize_message
 
-from stavpr_ros.ros.diagnostics import Health, diagnostic_array
+from stavpr_ros.ros.diagnostics import diagnostic_array
+from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.statistics import Snapshot, StageTime
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -195,8 +196,8 @@ class TestInput:
     @pytest.mark.parametrize('verdict', ['invalid image', 'dropped', 'not ready', 'skipped'])
     def test_all_images_are_invalid(self, verdict):
         message = (
-            'all images in the last 10 s were invalid (depth 30): see the log and compare the encoding '
-            'with the README'
+            'all images in the last 10 s were invalid (depth 30): see the log, and '
+            'docs/node.md for what is read'
         )
         drops = {'invalid: depth': 30, 'max_rate': 5}
         check('input', ERROR, message, recent_drops=drops, recent_verdicts={verdict: 30})

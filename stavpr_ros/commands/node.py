@@ -9,12 +9,16 @@ from stavpr_ros.threads import wait_passively
 HELP = """usage: node [--ros-args -p map_path:=FILE -p threshold:=VALUE [-p NAME:=VALUE ...]
             [-r image:=TOPIC]]
 
-Recognises where the images of the topic `image` (sensor_msgs/Image) were taken on the route of a map,
-and publishes one ~/match (stavpr_msgs/PlaceMatch) for every image received; for accepted matches also
-~/place_index (std_msgs/Int32) and ~/distance (std_msgs/Float32). ~/map_info describes the map.
+A managed (lifecycle) node, which configures and activates itself. It recognises where the images of the
+topic `image` (sensor_msgs/Image) were taken on the route of a map (operation localization), makes a map
+of them (mapping), or finds places that they have passed before (loop_closure), with poses from `odom`.
 
-Make the map with `build_map`. Without map_path (in mode paper: or threshold) the node stays up, says
-what is missing and publishes no match; both can be set later with `ros2 param set`.
+It publishes one ~/match (stavpr_msgs/PlaceMatch) for every image received, with a verdict; for accepted
+matches also ~/place_index, ~/distance, ~/pose and ~/loop_closure; ~/candidates, ~/match_image, ~/map_info
+and /diagnostics. Services: ~/load_map, ~/save_map, ~/reset, ~/relocalize, ~/set_operation.
+
+Make the map with `build_map`. Without a map (in mode paper: or a threshold) the node stays up and
+answers NOT_READY with the reason; both can be set later.
 
 parameters:
 {parameters}

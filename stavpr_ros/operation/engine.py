@@ -2,7 +2,7 @@
 
 import os
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap, save_map
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.operation.begin import LoadedMap, begin
-from stavpr_ros.operation.operations import Localization, LoopClosure, Mapping, Observed, Operation
+from stavpr_ros.operation.operations import LoopClosure, Observed, Operation
 from stavpr_ros.operation.outcome import Answer, Outcome, place_picture
 from stavpr_ros.operation.settings import EngineSettings
 from stavpr_ros.operation.stopwatch import Stopwatch
@@ -31,6 +31,15 @@ _ANSWERS = {
     Verdict.NO_MATCH: Answer.NO_MATCH,
     Verdict.MATCH: Answer.MATCH,
 }
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A map to be written, of which operation it is, and how many of its places are in no file yet."""
+
+    places: PlaceMap
+    operation: Operation | None
+    unsaved: int
 
 
 class Engine:
@@ -54,7 +63,7 @@ class Engine:
         self._last: Outcome | None = None
         self.path = ''  # of the file that the map came from, or was written to
         self.ranking = True  # tell the nearest places with every answer
-        self.unsaved = 0  # places that mapping has added since the map was loaded or saved
+        self.unsaved = 0  # places that have grown since the map was loaded or saved
         self._begin(operation, settings, None)
 
     @property
@@ -88,9 +97,9 @@ class Engine:
     def map_state(self) -> str:
         """``none``, ``loaded``, ``growing`` or ``full``."""
         operation = self._operation
-        if operation is None or isinstance(operation, Localization):
+        if self._name == 'localization':
             return 'loaded' if self._map is not None else 'none'
-        return 'full' if operation.full else 'growing'
+        return 'full' if operation is not None and operation.full else 'growing'
 
     @property
     def window_fill(self) -> int:
@@ -139,12 +148,13 @@ class Engine:
         :raises StavprError: no such operation, or settings that do not do.
         """
         settings, name = settings or self._settings, operation or self._name
-        threshold = settings.applied_threshold(name)
-        lost = (threshold is None) != (self.threshold is None)
-        if loaded is not None or name != self._name or (lost and name != 'mapping'):
+        threshold, was = settings.applied_threshold(name), self.threshold
+        if loaded is not None or name != self._name or (self._operation is None and threshold is not None):
             self._refuse_loss(name, loaded)
             self._begin(name, settings, loaded)
         elif self._operation is not None and threshold is not None:
+            if was is None and name != 'mapping':
+                self.reset()  # images were not looked at meanwhile
             self._operation.set_threshold(threshold)
         self._settings = settings
         self._keyframes.settings = settings.keyframes
@@ -153,7 +163,8 @@ class Engine:
     def _refuse_loss(self, name: str, loaded: LoadedMap | None) -> None:
         """Refuse to begin anew where that would lose places that nobody has given up."""
         leaves = name == 'loop_closure' != self._name  # its route will take the map's place
-        if self.unsaved and (leaves or (loaded is not None and self._name == 'mapping')):
+        replaces = loaded is not None and self._name == 'mapping'
+        if self.unsaved and (leaves or replaces):
             raise InputError(
                 f'the map has {self.unsaved} places that are not saved: save_map first (or give them up: '
                 'set_operation localization, then load_map)'
@@ -167,7 +178,8 @@ class Engine:
         """Begin an operation; on an error everything stays as it was."""
         place_map, describer = self.places_as_map(), self.describer
         from_route = isinstance(self._operation, LoopClosure) and place_map is not self._map
-        path, unsaved = ('' if from_route else self.path), self.unsaved
+        # a route that closed loops is worth a file only where one was named
+        path, unsaved = ('', 0) if from_route else (self.path, self.unsaved)
         if loaded is not None:
             place_map, describer, path, unsaved = loaded.places, loaded.describer, loaded.path, 0
         operation = begin(name, settings, place_map, describer)
@@ -183,9 +195,9 @@ class Engine:
             return self._map
         return self._operation.map()
 
-    def to_save(self, path: str, overwrite: bool) -> PlaceMap:
+    def to_save(self, path: str, overwrite: bool) -> Snapshot:
         """
-        Return the map, or the route so far, to be written to a file.
+        Return the map, or the route so far, to be written to a file; tell :meth:`saved` when it is.
 
         :raises MapFileError: a file is there already, or its folder is not.
         :raises InputError: there is nothing to save.
@@ -197,19 +209,20 @@ class Engine:
             raise MapFileError(f'{path} is there already: ask to overwrite it, or take another name')
         if not Path(path).absolute().parent.is_dir():
             raise MapFileError(f'the folder of {path} does not exist: make it first')
-        return place_map
+        return Snapshot(place_map, self._operation, self.unsaved)
 
     def save(self, path: str, overwrite: bool) -> int:
         """Write the map, or the route so far, whole or not at all; return its number of places."""
-        place_map = self.to_save(path, overwrite)
-        save_map(place_map, path)
-        self.saved(path, len(place_map))
-        return len(place_map)
+        snapshot = self.to_save(path, overwrite)
+        save_map(snapshot.places, path)
+        self.saved(path, snapshot)
+        return len(snapshot.places)
 
-    def saved(self, path: str, count: int) -> None:
-        """Take note that the first so many places were written to a file."""
-        self.path = path
-        self.unsaved = len(self.places or ()) - count if self._name == 'mapping' else 0
+    def saved(self, path: str, snapshot: Snapshot) -> None:
+        """Take note that a map was written to a file; places may have come since, even another map."""
+        if snapshot.operation is self._operation:
+            self.path = path
+            self.unsaved -= snapshot.unsaved
 
     def reset(self) -> None:
         """Empty the window: the images that come now have nothing to do with those before."""
@@ -276,7 +289,7 @@ class Engine:
             recognition = operation.add(observed)
         self._keyframes.accept(stamp, pose, image)
         self._window.append(stamp)
-        self.unsaved += isinstance(operation, Mapping)
+        self.unsaved += operation.newest_place >= 0
         if recognition is None:
             return Outcome(Answer.MAPPED, newest=operation.newest_place, places=operation.places, image=image)
         with watch.stage('check'):

@@ -301,6 +301,11 @@ class _Route:
                 norms[target] = (length * alive)[:, 0]
 
 
+def least_limit(exclude: int, length: int) -> int:
+    """Return the fewest places that do: after forgetting, a window's sequence at twice its speed fits in."""
+    return -(-FORGOTTEN * (exclude + 2 * length) // (FORGOTTEN - 1))
+
+
 def _require_fitting(
     settings: RecognitionSettings, exclude: int, limit: int | None, exclude_seconds: float
 ) -> None:
@@ -311,7 +316,7 @@ def _require_fitting(
         raise SettingsError(f'exclude_seconds = {exclude_seconds} must be a finite number >= 0')
     if limit is not None:
         # what is left after forgetting must hold the window's sequence at twice its speed
-        least = -(-FORGOTTEN * (exclude + 2 * settings.sequence.length) // (FORGOTTEN - 1))
+        least = least_limit(exclude, settings.sequence.length)
         if limit < least:
             raise SettingsError(
                 f'limit = {limit} places leaves too few beyond exclude = {exclude} and windows of '

@@ -1,13 +1,19 @@
 """From the node's health to diagnostics: what is wrong, in plain words, and what to do; no node in here."""
 
 import math
-import re
-from dataclasses import dataclass
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from std_msgs.msg import Header
 
+from stavpr_ros.ros.diagnostic_values import (
+    input_values,
+    key_values,
+    map_values,
+    processing_values,
+    recognition_values,
+)
+from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.statistics import RATE_WINDOW, Snapshot
 
 SILENCE = 2.0
@@ -16,9 +22,6 @@ SILENCE = 2.0
 BUSY = 0.8
 """Below this share of its time at work the worker keeps up, and a full queue means a burst."""
 
-INPUT_CAUSES = ('invalid', 'lost in transport', 'no odometry')
-"""What the causes begin with that are shown with the input; the others are shown with the processing."""
-
 JUDGED = ('match', 'no match')
 UNDECODED = ('invalid image', 'dropped', 'not ready', 'skipped')
 """Verdicts on images, the latter on those that need not have been decoded."""
@@ -26,59 +29,6 @@ UNDECODED = ('invalid image', 'dropped', 'not ready', 'skipped')
 NEXT_TRANSITION = {'unconfigured': 'configure', 'inactive': 'activate'}
 
 Finding = tuple[bytes, str]  # level and message
-Value = str | int | float | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Health:
-    """
-    Everything that diagnostics are made from.
-
-    :param snapshot: the counts.
-    :param state: label of the lifecycle state: unconfigured, inactive, active, finalized, configuring ...
-    :param topic: of the images, after remapping; ``publishers`` are on it now, whatever their QoS.
-    :param transport: raw, compressed ...
-    :param queue: images that wait, of at most ``queue_size``; ``window`` are in the window, of ``length``.
-    :param operation: localization, mapping or loop_closure; ``mode``: how places are recognised.
-    :param map_path: its file, empty = none; ``map_state``: none, loading, loaded, growing or full.
-    :param places: of the map, now; a growing map stops at ``max_places``.
-    :param features: kind of the local features.
-    :param backend: where images are matched, on which ``device``, in which ``precision``.
-    :param threshold: in force; None = not set.
-    :param problem: why the last transition failed, or the last map was not loaded; empty = nothing failed.
-    :param incompatible: publishers refused so far because of their QoS.
-    :param remedy: what to do about them, in words.
-    :param mistyped: what publishers on the topic send that is not the transport's type; empty = none does.
-    :param missing: what is missing before there can be a match, in words; empty = nothing.
-    :param odometry: fresh, stale or never; empty = no parameter needs it.
-    """
-
-    snapshot: Snapshot
-    state: str
-    topic: str
-    transport: str
-    publishers: int
-    queue: int
-    queue_size: int
-    window: int
-    length: int
-    operation: str
-    mode: str
-    map_path: str
-    map_state: str
-    places: int
-    max_places: int
-    features: str
-    backend: str
-    device: str
-    precision: str
-    threshold: float | None = None
-    problem: str = ''
-    incompatible: int = 0
-    remedy: str = ''
-    mistyped: str = ''
-    missing: str = ''
-    odometry: str = ''
 
 
 def diagnostic_array(health: Health, node: str, stamp: Time) -> DiagnosticArray:
@@ -91,10 +41,10 @@ def diagnostic_array(health: Health, node: str, stamp: Time) -> DiagnosticArray:
     active = health.state == 'active'
     idle = [] if active else [(DiagnosticStatus.OK, _inactive(health.state, node))]
     parts = {
-        'input': (idle or _input(health), _input_values(health)),
-        'map': (_map(health), _map_values(health)),
-        'recognition': (idle or _recognition(health), _recognition_values(health)),
-        'processing': (idle or _processing(health), _processing_values(health)),
+        'input': (idle or _input(health), input_values(health)),
+        'map': (_map(health), map_values(health)),
+        'recognition': (idle or _recognition(health), recognition_values(health)),
+        'processing': (idle or _processing(health), processing_values(health)),
     }
     return DiagnosticArray(
         header=Header(stamp=stamp),
@@ -105,7 +55,7 @@ def diagnostic_array(health: Health, node: str, stamp: Time) -> DiagnosticArray:
                 # The worst first: monitors cut long messages.
                 message='; '.join(text for _, text in sorted(findings, key=lambda f: f[0], reverse=True)),
                 hardware_id=health.device,
-                values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
+                values=key_values(values),
             )
             for part, (findings, values) in parts.items()
         ],
@@ -186,7 +136,12 @@ def _invalid(snapshot: Snapshot) -> list[Finding]:
     valid = sum(n for verdict, n in snapshot.recent_verdicts.items() if verdict not in UNDECODED)
     if valid or 'not a keyframe' in snapshot.recent_drops:
         return [(DiagnosticStatus.WARN, f'{_of(sum(invalid.values()), "image")} {where}')]
-    return [(DiagnosticStatus.ERROR, f'all images {where} and compare the encoding with the README')]
+    return [
+        (
+            DiagnosticStatus.ERROR,
+            f'all images {where}, and docs/node.md for what is read',
+        )
+    ]
 
 
 def _map(health: Health) -> list[Finding]:
@@ -265,93 +220,5 @@ def _why_full(health: Health) -> str:
     return f'{takes}, so {1e3 / snapshot.work.mean:.1f} can be done: {remedy}'
 
 
-def _input_values(health: Health) -> dict[str, Value]:
-    snapshot = health.snapshot
-    return {
-        'topic': health.topic,
-        'transport': health.transport,
-        'publishers': health.publishers,
-        'publishers_refused': health.incompatible,
-        'received': snapshot.received,
-        'rate_in_hz': snapshot.rate_in,
-        'last_image_age_s': snapshot.received_age,
-        'gaps': snapshot.gaps,
-        'longest_gap_s': snapshot.longest_gap,
-        'jumps_back': snapshot.jumps_back,
-        'longest_jump_back_s': snapshot.longest_jump_back,
-        'odometry': health.odometry or 'not needed',
-        **_drop_values(snapshot, from_input=True),
-    }
-
-
-def _map_values(health: Health) -> dict[str, Value]:
-    return {
-        'state': health.map_state,
-        'path': health.map_path or None,
-        'places': health.places,
-        'max_places': health.max_places,
-        'features': health.features,
-    }
-
-
-def _recognition_values(health: Health) -> dict[str, Value]:
-    snapshot = health.snapshot
-    return {
-        'operation': health.operation,
-        'mode': health.mode,
-        'threshold': health.threshold,
-        'window': health.window,
-        'length': health.length,
-        'last_verdict': snapshot.verdict or None,
-        'last_reason': snapshot.reason or None,
-        'last_place': snapshot.place if snapshot.place >= 0 else None,
-        'last_distance': snapshot.distance,
-        'last_answer_age_s': snapshot.answered_age,
-        **{_key('verdicts', verdict): count for verdict, count in snapshot.verdicts.items()},
-    }
-
-
-def _processing_values(health: Health) -> dict[str, Value]:
-    snapshot = health.snapshot
-    times = {'total': snapshot.total, 'work': snapshot.work, **snapshot.stages}
-    measured = {name: time for name, time in times.items() if time is not None}
-    return {
-        'state': health.state,
-        'uptime_s': snapshot.uptime,
-        'answered': snapshot.answered,
-        'rate_out_hz': snapshot.rate_out,
-        'queue': health.queue,
-        'queue_size': health.queue_size,
-        'backend': health.backend,
-        'device': health.device,
-        'precision': health.precision,
-        **_drop_values(snapshot, from_input=False),
-        **{_key(name, 'mean_ms'): time.mean for name, time in measured.items()},
-        **{_key(name, 'max_ms'): time.max for name, time in measured.items()},
-    }
-
-
-def _drop_values(snapshot: Snapshot, from_input: bool) -> dict[str, Value]:
-    """Return the drops by cause, since the start and recently."""
-    values: dict[str, Value] = {}
-    for cause, count in snapshot.drops.items():
-        if cause.startswith(INPUT_CAUSES) == from_input:
-            values[_key('dropped', cause)] = count
-            values[_key('dropped', cause, f'{RATE_WINDOW}s')] = snapshot.recent_drops.get(cause, 0)
-    return values
-
-
-def _key(*words: str) -> str:
-    """Return a key in snake case made of free words."""
-    return '_'.join(filter(None, re.split(r'\W+', ' '.join(words).lower())))
-
-
 def _of(count: int, noun: str) -> str:
     return f'{count} {noun}{"" if count == 1 else "s"}'
-
-
-def _text(value: Value) -> str:
-    """Return a value as monitors show it; three decimals are enough for Hz, ms, s and distances."""
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return 'none'
-    return f'{value:.3f}' if isinstance(value, float) else str(value)

@@ -193,6 +193,7 @@ class OdometryInput:
         self.trajectory = Trajectory(patience)
         self._node, self._patience = node, patience
         self._arrived: float | None = None
+        self.frame = ''  # that its poses are in
         self.subscription = _subscribe(node, Odometry, 'odom', self._on_odometry, 50)
 
     def freshness(self) -> str:
@@ -211,4 +212,4 @@ class OdometryInput:
         except InputError as error:
             self._node.get_logger().warning(f'odometry ignored: {error}', throttle_duration_sec=10.0)
             return
-        self._arrived = time.monotonic()
+        self._arrived, self.frame = time.monotonic(), message.header.frame_id

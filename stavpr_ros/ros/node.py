@@ -172,7 +172,7 @@ class PlaceRecognitionNode(ManagedNode):
         self._runtime = Runtime(self, settings, self.statistics)
         self._runtime.on_loading = self.publish_map_info
         if missing := self._runtime.engine.missing:
-            self.get_logger().warning(f'waiting, no match is published: {missing}')
+            self.get_logger().warning(f'waiting, no image can be matched: {missing}')
         self.publish_map_info()
 
     def _activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -189,7 +189,8 @@ class PlaceRecognitionNode(ManagedNode):
             if runtime is not None:
                 runtime.close()
                 del runtime
-                self._tell(MapInfo(operation=self._settings.operation, state='none'))
+                with self._telling:
+                    self._tell(MapInfo(operation=self._settings.operation, state='none'))
         gc.collect()  # runtime and worker refer to each other: the map would stay until Python tidies up
         if self._settings.engine.backend == 'cuda':
             import torch
@@ -284,6 +285,9 @@ class PlaceRecognitionNode(ManagedNode):
             self._lock.release()
         else:
             self.left_behind = True
+            runtime = self._runtime
+            if runtime is not None:
+                runtime.write_at_the_end()
         if self.left_behind:
             self.get_logger().warning('something is still being loaded or compiled: it is left to itself')
         seen = self.statistics.snapshot()

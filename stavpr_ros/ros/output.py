@@ -31,11 +31,10 @@ class Output:
     The publishers of answers.
 
     :param node: their node.
-    :param map_frame: frame of the map's poses.
     """
 
-    def __init__(self, node: ManagedNode, map_frame: str) -> None:
-        self._node, self._frame = node, map_frame
+    def __init__(self, node: ManagedNode) -> None:
+        self._node = node
         self.match = self._publisher(PlaceMatch, '~/match')
         self.place_index = self._publisher(Int32, '~/place_index')
         self.distance = self._publisher(Float32, '~/distance')
@@ -56,15 +55,19 @@ class Output:
             message_type, topic, qos, event_callbacks=PublisherEventCallbacks(incompatible_qos=refused)
         )
 
-    def publish(self, header: Header, outcome: Outcome) -> PlaceMatch:
-        """Publish everything that is to be said of an image, its ``~/match`` last; return that."""
+    def publish(self, header: Header, outcome: Outcome, frame: str = '') -> PlaceMatch:
+        """
+        Publish everything that is to be said of an image, its ``~/match`` last; return that.
+
+        :param frame: of the poses.
+        """
         answer = match_message(header, outcome)
         if outcome.answer is Answer.MATCH:
             self.place_index.publish(Int32(data=answer.place_index))
             self.distance.publish(Float32(data=answer.distance))
         for publisher, message in (
             (self.loop_closure, loop_closure_message(header, outcome)),
-            (self.pose, matched_pose_message(header, outcome, self._frame)),
+            (self.pose, matched_pose_message(header, outcome, frame)),
             (self.candidates, candidates_message(header, outcome)),
         ):
             if message is not None:

@@ -244,7 +244,8 @@ _OUTPUT = (
         'save_path',
         '',
         '',
-        'File that a growing map is written to when the node is deactivated or ends, besides ~/save_map.',
+        'File that what has grown is written to when the node is deactivated or ends; a file of another map '
+        'that is there stays, and a name beside it is taken.',
         'live',
     ),
     NodeParameter('map_frame', 'map', '', "Frame of the map's poses, for ~/pose."),

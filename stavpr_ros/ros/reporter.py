@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 
-from stavpr_ros.ros.diagnostics import Health, diagnostic_array
+from stavpr_ros.ros.diagnostics import diagnostic_array
+from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.runtime import Runtime
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def health(node: 'PlaceRecognitionNode') -> Health:
     return Health(
         snapshot=node.statistics.snapshot(),
         state=node.state,
-        problem=node.problem,
+        problem=node.problem or (runtime.problem if runtime is not None else ''),
         transport=settings.image_transport,
         queue_size=settings.queue_size,
         length=settings.sequence_length,
@@ -85,6 +86,7 @@ def _of_runtime(runtime: Runtime) -> dict[str, Any]:
     """Return what there is to tell of a configured node only."""
     engine, images, odometry = runtime.engine, runtime.images, runtime.odometry
     places, describer = engine.places, engine.describer
+    needs_poses = engine.settings.keyframes.needs_poses  # else they are welcome, not needed
     told = _UNCONFIGURED | {
         'queue': runtime.waiting,
         'window': engine.window_fill,
@@ -93,7 +95,7 @@ def _of_runtime(runtime: Runtime) -> dict[str, Any]:
         'places': 0 if places is None else len(places),
         'features': '' if describer is None else describer.settings.kind,
         'missing': engine.missing,
-        'odometry': '' if odometry is None else odometry.freshness(),
+        'odometry': odometry.freshness() if odometry is not None and needs_poses else '',
     }
     if images is not None:
         told |= {

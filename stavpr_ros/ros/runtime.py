@@ -11,13 +11,13 @@ from typing import Any, TypeVar
 
 from stavpr_msgs.msg import Candidate, MapInfo, PlaceMatch
 from stavpr_ros.errors import StavprError
-from stavpr_ros.mapping import save_map
 from stavpr_ros.operation import Answer, Engine, Outcome
 from stavpr_ros.operation.begin import LoadedMap, read_map
 from stavpr_ros.ros.input import ImageInput, OdometryInput
 from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.messages import candidate_messages, map_info_message, match_message, nanoseconds
 from stavpr_ros.ros.output import Output
+from stavpr_ros.ros.saving import write_at_the_end, write_map
 from stavpr_ros.ros.settings import NodeSettings
 from stavpr_ros.ros.statistics import WAITING, Statistics
 from stavpr_ros.ros.worker import PATIENCE, Worker
@@ -56,10 +56,11 @@ class Runtime:
         self._explained: set[str] = set()
         self._last_match: PlaceMatch | None = None
         self.loading = ''  # the map that is being loaded
+        self.problem = ''  # why the last map was not loaded
         self._one_load = threading.Lock()
         self.on_loading: Callable[[], None] = lambda: None  # called when that has changed
         self._worker = Worker(self._answer, settings.queue_size)
-        self._output = Output(node, settings.map_frame)
+        self._output = Output(node)
         self._made: Engine | None = None
         try:
             self._made = self._on_worker(lambda: self._make_engine(settings))
@@ -76,8 +77,9 @@ class Runtime:
     def _on_worker(self, function: Callable[[], Result]) -> Result:
         """Have the worker call a function; give up when the node ends meanwhile."""
         future = self._worker.call(function)
-        while not wait([future], NOTICE).done:
-            if self._node.ending.is_set():
+        while not future.done():
+            wait([future], NOTICE)
+            if self._node.ending.is_set() and not future.done():
                 raise StavprError('the node ends')
         try:
             return future.result()
@@ -96,7 +98,7 @@ class Runtime:
         """Hear images, with an empty window: the camera may have been moved meanwhile."""
         self.reset()
         s = self._settings
-        self._update_odometry()
+        self._update_odometry(s)
         self._images = ImageInput(
             self._node,
             s.image_transport,
@@ -109,57 +111,51 @@ class Runtime:
         )
 
     def deactivate(self) -> None:
-        """Hear nothing more; images that wait are forgotten."""
-        for heard in (self._images, self._odometry):
-            if heard is not None:
-                heard.close()
-        self._images = self._odometry = None
-        self._worker.clear()
+        """Hear nothing more; images that wait are answered as dropped, what has grown is written."""
+        self._hear_nothing()
         self._on_worker(lambda: None)  # the image in work is answered while answers are published
-        self._save_growing()
+        write_at_the_end(self.engine, self._on_worker, self._settings.save_path, self._node.get_logger())
 
     def close(self) -> None:
         """Hear, say and do nothing more."""
+        self._hear_nothing()
+        try:
+            self.write_at_the_end()
+        finally:
+            if not self._worker.stop():
+                self._node.left_behind = True
+            self._output.close()
+
+    def write_at_the_end(self) -> None:
+        """Write what has grown, unless the worker is busy with what may take for ever; that is said then."""
+        if self._made is None:
+            return
+
+        def on_worker(function: Callable[[], Result]) -> Result:
+            return self._worker.call(function).result(PATIENCE)
+
+        write_at_the_end(self._made, on_worker, self._settings.save_path, self._node.get_logger())
+
+    def _hear_nothing(self) -> None:
         for heard in (self._images, self._odometry):
             if heard is not None:
                 heard.close()
         self._images = self._odometry = None
-        self._save_growing()
-        if not self._worker.stop():
-            self._node.left_behind = True
-        self._output.close()
+        for item in self._worker.clear():
+            self._drop(
+                item.message, Answer.DROPPED, 'the node was deactivated before its turn', 'deactivated'
+            )
 
-    def _save_growing(self) -> None:
-        """Write a growing map to ``save_path``, once the image in work is done, or say that it is not."""
-        engine, path = self._made, self._settings.save_path
-        if engine is None or engine.operation == 'localization' or not engine.unsaved:
-            return
-        log = self._node.get_logger()
-        if not path:
-            if engine.operation == 'mapping':
-                log.warning('the map is not saved: neither save_path nor ~/save_map named a file')
-            return
-        try:
-            places = self._worker.call(lambda: engine.save(path, overwrite=True)).result(PATIENCE)
-            log.info(f'{places} places written to {path}')
-        except (StavprError, TimeoutError) as error:
-            log.error(f'the map is not saved: {error or "the worker is busy"}')
-
-    def _update_odometry(self) -> None:
+    def _update_odometry(self, settings: NodeSettings) -> None:
         """Subscribe to odometry where it is asked for, and only there."""
-        wanted = self.wants_odometry
+        wanted = settings.wants_odometry
         if wanted and self._odometry is None:
-            self._odometry = OdometryInput(self._node, self._settings.odometry_patience)
+            self._odometry = OdometryInput(self._node, settings.odometry_patience)
         elif not wanted and self._odometry is not None:
             self._odometry.close()
             self._odometry = None
 
     # what may change
-
-    @property
-    def wants_odometry(self) -> bool:
-        """Poses are asked for: by the keyframes, or for the places of a growing map."""
-        return self._settings.engine.keyframes.needs_poses or self._settings.operation != 'localization'
 
     def change(self, settings: NodeSettings) -> None:
         """
@@ -170,13 +166,19 @@ class Runtime:
         path = settings.map_path if settings.map_path != self._settings.map_path else ''
         with self._loading(path) if path else nullcontext():
             loaded = read_map(path, settings.engine) if path else None
-            self._on_worker(lambda: self.engine.change(settings.engine, settings.operation, loaded))
+            if self._images is not None:
+                self._update_odometry(settings)  # may fail, and is easily undone
+            try:
+                self._on_worker(lambda: self.engine.change(settings.engine, settings.operation, loaded))
+            except BaseException:
+                if self._images is not None:
+                    self._update_odometry(self._settings)
+                raise
         self._settings = settings
         if loaded is not None:
             self._tell(loaded)
         if self._images is not None:
             self._images.max_rate, self._images.stamps.gap = settings.max_rate, settings.max_gap
-            self._update_odometry()
 
     def load(self, path: str) -> None:
         """
@@ -197,6 +199,11 @@ class Runtime:
             self.on_loading()
             try:
                 yield
+            except Exception as error:
+                self.problem = f'cannot load {path}: {error}'
+                raise
+            else:
+                self.problem = ''
             finally:
                 self.loading = ''
                 self.on_loading()
@@ -210,10 +217,7 @@ class Runtime:
 
     def save(self, path: str, overwrite: bool) -> int:
         """Write the map; see :meth:`Engine.to_save`."""
-        place_map = self._on_worker(lambda: self.engine.to_save(path, overwrite))
-        save_map(place_map, path)  # on this thread: images go on meanwhile
-        self._on_worker(lambda: self.engine.saved(path, len(place_map)))
-        return len(place_map)
+        return write_map(self.engine, self._on_worker, path, overwrite)
 
     def relocalize(self, count: int) -> tuple[PlaceMatch, list[Candidate]]:
         """Return the answer for the window as it is, and candidates; see :meth:`Engine.relocalize`."""
@@ -290,8 +294,11 @@ class Runtime:
         self._publish(header, outcome, waited)
 
     def _publish(self, header: Any, outcome: Outcome, waited: float) -> None:
-        began = time.monotonic()
-        match = self._output.publish(header, outcome)
+        began, odometry = time.monotonic(), self._odometry
+        # poses of a map are in the map's frame, those of a route that grows in the odometry's
+        grows = odometry is not None and self.engine.operation != 'localization'
+        frame = odometry.frame if grows and odometry is not None else self._settings.map_frame
+        match = self._output.publish(header, outcome, frame)
         stages = {WAITING: waited, **outcome.stages, 'publishing': time.monotonic() - began}
         if outcome.cause:
             self._statistics.dropped(outcome.cause)
@@ -310,7 +317,7 @@ class Runtime:
             )
         elif outcome.answer is Answer.NOT_READY:
             self._node.get_logger().warning(
-                f'images arrive, but no match is published: {outcome.reason}',
+                f'images arrive, but cannot be matched: {outcome.reason}',
                 throttle_duration_sec=REPORT_PERIOD,
             )
 

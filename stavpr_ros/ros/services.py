@@ -69,9 +69,10 @@ class Services:
         return f'{response.map.places} places from {request.path}'
 
     def _save_map(self, runtime: 'Runtime', request: Any, response: Any) -> str:
-        path = request.path or self._node.get_parameter('map_path').value
+        settings = self._node.settings
+        path = request.path or settings.save_path or settings.map_path
         if not path:
-            raise StavprError("path = '' and the parameter map_path is not set: name a file")
+            raise StavprError("path = '', and neither save_path nor map_path is set: name a file")
         response.places = runtime.save(path, request.overwrite)
         self._node.publish_map_info()
         return f'{response.places} places to {path}'

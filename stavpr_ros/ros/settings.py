@@ -11,6 +11,7 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.operation import EngineSettings
 from stavpr_ros.recognition.geometry import GeometricSettings
+from stavpr_ros.recognition.loop_closure import least_limit
 from stavpr_ros.ros.parameters import BY_NAME
 
 _OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
@@ -27,6 +28,11 @@ class NodeSettings:
 
     values: Mapping[str, Any]
     engine: EngineSettings
+
+    @property
+    def wants_odometry(self) -> bool:
+        """Poses are asked for: by the keyframes, or for the places of a growing map."""
+        return self.engine.keyframes.needs_poses or self.operation != 'localization'
 
     def __getattr__(self, name: str) -> Any:
         """Return the value of a parameter."""
@@ -53,7 +59,17 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
             f'operation loop_closure with strategy {spatial.strategy}, vertical {spatial.vertical}: take '
             'strategy adaptive or vanilla, without vertical alignment'
         )
+    least = least_limit(values['exclude_places'], values['sequence_length'])
+    if operation == 'loop_closure' and values['max_places'] < least:
+        raise SettingsError(
+            f'max_places = {values["max_places"]} leaves too few beyond exclude_places = '
+            f'{values["exclude_places"]}: take at least {least}'
+        )
     method = values['geometric_check']
+    if method != 'none' and operation != 'localization' and not values['thumbnail_width']:
+        raise SettingsError(
+            f'geometric_check = {method} with thumbnail_width = 0: it compares images with those pictures'
+        )
     engine = EngineSettings(
         threshold=None if values['threshold'] < 0 else values['threshold'],
         spatial=spatial,

@@ -47,10 +47,12 @@ class Worker:
             self._changed.notify()
         return dropped
 
-    def clear(self) -> None:
-        """Drop the items that wait."""
+    def clear(self) -> list[Any]:
+        """Drop the items that wait, and return them."""
         with self._changed:
+            items = list(self._items)
             self._items.clear()
+        return items
 
     def call(self, function: Callable[[], Any]) -> Future[Any]:
         """Have the thread call a function; the future holds what came of it, cancelled after the end."""

@@ -1,0 +1,60 @@
+"""Writing a map that has grown: images go on meanwhile, and no file is replaced that it did not come from."""
+
+import itertools
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from stavpr_ros.errors import StavprError
+from stavpr_ros.mapping import save_map
+from stavpr_ros.operation import Engine
+
+OnWorker = Callable[[Callable[[], Any]], Any]
+
+
+def write_map(engine: Engine, on_worker: OnWorker, path: str, overwrite: bool) -> int:
+    """
+    Write the engine's map to a file, on this thread; return its number of places.
+
+    :param on_worker: has the worker call a function.
+    :raises StavprError: there is nothing to save, a file is there already, or it cannot be written.
+    """
+    snapshot = on_worker(lambda: engine.to_save(path, overwrite))
+    save_map(snapshot.places, path)
+    on_worker(lambda: engine.saved(path, snapshot))
+    return len(snapshot.places)
+
+
+def write_at_the_end(engine: Engine, on_worker: OnWorker, path: str, log: Any) -> None:
+    """
+    Write what has grown and is in no file yet to ``path``, or beside a file of another map that is there.
+
+    :param path: '' = nowhere: it is said what is lost.
+    :param log: the node's logger.
+    """
+    if not engine.unsaved:
+        return
+    if not path:
+        if engine.operation != 'loop_closure':
+            log.warning(f'{engine.unsaved} places are in no file: neither save_path nor ~/save_map named one')
+        return
+    target = path if engine.path == path else _free_name(path)
+    log.info(f'writing the map to {target}')
+    try:
+        places = write_map(engine, on_worker, target, overwrite=True)
+    except TimeoutError:
+        log.error('the map is not saved: the worker is busy, and the node ends')
+    except Exception as error:  # whatever it is, the node must end, and it must be said
+        log.error(f'the map is not saved: {error if isinstance(error, StavprError) else repr(error)}')
+    else:
+        log.info(f'{places} places written to {target}')
+
+
+def _free_name(path: str) -> str:
+    """Return the path, or where a file is there, the first of name-2.end, name-3.end ... that is free."""
+    if not os.path.exists(path):
+        return path
+    there = Path(path)
+    names = (there.with_name(f'{there.stem}-{number}{there.suffix}') for number in itertools.count(2))
+    return str(next(name for name in names if not name.exists()))

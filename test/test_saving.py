@@ -1,0 +1,129 @@
+"""What has grown is written at the end, and no file of another map is replaced."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+
+import pytest
+from engines import settings_of, show
+
+from stavpr_ros.errors import StavprError
+from stavpr_ros.mapping import load_map
+from stavpr_ros.operation import Engine
+from stavpr_ros.ros.runtime import Runtime
+from stavpr_ros.ros.saving import write_at_the_end, write_map
+from stavpr_ros.ros.worker import Worker
+
+
+class Log:
+    """A logger that remembers."""
+
+    def __init__(self):
+        self.said = []
+
+    def __getattr__(self, level):
+        return lambda text: self.said.append((level, text))
+
+
+@pytest.fixture
+def mapping(route):
+    engine = Engine(settings_of(), 'mapping')
+    show(engine, route[:7])
+    return engine
+
+
+def at_the_end(engine, path):
+    log = Log()
+    write_at_the_end(engine, lambda function: function(), str(path), log)
+    return log.said
+
+
+def test_what_has_grown_is_written_once(mapping, route, tmp_path):
+    path = tmp_path / 'route.stavpr'
+    assert at_the_end(mapping, path)[-1] == ('info', f'7 places written to {path}')
+    assert len(load_map(path)) == 7
+    assert at_the_end(mapping, path) == []  # nothing new
+    show(mapping, route[7:9], first=7)
+    assert at_the_end(mapping, path)[-1] == ('info', f'9 places written to {path}')  # its own file
+
+
+def test_a_file_of_another_map_stays(mapping, tmp_path):
+    path = tmp_path / 'route.stavpr'
+    for there in (path, tmp_path / 'route-2.stavpr'):
+        there.write_bytes(b'yesterday')
+    assert at_the_end(mapping, path)[-1][1].endswith('route-3.stavpr')
+    assert path.read_bytes() == b'yesterday'
+    assert len(load_map(tmp_path / 'route-3.stavpr')) == 7
+
+
+def test_what_is_lost_is_said(mapping, route, tmp_path):
+    assert at_the_end(mapping, '') == [
+        ('warning', '7 places are in no file: neither save_path nor ~/save_map named one')
+    ]
+    level, text = at_the_end(mapping, tmp_path / 'missing' / 'route.stavpr')[-1]
+    assert (level, 'does not exist' in text) == ('error', True)
+    mapping.set_operation('localization')  # it is the map now, and still in no file
+    assert at_the_end(mapping, '')[0][0] == 'warning'
+    path = tmp_path / 'route.stavpr'
+    assert at_the_end(mapping, path)[-1] == ('info', f'7 places written to {path}')
+
+
+def test_a_route_that_closes_loops_is_written_where_a_file_is_named(route, tmp_path):
+    engine = Engine(settings_of(), 'loop_closure')
+    show(engine, route[:9])
+    assert at_the_end(engine, '') == []
+    at_the_end(engine, tmp_path / 'loop.stavpr')
+    assert len(load_map(tmp_path / 'loop.stavpr')) == 9
+
+
+def test_places_that_come_while_it_is_written_are_unsaved(mapping, route, tmp_path):
+    calls = []
+
+    def on_worker(function):
+        if calls:
+            show(mapping, route[7:10], first=7)
+        calls.append(function)
+        return function()
+
+    assert write_map(mapping, on_worker, str(tmp_path / 'route.stavpr'), overwrite=False) == 7
+    assert (mapping.unsaved, mapping.path) == (3, str(tmp_path / 'route.stavpr'))
+
+
+def test_another_map_is_not_taken_for_the_one_that_was_written(mapping, tmp_path):
+    path = str(tmp_path / 'route.stavpr')
+
+    def on_worker(function):
+        result = function()
+        mapping.set_operation('localization')
+        return result
+
+    write_map(mapping, on_worker, path, overwrite=False)
+    assert (mapping.unsaved, mapping.path) == (7, '')
+
+
+@pytest.mark.parametrize('busy', [False, True])
+def test_who_asks_a_worker_that_is_stopped_is_told(busy):
+    """Before or after it is stopped; it must not wait for ever."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    def work(item):
+        begun.set()
+        go_on.wait(30)
+
+    worker = Worker(work, 2)
+    owner = SimpleNamespace(_worker=worker, _node=SimpleNamespace(ending=threading.Event()))
+    with ThreadPoolExecutor(2) as pool:
+        if busy:
+            worker.put(1)
+            begun.wait(30)
+            asked = pool.submit(Runtime._on_worker, owner, lambda: 7)
+            stopped = pool.submit(worker.stop)
+            while not worker._stopping:
+                pass
+            go_on.set()
+            stopped.result(30)
+        else:
+            worker.stop()
+            asked = pool.submit(Runtime._on_worker, owner, lambda: 7)
+        with pytest.raises(StavprError, match='no longer configured'):
+            asked.result(30)
