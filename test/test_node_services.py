@@ -193,6 +193,7 @@ def test_images_that_come_while_the_first_map_is_loaded_are_answered(bare, robot
     assert not future.result().success
     assert 'slow.stavpr' in future.result().message
     robot.until_told(state='none')
+    robot.until_diagnosed('map', DiagnosticStatus.ERROR, 'cannot load')
     assert 'map_path' in robot.drive(route[:1])[0].reason
 
 

@@ -148,8 +148,9 @@ def _map(health: Health) -> list[Finding]:
     """What is to be said of the map, in every state: a failed transition leaves the node not active."""
     places = _of(health.places, 'place')
     if health.problem:
-        in_use = f'; the map in use has {places}' if health.map_state in ('loaded', 'growing', 'full') else ''
-        return [(DiagnosticStatus.ERROR, health.problem + in_use)]
+        in_use = health.map_state in ('loaded', 'growing', 'full')
+        level = DiagnosticStatus.WARN if in_use else DiagnosticStatus.ERROR
+        return [(level, health.problem + (f'; the map in use has {places}' if in_use else ''))]
     warning = DiagnosticStatus.WARN if health.state == 'active' else DiagnosticStatus.OK
     if health.map_state == 'none':
         return [(warning, 'no map: set map_path or call ~/load_map')]

@@ -195,15 +195,13 @@ class Runtime:
     def _loading(self, path: str) -> Iterator[None]:
         """Tell that a map is being loaded, if one is."""
         with self._one_load:
-            self.loading = path
+            self.loading, self.problem = path, ''
             self.on_loading()
             try:
                 yield
             except Exception as error:
                 self.problem = f'cannot load {path}: {error}'
                 raise
-            else:
-                self.problem = ''
             finally:
                 self.loading = ''
                 self.on_loading()
