@@ -174,6 +174,10 @@ class PlaceRecognitionNode(ManagedNode):
         if missing := self._runtime.engine.missing:
             self.get_logger().warning(f'waiting, no image can be matched: {missing}')
         self.publish_map_info()
+        # what is there now stays: Python's collector would look through all of it again and again, which takes
+        # half a second each time, in the middle of an image
+        gc.collect()
+        gc.freeze()
 
     def _activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self.statistics.reset()
@@ -191,6 +195,7 @@ class PlaceRecognitionNode(ManagedNode):
                 del runtime
                 with self._telling:
                     self._tell(MapInfo(operation=self._settings.operation, state='none'))
+        gc.unfreeze()
         gc.collect()  # runtime and worker refer to each other: the map would stay until Python tidies up
         if self._settings.engine.backend == 'cuda':
             import torch
