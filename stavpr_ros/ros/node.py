@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
@@ -19,6 +18,7 @@ from rclpy.timer import Timer
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.devices import why_no_cuda
 from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.ros.executor import SlowCallbackGroup
 from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.parameter_table import declare_parameters
 from stavpr_ros.ros.parameters import BY_NAME, PARAMETERS
@@ -38,12 +38,12 @@ class PlaceRecognitionNode(ManagedNode):
 
     A managed node: configuring loads the map and the model and compiles the kernels, activating subscribes,
     deactivating stops, cleaning up frees. With parameter ``autostart`` it configures and activates itself
-    as soon as it spins. It wants an executor with several threads: see :data:`THREADS`.
+    as soon as it spins. It wants an executor that serves on threads: see :data:`THREADS`.
 
     :raises StavprError: parameters that cannot work together, or a backend that is not here.
     """
 
-    THREADS = 4  # images, odometry, services, life cycle and parameters: none waits for another
+    THREADS = 4  # for services, the life cycle and parameters: images wait for none of them
 
     def __init__(self, **options: Any) -> None:
         self._lock = threading.RLock()  # one change at a time: transitions and parameters
@@ -73,7 +73,7 @@ class PlaceRecognitionNode(ManagedNode):
             self._start = self.create_timer(
                 0.0,
                 self._on_start,
-                callback_group=MutuallyExclusiveCallbackGroup(),
+                callback_group=SlowCallbackGroup(),
                 clock=Clock(clock_type=ClockType.STEADY_TIME),
             )
 
@@ -174,8 +174,8 @@ class PlaceRecognitionNode(ManagedNode):
         if missing := self._runtime.engine.missing:
             self.get_logger().warning(f'waiting, no image can be matched: {missing}')
         self.publish_map_info()
-        # what is there now stays: Python's collector would look through all of it again and again, which takes
-        # half a second each time, in the middle of an image
+        # what is there now stays: Python's collector would look through all of it again and again, half a
+        # second each time, in the middle of an image
         gc.collect()
         gc.freeze()
 

@@ -11,7 +11,6 @@ import rclpy
 from rclpy.executors import (
     Executor,
     ExternalShutdownException,
-    MultiThreadedExecutor,
     SingleThreadedExecutor,
 )
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -20,6 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from stavpr_ros.errors import SettingsError
+from stavpr_ros.ros.executor import ServiceThreadsExecutor
 from stavpr_ros.signals import interrupted, signals_deferred
 
 LONGEST_WAIT = 0.2  # seconds until a signal is noticed
@@ -84,12 +84,12 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
     """
     Spin until ``done`` says so, or the context is shut down; a signal raises KeyboardInterrupt.
 
-    :param threads: that run callbacks.
+    :param threads: for services; 1 = everything on this one.
     """
     executor: Executor = (
         SingleThreadedExecutor(context=node.context)
         if threads == 1
-        else MultiThreadedExecutor(threads, context=node.context)
+        else ServiceThreadsExecutor(threads, context=node.context)
     )
     executor.add_node(node)
     try:
@@ -99,12 +99,12 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
     except ExternalShutdownException:
         pass
     finally:
-        if threads > 1:
+        if isinstance(executor, ServiceThreadsExecutor):
             _let_callbacks_end(executor, node)
         executor.shutdown()
 
 
-def _let_callbacks_end(executor: Executor, node: Node) -> None:
+def _let_callbacks_end(executor: ServiceThreadsExecutor, node: Node) -> None:
     """
     Wait for the callbacks that have been handed to other threads.
 
@@ -115,5 +115,5 @@ def _let_callbacks_end(executor: Executor, node: Node) -> None:
     if hasattr(node, 'ending'):
         node.ending.set()
     end = time.monotonic() + LONGEST_CALLBACK
-    while not all(task.done() for task in executor._futures) and time.monotonic() < end:
+    while executor.busy and time.monotonic() < end:
         time.sleep(0.01)
