@@ -89,7 +89,7 @@ class Localization:
         self, place_map: PlaceMap, describer: Describer, settings: EngineSettings, threshold: float
     ) -> None:
         self.describer = describer
-        self._map, self._fill, self._length = place_map, 0, settings.sequence.length
+        self._map = place_map
         self._recogniser = Recogniser(
             place_map, settings.recognition(threshold), settings.backend, settings.precision
         )
@@ -102,13 +102,11 @@ class Localization:
     @property
     def window_fill(self) -> int:
         """Images in the window."""
-        return self._fill
+        return self._recogniser.window_fill
 
     def add(self, observed: Observed) -> Recognition:
         """Recognise the window that ends with an image."""
-        recognition = self._recogniser.add(observed.features)
-        self._fill = min(self._fill + 1, self._length)
-        return recognition
+        return self._recogniser.add(observed.features)
 
     def ranked(self, count: int) -> list[Candidate]:
         """Return the nearest places of the window answered last."""
@@ -121,7 +119,6 @@ class Localization:
     def reset(self) -> None:
         """Empty the window."""
         self._recogniser.reset()
-        self._fill = 0
 
     def map(self) -> PlaceMap:
         """Return the map."""
