@@ -23,6 +23,7 @@ from stavpr_msgs.msg import PlaceMatch
 
 DOMAIN = 1 + os.getpid() % 100
 PATIENCE = 60.0  # seconds until something that should happen counts as not happening
+UNHEARD = 25.0  # seconds without an answer until a request counts as lost on its way
 
 
 def executable(name: str) -> str:
@@ -62,6 +63,7 @@ class Process:
         except subprocess.TimeoutExpired:
             self.popen.kill()
             self.popen.wait()
+        print(self.output())  # which pytest shows when the test has failed
 
 
 def node_process(log: Path, **parameters: object) -> Process:
@@ -144,13 +146,25 @@ class Bench:
         return found[0]
 
     def call(self, kind: type, name: str, **fields: object) -> Any:
-        """Call a service of the node, such as ``reset``, and return its response."""
+        """
+        Call a service of the node, such as ``reset``, and return its response.
+
+        A client that sees the service may not have been seen by it, and then the request is lost: it is
+        sent again when there is no answer for long.
+        """
         client = self.node.create_client(kind, f'/stavpr/{name}')
         self.until(client.service_is_ready, f'the service {name}')
-        future = client.call_async(kind.Request(**fields))
-        self.until(future.done, f'the answer of {name}')
+        futures: list[Any] = []
+
+        def answered() -> bool:
+            if time.monotonic() >= began + len(futures) * UNHEARD:
+                futures.append(client.call_async(kind.Request(**fields)))
+            return any(future.done() for future in futures)
+
+        began = time.monotonic()
+        self.until(answered, f'the answer of {name}')
         self.node.destroy_client(client)
-        return future.result()
+        return next(future for future in futures if future.done()).result()
 
     def set_parameter(self, name: str, value: object) -> tuple[bool, str]:
         values = [Parameter(name, value=value).to_parameter_msg()]

@@ -9,6 +9,8 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from rclpy.node import Node
 
+from stavpr_ros.ros.answers import wait_for_clients
+
 
 class ManagedNode(LifecycleNodeMixin, Node):
     """
@@ -24,6 +26,8 @@ class ManagedNode(LifecycleNodeMixin, Node):
         service = self._service_change_state
         self._change_as_asked = service.callback
         service.callback = self._change_or_refuse
+        for service in self.services:
+            wait_for_clients(service)
 
     @property
     def state(self) -> str:
