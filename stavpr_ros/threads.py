@@ -1,6 +1,7 @@
 """How the numerics use the processor beside everything else that runs on a robot."""
 
 import os
+from functools import cache
 
 
 def wait_passively() -> None:
@@ -15,15 +16,25 @@ def wait_passively() -> None:
 
 def limit_threads(count: int) -> None:
     """
-    Limit torch, numba and OpenCV to so many threads; numba for the thread that calls.
+    Limit torch, numba and OpenCV to so many threads; OpenCV for all, the others for the thread that calls.
 
-    :param count: 0 = all cores.
+    :param count: 0 = as many as they take of themselves.
     """
     import cv2
     import numba
     import torch
 
-    if count:
-        torch.set_num_threads(count)
-        cv2.setNumThreads(count)
-        numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+    of_torch, of_opencv = _unlimited()
+    torch.set_num_threads(count or of_torch)
+    cv2.setNumThreads(count or of_opencv)
+    most = numba.config.NUMBA_NUM_THREADS
+    numba.set_num_threads(min(count or most, most))
+
+
+@cache
+def _unlimited() -> tuple[int, int]:
+    """Return how many threads torch and OpenCV take, asked before they are limited for the first time."""
+    import cv2
+    import torch
+
+    return torch.get_num_threads(), cv2.getNumThreads()

@@ -1,6 +1,7 @@
 """Fixtures: the folder of real data, synthetic images and maps."""
 
 import os
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,43 @@ def small_map(route):
     poses = np.zeros((len(route), 7))
     poses[:, 0], poses[:, 6] = np.arange(len(route)), 1
     return build_map(frames, Describer(projection=64), poses, progress=False)
+
+
+@pytest.fixture(scope='module')
+def bench():
+    """A node beside the one that is tested, whose images come as a camera's; for those who have ROS."""
+    from processes import Bench
+
+    bench = Bench()
+    yield bench
+    bench.close()
+
+
+@pytest.fixture(scope='module')
+def start(small_map, tmp_path_factory):
+    """Start a node on the map of the made-up route, with more options of the command line."""
+    from camera import start_node
+
+    from stavpr_ros.mapping import save_map
+
+    folder = tmp_path_factory.mktemp('node')
+    save_map(small_map, folder / 'route.stavpr')
+    return partial(start_node, folder)
+
+
+@pytest.fixture(scope='class')
+def stream(bench, process):
+    """Images for the node that a module's ``process`` runs."""
+    from camera import Camera
+
+    return Camera(bench, bench.publisher)
+
+
+@pytest.fixture
+def camera(stream):
+    """The same, with an empty window."""
+    stream.reset()
+    return stream
 
 
 @pytest.fixture

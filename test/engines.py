@@ -2,10 +2,7 @@
 
 from contextlib import contextmanager
 
-import cv2
-import numba
 import numpy as np
-import torch
 
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.operation import Engine, EngineSettings, read_map
@@ -38,6 +35,11 @@ def show(engine, images, first=0, poses=False):
     ]
 
 
+def as_if_saved(engine):
+    """Take every place for written to a file."""
+    engine.filing.written = engine.filing.grown
+
+
 def answers(outcomes):
     return [outcome.answer for outcome in outcomes]
 
@@ -49,14 +51,11 @@ def stamps_of(place_map):
 @contextmanager
 def one_thread():
     """Threads that wait for each other spin, 100 ms an image where others want the cores as well."""
-    before = torch.get_num_threads(), cv2.getNumThreads(), numba.get_num_threads()
     limit_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before[0])
-        cv2.setNumThreads(before[1])
-        numba.set_num_threads(before[2])
+        limit_threads(0)
 
 
 def localizing(map_file, **changes):

@@ -4,7 +4,8 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import SetParameters
+from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
@@ -24,6 +26,11 @@ from stavpr_msgs.msg import PlaceMatch
 DOMAIN = 1 + os.getpid() % 100
 PATIENCE = 60.0  # seconds until something that should happen counts as not happening
 UNHEARD = 25.0  # seconds without an answer until a request counts as lost on its way
+RELIABLE = QoSProfile(depth=1000)
+TAKEN_RELIABLY = {
+    'qos_overrides./image.subscription.reliability': 'reliable',
+    'qos_overrides./image.subscription.depth': 1000,
+}
 
 
 def executable(name: str) -> str:
@@ -73,15 +80,20 @@ def node_process(log: Path, **parameters: object) -> Process:
 
 
 class Bench:
-    """A node in the test's own process: publishes images, hears answers, calls services."""
+    """
+    A node in the test's own process: publishes images, hears answers, calls services.
 
-    def __init__(self) -> None:
+    :param images: QoS of the images; with RELIABLE, and a node that takes them so, none is lost on its way.
+    """
+
+    def __init__(self, images: QoSProfile = qos_profile_sensor_data) -> None:
+        self.images = images
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=DOMAIN)
         self.node = rclpy.create_node('bench', context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
-        self.publisher = self.node.create_publisher(Image, 'image', qos_profile_sensor_data)
+        self.publisher = self.node.create_publisher(Image, 'image', images)
         self.answers: list[PlaceMatch] = []
         self.probes = 0  # answered empty images that only tested the connection
         self.node.create_subscription(
@@ -117,6 +129,11 @@ class Bench:
         self.until(lambda: self.answers[-1].header.stamp.nanosec == sent, 'the answer to the last probe')
         self.probes = len(self.answers) - before
 
+    def publish_anew(self) -> None:
+        """Take another publisher of images."""
+        self.node.destroy_publisher(self.publisher)
+        self.publisher = self.node.create_publisher(Image, 'image', self.images)
+
     def wait_for_nobody(self) -> None:
         """Wait until no node subscribes to the images any more."""
         self.until(lambda: self.publisher.get_subscription_count() == 0, 'the node to be gone')
@@ -146,25 +163,37 @@ class Bench:
         return found[0]
 
     def call(self, kind: type, name: str, **fields: object) -> Any:
-        """
-        Call a service of the node, such as ``reset``, and return its response.
+        """Call a service of the node, such as ``reset``, and return its response."""
+        futures: list[Any] = []
+        with self.request(futures, kind, name, lambda: any(f.done() for f in futures), **fields):
+            return next(future for future in futures if future.done()).result()
 
-        A client that sees the service may not have been seen by it, and then the request is lost: it is
-        sent again when there is no answer for long.
+    @contextmanager
+    def request(
+        self, futures: list[Any], kind: type, name: str, heard: Callable[[], bool], **fields: object
+    ) -> Iterator[Client]:
+        """
+        Send a request to a service of the node, and again until it is heard; the client lives in the block.
+
+        A client that sees the service may not have been seen by it, or what it sees may be that of the node
+        before: then a request is lost.
+
+        :param futures: of the answers, is filled.
         """
         client = self.node.create_client(kind, f'/stavpr/{name}')
         self.until(client.service_is_ready, f'the service {name}')
-        futures: list[Any] = []
+        began = time.monotonic()
 
-        def answered() -> bool:
+        def sent_and_heard() -> bool:
             if time.monotonic() >= began + len(futures) * UNHEARD:
                 futures.append(client.call_async(kind.Request(**fields)))
-            return any(future.done() for future in futures)
+            return heard()
 
-        began = time.monotonic()
-        self.until(answered, f'the answer of {name}')
-        self.node.destroy_client(client)
-        return next(future for future in futures if future.done()).result()
+        try:
+            self.until(sent_and_heard, f'an effect of {name}')
+            yield client
+        finally:
+            self.node.destroy_client(client)
 
     def set_parameter(self, name: str, value: object) -> tuple[bool, str]:
         values = [Parameter(name, value=value).to_parameter_msg()]

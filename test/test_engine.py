@@ -13,6 +13,7 @@ from engines import (
     LENGTH,
     SECOND,
     answers,
+    as_if_saved,
     at,
     localizing,
     one_thread,
@@ -184,7 +185,7 @@ def test_every_change_of_operation(route, images):
         for name, count in zip(names, images, strict=True):
             if name != engine.operation:
                 held, grown, full = grown or held, [], 0
-                engine.unsaved = 0  # as if it had been saved
+                as_if_saved(engine)
                 engine.set_operation(name)
             assert engine.operation == name
             outcomes = show(engine, route[came : came + count], first=came)
@@ -229,7 +230,9 @@ def test_no_places_are_lost_unless_they_were_given_up(map_file, route):
         engine.use(loaded)
     assert len(engine.places) == 3
     engine.set_operation('localization')
-    assert (len(engine.places), engine.path) == (3, '')  # no file holds this map
+    assert (len(engine.places), engine.path, engine.unsaved) == (3, '', 3)  # no file holds this map
+    with pytest.raises(InputError, match='3 places that are not saved'):
+        engine.set_operation('loop_closure')
     engine.change(operation='localization', loaded=loaded)
     assert engine.path == map_file
 
@@ -291,10 +294,15 @@ def test_a_map_that_does_not_fit_changes_nothing(operation, small_map, map_file,
 def test_a_map_in_loop_closure_gives_the_kind_of_features(map_file, route):
     engine = Engine(settings_of(), 'loop_closure')
     engine.use(read_map(map_file, engine.settings))
-    assert (len(engine.places), engine.describer.settings.projection is not None) == (0, True)
+    assert (len(engine.places), engine.path) == (0, '')  # the map's file is not the route's
+    assert engine.describer.settings.projection is not None
+    engine.set_operation('localization')
+    assert (len(engine.places), engine.path) == (60, map_file)
+    engine.set_operation('loop_closure')
     show(engine, route[:8])
     assert engine.places.features.strips.shape == (7, 8, 64)
     assert stamps_of(engine.places_as_map()) == list(range(1, 9))
+    assert not engine.filing.owns(map_file)
 
 
 def test_a_grown_map_is_not_lost_to_another(map_file, route, tmp_path):

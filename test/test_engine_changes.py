@@ -10,6 +10,7 @@ from engines import (
     LENGTH,
     SECOND,
     answers,
+    as_if_saved,
     localizing,
     message,
     one_thread,
@@ -111,7 +112,7 @@ def test_the_geometric_check(operation, small_map, route, tmp_path):
     """Accepts, rejects by its parameter, and rejects where there is no picture; it is changed live."""
     engine = Engine(settings_of(candidates=2), 'mapping')
     show(engine, route[:30])
-    engine.unsaved = 0  # as if they had been saved
+    as_if_saved(engine)
     engine.set_operation(operation)
     if operation == 'loop_closure':
         show(engine, route[:30])
@@ -170,7 +171,7 @@ def test_an_error_in_the_middle_of_an_image_changes_nothing(operation, route, mo
     )
     for each in (engine, other):
         show(each, route[:30], poses=True)
-        each.unsaved = 0  # as if they had been saved
+        as_if_saved(each)
         each.set_operation(operation)
     describe = Stumbles(engine.describer.describe)
     monkeypatch.setattr(engine.describer, 'describe', describe)
@@ -206,7 +207,7 @@ def test_an_error_in_the_middle_of_an_image_changes_nothing(operation, route, mo
 def test_a_reset_empties_the_window_and_keeps_the_places(operation, route):
     engine = Engine(settings_of(keyframes=KeyframeSettings(change=0.01)), 'mapping')
     show(engine, route[:30])
-    engine.unsaved = 0  # as if they had been saved
+    as_if_saved(engine)
     engine.set_operation(operation)
     if operation == 'loop_closure':
         show(engine, route[:30])

@@ -10,12 +10,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from image_messages import image_message
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState
-from processes import DOMAIN, Bench, Process, node_process
+from processes import DOMAIN, RELIABLE, TAKEN_RELIABLY, Bench, Process, node_process
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
 from stavpr_msgs.msg import MapInfo, PlaceMatch
@@ -25,21 +24,14 @@ from stavpr_ros.mapping import PlaceMap, save_map
 
 LENGTH = 5
 PARAMETERS = {'sequence_length': LENGTH, 'xi': 0, 'threshold': 0.2, 'max_rate': 0.0, 'verbosity': 'info'}
-IMAGES = QoSProfile(depth=1000)  # reliable, and the node takes them so: none is lost on its way
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BACK = {'unconfigured': (), 'inactive': ('cleanup',), 'active': ('deactivate', 'cleanup')}
 MEGABYTE = 1 << 20
 
 
-def publish_anew(bench):
-    bench.node.destroy_publisher(bench.publisher)
-    bench.publisher = bench.node.create_publisher(Image, 'image', IMAGES)
-
-
 @pytest.fixture(scope='module')
 def bench():
-    bench = Bench()
-    publish_anew(bench)
+    bench = Bench(RELIABLE)
     yield bench
     bench.close()
 
@@ -71,13 +63,9 @@ def late_map_file(small_map, folder):
 @pytest.fixture(scope='module')
 def managed(bench, folder):
     """One node for the module; a manager, which is the test, takes it through its states."""
-    qos = {
-        f'qos_overrides./image.subscription.{name}': value
-        for name, value in {'reliability': 'reliable', 'depth': 1000}.items()
-    }
     process = node_process(
         folder / 'node.log',
-        **PARAMETERS | qos,
+        **PARAMETERS | TAKEN_RELIABLY,
         autostart=False,
         mode='paper',
         neighbourhood=5,
@@ -357,7 +345,7 @@ def test_another_publisher_goes_on_where_the_first_stopped(bench, node, map_file
     verdicts(bench, route[:3])
     bench.node.destroy_publisher(bench.publisher)
     bench.until_diagnosed('input', DiagnosticStatus.WARN, 'no publisher')
-    publish_anew(bench)
+    bench.publish_anew()
     bench.wait_for_node()
     assert verdicts(bench, route[3:5], 4) == [PlaceMatch.WARMING_UP, PlaceMatch.MATCH]
     bench.until_diagnosed('recognition', DiagnosticStatus.OK, '1 of 1 image matched')

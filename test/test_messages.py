@@ -291,7 +291,7 @@ def test_a_picture_is_drawn_only_when_somebody_listens(monkeypatch):
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=DOMAIN)
     node = LifecycleNode('stavpr', context=context, enable_communication_interface=False)
-    said = output.Output(node)
+    said = output.Output(node, burst=5)
     node.trigger_configure()
     node.trigger_activate()
     bench = Bench()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from image_messages import image_message
-from processes import Bench, node_process
+from processes import node_process
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float32, Int32
@@ -18,13 +18,6 @@ from stavpr_ros.mapping import save_map
 from stavpr_ros.recognition import Recogniser, RecognitionSettings
 
 LENGTH, THRESHOLD = 5, 0.2
-
-
-@pytest.fixture(scope='module')
-def bench():
-    bench = Bench()
-    yield bench
-    bench.close()
 
 
 @pytest.fixture(scope='module')

@@ -1,16 +1,14 @@
 """What the node hears, from outside: transports, encodings, broken images, keyframes, odometry, QoS."""
 
 import array
-from functools import partial
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from camera import LENGTH, SECOND, Camera, start_node
+from camera import LENGTH, SECOND, Camera
 from diagnostic_msgs.msg import DiagnosticStatus
 from image_messages import compressed_message, image_message
 from nav_msgs.msg import Odometry
-from processes import Bench
 from raw_images import BAYER, CHANNELS, YUV, is_deep, mosaic, packed_yuv
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
@@ -18,26 +16,11 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
 from stavpr_msgs.msg import PlaceMatch
-from stavpr_ros.mapping import save_map
 from stavpr_ros.ros.parameters import BY_NAME
 
 WARN, ERROR = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 WARMING_UP, MATCH = PlaceMatch.WARMING_UP, PlaceMatch.MATCH
 INVALID, SKIPPED = PlaceMatch.INVALID_IMAGE, PlaceMatch.SKIPPED
-
-
-@pytest.fixture(scope='module')
-def bench():
-    bench = Bench()
-    yield bench
-    bench.close()
-
-
-@pytest.fixture(scope='module')
-def start(small_map, tmp_path_factory):
-    folder = tmp_path_factory.mktemp('node')
-    save_map(small_map, folder / 'route.stavpr')
-    return partial(start_node, folder)
 
 
 def encoded(image, encoding):
@@ -82,17 +65,6 @@ def process(bench, start):
     yield process
     process.end()
     bench.wait_for_nobody()
-
-
-@pytest.fixture(scope='class')
-def stream(bench, process):
-    return Camera(bench, bench.publisher)
-
-
-@pytest.fixture
-def camera(stream):
-    stream.reset()
-    return stream
 
 
 class TestImages:
@@ -304,6 +276,10 @@ class TestQualityOfService:
         bench.until(told, 'a warning')
         counts = reliable.counts('input')
         assert (counts['publishers'], counts['publishers_refused']) == ('2', '1')
+        bench.node.destroy_publisher(bench.publisher)
+        bench.until_diagnosed('input', WARN, '1 publisher there, but silent')  # the refused one is gone
+        assert reliable.counts('input')['publishers_refused'] == '0'
+        bench.publish_anew()
         depth = bench.call(GetParameters, 'get_parameters', names=['qos_overrides./image.subscription.depth'])
         assert depth.values[0].integer_value == 7
 

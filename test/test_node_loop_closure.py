@@ -7,9 +7,7 @@ import pytest
 from conftest import route_images
 from image_messages import image_message
 from nav_msgs.msg import Odometry
-from processes import Bench, node_process
-from rclpy.qos import QoSProfile
-from sensor_msgs.msg import Image
+from processes import RELIABLE, TAKEN_RELIABLY, Bench, node_process
 
 from stavpr_msgs.msg import LoopClosure, PlaceMatch
 from stavpr_msgs.srv import SaveMap
@@ -38,9 +36,7 @@ class Drive:
 
 @pytest.fixture(scope='module')
 def bench():
-    bench = Bench()
-    bench.node.destroy_publisher(bench.publisher)  # for one that loses nothing, together with the node's
-    bench.publisher = bench.node.create_publisher(Image, 'image', QoSProfile(depth=1000))
+    bench = Bench(RELIABLE)
     bench.odometry = bench.node.create_publisher(Odometry, 'odom', 100)
     bench.closures = bench.listen(LoopClosure, '/stavpr/loop_closure', 1000)
     yield bench
@@ -54,8 +50,7 @@ def start(bench, tmp_path_factory):
     def start(**parameters):
         end()
         values = {'operation': 'loop_closure', 'threads': 1, 'keyframe_change': 0.0} | parameters
-        values['qos_overrides./image.subscription.reliability'] = 'reliable'
-        started.append(node_process(tmp_path_factory.mktemp('node') / 'node.log', **values))
+        started.append(node_process(tmp_path_factory.mktemp('node') / 'node.log', **values | TAKEN_RELIABLY))
         bench.wait_for_node()
         bench.closures.clear()
 

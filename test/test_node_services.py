@@ -1,6 +1,7 @@
 """The node's services and what it publishes beside ~/match, from the outside: good requests and bad ones."""
 
 import os
+from contextlib import contextmanager
 from dataclasses import replace
 
 import cv2
@@ -11,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from image_messages import image_message
 from nav_msgs.msg import Odometry
-from processes import Bench, node_process
+from processes import RELIABLE, TAKEN_RELIABLY, Bench, node_process
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
@@ -24,17 +25,13 @@ LENGTH, SECOND = 5, 10**9
 LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SHORT = {'sequence_length': LENGTH, 'neighbourhood': 5, 'candidates': 3, 'threads': 1, 'max_places': 100,
          'queue_size': 1000, 'keyframe_change': 0.0, 'diagnostics_period': 0.2}  # fmt: skip
-RELIABLE = {'qos_overrides./image.subscription.reliability': 'reliable',
-            'qos_overrides./image.subscription.depth': 1000}  # fmt: skip
 
 
 class Robot(Bench):
     """A bench whose images are not lost, and which drives along the route; every image has a new stamp."""
 
     def __init__(self):
-        super().__init__()
-        self.node.destroy_publisher(self.publisher)
-        self.publisher = self.node.create_publisher(Image, 'image', QoSProfile(depth=1000))
+        super().__init__(RELIABLE)
         self.odometry = self.node.create_publisher(Odometry, 'odom', 100)
         self.infos = self.listen(MapInfo, '/stavpr/map_info', LATCHED)
         self.clock = 1000
@@ -81,6 +78,22 @@ class Robot(Bench):
         assert not response.success
         return response.message
 
+    @contextmanager
+    def while_loading(self, path):
+        """Have the node load a pipe, which nobody writes into until the block ends: it is no map then."""
+        os.mkfifo(path)
+        futures = []
+
+        def loading():
+            return bool(self.infos) and self.infos[-1].state == 'loading'
+
+        with self.request(futures, LoadMap, 'load_map', loading, path=str(path)):
+            yield path
+            os.close(os.open(path, os.O_WRONLY))  # waits for the reader
+            self.until(futures[0].done, 'the answer of load_map')
+        assert not futures[0].result().success
+        assert path.name in futures[0].result().message
+
     def begin(self, operation, path):
         """Bring a node that other tests have used into an operation with a map and an empty window."""
         self.does(SetOperation, 'set_operation', operation='localization')
@@ -115,7 +128,7 @@ def _nodes(robot, folder):
     def node(name, **parameters):
         if name not in kept:
             end()
-            kept[name] = node_process(folder / f'{name}.log', **SHORT | RELIABLE | parameters)
+            kept[name] = node_process(folder / f'{name}.log', **SHORT | TAKEN_RELIABLY | parameters)
             robot.wait_for_node()
         return kept[name]
 
@@ -146,23 +159,6 @@ def mapped(_nodes, robot, map_file):
     return process
 
 
-class Slow:
-    """A map file that takes as long to be read as the test wants, and is none in the end."""
-
-    def __init__(self, path):
-        self.path = str(path)
-        os.mkfifo(path)
-
-    def end(self):
-        os.close(os.open(self.path, os.O_WRONLY))  # waits for the reader
-
-
-def call_in_the_background(robot, kind, name, **fields):
-    client = robot.node.create_client(kind, f'/stavpr/{name}')
-    robot.until(client.service_is_ready, f'the service {name}')
-    return client.call_async(kind.Request(**fields))
-
-
 # ------------------------------------------------ a node without a map: the first tests of this file
 
 
@@ -181,17 +177,11 @@ def test_without_a_map_everything_says_what_is_missing(bare, robot, route, tmp_p
 
 
 def test_images_that_come_while_the_first_map_is_loaded_are_answered(bare, robot, route, tmp_path):
-    slow = Slow(tmp_path / 'slow.stavpr')
-    future = call_in_the_background(robot, LoadMap, 'load_map', path=slow.path)
-    robot.until_told(state='loading')
-    answers = robot.drive(route[:5])
-    assert {answer.verdict for answer in answers} == {PlaceMatch.NOT_READY}
-    assert {answer.reason for answer in answers} == {f'map {slow.path} is being loaded'}
-    robot.until_diagnosed('map', DiagnosticStatus.OK, 'loading')
-    slow.end()
-    robot.until(future.done, 'the answer of load_map')
-    assert not future.result().success
-    assert 'slow.stavpr' in future.result().message
+    with robot.while_loading(tmp_path / 'slow.stavpr') as slow:
+        answers = robot.drive(route[:5])
+        assert {answer.verdict for answer in answers} == {PlaceMatch.NOT_READY}
+        assert {answer.reason for answer in answers} == {f'map {slow} is being loaded'}
+        robot.until_diagnosed('map', DiagnosticStatus.OK, 'loading')
     robot.until_told(state='none')
     robot.until_diagnosed('map', DiagnosticStatus.ERROR, 'cannot load')
     assert 'map_path' in robot.drive(route[:1])[0].reason
@@ -280,7 +270,7 @@ def test_a_map_is_swapped_under_a_stream(mapped, robot, small_map, route, folder
     robot.until_told(state='loaded', places=60)
     robot.drive(route[20:28])
     before, infos = len(robot.answers), len(robot.infos)
-    sent, future = [], None
+    sent = []
 
     def publish():
         sent.append(robot.stamped(route[28 + len(sent) % 30]))
@@ -288,10 +278,8 @@ def test_a_map_is_swapped_under_a_stream(mapped, robot, small_map, route, folder
 
     timer = robot.node.create_timer(0.05, publish)
     robot.until(lambda: len(sent) >= 4, 'a stream')
-    future = call_in_the_background(robot, LoadMap, 'load_map', path=str(folder / 'large.stavpr'))
-    robot.until(future.done, 'the answer of load_map')
-    assert future.result().success
-    assert (future.result().map.places, future.result().map.path) == (n, str(folder / 'large.stavpr'))
+    loaded = robot.does(LoadMap, 'load_map', path=str(folder / 'large.stavpr')).map
+    assert (loaded.places, loaded.path) == (n, str(folder / 'large.stavpr'))
     during = len(sent)
     robot.until(lambda: len(sent) >= during + 2 * LENGTH, 'more of the stream')
     robot.node.destroy_timer(timer)
@@ -314,14 +302,9 @@ def test_a_damaged_map_leaves_the_old_one_in_use(mapped, robot, route, tmp_path)
     """While it is read, the window goes on, and after it as well."""
     answers = robot.drive(route[:6])
     infos = len(robot.infos)
-    slow = Slow(tmp_path / 'slow.stavpr')
-    future = call_in_the_background(robot, LoadMap, 'load_map', path=slow.path)
-    robot.until_told(state='loading', places=60)
-    answers += robot.drive(route[6:12])
-    slow.end()
-    robot.until(future.done, 'the answer of load_map')
-    assert not future.result().success
-    assert 'slow.stavpr' in future.result().message
+    with robot.while_loading(tmp_path / 'slow.stavpr'):
+        robot.until_told(state='loading', places=60)
+        answers += robot.drive(route[6:12])
     answers += robot.drive(route[12:14])  # told at once, not with the next diagnostics
     assert [info.state for info in robot.infos[infos:]] == ['loading', 'loaded']
     damaged = tmp_path / 'damaged.stavpr'

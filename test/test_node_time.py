@@ -1,33 +1,15 @@
 """Time, from outside: rates, gaps and jumps of stamps, simulated time, bags that loop or pause."""
 
-from functools import partial
-
 import pytest
 from builtin_interfaces.msg import Time
-from camera import LENGTH, SECOND, Camera, start_node
+from camera import LENGTH, SECOND
 from image_messages import image_message
-from processes import Bench
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from stavpr_msgs.msg import PlaceMatch
-from stavpr_ros.mapping import save_map
 
 WARMING_UP, MATCH, SKIPPED = PlaceMatch.WARMING_UP, PlaceMatch.MATCH, PlaceMatch.SKIPPED
-
-
-@pytest.fixture(scope='module')
-def bench():
-    bench = Bench()
-    yield bench
-    bench.close()
-
-
-@pytest.fixture(scope='module')
-def start(small_map, tmp_path_factory):
-    folder = tmp_path_factory.mktemp('node')
-    save_map(small_map, folder / 'route.stavpr')
-    return partial(start_node, folder)
 
 
 @pytest.fixture(scope='class')
@@ -38,17 +20,6 @@ def process(bench, start, request):
     yield process
     process.end()
     bench.wait_for_nobody()
-
-
-@pytest.fixture(scope='class')
-def stream(bench, process):
-    return Camera(bench, bench.publisher)
-
-
-@pytest.fixture
-def camera(stream):
-    stream.reset()
-    return stream
 
 
 class World:

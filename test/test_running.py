@@ -1,6 +1,7 @@
 """The node as users run it: renamed, with parameters changed under load, and ended at any moment."""
 
 import os
+import shutil
 import signal
 import time
 
@@ -10,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from image_messages import image_message
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from processes import Bench, Process, node_process
+from processes import RELIABLE, TAKEN_RELIABLY, Bench, Process, node_process
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -20,20 +21,13 @@ from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_msgs.srv import LoadMap
 from stavpr_ros.mapping import save_map
 
-IMAGES = QoSProfile(depth=1000)  # reliable, and the node takes them so: none is lost on its way
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-RELIABLE = {
-    'qos_overrides./image.subscription.reliability': 'reliable',
-    'qos_overrides./image.subscription.depth': 1000,
-}
 LONGEST_END = 8.0  # seconds; `ros2 launch` kills what is not gone 10 s after its SIGINT
 
 
 @pytest.fixture(scope='module')
 def bench():
-    bench = Bench()
-    bench.node.destroy_publisher(bench.publisher)
-    bench.publisher = bench.node.create_publisher(Image, 'image', IMAGES)
+    bench = Bench(RELIABLE)
     yield bench
     bench.close()
 
@@ -52,7 +46,7 @@ def run(bench, tmp_path):
 
     def run(**parameters):
         values = {'sequence_length': 5, 'neighbourhood': 5, 'keyframe_change': 0.0, 'diagnostics_period': 0.1}
-        started.append(node_process(tmp_path / 'node.log', **values | RELIABLE | parameters))
+        started.append(node_process(tmp_path / 'node.log', **values | TAKEN_RELIABLY | parameters))
         return started[0]
 
     yield run
@@ -118,38 +112,45 @@ def test_a_signal_while_the_kernels_are_compiled(bench, run, map_file, tmp_path,
     """Compiling takes ten seconds and cannot be interrupted; the node does not wait for it."""
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'cache'))
     process = run(autostart=False, map_path=map_file)
-    client = bench.node.create_client(ChangeState, '/stavpr/change_state')
-    bench.until(client.service_is_ready, 'the service')
-    request = ChangeState.Request(transition=Transition(label='configure'))
-    future = client.call_async(request)
-    bench.until(lambda: 'backend cpu' in process.output(), 'the configuration to begin')
-    assert not future.done()
-    assert ends_well(process, signal.SIGINT)
-    bench.node.destroy_client(client)
+    configure, futures = Transition(label='configure'), []
+
+    def begun():
+        return 'backend cpu' in process.output()
+
+    with bench.request(futures, ChangeState, 'change_state', begun, transition=configure):
+        assert not any(future.done() for future in futures)
+        assert ends_well(process, signal.SIGINT)
 
 
-@pytest.mark.parametrize('how', ['load_map', 'configure'])
+@pytest.mark.parametrize('how', ['load_map', 'load_map again', 'configure'])
 def test_a_signal_while_a_map_is_read(bench, run, map_file, tmp_path, how):
     """The file is a pipe into which nobody writes: reading it takes for ever."""
     pipe = tmp_path / 'pipe.stavpr'
     os.mkfifo(pipe)
+    if how == 'load_map again':  # the file of the map in use is another one now
+        pipe.unlink()
+        shutil.copy(map_file, pipe)
     process = run(map_path=map_file if how == 'load_map' else pipe)
-    client = bench.node.create_client(LoadMap, '/stavpr/load_map')
-    if how == 'load_map':
+    if how != 'configure':
         bench.wait_for_node()
-        bench.until(client.service_is_ready, 'the service')
-        future = client.call_async(LoadMap.Request(path=str(pipe)))
-        bench.until_diagnosed('map', DiagnosticStatus.OK, f'loading {pipe}')
-        assert not future.done()
+        pipe.unlink()
+        os.mkfifo(pipe)
+        futures = []
+
+        def loading():
+            return f'loading {pipe}' in bench.diagnostics['map'].message
+
+        with bench.request(futures, LoadMap, 'load_map', loading, path=str(pipe)):
+            assert not any(future.done() for future in futures)
         answer = bench.ask(image_message(np.zeros((96, 128, 3), np.uint8), 1))  # goes on meanwhile
         assert answer.verdict == PlaceMatch.WARMING_UP
     else:
         bench.until_diagnosed('processing', DiagnosticStatus.OK, 'configuring')
+        bench.until_diagnosed('map', DiagnosticStatus.OK, f'loading {pipe}')
         assert bench.state() == 'configuring'  # asked for meanwhile
         assert not bench.transition('cleanup')
         assert 'another is under way' in process.output()
     assert ends_well(process, signal.SIGINT)
-    bench.node.destroy_client(client)
 
 
 def test_parameters_change_under_load(bench, run, small_map, map_file, route, tmp_path):
@@ -159,8 +160,6 @@ def test_parameters_change_under_load(bench, run, small_map, map_file, route, tm
     run(map_path=map_file)
     bench.wait_for_node()
     before, images, futures = len(bench.answers), 150, []
-    client = bench.node.create_client(SetParameters, '/stavpr/set_parameters')
-    bench.until(client.service_is_ready, 'the service')
     changes = [
         ('threshold', (0.1, 0.3)),
         ('max_rate', (10.0, 0.0)),
@@ -176,15 +175,17 @@ def test_parameters_change_under_load(bench, run, small_map, map_file, route, tm
             value = Parameter(name, value=values[i // 4 % 2]).to_parameter_msg()
             futures.append(client.call_async(SetParameters.Request(parameters=[value])))
 
-    clock = bench.node.create_timer(1 / 30, stream)
-
     def done():
         return len(futures) == images and all(future.done() for future in futures)
 
-    bench.until(done, 'all changes')
-    bench.until(lambda: len(bench.answers) >= before + images, 'all answers')
-    bench.node.destroy_timer(clock)
-    bench.node.destroy_client(client)
+    first = []
+    with bench.request(
+        first, SetParameters, 'set_parameters', lambda: any(f.done() for f in first)
+    ) as client:
+        clock = bench.node.create_timer(1 / 30, stream)
+        bench.until(done, 'all changes')
+        bench.until(lambda: len(bench.answers) >= before + images, 'all answers')
+        bench.node.destroy_timer(clock)
     assert all(result.successful for future in futures for result in future.result().results)
     assert bench.set_parameter('max_rate', 0.0)[0]
     last = bench.ask(image_message(route[0], 100 * 10**9))  # behind it nothing is on its way any more
@@ -192,6 +193,20 @@ def test_parameters_change_under_load(bench, run, small_map, map_file, route, tm
     stamps = [answer.header.stamp.sec * 10**9 + answer.header.stamp.nanosec for answer in bench.answers]
     assert sorted(stamps[before:-1]) == [10**9 + i * 10**9 // 30 for i in range(images)]
     assert {PlaceMatch.WARMING_UP, PlaceMatch.SKIPPED} <= {a.verdict for a in bench.answers[before:]}
+
+
+@pytest.mark.parametrize('verbosity', ['default', 'info'])
+def test_the_log_level_of_the_command_line_holds_until_a_parameter_has_another(bench, verbosity, tmp_path):
+    process = Process(
+        tmp_path / 'quiet.log', 'node', '--ros-args', '--log-level', 'error', '-p', f'verbosity:={verbosity}'
+    )
+    try:
+        bench.wait_for_node()
+        assert process.stop() == 0
+        bench.wait_for_nobody()
+        assert ('[INFO]' in process.output()) == (verbosity == 'info')
+    finally:
+        process.end()
 
 
 def test_another_namespace_and_name(bench, map_file, route, tmp_path):
@@ -203,7 +218,7 @@ def test_another_namespace_and_name(bench, map_file, route, tmp_path):
         bench.listen(MapInfo, '/robot/places/map_info', LATCHED),
     )
     reports = bench.listen(DiagnosticArray, '/diagnostics')
-    publisher = bench.node.create_publisher(Image, '/robot/front/camera', IMAGES)
+    publisher = bench.node.create_publisher(Image, '/robot/front/camera', RELIABLE)
     process = Process(tmp_path / 'robot.log', 'node', '--ros-args', *arguments, *values)
     try:
         bench.until(lambda: publisher.get_subscription_count() > 0, 'the subscription')

@@ -8,8 +8,8 @@ import pytest
 from engines import settings_of, show
 
 from stavpr_ros.errors import StavprError
-from stavpr_ros.mapping import load_map
-from stavpr_ros.operation import Engine
+from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.operation import Engine, read_map
 from stavpr_ros.ros.runtime import Runtime
 from stavpr_ros.ros.saving import write_at_the_end, write_map
 from stavpr_ros.ros.worker import Worker
@@ -47,13 +47,25 @@ def test_what_has_grown_is_written_once(mapping, route, tmp_path):
     assert at_the_end(mapping, path)[-1] == ('info', f'9 places written to {path}')  # its own file
 
 
-def test_a_file_of_another_map_stays(mapping, tmp_path):
+def test_a_file_of_another_map_stays(mapping, route, tmp_path):
     path = tmp_path / 'route.stavpr'
     for there in (path, tmp_path / 'route-2.stavpr'):
         there.write_bytes(b'yesterday')
     assert at_the_end(mapping, path)[-1][1].endswith('route-3.stavpr')
+    show(mapping, route[7:9], first=7)
+    assert at_the_end(mapping, path)[-1][1].endswith('route-3.stavpr')  # again: it is this map's
     assert path.read_bytes() == b'yesterday'
-    assert len(load_map(tmp_path / 'route-3.stavpr')) == 7
+    assert len(load_map(tmp_path / 'route-3.stavpr')) == 9
+
+
+def test_a_copy_elsewhere_does_not_make_the_file_another_maps(small_map, route, tmp_path):
+    path = str(tmp_path / 'route.stavpr')
+    save_map(small_map, path)
+    engine = Engine(settings_of(), 'mapping')
+    engine.use(read_map(path, engine.settings))
+    engine.save(str(tmp_path / 'backup.stavpr'), overwrite=False)
+    show(engine, route[:2])
+    assert at_the_end(engine, path)[-1] == ('info', f'62 places written to {path}')
 
 
 def test_what_is_lost_is_said(mapping, route, tmp_path):
@@ -74,6 +86,20 @@ def test_a_route_that_closes_loops_is_written_where_a_file_is_named(route, tmp_p
     assert at_the_end(engine, '') == []
     at_the_end(engine, tmp_path / 'loop.stavpr')
     assert len(load_map(tmp_path / 'loop.stavpr')) == 9
+    show(engine, route[9:11], first=9)
+    engine.set_operation('localization')  # now it is the map, and goes to its file all the same
+    at_the_end(engine, tmp_path / 'loop.stavpr')
+    assert len(load_map(tmp_path / 'loop.stavpr')) == 11
+
+
+def test_a_route_does_not_replace_the_map_that_it_was_begun_with(small_map, route, tmp_path):
+    path = tmp_path / 'route.stavpr'
+    save_map(small_map, path)
+    engine = Engine(settings_of(), 'loop_closure')
+    engine.use(read_map(str(path), engine.settings))
+    show(engine, route[:9])
+    assert at_the_end(engine, path)[-1][1].endswith('route-2.stavpr')
+    assert (len(load_map(path)), len(load_map(tmp_path / 'route-2.stavpr'))) == (60, 9)
 
 
 def test_places_that_come_while_it_is_written_are_unsaved(mapping, route, tmp_path):
@@ -89,16 +115,34 @@ def test_places_that_come_while_it_is_written_are_unsaved(mapping, route, tmp_pa
     assert (mapping.unsaved, mapping.path) == (3, str(tmp_path / 'route.stavpr'))
 
 
-def test_another_map_is_not_taken_for_the_one_that_was_written(mapping, tmp_path):
-    path = str(tmp_path / 'route.stavpr')
+@pytest.mark.parametrize('another', [False, True])
+def test_another_map_is_not_taken_for_the_one_that_was_written(another, mapping, small_map, tmp_path):
+    """While it is written, what grew becomes the map, and another one may be loaded."""
+    path, other = (str(tmp_path / name) for name in ('route.stavpr', 'other.stavpr'))
+    save_map(small_map, other)
 
     def on_worker(function):
         result = function()
         mapping.set_operation('localization')
+        if another:
+            mapping.use(read_map(other, mapping.settings))
         return result
 
     write_map(mapping, on_worker, path, overwrite=False)
-    assert (mapping.unsaved, mapping.path) == (7, '')
+    assert (mapping.unsaved, mapping.path) == (0, other if another else path)
+    assert mapping.filing.owns(other) == another
+
+
+def test_two_that_write_at_once_write_what_they_say(mapping, route, tmp_path):
+    """A service, and a transition on another thread: what came after both is unsaved."""
+    path = str(tmp_path / 'route.stavpr')
+    snapshots = [mapping.to_save(path, overwrite=True)]
+    show(mapping, route[7:9], first=7)
+    snapshots.append(mapping.to_save(path, overwrite=True))
+    show(mapping, route[9:10], first=9)
+    for snapshot in reversed(snapshots):
+        mapping.saved(path, snapshot)
+    assert mapping.unsaved == 1
 
 
 @pytest.mark.parametrize('busy', [False, True])

@@ -112,6 +112,21 @@ class GrowingMap:
         return self._thumbnails
 
     @property
+    def has_stamps(self) -> bool:
+        """Some place has a stamp."""
+        return bool(np.any(self.stamps))
+
+    @property
+    def has_ids(self) -> bool:
+        """Some place has an external identifier."""
+        return any(self._ids)
+
+    @property
+    def has_poses(self) -> bool:
+        """Some place has a pose."""
+        return bool(np.isfinite(self.poses).any())
+
+    @property
     def memory(self) -> int:
         """Bytes held, the room for places to come included."""
         arrays = (self._strips, self._weights, self._stamps, self._poses)

@@ -14,7 +14,8 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap, save_map
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.operation.begin import LoadedMap, begin
-from stavpr_ros.operation.operations import LoopClosure, Observed, Operation
+from stavpr_ros.operation.filing import Filing
+from stavpr_ros.operation.operations import Observed, Operation
 from stavpr_ros.operation.outcome import Answer, Outcome, place_picture
 from stavpr_ros.operation.settings import EngineSettings
 from stavpr_ros.operation.stopwatch import Stopwatch
@@ -35,11 +36,11 @@ _ANSWERS = {
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A map to be written, of which operation it is, and how many of its places are in no file yet."""
+    """A map to be written, what was known of its files, and by how many places it had grown."""
 
     places: PlaceMap
-    operation: Operation | None
-    unsaved: int
+    filing: Filing
+    grown: int
 
 
 class Engine:
@@ -61,9 +62,9 @@ class Engine:
         self._check = GeometricCheck(settings.geometric) if settings.geometric else None
         self._window: deque[int] = deque(maxlen=settings.sequence.length)
         self._last: Outcome | None = None
-        self.path = ''  # of the file that the map came from, or was written to
+        self.filing = Filing()  # of the places in use
+        self._map_filing = self.filing  # of the map, where loop closure uses places of its own
         self.ranking = True  # tell the nearest places with every answer
-        self.unsaved = 0  # places that have grown since the map was loaded or saved
         self._begin(operation, settings, None)
 
     @property
@@ -86,6 +87,16 @@ class Engine:
         """The map, or the route so far."""
         operation = self._operation  # once: others may look while the worker changes it
         return operation.places if operation else self._map
+
+    @property
+    def path(self) -> str:
+        """File that the places in use came from, or were written to last, '' = none."""
+        return self.filing.path
+
+    @property
+    def unsaved(self) -> int:
+        """Places in use that are in no file."""
+        return min(self.filing.unsaved, len(self.places or ()))
 
     @property
     def describer(self) -> Describer | None:
@@ -177,16 +188,14 @@ class Engine:
     def _begin(self, name: str, settings: EngineSettings, loaded: LoadedMap | None) -> None:
         """Begin an operation; on an error everything stays as it was."""
         place_map, describer = self.places_as_map(), self.describer
-        from_route = isinstance(self._operation, LoopClosure) and place_map is not self._map
-        # a route that closed loops is worth a file only where one was named
-        path, unsaved = ('', 0) if from_route else (self.path, self.unsaved)
+        filing = self._map_filing if place_map is self._map else self.filing
         if loaded is not None:
-            place_map, describer, path, unsaved = loaded.places, loaded.describer, loaded.path, 0
+            place_map, describer, filing = loaded.places, loaded.describer, Filing(loaded.path)
         operation = begin(name, settings, place_map, describer)
         self._map = None if name == 'mapping' else place_map  # in mapping, the growing map holds it
         self._operation, self._name = operation, name
         self._describer = operation.describer if operation is not None else describer
-        self.path, self.unsaved = path, unsaved
+        self._map_filing, self.filing = filing, Filing() if name == 'loop_closure' else filing
         self.reset()
 
     def places_as_map(self) -> PlaceMap | None:
@@ -209,7 +218,8 @@ class Engine:
             raise MapFileError(f'{path} is there already: ask to overwrite it, or take another name')
         if not Path(path).absolute().parent.is_dir():
             raise MapFileError(f'the folder of {path} does not exist: make it first')
-        return Snapshot(place_map, self._operation, self.unsaved)
+        filing = self._map_filing if place_map is self._map else self.filing
+        return Snapshot(place_map, filing, filing.grown)
 
     def save(self, path: str, overwrite: bool) -> int:
         """Write the map, or the route so far, whole or not at all; return its number of places."""
@@ -220,9 +230,7 @@ class Engine:
 
     def saved(self, path: str, snapshot: Snapshot) -> None:
         """Take note that a map was written to a file; places may have come since, even another map."""
-        if snapshot.operation is self._operation:
-            self.path = path
-            self.unsaved -= snapshot.unsaved
+        snapshot.filing.wrote(path, snapshot.grown)
 
     def reset(self) -> None:
         """Empty the window: the images that come now have nothing to do with those before."""
@@ -289,7 +297,7 @@ class Engine:
             recognition = operation.add(observed)
         self._keyframes.accept(stamp, pose, image)
         self._window.append(stamp)
-        self.unsaved += operation.newest_place >= 0
+        self.filing.grown += operation.newest_place >= 0
         if recognition is None:
             return Outcome(Answer.MAPPED, newest=operation.newest_place, places=operation.places, image=image)
         with watch.stage('check'):

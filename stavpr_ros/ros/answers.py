@@ -8,7 +8,7 @@ from typing import Any
 from rclpy.service import Service
 
 UNHEARD = 'failed to send response'  # what rclpy warns of when it gives an answer up
-PATIENCE = 5.0  # seconds until it is given up
+PATIENCE = 3.5  # seconds until it is given up; shorter than what callbacks have at the end
 PAUSE = 0.05  # seconds between two attempts; each takes another 0.1, in which no other thread runs
 
 _one_at_a_time = threading.Lock()  # filters of warnings are the process's

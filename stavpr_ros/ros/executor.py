@@ -7,6 +7,7 @@ from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.executors import Executor, ShutdownException, TimeoutException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger
 from rclpy.service import Service
 
@@ -42,8 +43,8 @@ class ServiceThreadsExecutor(Executor):
         """Run the next callback, if one is ready in time."""
         try:
             task, entity, _ = self.wait_for_ready_callbacks(timeout_sec)
-        except (ShutdownException, TimeoutException):
-            return
+        except (ShutdownException, TimeoutException, rclpy_implementation.InvalidHandle):
+            return  # the last: a thread has destroyed something just now, and rclpy stumbles over it
         group = getattr(entity, 'callback_group', None)
         if not (isinstance(entity, Service) or isinstance(group, SlowCallbackGroup)):
             _run(task)

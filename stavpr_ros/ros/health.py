@@ -22,7 +22,7 @@ class Health:
     :param backend: where images are matched, on which ``device``, in which ``precision``.
     :param threshold: in force; None = not set.
     :param problem: why the last transition failed, or the last map was not loaded; empty = nothing failed.
-    :param incompatible: publishers refused so far because of their QoS.
+    :param incompatible: publishers that are there and refused because of their QoS.
     :param remedy: what to do about them, in words.
     :param mistyped: what publishers on the topic send that is not the transport's type; empty = none does.
     :param missing: what is missing before there can be a match, in words; empty = nothing.

@@ -10,7 +10,14 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
-from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from rclpy.qos import (
+    QoSCompatibility,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+    qos_policy_name_from_kind,
+)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
@@ -102,7 +109,6 @@ class ImageInput:
         self._hand_over, self._skip, self._restart = hand_over, skip, restart
         self.stamps = StampWatch(max_gap)
         self.max_rate = max_rate
-        self.incompatible = 0
         self.remedy = ''
         self._last: float | None = None  # seconds, of the last image handed over
         self._lock = threading.Lock()  # an image is handed over whole before this is closed, or not at all
@@ -119,6 +125,17 @@ class ImageInput:
     def publishers(self) -> int:
         """Publishers of the topic, whether they are heard or not."""
         return self._node.count_publishers(self.topic)
+
+    @property
+    def incompatible(self) -> int:
+        """Publishers of the topic that are not heard because of their QoS."""
+        asked, infos = self._subscription.qos_profile, self._node.get_publishers_info_by_topic(self.topic)
+        verdicts = (
+            qos_check_compatible(info.qos_profile, asked)[0]
+            for info in infos
+            if info.topic_type == self._type
+        )
+        return sum(verdict == QoSCompatibility.ERROR for verdict in verdicts)
 
     @property
     def mistyped(self) -> str:
@@ -141,7 +158,6 @@ class ImageInput:
             return _subscribe(self._node, message_type, topic, self._on_image, 5, **events)
 
     def _on_incompatible(self, event: Any) -> None:
-        self.incompatible = event.total_count
         self.remedy = qos_remedy(self.topic, qos_policy_name_from_kind(event.last_policy_kind))
         self._node.get_logger().error(f'images are not heard: {self.remedy}')
 

@@ -23,6 +23,8 @@ class ManagedNode(LifecycleNodeMixin, Node):
         Node.__init__(self, name, **options)
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
         self._transit = threading.Lock()  # one transition at a time
+        self.ending = threading.Event()  # nobody waits for anything any more
+        self.left_behind = False  # something was still under way when the node was destroyed
         service = self._service_change_state
         self._change_as_asked = service.callback
         service.callback = self._change_or_refuse

@@ -250,8 +250,7 @@ def map_info_message(
         message.places = len(places)
         if len(places):
             message.dimension = places.features.strips.shape[2]
-        message.has_stamps = bool(np.any(places.stamps))
-        message.has_ids = any(places.ids)
-        message.has_poses = places.poses is not None and bool(np.isfinite(places.poses).any())
+        message.has_stamps, message.has_ids = places.has_stamps, places.has_ids
+        message.has_poses = places.has_poses
         message.has_thumbnails = any(places.thumbnails)
     return message

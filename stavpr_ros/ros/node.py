@@ -17,7 +17,8 @@ from rclpy.timer import Timer
 
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.devices import why_no_cuda
-from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.errors import SettingsError, SourceError, StavprError
+from stavpr_ros.output_file import require_room
 from stavpr_ros.ros.executor import SlowCallbackGroup
 from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.parameter_table import declare_parameters
@@ -51,15 +52,14 @@ class PlaceRecognitionNode(ManagedNode):
         for said in unknown_parameters(self._parameter_overrides):
             self.get_logger().warning(said)
         self._settings = node_settings(declare_parameters(self, PARAMETERS))
+        self._verbosity = 'default'
         self._apply_verbosity(self._settings.verbosity)
-        self.ending = threading.Event()  # nobody waits for anything any more
-        self.left_behind = False  # something was still under way when the node was destroyed
         self._runtime: Runtime | None = None
         self.statistics = Statistics()
         self.problem = ''  # why the last transition failed
         self._map_info = self.create_publisher(MapInfo, '~/map_info', LATCHED)
         self._told: MapInfo | None = None
-        self._telling = threading.Lock()  # what was published last is what was true last
+        self._telling = threading.RLock()  # what was published last is what was true last
         self._served = Services(self)
         self.add_on_set_parameters_callback(self._on_parameters)
         self.add_post_set_parameters_callback(self._on_parameters_set)
@@ -107,10 +107,14 @@ class PlaceRecognitionNode(ManagedNode):
         """Configure and activate, once; again only when a parameter was changed after a failure."""
         assert self._start is not None
         self._start.cancel()
-        if self.state != 'unconfigured' or not self.advance(self.trigger_configure):
+        if self.state != 'unconfigured':
             return
-        if not self.ending.is_set():
-            self.advance(self.trigger_activate)
+        tried = self._settings
+        if self.advance(self.trigger_configure):
+            if not self.ending.is_set():
+                self.advance(self.trigger_activate)
+        elif self.state == 'unconfigured' and self._settings is not tried:
+            self._start.reset()  # a parameter was set while that failed
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load map and model, warm the kernels, make the publishers."""
@@ -169,6 +173,9 @@ class PlaceRecognitionNode(ManagedNode):
         backend, wish = settings.engine.backend, settings.backend
         reason = (why_no_cuda() or 'there is a device') if wish == 'auto' else 'as asked for'
         self.get_logger().info(f'backend {backend} ({reason})')
+        _require_room(settings.save_path)
+        if settings.map_path:
+            self._tell(MapInfo(operation=settings.operation, state='loading', path=settings.map_path))
         self._runtime = Runtime(self, settings, self.statistics)
         self._runtime.on_loading = self.publish_map_info
         if missing := self._runtime.engine.missing:
@@ -193,8 +200,8 @@ class PlaceRecognitionNode(ManagedNode):
             if runtime is not None:
                 runtime.close()
                 del runtime
-                with self._telling:
-                    self._tell(MapInfo(operation=self._settings.operation, state='none'))
+            if self._told is not None:
+                self._tell(MapInfo(operation=self._settings.operation, state='none'))
         gc.unfreeze()
         gc.collect()  # runtime and worker refer to each other: the map would stay until Python tidies up
         if self._settings.engine.backend == 'cuda':
@@ -239,6 +246,8 @@ class PlaceRecognitionNode(ManagedNode):
                 'clean it up first (`ros2 lifecycle set NODE deactivate`, then cleanup)'
             )
         settings = node_settings({**old.values, **changes})
+        if settings.save_path != old.save_path:
+            _require_room(settings.save_path)
         if self._runtime is not None:
             if old.map_path and not settings.map_path:
                 raise SettingsError(
@@ -255,8 +264,21 @@ class PlaceRecognitionNode(ManagedNode):
         elif self._start is not None and self.problem and self.state == 'unconfigured':
             self._start.reset()
 
+    def load_again(self) -> None:
+        """
+        Load the map of ``map_path`` once more: the file may have changed.
+
+        :raises StavprError: the node is not configured, or the map does not do; the old one stays.
+        """
+        with self._lock:
+            self.runtime.load(self._settings.map_path)
+
     def _apply_verbosity(self, verbosity: str) -> None:
-        self.get_logger().set_level(LoggingSeverity[verbosity.upper()])
+        """Log so much; what --log-level says of this node is not touched until a parameter says otherwise."""
+        if verbosity != self._verbosity:
+            level = LoggingSeverity.UNSET if verbosity == 'default' else LoggingSeverity[verbosity.upper()]
+            self.get_logger().set_level(level)
+        self._verbosity = verbosity
 
     # what is told
 
@@ -273,11 +295,13 @@ class PlaceRecognitionNode(ManagedNode):
                 self._tell(runtime.map_info())
 
     def _tell(self, info: MapInfo) -> None:
-        told, self._told = self._told, info
-        if told is not None:
-            told.header = info.header  # when it was told is no change
-        if told != info:
-            self._map_info.publish(info)
+        with self._telling:
+            info.header.stamp = self.get_clock().now().to_msg()
+            told, self._told = self._told, info
+            if told is not None:
+                told.header = info.header  # when it was told is no change
+            if told != info and self.context.ok():
+                self._map_info.publish(info)
 
     def destroy_node(self) -> None:
         """End the worker, say what was done, and take the node down."""
@@ -286,8 +310,10 @@ class PlaceRecognitionNode(ManagedNode):
         self.ending.set()
         # who holds the lock may be reading a large map, or compiling: nobody waits for that at the end
         if self._lock.acquire(timeout=patience):
-            self._free()
-            self._lock.release()
+            try:
+                self._free()
+            finally:
+                self._lock.release()
         else:
             self.left_behind = True
             runtime = self._runtime
@@ -299,3 +325,12 @@ class PlaceRecognitionNode(ManagedNode):
         drops = ''.join(f', {count} {cause}' for cause, count in sorted(seen.drops.items()))
         self.get_logger().info(f'{seen.received} images received, {seen.answered} answered{drops}')
         super().destroy_node()
+
+
+def _require_room(save_path: str) -> None:
+    """Refuse a file that cannot be written before what has grown would be lost."""
+    try:
+        if save_path:
+            require_room(save_path)
+    except SourceError as error:
+        raise SettingsError(f'save_path: {error}') from error

@@ -22,7 +22,7 @@ from stavpr_ros.ros.messages import (
     matched_pose_message,
 )
 
-ANSWERS = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
+DEPTH = 50  # answers kept for subscribers that are slower
 PICTURES = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -31,10 +31,12 @@ class Output:
     The publishers of answers.
 
     :param node: their node.
+    :param burst: answers that may be published at once.
     """
 
-    def __init__(self, node: ManagedNode) -> None:
+    def __init__(self, node: ManagedNode, burst: int) -> None:
         self._node = node
+        self._answers = QoSProfile(depth=max(DEPTH, burst), reliability=ReliabilityPolicy.RELIABLE)
         self.match = self._publisher(PlaceMatch, '~/match')
         self.place_index = self._publisher(Int32, '~/place_index')
         self.distance = self._publisher(Float32, '~/distance')
@@ -43,7 +45,7 @@ class Output:
         self.loop_closure = self._publisher(LoopClosure, '~/loop_closure')
         self.match_image = self._publisher(Image, '~/match_image', PICTURES)
 
-    def _publisher(self, message_type: type, topic: str, qos: QoSProfile = ANSWERS) -> Any:
+    def _publisher(self, message_type: type, topic: str, qos: QoSProfile | None = None) -> Any:
         def refused(event: Any) -> None:
             policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
             self._node.get_logger().warning(
@@ -52,7 +54,10 @@ class Output:
             )
 
         return self._node.create_lifecycle_publisher(
-            message_type, topic, qos, event_callbacks=PublisherEventCallbacks(incompatible_qos=refused)
+            message_type,
+            topic,
+            qos or self._answers,
+            event_callbacks=PublisherEventCallbacks(incompatible_qos=refused),
         )
 
     def publish(self, header: Header, outcome: Outcome, frame: str = '') -> PlaceMatch:
@@ -62,6 +67,8 @@ class Output:
         :param frame: of the poses.
         """
         answer = match_message(header, outcome)
+        if not self._node.context.ok():  # ROS was shut down before the node
+            return answer
         if outcome.answer is Answer.MATCH:
             self.place_index.publish(Int32(data=answer.place_index))
             self.distance.publish(Float32(data=answer.distance))

@@ -21,7 +21,7 @@ from stavpr_ros.ros.parameter_table import (
 
 TRANSPORTS = ('raw', 'compressed')
 CHECKS = ('none', 'orb', 'sift')
-VERBOSITIES = ('debug', 'info', 'warn', 'error')
+VERBOSITIES = ('default', 'debug', 'info', 'warn', 'error')
 
 _WHAT = (
     NodeParameter(
@@ -250,7 +250,14 @@ _OUTPUT = (
     ),
     NodeParameter('map_frame', 'map', '', "Frame of the map's poses, for ~/pose."),
     NodeParameter('diagnostics_period', 1.0, 's', 'Time between two diagnostics.', 'start', (0.1, 60.0)),
-    NodeParameter('verbosity', 'info', '', 'What the node logs.', 'live', choices=VERBOSITIES),
+    NodeParameter(
+        'verbosity',
+        'default',
+        '',
+        'What the node logs; default: as --log-level has it.',
+        'live',
+        choices=VERBOSITIES,
+    ),
 )
 
 _MACHINE = (

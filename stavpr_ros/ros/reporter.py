@@ -66,7 +66,7 @@ def health(node: 'PlaceRecognitionNode') -> Health:
         device=_device(settings.engine.backend),
         precision=settings.precision,
         threshold=settings.engine.applied_threshold(settings.operation),
-        **(_UNCONFIGURED if runtime is None else _of_runtime(runtime)),
+        **(_of_runtime(runtime) if runtime is not None else _unconfigured(node)),
     )
 
 
@@ -80,6 +80,13 @@ _UNCONFIGURED: dict[str, Any] = {
     'places': 0,
     'features': '',
 }
+
+
+def _unconfigured(node: 'PlaceRecognitionNode') -> dict[str, Any]:
+    """Return what there is to tell of a node that has no map yet, but may be about to have one."""
+    path = node.settings.map_path
+    loads = node.state == 'configuring' and path
+    return _UNCONFIGURED | ({'map_state': 'loading', 'map_path': path} if loads else {})
 
 
 def _of_runtime(runtime: Runtime) -> dict[str, Any]:

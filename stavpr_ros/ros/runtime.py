@@ -60,7 +60,7 @@ class Runtime:
         self._one_load = threading.Lock()
         self.on_loading: Callable[[], None] = lambda: None  # called when that has changed
         self._worker = Worker(self._answer, settings.queue_size)
-        self._output = Output(node)
+        self._output = Output(node, settings.queue_size)
         self._made: Engine | None = None
         try:
             self._made = self._on_worker(lambda: self._make_engine(settings))
@@ -113,13 +113,12 @@ class Runtime:
     def deactivate(self) -> None:
         """Hear nothing more; images that wait are answered as dropped, what has grown is written."""
         self._hear_nothing()
-        self._on_worker(lambda: None)  # the image in work is answered while answers are published
         write_at_the_end(self.engine, self._on_worker, self._settings.save_path, self._node.get_logger())
 
     def close(self) -> None:
         """Hear, say and do nothing more."""
-        self._hear_nothing()
         try:
+            self._hear_nothing()
             self.write_at_the_end()
         finally:
             if not self._worker.stop():
@@ -280,6 +279,9 @@ class Runtime:
         stamp = nanoseconds(header.stamp)
         odometry = self._odometry  # another thread may take it away
         pose = odometry.trajectory.at(stamp) if odometry is not None else None
+        # poses of a map are in the map's frame, those of a route that grows in the odometry's
+        grows = odometry is not None and self.engine.operation != 'localization'
+        frame = odometry.frame if grows and odometry is not None else self._settings.map_frame
         self.engine.ranking = self._output.candidates.get_subscription_count() > 0
         try:
             outcome = self.engine.process(item.message, stamp, pose)
@@ -289,13 +291,10 @@ class Runtime:
             outcome = Outcome(Answer.INVALID_IMAGE, reason, cause='internal error')
         if outcome.answer is Answer.NOT_READY and self.loading:
             outcome = replace(outcome, reason=f'map {self.loading} is being loaded')
-        self._publish(header, outcome, waited)
+        self._publish(header, outcome, frame, waited)
 
-    def _publish(self, header: Any, outcome: Outcome, waited: float) -> None:
-        began, odometry = time.monotonic(), self._odometry
-        # poses of a map are in the map's frame, those of a route that grows in the odometry's
-        grows = odometry is not None and self.engine.operation != 'localization'
-        frame = odometry.frame if grows and odometry is not None else self._settings.map_frame
+    def _publish(self, header: Any, outcome: Outcome, frame: str, waited: float) -> None:
+        began = time.monotonic()
         match = self._output.publish(header, outcome, frame)
         stages = {WAITING: waited, **outcome.stages, 'publishing': time.monotonic() - began}
         if outcome.cause:

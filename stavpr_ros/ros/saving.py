@@ -9,6 +9,7 @@ from typing import Any
 from stavpr_ros.errors import StavprError
 from stavpr_ros.mapping import save_map
 from stavpr_ros.operation import Engine
+from stavpr_ros.operation.filing import Filing
 
 OnWorker = Callable[[Callable[[], Any]], Any]
 
@@ -33,28 +34,25 @@ def write_at_the_end(engine: Engine, on_worker: OnWorker, path: str, log: Any) -
     :param path: '' = nowhere: it is said what is lost.
     :param log: the node's logger.
     """
-    if not engine.unsaved:
-        return
-    if not path:
-        if engine.operation != 'loop_closure':
-            log.warning(f'{engine.unsaved} places are in no file: neither save_path nor ~/save_map named one')
-        return
-    target = path if engine.path == path else _free_name(path)
-    log.info(f'writing the map to {target}')
     try:
-        places = write_map(engine, on_worker, target, overwrite=True)
+        unsaved = on_worker(lambda: engine.unsaved)  # with the image in work
+        if unsaved and path:
+            target = _own_name(path, engine.filing)
+            log.info(f'writing the map to {target}')
+            places = write_map(engine, on_worker, target, overwrite=True)
+            log.info(f'{places} places written to {target}')
+        elif unsaved and engine.operation != 'loop_closure':
+            log.warning(f'{unsaved} places are in no file: neither save_path nor ~/save_map named one')
     except TimeoutError:
-        log.error('the map is not saved: the worker is busy, and the node ends')
+        if engine.unsaved:
+            log.error('the map is not saved: the worker is busy, and the node ends')
     except Exception as error:  # whatever it is, the node must end, and it must be said
         log.error(f'the map is not saved: {error if isinstance(error, StavprError) else repr(error)}')
-    else:
-        log.info(f'{places} places written to {target}')
 
 
-def _free_name(path: str) -> str:
-    """Return the path, or where a file is there, the first of name-2.end, name-3.end ... that is free."""
-    if not os.path.exists(path):
-        return path
+def _own_name(path: str, filing: Filing) -> str:
+    """Return the path, or the first of name-2.end, name-3.end ... that is free, or is of this map."""
     there = Path(path)
-    names = (there.with_name(f'{there.stem}-{number}{there.suffix}') for number in itertools.count(2))
-    return str(next(name for name in names if not name.exists()))
+    numbered = (str(there.with_name(f'{there.stem}-{number}{there.suffix}')) for number in itertools.count(2))
+    names = itertools.chain([path], numbered)
+    return next(name for name in names if filing.owns(name) or not os.path.exists(name))

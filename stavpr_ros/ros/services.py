@@ -63,7 +63,7 @@ class Services:
         if not request.path:
             raise StavprError("path = '' names no file: give the map's")
         if request.path == self._node.get_parameter('map_path').value:
-            runtime.load(request.path)  # once more: the file may have changed
+            self._node.load_again()
         else:
             self._set_parameter('map_path', request.path)
         response.map = runtime.map_info()

@@ -1,0 +1,20 @@
+"""A file that is written at the end, looked at before the work."""
+
+import os
+
+from stavpr_ros.errors import SourceError
+
+
+def require_room(path: str) -> None:
+    """
+    Refuse a file that could not be written.
+
+    :raises SourceError: it is a folder, or there is no folder that it could be in.
+    """
+    if os.path.isdir(path):
+        raise SourceError(f'{path} is a folder: name a file in it')
+    folder = os.path.dirname(os.path.abspath(path))
+    if not os.path.isdir(folder):
+        raise SourceError(f'the folder of {path} does not exist: make it first')
+    if not os.access(folder, os.W_OK):
+        raise SourceError(f'the folder of {path} is write-protected: name another')
