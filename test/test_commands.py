@@ -14,12 +14,17 @@ from processes import PATIENCE, Process, executable
 from test_trajectory import write_odometry
 
 from stavpr_msgs.msg import AlignedImages, LoopClosure, PlaceMatch
+from stavpr_ros.commands import build_map as build_map_command
+from stavpr_ros.commands import record as record_command
+from stavpr_ros.commands.demo import TOPIC, make_room
 from stavpr_ros.commands.loop_demo import read_result
 from stavpr_ros.commands.loop_demo_pictures import choose_closures
 from stavpr_ros.commands.record import loop_closure_record, match_record
+from stavpr_ros.errors import SourceError
 from stavpr_ros.evaluation.drive import judge
 from stavpr_ros.evaluation.truth import GroundTruth
 from stavpr_ros.mapping import load_map
+from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 
 
@@ -136,6 +141,29 @@ def test_build_map_says_what_is_wrong(drive, tmp_path, options, code, word):
     assert (tmp_path / 'map.stavpr').exists() is (code == 0)
 
 
+def test_build_map_looks_at_its_output_first(drive, tmp_path):
+    for output, words in ((tmp_path, 'name a file in it'), (tmp_path / 'missing' / 'map', 'make it first')):
+        result = run('build_map', '--input', drive, '--output', output)
+        assert result.returncode == 1
+        assert words in result.stderr
+
+
+def interrupt(*_, **__):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ('where', 'words'),
+    [('mapping.save_map', 'nothing was written'), ('evaluation.threshold.suggest_threshold', 'is written')],
+)
+def test_build_map_interrupted(drive, tmp_path, monkeypatch, capsys, where, words):
+    monkeypatch.setattr(build_map_command, 'obey_signals', lambda: None)
+    monkeypatch.setattr(f'stavpr_ros.{where}', interrupt)
+    assert build_map_command.main(['--input', str(drive), '--output', str(tmp_path / 'map')]) == 130
+    assert words in capsys.readouterr().err
+    assert (tmp_path / 'map').exists() is (words == 'is written')
+
+
 def test_build_map_with_a_bad_image(drive, tmp_path):
     images = write_images(tmp_path / 'images', route_images(3))
     (images / '1.png').write_bytes(b'no picture')
@@ -158,6 +186,20 @@ def test_wrong_ros_arguments(name, drive, tmp_path):
         assert 'Traceback' not in result.stderr
 
 
+def test_record_of_a_topic_that_is_none(tmp_path):
+    result = run('record', '--output', tmp_path / 'x', '--topic', 'a b')
+    assert result.returncode == 2
+    assert 'record: Invalid topic name' in result.stderr
+    assert 'Traceback' not in result.stderr
+
+
+def test_record_interrupted_before_it_began(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(record_command, 'obey_signals', lambda: None)
+    monkeypatch.setattr('stavpr_ros.ros.process.own_arguments', interrupt)
+    assert record_command.main(['--output', str(tmp_path / 'x')]) == 130
+    assert capsys.readouterr().err == 'record: interrupted\n'
+
+
 @pytest.mark.parametrize(
     ('options', 'word'),
     [
@@ -173,6 +215,8 @@ def test_wrong_ros_arguments(name, drive, tmp_path):
         (['--loop', '--sequence-length', '1'], '--sequence-length'),
         (['--loop', '--mode', 'paper'], '--threshold'),
         (['--loop', '.', '--check', 'surf'], 'surf'),
+        (['--map', 'x', '--query', 'y', '--check', 'sift'], 'go with --loop'),
+        (['--exclude', '50'], 'go with --loop'),
     ],
 )
 def test_demo_usage(options, word):
@@ -181,13 +225,43 @@ def test_demo_usage(options, word):
     assert word in result.stderr
 
 
-def test_demo_on_two_folders(drive, tmp_path):
+@pytest.mark.parametrize(
+    ('options', 'name'), [([], 'first_drive'), ([], 'second_drive'), (['--loop'], 'loop')]
+)
+def test_demo_leaves_alone_what_it_has_not_written(tmp_path, options, name):
+    picture = tmp_path / name / 'holidays.jpg'
+    picture.parent.mkdir()
+    picture.touch()
+    result = run('demo', *options, '--output', tmp_path)
+    assert result.returncode == 1
+    assert f'{name} is there already and no bag of an earlier demo' in result.stderr
+    assert picture.exists()
+
+
+def test_demo_makes_room_for_its_bag(tmp_path):
+    bag = tmp_path / 'loop'
+    make_room(bag)
+    write_bag(bag, TOPIC, [ImageRecord.of_image(image, 10**9) for image in route_images(1)])
+    make_room(bag)
+    assert not bag.exists()
+    bag.touch()
+    with pytest.raises(SourceError, match='cannot be replaced'):
+        make_room(bag)
+
+
+def test_demo_on_a_bag_and_a_folder(drive, tmp_path):
     """The whole way, with a bad image in the query that is said and skipped."""
+    images = [ImageRecord.of_image(image, (i + 1) * 10**9) for i, image in enumerate(route_images(24))]
+    write_bag(tmp_path / 'bag', '/front', images)
     dim = [(image * 0.6).astype(np.uint8) for image in route_images(24)]
     query = write_images(tmp_path / 'query', dim)
     (query / '24.png').write_bytes(b'no picture')
     output = tmp_path / 'output'
-    result = run('demo', '--map', drive, '--query', query, '--threshold', 0.3, '--output', output)
+    options = ['--query', query, '--topic', '/front', '--threshold', 0.3, '--output', output]
+    result = run('demo', '--map', drive, *options)
+    assert result.returncode == 2
+    assert 'neither drive is a bag' in result.stderr
+    result = run('demo', '--map', tmp_path / 'bag', *options)
     assert result.returncode == 0, result.stdout + result.stderr
     assert '24.png' in result.stdout
     assert '24 of 24 images matched' in result.stdout

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import subprocess
 import sys
@@ -102,6 +103,7 @@ def test_a_plain_run(drives, judged):
     assert found['sequence_without_ends']['queries'] == PLACES - 19
     assert found['settings']['mode'] == 'paper'
     assert found['settings']['tolerance'] == 1
+    assert found['settings']['vertical'] is False
     assert 'gradient' in found['settings']['features']
     assert found['times']['total_s'] > 0
     assert 'false_alarm_rate' not in found
@@ -198,6 +200,9 @@ def test_a_title_is_text(tmp_path, run):
     images = route_images(24)
     first = write_images(tmp_path / '<b>map', images)
     query = write_images(tmp_path / 'a&b@@DATA@@', images)
+    # names need not be text at all
+    (query / '000.png').rename(query / os.fsdecode(b'000\xe9.png'))
+    query = query.rename(tmp_path / os.fsdecode(b'a&b@@DATA@@\xe9'))
     code, _, errors = run('--map', first, '--query', query, '--output', tmp_path / 'out')
     assert code == 0, errors
     page = (tmp_path / 'out' / 'report.html').read_text(encoding='utf-8')
@@ -235,6 +240,9 @@ def test_saved_maps_are_drives_too(drives, tmp_path, judged, run):
         (['--features', 'onnx'], 'was made with gradient'),
         (['--strips', 5], 'was made with 7'),
         (['--projection', 9], '--projection'),
+        (['--seed', 0], '--seed'),
+        (['--gradient-cell', 32], '--gradient-cell'),
+        (['--densenet161_places365-size', 224], '--densenet161_places365-size'),
         (['--crop-map', 0.3], '--crop-map'),
     ):
         code, _, errors = run('--map', saved, '--query', drives / 'query', *wrong)
@@ -311,6 +319,12 @@ def test_a_known_data_set(tmp_path, judged, run):
     found = judged('--dataset', f'nordland={tmp_path}')
     assert found['settings']['tolerance'] == 3
     assert found['sequence']['f1'] == 1
+    source, saved = open_source(tmp_path / 'nordland' / 'winter'), tmp_path / 'unknown.stavpr'
+    save_map(build_map(source, Describer(projection=32), progress=False), saved)
+    options = ['--dataset', f'nordland={tmp_path}', '--projection', 32, '--unknown', saved]
+    assert judged(*options)['unknown_images'] == 24
+    code, _, errors = run(*options, '--seed', 1)
+    assert (code, 'those of the first drive' in errors) == (1, True)
     code, _, errors = run('--dataset', 'nordland')
     assert (code, 'NAME=FOLDER' in errors) == (2, True)
 
@@ -324,9 +338,15 @@ def test_a_known_data_set(tmp_path, judged, run):
         (['--query', 'x', '--loop-closure', '9'], 2, '--truth'),
         (['--query', 'x', '--loop-closure', '0', '--truth', 'y'], 2, 'at least 1'),
         (['--query', 'x', '--loop-closure', '9', '--truth', 'y', '--warp', '2x'], 2, '--warp'),
+        (['--query', 'x', '--loop-closure', '9', '--truth', 'y', '--backend', 'auto'], 2, '--backend'),
+        (['--query', 'x', '--loop-closure', '9', '--truth', 'y', '--precision', 'float16'], 2, '--precision'),
+        (['--query', 'x', '--loop-closure', '9', '--truth', 'y', '--crop-map', '0.3'], 2, '--crop-map'),
+        (['--query', 'x', '--loop-closure', '9', '--truth', 'poses', '--map-poses', 'y'], 2, '--map-poses'),
         (['--map', 'x', '--query', 'y', '--tolerance', '-1'], 2, '--tolerance'),
         (['--map', 'x', '--query', 'y', '--map-poses', 'z'], 2, '--truth poses'),
         (['--map', 'x', '--query', 'y', '--json', '/missing/x.json'], 1, 'does not exist'),
+        (['--map', 'x', '--query', 'y', '--json', '/tmp'], 1, 'name a file in it'),
+        (['--map', 'x', '--query', 'y', '--output', __file__], 1, 'takes a folder'),
         (['--dataset', 'ua=x', '--map', 'y'], 2, 'leave'),
     ],
 )
@@ -339,6 +359,8 @@ def test_wrong_usage(run, options, code, word):
 def test_drives_that_do_not_fit(drives, run, tmp_path):
     code, _, errors = run('--map', drives / 'map', '--query', drives / 'elsewhere')
     assert (code, '40 query images and 60 places' in errors) == (1, True)
+    code, _, errors = run(*pair(drives), '--strips', 0)
+    assert (code, 'W = 0' in errors) == (2, True)
     code, _, errors = run(*pair(drives), '--length', 61)
     assert (code, 'at least l = 61' in errors) == (1, True)
     folder = tmp_path / 'none'

@@ -167,6 +167,13 @@ def test_poses_that_do_not_fit(route):
             build_map(frames, describer, straight(count), progress=False)
     with pytest.raises(InputError, match='shape'):
         build_map(frames, describer, straight(20)[:, :6], progress=False)
+    for bad in ([1, 2, 0, 0, 0, 0, 0], [1, 2, 0, 0, 0, 0, np.nan]):
+        poses = straight(20)
+        poses[7] = bad
+        with pytest.raises(InputError, match=r"image 7 '7': pose \[1.0, 2.0"):
+            build_map(frames, describer, poses, progress=False)
+    built = build_map(frames, describer, straight(20) * 2, progress=False)
+    assert built.pose(3).tolist() == [6, 0, 0, 0, 0, 0, 1]
     with pytest.raises(SettingsError, match='without poses'):
         build_map(frames, describer, progress=False, keyframes=KeyframeSettings(degrees=1))
     nowhere = Trajectory()

@@ -105,6 +105,18 @@ def test_centring_takes_the_mean_off_and_leaves_zeros():
     assert not torch.allclose(first, second)
 
 
+def test_centring_forgets_no_image_of_a_long_query():
+    """An image that stays the same is off the mean so far in one direction, however near the mean comes."""
+    generator = torch.Generator().manual_seed(0)
+    places = torch.rand((2, 3, 8), generator=generator)
+    strips = torch.rand((2, 8), generator=generator)
+    centring = Centring(LocalFeatures(places, torch.ones(2, 3), FeatureSettings('gradient', None, 2)))
+    first = centring.next_query(strips)
+    for _ in range(5000):
+        last = centring.next_query(strips)
+    torch.testing.assert_close(last, first, rtol=0, atol=1e-4)
+
+
 def test_calibration_is_the_running_mean_and_variance():
     """Against a plain recursion: prior rows, then every row with weight 1 / count, at least 1 / MEMORY."""
     rng = np.random.default_rng(0)

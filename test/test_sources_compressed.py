@@ -1,5 +1,6 @@
 """Image files and compressed image messages to RGB: every format, mosaics, depth, damage, garbage."""
 
+from io import BytesIO
 from types import SimpleNamespace
 from unittest import mock
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from stavpr_ros.errors import ImageError
 from stavpr_ros.sources import files, open_source
@@ -108,6 +110,31 @@ def test_half_a_jpeg():
         with pytest.raises(ImageError, match='is cut off: expected the end of a JPEG') as caught:
             decode_compressed(data[:-missing])
         assert caught.value.kind == 'cut off'
+
+
+@pytest.mark.parametrize(
+    'options', [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]]
+)
+def test_a_jpeg_with_a_video_behind_it(options):
+    """As phones append one; any two bytes may be in it. Noise: the picture has every byte too."""
+    bgr = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
+    data = cv2.imencode('.jpg', bgr, options)[1].tobytes()
+    expected = decode_compressed(data)
+    for video in (b'\xff\xda ftyp \xff\xd9', b'\xff\xd9 ftyp \xff\xda'):
+        np.testing.assert_array_equal(decode_compressed(data + video), expected)
+    for missing in (1, 2, 20, len(data) // 2):
+        with pytest.raises(ImageError, match='is cut off'):
+            decode_compressed(data[:-missing])
+
+
+def test_of_several_pictures_in_a_jpeg_the_first_is_read():
+    first, second = (Image.new('RGB', (64, 64), colour) for colour in ((200, 100, 30), (0, 0, 0)))
+    file = BytesIO()
+    first.save(file, 'MPO', save_all=True, append_images=[second])
+    data = file.getvalue()
+    assert np.abs(decode_compressed(data)[0, 0].astype(int) - (200, 100, 30)).max() <= 4
+    with pytest.raises(ImageError, match='is cut off'):
+        decode_compressed(data[: data.index(b'\xff\xd9')])
 
 
 def test_what_opencv_refuses_with_an_error_of_its_own():

@@ -1,7 +1,9 @@
 """A folder of images: order, what counts as one, what is refused."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -78,6 +80,34 @@ def test_what_is_no_folder_of_images(tmp_path):
         open_source(tmp_path / '1.png')
     with pytest.raises(SourceError, match='leave the topic out'):
         open_source(tmp_path, '/image')
+
+
+@pytest.mark.parametrize('method', ['exists', 'is_dir', 'iterdir'])
+def test_a_folder_that_may_not_be_looked_into(tmp_path, monkeypatch, method):
+    """As user root, permissions forbid nothing."""
+
+    def refuse(*_):
+        raise PermissionError(13, 'Permission denied')
+
+    fill(tmp_path, ['1.png'])
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, method, refuse)
+        with pytest.raises(SourceError, match='Permission denied; check its name and permissions'):
+            open_source(tmp_path)
+        if method != 'exists':
+            with pytest.raises(SourceError, match='Permission denied; check permissions'):
+                FolderSource(tmp_path)
+
+
+def test_names_that_are_no_utf_8(tmp_path):
+    fill(tmp_path, ['1.png', '2.png'])
+    for number, name in (('1', b'caf\xe9.png'), ('2', 'caff\u00e8.png'.encode())):
+        (tmp_path / f'{number}.png').rename(tmp_path / os.fsdecode(name))
+    identifiers = [frame.identifier for frame in open_source(tmp_path)]
+    assert sorted(identifiers) == ['caff\u00e8.png', 'caf\ufffd.png']
+    (tmp_path / os.fsdecode(b'caf\xe9.png')).write_bytes(b'')
+    with pytest.raises(ImageError, match=r'caf\ufffd\.png: 0 bytes'):
+        list(open_source(tmp_path))
 
 
 def test_importing_sources_is_light():

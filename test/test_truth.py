@@ -311,6 +311,17 @@ def test_pose_files(tmp_path):
         GroundTruth.from_pose_files(tmp_path / 'none.csv', paths[1], 2, 1, 1.0)
 
 
+def test_places_whose_pose_is_not_known_are_nobodys_truth():
+    unknown = [np.nan] * 7
+    places, queries = np.array([pose(0), unknown, pose(5)]), np.array([pose(0), pose(5), pose(9)])
+    for degrees in (None, 90):
+        truth = GroundTruth.from_poses(queries, places, 1, degrees)
+        assert truth.pairs.tolist() == [[0, 0], [1, 2]]
+        assert truth.n == 3
+    with pytest.raises(InputError, match=r'2 of 3 query images have no pose \(0, 2\)'):
+        GroundTruth.from_poses(np.array([unknown, pose(5), unknown]), places, 1)
+
+
 @pytest.mark.parametrize('wrong', [np.zeros((2, 3)), np.zeros((2, 7)), np.full((2, 7), np.nan)])
 def test_poses_that_are_wrong(wrong):
     with pytest.raises(InputError, match='map poses'):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stavpr_ros.errors import ImageError, SettingsError, SourceError, StavprError
+from stavpr_ros.output_file import require_room
 from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
@@ -28,7 +29,7 @@ examples:
       --onnx-model squeezenet.onnx --onnx-layer fire6/concat_1
 
 exit codes: 0 the map is written; 1 it is not (the reason is printed, a map that was there is untouched);
-2 usage
+2 usage; 130 interrupted (it says whether the map is written)
 """
 
 
@@ -60,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
         '--thumbnail-width',
         type=int,
         metavar='PX',
-        help='of these pictures; the geometric check of the node wants larger ones (192)',
+        help='of these pictures (192); larger ones do not help the geometric check of the node',
     )
     parser.add_argument(
         '--skip-bad-images', action='store_true', help='go on after an image that cannot be read'
@@ -123,8 +124,7 @@ def _check(arguments: argparse.Namespace) -> None:
         raise SettingsError(f'--keyframe-seconds: {arguments.input} is no bag, its images have no times')
     if arguments.thumbnail_width is not None and arguments.no_thumbnails:
         raise SettingsError('--thumbnail-width and --no-thumbnails: give one')
-    if not Path(arguments.output).absolute().parent.is_dir():
-        raise SourceError(f'the folder of {arguments.output} does not exist: make it first')
+    require_room(arguments.output)
 
 
 def _keyframes(arguments: argparse.Namespace) -> 'KeyframeSettings':
@@ -160,7 +160,7 @@ def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajecto
 
 def _build(arguments: argparse.Namespace) -> 'PlaceMap':
     from stavpr_ros.commands.feature_options import make_describer
-    from stavpr_ros.mapping import build_map, save_map
+    from stavpr_ros.mapping import build_map
     from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
     from stavpr_ros.sources import open_source
 
@@ -188,7 +188,6 @@ def _build(arguments: argparse.Namespace) -> 'PlaceMap':
             f'--odometry {arguments.odometry}: no image was taken while it has poses; do the stamps of both '
             'come from one clock?'
         )
-    save_map(place_map, arguments.output)
     if skipped:
         print(f'{len(skipped)} images skipped', file=sys.stderr)
     print(f'{len(place_map)} of {images.read} images became places{_known_poses(place_map)}')
@@ -221,15 +220,20 @@ def main(args: list[str] | None = None) -> int:
     """Run the command."""
     obey_signals()
     wait_passively()
-    arguments = _parser().parse_args(args)
+    outcome = 'nothing was written'
     try:
+        from stavpr_ros.mapping import save_map
+
+        arguments = _parser().parse_args(args)
         place_map = _build(arguments)
+        save_map(place_map, arguments.output)
+        outcome = f'{arguments.output} is written, only the threshold for mode paper is not known'
         _report(place_map, arguments.output)
     except StavprError as error:
         print(f'build_map: {error}', file=sys.stderr)
         return 2 if isinstance(error, SettingsError) else 1
     except KeyboardInterrupt:
-        print('build_map: interrupted, nothing was written', file=sys.stderr)
+        print(f'build_map: interrupted, {outcome}', file=sys.stderr)
         return 130
     return 0
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from stavpr_ros.mapping import PlaceMap
 
 TOPIC = '/camera/image_raw'
+EXCLUDE, CHECK = 50, 'sift'  # of --loop, unless told otherwise
 
 DESCRIPTION = """
 Without options: makes a street, drives along it twice (the second time at dusk in the rain, from the other
@@ -50,12 +51,13 @@ class Drives:
     """
     What the map is made from and what is replayed.
 
+    :param topics: image topics of both; None where there is one only, or no bag.
     :param truth: true place of each query image, -1 = not in the map; None = unknown.
     """
 
     reference: str
     query: str
-    topic: str | None
+    topics: tuple[str | None, str | None]
     truth: 'np.ndarray | None'
     title: str
 
@@ -80,15 +82,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--exclude',
         type=int,
-        default=50,
         metavar='N',
-        help='--loop: the latest N images are not compared (50)',
+        help=f'with --loop: the latest N images are not compared ({EXCLUDE})',
     )
     parser.add_argument(
         '--check',
-        default='sift',
         choices=('none', 'orb', 'sift'),
-        help='with --loop: geometric check of the matches, by keypoints (%(default)s)',
+        help=f'with --loop: geometric check of the matches, by keypoints ({CHECK})',
     )
     parser.add_argument('--topic', help='image topic of the bags, if they have several')
     parser.add_argument(
@@ -107,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--threshold',
         type=float,
-        help='of the node (robust: 1; paper: found from the first drive alone)',
+        help='of the node (robust: 1, with --loop 0.8; paper: found from the first drive alone)',
     )
     parser.add_argument(
         '--world-seed', type=int, default=7, help='another number, another street (%(default)s)'
@@ -136,30 +136,56 @@ def image_records(drive: 'Drive', name: str, epoch: int | None = None) -> Iterat
         yield ImageRecord.of_image(frame.image, frame.stamp + later, frame_id='camera')
 
 
+def make_room(bag: Path) -> None:
+    """
+    Remove the bag that an earlier demonstration wrote.
+
+    :raises SourceError: something else is there; it is left alone.
+    """
+    from stavpr_ros.sources.bag_file import METADATA
+
+    try:
+        if {file.name for file in bag.iterdir()} <= {METADATA, f'{bag.name}.db3'}:
+            shutil.rmtree(bag)
+            return
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise SourceError(f'{bag} cannot be replaced: {error}; choose another --output') from error
+    raise SourceError(
+        f'{bag} is there already and no bag of an earlier demo: it is left alone; choose another --output'
+    )
+
+
 def _make_world(folder: Path, seed: int) -> Drives:
     """Drive twice through a made-up street and write a bag of each drive."""
     from stavpr_ros.evaluation.world import World, first_drive, ground_truth, second_drive
     from stavpr_ros.sources.bag_writer import write_bag
 
     say('1. Two drives through a made-up street')
+    bags = folder / 'first_drive', folder / 'second_drive'
+    for bag in bags:
+        make_room(bag)
     world = World(seed)
     first, second = first_drive(world), second_drive(world)
-    for drive, name in ((first, 'first_drive'), (second, 'second_drive')):
-        shutil.rmtree(folder / name, ignore_errors=True)
-        write_bag(folder / name, TOPIC, image_records(drive, name.replace('_', ' ')))
+    for drive, bag in zip((first, second), bags, strict=True):
+        write_bag(bag, TOPIC, image_records(drive, bag.name.replace('_', ' ')))
     title = 'A made-up street, by day and in the rain at dusk'
-    return Drives(
-        str(folder / 'first_drive'), str(folder / 'second_drive'), TOPIC, ground_truth(first, second), title
-    )
+    return Drives(str(bags[0]), str(bags[1]), (TOPIC, TOPIC), ground_truth(first, second), title)
 
 
 def _users_drives(arguments: argparse.Namespace) -> Drives:
     import numpy as np
 
     from stavpr_ros.sources import open_source
+    from stavpr_ros.sources.bag_file import is_bag
 
     say(f'1. Your drives: {arguments.map} is the map, {arguments.query} the query')
-    places, images = (len(open_source(path, arguments.topic)) for path in (arguments.map, arguments.query))
+    paths = arguments.map, arguments.query
+    first, second = (arguments.topic if is_bag(Path(path)) else None for path in paths)
+    places, images = len(open_source(arguments.map, first)), len(open_source(arguments.query, second))
+    if arguments.topic is not None and first is second is None:
+        raise SettingsError(f'--topic {arguments.topic}: neither drive is a bag; leave it out')
     length = arguments.sequence_length
     if images < length:
         raise SettingsError(f'{arguments.query} has {images} images: the window alone needs {length}')
@@ -169,7 +195,7 @@ def _users_drives(arguments: argparse.Namespace) -> Drives:
             raise SettingsError(f'--truth identity: {images} query images on a map of {places} places')
         truth = np.arange(images)
     title = f'{Path(arguments.query).name} recognised on the map of {Path(arguments.map).name}'
-    return Drives(arguments.map, arguments.query, arguments.topic, truth, title)
+    return Drives(*paths, (first, second), truth, title)
 
 
 def describe(path: str, topic: str | None, describer: 'Describer') -> 'PlaceMap':
@@ -231,12 +257,12 @@ def _two_drives(arguments: argparse.Namespace, folder: Path) -> None:
 
     map_path = folder / 'map.stavpr'
     say(f'2. The map of the first drive: {map_path}')
-    place_map = describe(drives.reference, drives.topic, make_describer(arguments))
+    place_map = describe(drives.reference, drives.topics[0], make_describer(arguments))
     save_map(place_map, map_path)
     threshold = _choose_threshold(place_map, arguments.mode, arguments.threshold)
 
     say('3. The second drive through the node, over ROS, with replay and listener as processes of their own')
-    query = describe(drives.query, drives.topic, place_map.describer())
+    query = describe(drives.query, drives.topics[1], place_map.describer())
     if drives.truth is not None and len(query) != len(drives.truth):
         raise SourceError('images were skipped: the truth of the others is not known; repair or remove them')
     parameters = {
@@ -246,7 +272,7 @@ def _two_drives(arguments: argparse.Namespace, folder: Path) -> None:
         'sequence_length': arguments.sequence_length,
         'keyframe_change': 0.0,  # every image is judged
     }
-    records = run_live(parameters, drives.query, len(query), folder, drives.topic)
+    records = run_live(parameters, drives.query, len(query), folder, drives.topics[1])
     result = judge(records, arguments.sequence_length, threshold, drives.truth, arguments.tolerance)
     draw_result(result, query, place_map, threshold, drives.title, folder)
     _tell(result, folder)
@@ -257,7 +283,7 @@ def _refuse_wrong_usage(parser: argparse.ArgumentParser, arguments: argparse.Nam
         parser.error(f'--threshold {arguments.threshold} must be above 0')
     for name, least in (('tolerance', 0), ('exclude', 1), ('sequence_length', 2)):
         value = getattr(arguments, name)
-        if value < least:
+        if value is not None and value < least:
             parser.error(f'--{name.replace("_", "-")} {value} must be at least {least}')
     if arguments.loop is not None:
         if arguments.map or arguments.query:
@@ -267,6 +293,8 @@ def _refuse_wrong_usage(parser: argparse.ArgumentParser, arguments: argparse.Nam
         if arguments.mode == 'paper' and arguments.threshold is None:
             parser.error('--loop in mode paper needs --threshold')
         return
+    if arguments.exclude is not None or arguments.check is not None:
+        parser.error('--exclude and --check go with --loop')
     if (arguments.map is None) != (arguments.query is None):
         parser.error('--map and --query go together')
     if arguments.truth and arguments.map is None:
@@ -279,10 +307,10 @@ def main(args: list[str] | None = None) -> int:
     """Run the command."""
     obey_signals()
     wait_passively()
-    parser = _parser()
-    arguments = parser.parse_args(args)
-    _refuse_wrong_usage(parser, arguments)
     try:
+        parser = _parser()
+        arguments = parser.parse_args(args)
+        _refuse_wrong_usage(parser, arguments)
         _run(arguments)
     except StavprError as error:
         print(f'demo: {error}', file=sys.stderr)

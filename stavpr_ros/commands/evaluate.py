@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stavpr_ros.errors import SettingsError, SourceError, StavprError
+from stavpr_ros.output_file import require_room
 from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
@@ -130,6 +131,12 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         parser.error('give --map or, for the query on its own past, --loop-closure')
     if loop and (arguments.warp or arguments.unknown):
         parser.error('--loop-closure: --warp and --unknown need a --map')
+    cuda = arguments.backend != 'cpu' or arguments.precision != 'float32'
+    if loop and (cuda or arguments.crop_map or arguments.map_poses):
+        parser.error(
+            '--loop-closure is computed on the CPU, in float32, on the query alone: leave --backend, '
+            '--precision, --crop-map and --map-poses out'
+        )
     if loop and arguments.truth == 'identity':
         parser.error('--loop-closure needs --truth FILE or poses')
     if loop and arguments.loop_closure < 1:
@@ -189,12 +196,15 @@ def _evaluate(
 
 def _settings_told(arguments: argparse.Namespace, drives: 'Drives') -> dict[str, Any]:
     """Return everything that decides the numbers."""
+    from stavpr_ros.sources.folder import text_of
+
     names = [
         *('map', 'query', 'dataset', 'topic', 'unknown', 'loop_closure', 'warp', 'crop_map', 'crop_query'),
         *(('truth', 'query_poses', 'map_poses', 'metres', 'degrees') if drives.posed else ('truth',)),
-        *('mode', 'length', 'beta', 'spatial', 'sigma', 'xi', 'backend', 'precision'),
+        *('mode', 'length', 'beta', 'spatial', 'sigma', 'xi', 'vertical', 'backend', 'precision'),
     ]
     told: dict[str, Any] = {name: getattr(arguments, name) for name in names}
+    told |= {name: text_of(value) for name, value in told.items() if isinstance(value, str)}
     return {**told, 'tolerance': drives.tolerance, 'features': drives.query.settings.to_json()}
 
 
@@ -253,8 +263,10 @@ def _run(arguments: argparse.Namespace) -> None:
     from stavpr_ros.evaluation.report import chosen_view, write_folder, write_json
 
     folder = arguments.output or (None if arguments.json else OUTPUT)
-    if arguments.json and not Path(arguments.json).absolute().parent.is_dir():
-        raise SourceError(f'the folder of {arguments.json} does not exist: make it first')
+    if arguments.json:
+        require_room(arguments.json)
+    if folder and Path(folder).is_file():
+        raise SourceError(f'{folder} is a file: --output takes a folder')
     report = _report(arguments)
     chosen_view(report.evaluation, arguments.window)  # an image without a window is refused before writing
     _tell(report)
@@ -269,11 +281,12 @@ def main(args: list[str] | None = None) -> int:
     """Run the command."""
     obey_signals()
     wait_passively()
-    parser = _parser()
-    # what decides a saved map's features must not be mistaken for a wish: None = not given
-    arguments = parser.parse_args(args, argparse.Namespace(features=None, strips=None))
-    _check(parser, arguments)
     try:
+        parser = _parser()
+        # what decides a saved map's features must not be mistaken for a wish: None = not given
+        given = argparse.Namespace(features=None, strips=None, seed=None)
+        arguments = parser.parse_args(args, given)
+        _check(parser, arguments)
         _run(arguments)
     except StavprError as error:
         print(f'evaluate: {error}', file=sys.stderr)

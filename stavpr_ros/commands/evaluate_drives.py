@@ -1,6 +1,7 @@
 """Opening what the command ``evaluate`` is given: folders, bags, saved maps, data sets, truth."""
 
 import argparse
+import os
 import time
 import zipfile
 from dataclasses import dataclass, field
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stavpr_ros.commands.feature_options import make_describer
+from stavpr_ros.commands.feature_options import kind_options, make_describer
 from stavpr_ros.devices import choose_device
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.evaluation.datasets import open_dataset
@@ -19,9 +20,10 @@ from stavpr_ros.features import Describer, LocalFeatures
 from stavpr_ros.mapping import PlaceMap, build_map, load_map
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import is_bag
+from stavpr_ros.sources.folder import text_of
 
 IDENTITY_TOLERANCE = 3  # places; a file of accepted pairs has its tolerance in it
-W = 7
+DEFAULTS = {'features': 'gradient', 'strips': 7, 'seed': 0}
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,8 @@ def load_drives(arguments: argparse.Namespace) -> Drives:
 
 def is_saved_map(path: str | None) -> bool:
     """Tell whether a path is a map's file, by its content."""
-    return path is not None and Path(path).is_file() and zipfile.is_zipfile(path)
+    # what cannot be looked at is none: whoever opens it says why
+    return path is not None and os.path.isfile(path) and zipfile.is_zipfile(path)
 
 
 class _Loader:
@@ -106,8 +109,9 @@ class _Loader:
     def _take(self, path: str) -> PlaceMap:
         found = load_map(path)
         given = self._arguments
-        if self._saved is not None:
-            found.features.require_same_settings(self._saved.settings, 'the first map')
+        first = self._describer if self._saved is None else self._saved
+        if first is not None:
+            found.features.require_same_settings(first.settings, 'the first drive')
             return found
         for name, wanted, there in (
             ('features', given.features, found.settings.kind),
@@ -115,8 +119,11 @@ class _Loader:
         ):
             if wanted is not None and wanted != there:
                 raise SettingsError(f'--{name} {wanted}: the map {path} was made with {there}; leave it out')
-        if given.projection is not None:
-            raise SettingsError(f'--projection: the map {path} has its own or none; leave it out')
+        model = f'--{found.settings.kind}-model'  # which may lie elsewhere now
+        options = {'--projection': given.projection, '--seed': given.seed, **kind_options(given)}
+        for option, value in options.items():
+            if value is not None and option != model:
+                raise SettingsError(f'{option}: the map {path} has its own or none; leave it out')
         self._saved = found
         return found
 
@@ -127,8 +134,11 @@ class _Loader:
                 model = getattr(given, f'{self._saved.settings.kind}_model', None)
                 self._describer = self._saved.describer(choose_device(given.device), model or '')
             else:
-                given.features, given.strips = given.features or 'gradient', given.strips or W
-                self._describer = make_describer(given)
+                options = argparse.Namespace(**vars(given))
+                for name, default in DEFAULTS.items():
+                    if getattr(options, name) is None:
+                        setattr(options, name, default)
+                self._describer = make_describer(options)
         return self._describer
 
 
@@ -161,7 +171,7 @@ def _of_paths(arguments: argparse.Namespace, opened: dict[str, PlaceMap], times:
 
 
 def _name(path: str) -> str:
-    return Path(path).resolve().name
+    return text_of(Path(path).resolve().name)
 
 
 def _truth(
@@ -186,7 +196,7 @@ def _truth(
 def _poses(path: str | None, place_map: PlaceMap, name: str, degrees: float | None) -> np.ndarray:
     """Return the poses of a drive, from a file or from the saved map."""
     if path is None:
-        if place_map.poses is None:
+        if place_map.poses is None or not place_map.has_poses:
             raise SettingsError(f'--truth poses: the {name} has none, give --{name}-poses')
         return place_map.poses
     poses, oriented = read_poses(Path(path))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stavpr_ros.errors import SettingsError, SourceError, StavprError
+from stavpr_ros.output_file import require_room
 from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
@@ -68,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument('--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)')
     parser.add_argument('--metric', choices=METRICS, default='f1', help='what is printed (%(default)s)')
-    parser.add_argument('--parameter', choices=tuple(SWEEPS), default='l', help='of sweep (%(default)s)')
+    parser.add_argument('--parameter', choices=tuple(SWEEPS), help='of sweep (l)')
     parser.add_argument('--values', nargs='+', type=float, default=(), metavar='X', help='of sweep')
     parser.add_argument('--json', metavar='FILE', help='write all numbers')
     add_feature_options(parser)
@@ -79,9 +80,9 @@ def _columns(arguments: argparse.Namespace) -> 'tuple[Configuration, ...]':
     from stavpr_ros.evaluation.experiments import PRESETS, sweep_configurations
 
     if arguments.experiment == 'sweep':
-        return sweep_configurations(arguments.parameter, arguments.values)
-    if arguments.values:
-        raise SettingsError('--values goes with the experiment sweep')
+        return sweep_configurations(arguments.parameter or 'l', arguments.values)
+    if arguments.values or arguments.parameter:
+        raise SettingsError('--parameter and --values go with the experiment sweep')
     return PRESETS[arguments.experiment]
 
 
@@ -115,16 +116,33 @@ def _backbones(arguments: argparse.Namespace) -> dict[str, argparse.Namespace]:
     from stavpr_ros.commands.feature_options import add_feature_options
 
     if not arguments.backbone:
-        return {arguments.features: arguments}
+        arguments.features = arguments.features or 'gradient'
+        return {arguments.features: _checked(arguments)}
     parser = argparse.ArgumentParser(prog='experiments --backbone', add_help=False)
     add_feature_options(parser)
+    untouched = vars(parser.parse_args([], argparse.Namespace(features=None)))
+    if any(getattr(arguments, name) != value for name, value in untouched.items()):
+        raise SettingsError('features options beside --backbone: write them into those of each backbone')
     found = {}
     for entry in arguments.backbone:
         label, separator, options = entry.partition('=')
         if not separator:
             raise SettingsError(f'--backbone {entry!r}: expected LABEL=OPTIONS')
-        found[label] = parser.parse_args(shlex.split(options))
+        try:
+            words = shlex.split(options)
+        except ValueError as error:
+            raise SettingsError(f'--backbone {entry!r}: {error}') from error
+        found[label] = _checked(parser.parse_args(words))
     return found
+
+
+def _checked(options: argparse.Namespace) -> argparse.Namespace:
+    """Refuse features options that the experiment decides."""
+    from stavpr_ros.evaluation.experiments import W
+
+    if options.strips != W or options.projection is not None or options.seed:
+        raise SettingsError('--strips, --projection, --seed: the experiment decides them; leave them out')
+    return options
 
 
 def _run_row(
@@ -139,10 +157,8 @@ def _run_row(
 
     from stavpr_ros.commands.feature_options import make_describer
     from stavpr_ros.devices import choose_device
-    from stavpr_ros.evaluation.experiments import Bench, W
+    from stavpr_ros.evaluation.experiments import Bench
 
-    if options.strips != W or options.projection is not None:
-        raise SettingsError('--strips and --projection: the experiment decides them; leave them out')
     features = make_describer(options).settings
     bench = Bench(dataset, features.kind, features.backbone, mode, choose_device(options.device))
     found: dict[str, Judgement | None] = {}
@@ -185,7 +201,9 @@ def _run(arguments: argparse.Namespace) -> None:
     from stavpr_ros.evaluation.report_html import jsonable
 
     import_sklearn()
-    columns, datasets, backbones = _columns(arguments), _datasets(arguments), _backbones(arguments)
+    if arguments.json:
+        require_room(arguments.json)
+    columns, backbones, datasets = _columns(arguments), _backbones(arguments), _datasets(arguments)
     rows = [['data set', 'features', *(column.title for column in columns)]]
     results: list[dict[str, Any]] = []
     for name, dataset in datasets.items():
@@ -213,9 +231,9 @@ def main(args: list[str] | None = None) -> int:
     """Run the command."""
     obey_signals()
     wait_passively()
-    arguments = _parser().parse_args(args)
     try:
-        _run(arguments)
+        # None = not given
+        _run(_parser().parse_args(args, argparse.Namespace(features=None)))
     except StavprError as error:
         print(f'experiments: {error}', file=sys.stderr)
         return 2 if isinstance(error, SettingsError) else 1

@@ -74,6 +74,12 @@ def make_describer(arguments: argparse.Namespace) -> 'Describer':
     )
 
 
+def kind_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return what was given as ``--KIND-NAME``, by that name; None = not given."""
+    rows = [(kind, row.name) for kind in KINDS for row in dataclasses.fields(settings_class(kind))]
+    return {f'--{kind}-{name.replace("_", "-")}': getattr(arguments, f'{kind}_{name}') for kind, name in rows}
+
+
 def _backbone_settings(arguments: argparse.Namespace) -> Any:
     """
     Return the settings of the chosen kind from the parsed options.

@@ -1,7 +1,6 @@
 """The demonstration of loop closure: one drive, replayed into the node, recognised on its own past."""
 
 import argparse
-import shutil
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stavpr_ros.commands.demo import TOPIC, describe, image_records, say
+from stavpr_ros.commands.demo import CHECK, EXCLUDE, TOPIC, describe, image_records, make_room, say
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.evaluation.drive import IN_WINDOW
 from stavpr_ros.evaluation.truth import GroundTruth
@@ -112,6 +111,7 @@ def _make_world(folder: Path, seed: int) -> LoopDrive:
     from stavpr_ros.sources.bag_writer import write_bag
 
     say('1. One drive twice along a made-up street, the second time on the other lane and with a detour')
+    make_room(folder / 'loop')
     later = replace(
         GOOD_LIGHT, sun=0.25, sun_azimuth=250.0, sun_elevation=20.0, clouds=0.7, ambient=0.55, warmth=0.08,
         lane=-1.0, traffic=2,
@@ -125,7 +125,6 @@ def _make_world(folder: Path, seed: int) -> LoopDrive:
         yield from image_records(first, 'first time')
         yield from image_records(second, 'second time', epoch)
 
-    shutil.rmtree(folder / 'loop', ignore_errors=True)
     write_bag(folder / 'loop', TOPIC, both())
     places = ground_truth(first, second)
     again = np.flatnonzero(places >= 0)
@@ -172,7 +171,7 @@ def close_loops(arguments: argparse.Namespace, folder: Path) -> None:
     from stavpr_ros.sources import open_source
 
     drive = _users_drive(arguments) if arguments.loop else _make_world(folder, arguments.world_seed)
-    length, exclude = arguments.sequence_length, arguments.exclude
+    length, exclude = arguments.sequence_length, arguments.exclude or EXCLUDE
     N = len(open_source(drive.path, drive.topic))
     if exclude + length >= N:
         raise SettingsError(f'{drive.path} has {N} images: --exclude {exclude} leaves no window of {length}')
@@ -192,7 +191,7 @@ def close_loops(arguments: argparse.Namespace, folder: Path) -> None:
         'threshold': threshold,
         'sequence_length': length,
         'exclude_places': exclude,
-        'geometric_check': arguments.check,
+        'geometric_check': arguments.check or CHECK,
     }
     matches, closures = run_loop_closure(parameters, drive.path, len(described), folder, drive.topic)
     result = read_result(matches, closures, truth, exclude)

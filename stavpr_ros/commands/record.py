@@ -33,7 +33,8 @@ of stavpr_msgs/LoopClosure. Stamps are nanoseconds, numbers that are not there a
 of [query_index, map_index], pairs are [query_index, query_stamp, place_index, place_stamp], a pose is
 [x, y, z, qx, qy, qz, qw], null without odometry. received is the time of arrival (ns, system clock).
 
-exit codes: 0 done (--count reached, or stopped by a signal), 1 the file cannot be written, 2 usage
+exit codes: 0 done (--count reached, or stopped by a signal), 1 the file cannot be written, 2 usage,
+130 stopped by a signal before it began
 """
 
 
@@ -82,6 +83,18 @@ def loop_closure_record(message: 'LoopClosure') -> dict[str, Any]:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
+    obey_signals()
+    try:
+        return _run(sys.argv[1:] if args is None else args)
+    except (OSError, StavprError) as error:
+        print(f'record: {error}', file=sys.stderr)
+        return 2 if isinstance(error, SettingsError) else 1
+    except KeyboardInterrupt:
+        print('record: interrupted', file=sys.stderr)
+        return 130
+
+
+def _run(given: list[str]) -> int:
     parser = argparse.ArgumentParser(
         prog='record',
         description=__doc__,
@@ -101,15 +114,9 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--count', type=int, default=0, help='end after so many (0 = go on)')
     from stavpr_ros.ros.process import own_arguments
 
-    given = sys.argv[1:] if args is None else args
-    obey_signals()
-    try:
-        arguments = parser.parse_args(own_arguments(given))
-        with open(arguments.output, 'w') as file:
-            written = _record(arguments, file, given)
-    except (OSError, StavprError) as error:
-        print(f'record: {error}', file=sys.stderr)
-        return 2 if isinstance(error, SettingsError) else 1
+    arguments = parser.parse_args(own_arguments(given))
+    with open(arguments.output, 'w') as file:
+        written = _record(arguments, file, given)
     print(f'{written} {arguments.what} written to {arguments.output}')
     return 0
 
@@ -117,6 +124,7 @@ def main(args: list[str] | None = None) -> int:
 def _record(arguments: argparse.Namespace, file: TextIO, ros_arguments: list[str]) -> int:
     """Write what is heard until a signal or the count; return how many."""
     import rclpy
+    from rclpy.exceptions import InvalidTopicNameException
     from rclpy.qos import QoSProfile
 
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
@@ -149,6 +157,8 @@ def _record(arguments: argparse.Namespace, file: TextIO, ros_arguments: list[str
             spin_until(node, lambda: introduction.done() or complete())
             print(LISTENING.format(topic=topic), flush=True)
             spin_until(node, complete)
+    except InvalidTopicNameException as error:
+        raise SettingsError(str(error)) from error
     except KeyboardInterrupt:
         pass  # the usual end
     return written

@@ -11,6 +11,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.evaluation.truth_files import read_pairs, read_poses
 
 CHUNK = 1_000_000  # pairs of poses compared at a time
+LISTED = 10  # images that an error names, of however many
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +99,19 @@ class GroundTruth:
         Accept places that are near and look the same way.
 
         :param queries: x y z (metres), quaternion x y z w of each query, shape (N, 7).
-        :param places: the same of each place, shape (n, 7).
+        :param places: the same of each place, shape (n, 7); a row of NaN = unknown, which accepts nothing.
         :param metres: largest distance, >= 0.
         :param degrees: largest angle between the two orientations, >= 0; None = any.
+        :raises InputError: a query whose pose is not known, or no place whose pose is; poses that are none.
         """
         query, place = _checked_poses(queries, 'query'), _checked_poses(places, 'map')
+        unknown = np.flatnonzero(np.isnan(query[:, 0]))
+        if len(unknown):
+            listed = ', '.join(map(str, unknown[:LISTED])) + (' ...' if len(unknown) > LISTED else '')
+            raise InputError(
+                f'{len(unknown)} of {len(query)} query images have no pose ({listed}): give poses of all, or '
+                'leave these images out'
+            )
         if not metres >= 0 or (degrees is not None and not degrees >= 0):
             raise InputError(f'{metres} metres and {degrees} degrees: expected numbers >= 0')
         pairs = []
@@ -253,11 +262,15 @@ class GroundTruth:
 
 
 def _checked_poses(poses: np.ndarray, name: str) -> np.ndarray:
+    """Return poses with quaternions of norm 1; rows of NaN, which are unknown, stay so."""
     poses = np.array(poses, np.float64)
     if poses.ndim != 2 or poses.shape[1] != 7 or not len(poses):
         raise InputError(f'{name} poses have shape {poses.shape}: expected (images, 7)')
+    known = ~np.isnan(poses).all(axis=1)
     lengths = np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    if not np.isfinite(poses).all() or not lengths.all():
+    if not np.isfinite(poses[known]).all() or not lengths.all():
         raise InputError(f'{name} poses: expected finite numbers and quaternions other than 0')
+    if not known.any():
+        raise InputError(f'{name} poses: not one of {len(poses)} is known; give others')
     poses[:, 3:] /= lengths
     return poses

@@ -13,7 +13,7 @@ from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import Describer, LocalFeatures
 from stavpr_ros.mapping.keyframes import KeyframeSelector, KeyframeSettings
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH, PlaceMap, encode_thumbnail
-from stavpr_ros.mapping.trajectory import Trajectory
+from stavpr_ros.mapping.trajectory import Trajectory, checked_pose
 from stavpr_ros.sources.frame import Frame
 
 BATCH = 16  # images described at a time
@@ -143,10 +143,18 @@ def _with_poses(
         count = 0
         for count, frame in enumerate(frames, 1):
             if count <= len(poses):
-                row = poses[count - 1]
-                yield frame, None if np.isnan(row).all() else row
+                yield frame, _pose(poses[count - 1], f'image {count - 1} {frame.identifier!r}')
         if count != len(poses):
             raise InputError(f'{len(poses)} poses for {count} images: expected one each')
+
+
+def _pose(row: np.ndarray, name: str) -> np.ndarray | None:
+    if np.isnan(row).all():
+        return None
+    try:
+        return checked_pose(row)
+    except InputError as error:
+        raise InputError(f'{name}: {error}') from error
 
 
 def _rows(poses: Iterable[np.ndarray | None]) -> np.ndarray | None:

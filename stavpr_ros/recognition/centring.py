@@ -22,7 +22,8 @@ class Centring:
 
     def reset(self) -> None:
         """Forget the query."""
-        self._sum, self._count = self._mean * PRIOR, PRIOR
+        # float64: in float32, a long drive's images would be rounded away
+        self._sum, self._count = self._mean.double() * PRIOR, PRIOR
 
     def places(self, features: LocalFeatures) -> LocalFeatures:
         """Features of the map, or of a query of which nothing else is known, less the map's mean."""
@@ -37,7 +38,7 @@ class Centring:
         strips = strips.to(self._mean.device)
         self._sum = self._sum + strips
         self._count += 1
-        return without_mean(strips[:, None], self._sum / self._count)[:, 0]
+        return without_mean(strips[:, None], (self._sum / self._count).float())[:, 0]
 
 
 def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:

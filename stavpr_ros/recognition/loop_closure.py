@@ -10,16 +10,15 @@ import torch
 from stavpr_ros.alignment.kernels.cpu import products
 from stavpr_ros.alignment.similarity import tiled
 from stavpr_ros.alignment.spatial import adaptive_weights
-from stavpr_ros.alignment.temporal import SequenceMatch
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.calibrated_window import CalibratedWindow
-from stavpr_ros.recognition.candidates import Candidate, nearest_places, ranked_candidates
 from stavpr_ros.recognition.cures import Track
 from stavpr_ros.recognition.recogniser import (
     Recognition,
     RecognitionSettings,
     Verdict,
+    WindowAnswers,
     answer,
     require_finite,
 )
@@ -31,7 +30,7 @@ LEAST_PLACES = 5  # fewer distances have no mean and deviation worth the name
 PIECE = 512  # images centred at a time: what is in between stays in the cache
 
 
-class LoopCloser:
+class LoopCloser(WindowAnswers):
     """
     Recognises places that the same drive has passed before, one image at a time.
 
@@ -49,6 +48,8 @@ class LoopCloser:
     :param exclude_seconds: places younger than so many seconds are not part of the map either.
     :raises SettingsError: settings that do not do.
     """
+
+    _window: CalibratedWindow
 
     def __init__(
         self,
@@ -69,7 +70,7 @@ class LoopCloser:
         self._track = Track()
         self._young: deque[int] = deque()  # stamps of the latest places, not yet old enough in seconds
         self._places = 0  # kept places that the newest image may be matched with: the oldest so many
-        self._nearest: SequenceMatch | None = None  # as it was answered last
+        self._nearest = None
 
     def __len__(self) -> int:
         """Count the places that are kept; ``first + len`` images have come."""
@@ -84,24 +85,6 @@ class LoopCloser:
     def limit(self) -> int | None:
         """Most places that are kept, None for all."""
         return self._limit
-
-    @property
-    def settings(self) -> RecognitionSettings:
-        """The settings in force."""
-        return self._settings
-
-    @property
-    def window_fill(self) -> int:
-        """Images in the window, up to l."""
-        return len(self._window)
-
-    def set_threshold(self, threshold: float) -> None:
-        """
-        Change the threshold from the next image on.
-
-        :raises SettingsError: not above 0.
-        """
-        self._settings = replace(self._settings, threshold=threshold)
 
     def reset(self) -> None:
         """
@@ -144,25 +127,6 @@ class LoopCloser:
         :returns: shape (m,), float32, of the places from ``first`` on; lower is nearer.
         """
         return self._window.newest_row()[: self._places]
-
-    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nearest places of the window answered last, nearest first, each once."""
-        return nearest_places(*self._window.sequences(), count)
-
-    def ranked(self, count: int) -> list[Candidate]:
-        """
-        Rank places for the window answered last, no two of them neighbours, nearest first.
-
-        See :meth:`stavpr_ros.recognition.Recogniser.ranked`.
-        """
-        settings = self._settings
-        return ranked_candidates(
-            self._nearest,
-            self._window.sequences(),
-            count,
-            settings.neighbourhood,
-            settings.applied_cures.contrast,
-        )
 
     def _keep(self, strips: torch.Tensor, stamp: int) -> None:
         """Make the image a place, and say how many places it may be matched with."""

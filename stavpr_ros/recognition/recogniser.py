@@ -107,7 +107,60 @@ class Recognition:
         return aligned_index(self.path, int(self.path[-1, 0])) if self.verdict is Verdict.MATCH else -1
 
 
-class Recogniser:
+class WindowAnswers:
+    """The window answered last: what recognition on a map and on a route's own past can both tell of it."""
+
+    _settings: RecognitionSettings
+    _window: 'Window'
+    _nearest: SequenceMatch | None  # as it was answered last
+
+    @property
+    def settings(self) -> RecognitionSettings:
+        """The settings in force."""
+        return self._settings
+
+    @property
+    def window_fill(self) -> int:
+        """Images in the window, up to l."""
+        return len(self._window)
+
+    def set_threshold(self, threshold: float) -> None:
+        """
+        Change the threshold from the next image on.
+
+        :raises SettingsError: not above 0.
+        """
+        self._settings = replace(self._settings, threshold=threshold)
+
+    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return the nearest places of the window answered last, nearest first, each once.
+
+        :returns: places, int64, and the distances of their sequences, at most ``count`` of each.
+        """
+        return nearest_places(*self._window.sequences(), count)
+
+    def ranked(self, count: int) -> list[Candidate]:
+        """
+        Rank places for the window answered last, no two of them neighbours, nearest first.
+
+        The first is the answer's nearest place, matched or not, with its distance, the second its runner-up.
+
+        :param count: most candidates, at least 0.
+        :returns: none before the first full window.
+        :raises InputError: count below 0.
+        """
+        settings = self._settings
+        return ranked_candidates(
+            self._nearest,
+            self._window.sequences(),
+            count,
+            settings.neighbourhood,
+            settings.applied_cures.contrast,
+        )
+
+
+class Recogniser(WindowAnswers):
     """
     Recognises places of one map, one image at a time.
 
@@ -139,10 +192,10 @@ class Recogniser:
         self._matcher = make_matcher(
             features, settings.spatial, settings.sequence, choose_backend(backend), precision
         )
-        self._window: Window = self._matcher
+        self._window = self._matcher
         self._newest_row = torch.empty(0)
         self._track = Track()
-        self._nearest: SequenceMatch | None = None  # as it was answered last
+        self._nearest = None
         if cures.any:
             self._window = window = CalibratedWindow(self.places, settings.sequence, cures)
             window.calibration.start_from(self._distances_to_itself(features))
@@ -158,27 +211,9 @@ class Recogniser:
         return np.where(near, np.float32(np.nan), rows.cpu().numpy())
 
     @property
-    def settings(self) -> RecognitionSettings:
-        """The settings in force."""
-        return self._settings
-
-    @property
     def places(self) -> int:
         """Number of places n of the map."""
         return self._matcher.places
-
-    @property
-    def window_fill(self) -> int:
-        """Images in the window, up to l."""
-        return len(self._window)
-
-    def set_threshold(self, threshold: float) -> None:
-        """
-        Change the threshold from the next image on.
-
-        :raises SettingsError: not above 0.
-        """
-        self._settings = replace(self._settings, threshold=threshold)
 
     def reset(self) -> None:
         """Forget the images of the window, and what was learned from them and those before."""
@@ -229,33 +264,6 @@ class Recogniser:
         if isinstance(self._window, CalibratedWindow):
             return self._window.newest_row()
         return self._newest_row.cpu().numpy()
-
-    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return the nearest places of the window answered last, nearest first, each once.
-
-        :returns: places, int64, and the distances of their sequences, at most ``count`` of each.
-        """
-        return nearest_places(*self._window.sequences(), count)
-
-    def ranked(self, count: int) -> list[Candidate]:
-        """
-        Rank places for the window answered last, no two of them neighbours, nearest first.
-
-        The first is the answer's nearest place, matched or not, with its distance, the second its runner-up.
-
-        :param count: most candidates, at least 0.
-        :returns: none before the first full window.
-        :raises InputError: count below 0.
-        """
-        settings = self._settings
-        return ranked_candidates(
-            self._nearest,
-            self._window.sequences(),
-            count,
-            settings.neighbourhood,
-            settings.applied_cures.contrast,
-        )
 
     def _check(self, features: LocalFeatures) -> None:
         features.require_same_settings(self._feature_settings, 'the map')

@@ -26,7 +26,11 @@ def open_source(
     :raises SourceError: it cannot be read, or which topic is meant is not clear.
     """
     path = Path(path)
-    if not path.exists():
+    try:
+        there = path.exists()
+    except OSError as error:
+        raise SourceError(f'{path} cannot be read: {error}; check its name and permissions') from error
+    if not there:
         raise SourceError(f'{path} does not exist: expected a folder of images or a bag')
     # imported here: rosbags and OpenCV take a moment that `import stavpr_ros` must not
     from stavpr_ros.sources.bag import BagSource, is_bag

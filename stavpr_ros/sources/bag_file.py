@@ -28,8 +28,9 @@ class OpenBag:
     A bag that is open for reading.
 
     :param reader: of rosbags.
-    :param deserialize: (bytes, message type) to message. Only types of ``sensor_msgs`` are read here, which
-        are the same in every distribution, so no definition is needed from the bag: old bags have none.
+    :param deserialize: (bytes, message type) to message. Only types of ``sensor_msgs`` and ``nav_msgs`` are
+        read, which are the same in every distribution: no definition is needed from the bag, old ones have
+        none.
     """
 
     reader: Ros1Reader | Ros2Reader
@@ -42,10 +43,15 @@ class OpenBag:
 
 
 def is_bag(path: Path) -> bool:
-    """Tell a bag from a folder of images by its names; whether it is sound shows on reading."""
-    if path.is_dir():
-        return (path / METADATA).exists() or bool(_storage_files(path))
-    return path.suffix in STORAGE_SUFFIXES or path.suffix == '.bag'
+    """
+    Tell a bag from a folder of images by its names; whether it is sound shows on reading.
+
+    :raises SourceError: the folder cannot be looked into.
+    """
+    with reading(path):
+        if path.is_dir():
+            return (path / METADATA).exists() or bool(_storage_files(path))
+        return path.suffix in STORAGE_SUFFIXES or path.suffix == '.bag'
 
 
 def message_type(connection: Connection) -> str:

@@ -1,5 +1,6 @@
 """Bytes of image files to one kind of image: RGB, uint8, shape (height, width, 3), C-contiguous."""
 
+import re
 from collections.abc import Callable
 from io import BytesIO
 from typing import Any
@@ -13,6 +14,10 @@ from stavpr_ros.sources.colour import convert
 
 MAX_PIXELS = 64_000_000
 """Largest image that is decoded: a small file may claim a picture that fills the memory."""
+
+JPEG_MARKER = re.compile(rb'\xff[\xc0-\xcf\xd9-\xfe]')
+"""What a length and so many bytes follow, and END_OF_JPEG; the picture's own bytes never look so."""
+END_OF_JPEG = b'\xff\xd9'
 
 COMPRESSED_FORMATS = ('JPEG', 'PNG', 'BMP', 'TIFF', 'PPM', 'WEBP')
 """What :func:`decode_compressed` reads, in Pillow's names."""
@@ -89,19 +94,24 @@ def _check_file(flat: np.ndarray) -> str:
             kind='damaged',
         ) from error
     check_pixels(width, height)
-    if kind == 'JPEG':
+    if kind in ('JPEG', 'MPO'):  # MPO: several pictures in one file, of which the first is read
         _check_end_of_jpeg(flat.tobytes())
     return mode
 
 
 def _check_end_of_jpeg(data: bytes) -> None:
     """Refuse half a picture, whose rest OpenCV before version 5 makes up in grey."""
-    # neither marker can be part of the picture's own bytes, but a thumbnail has them too, further in front
-    if data.rfind(b'\xff\xd9') < data.rfind(b'\xff\xda'):
-        raise ImageError(
-            f'compressed image of {len(data)} bytes is cut off: expected the end of a JPEG; copy it anew',
-            kind='cut off',
-        )
+    # segment by segment: a thumbnail in one, and a video behind the picture, have the same two bytes
+    at = 2
+    while found := JPEG_MARKER.search(data, at):
+        at = found.end()
+        if found[0] == END_OF_JPEG:
+            return
+        at += int.from_bytes(data[at : at + 2], 'big')
+    raise ImageError(
+        f'compressed image of {len(data)} bytes is cut off: expected the end of a JPEG; copy it anew',
+        kind='cut off',
+    )
 
 
 def flat_bytes(data: Any) -> np.ndarray:

@@ -1,5 +1,6 @@
 """A folder of image files as a sequence."""
 
+import os
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,6 +22,11 @@ def natural_key(name: str) -> tuple[list[str | int], str]:
     return [int(part) if i % 2 else part.casefold() for i, part in enumerate(parts)], name
 
 
+def text_of(path: str | Path) -> str:
+    """Return a path, or a name, as text that can be written; bytes of it that are no UTF-8 are replaced."""
+    return os.fsencode(path).decode('utf-8', 'replace')
+
+
 class FolderSource:
     """
     The images of one folder in natural order; sub-folders and hidden files are left out.
@@ -36,9 +42,9 @@ class FolderSource:
     def __init__(self, path: str | Path, on_error: Callable[[ImageError], None] | None = None) -> None:
         self.path = Path(path)
         self.on_error = on_error
-        if not self.path.is_dir():
-            raise SourceError(f'{self.path} is not a folder: expected a folder of images')
         try:
+            if not self.path.is_dir():
+                raise SourceError(f'{self.path} is not a folder: expected a folder of images')
             files = [file for file in self.path.iterdir() if _is_image(file)]
         except OSError as error:
             raise SourceError(f'{self.path} cannot be listed: {error.strerror}; check permissions') from error
@@ -72,7 +78,7 @@ class FolderSource:
     def _numbered(self) -> Iterator[tuple[int, Frame]]:
         for i, file in enumerate(self.files):
             try:
-                frame = Frame(_read(file), 0, file.name)
+                frame = Frame(_read(file), 0, text_of(file.name))
             except ImageError as error:
                 if self.on_error is None:
                     raise
@@ -90,7 +96,7 @@ def _read(file: Path) -> np.ndarray:
         return decode_compressed(file.read_bytes())
     except OSError as error:
         raise ImageError(
-            f'{file} cannot be read: {error.strerror}; check its permissions', kind='unreadable'
+            f'{text_of(file)} cannot be read: {error.strerror}; check its permissions', kind='unreadable'
         ) from error
     except ImageError as error:
-        raise ImageError(f'{file}: {error}', kind=error.kind) from error
+        raise ImageError(f'{text_of(file)}: {error}', kind=error.kind) from error
