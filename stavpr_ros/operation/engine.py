@@ -177,8 +177,8 @@ class Engine:
         replaces = loaded is not None and self._name == 'mapping'
         if self.unsaved and (leaves or replaces):
             raise InputError(
-                f'the map has {self.unsaved} places that are not saved: save_map first (or give them up: '
-                'set_operation localization, then load_map)'
+                f'the map has {self.unsaved} places that are not saved: save_map first (or give them up by '
+                'load_map, in operation localization)'
             )
         if loaded is not None and self._name == name == 'loop_closure' and len(self.places or ()):
             raise InputError(
