@@ -64,15 +64,21 @@ def bench():
 
 
 @pytest.fixture(scope='module')
-def start(small_map, tmp_path_factory):
-    """Start a node on the map of the made-up route, with more options of the command line."""
-    from camera import start_node
-
+def map_file(small_map, tmp_path_factory) -> str:
+    """That map in a file."""
     from stavpr_ros.mapping import save_map
 
-    folder = tmp_path_factory.mktemp('node')
-    save_map(small_map, folder / 'route.stavpr')
-    return partial(start_node, folder)
+    path = tmp_path_factory.mktemp('map') / 'route.stavpr'
+    save_map(small_map, path)
+    return str(path)
+
+
+@pytest.fixture(scope='module')
+def start(map_file):
+    """Start a node on it, with more options of the command line."""
+    from camera import start_node
+
+    return partial(start_node, Path(map_file).parent)
 
 
 @pytest.fixture(scope='class')

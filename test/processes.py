@@ -25,6 +25,7 @@ from stavpr_msgs.msg import PlaceMatch
 
 DOMAIN = 1 + os.getpid() % 100
 PATIENCE = 60.0  # seconds until something that should happen counts as not happening
+SETTLING = 0.2  # seconds until an endpoint that has just been discovered is matched
 UNHEARD = 25.0  # seconds without an answer until a request counts as lost on its way
 RELIABLE = QoSProfile(depth=1000)
 TAKEN_RELIABLY = {
@@ -181,7 +182,9 @@ class Bench:
         :param futures: of the answers, is filled.
         """
         client = self.node.create_client(kind, f'/stavpr/{name}')
-        self.until(client.service_is_ready, f'the service {name}')
+        if not client.service_is_ready():
+            self.until(client.service_is_ready, f'the service {name}')
+            time.sleep(SETTLING)  # it is known, but not matched yet: what is sent now may be lost
         began = time.monotonic()
 
         def sent_and_heard() -> bool:

@@ -1,6 +1,7 @@
 """The node in a process of somebody else's: their executor, their context, their end."""
 
 import threading
+import time
 
 import cv2
 import pytest
@@ -51,11 +52,24 @@ def test_ros_may_be_shut_down_before_the_node_is_destroyed(make, context, route,
     assert node.trigger_configure() == node.trigger_activate() == SUCCESS
     for i, image in enumerate(route[:20]):
         node.configured.images._on_image(image_message(image, i + 1))
+    while not len(node.configured.engine.places):
+        time.sleep(0.001)
     rclpy.shutdown(context=context)
     node.destroy_node()
     assert path.exists()
     assert 0 < len(load_map(path)) <= 20
     assert not [thread for thread in threading.enumerate() if thread.name == 'recognition']
+
+
+def test_nobody_sees_the_services_of_a_node_that_is_destroyed(make, bench):
+    node = make()
+
+    def seen():
+        return '/stavpr/get_state' in dict(bench.node.get_service_names_and_types())
+
+    bench.until(seen, 'the node')
+    node.destroy_node()
+    bench.until(lambda: not seen(), 'the node to be gone')
 
 
 def test_what_is_destroyed_while_the_executor_looks_does_not_end_it(context, monkeypatch):

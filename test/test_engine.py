@@ -37,13 +37,6 @@ def _one_thread():
         yield
 
 
-@pytest.fixture(scope='module')
-def map_file(small_map, tmp_path_factory):
-    path = tmp_path_factory.mktemp('map') / 'route.stavpr'
-    save_map(small_map, path)
-    return str(path)
-
-
 @pytest.mark.parametrize(('mode', 'threshold'), [('paper', 0.2), ('robust', None)])
 def test_localization_is_the_recogniser(map_file, small_map, route, mode, threshold):
     engine = localizing(map_file, mode=mode, threshold=threshold)

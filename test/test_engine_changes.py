@@ -32,13 +32,6 @@ def _one_thread():
         yield
 
 
-@pytest.fixture(scope='module')
-def map_file(small_map, tmp_path_factory):
-    path = tmp_path_factory.mktemp('map') / 'route.stavpr'
-    save_map(small_map, path)
-    return str(path)
-
-
 def test_the_threshold_and_the_number_of_candidates_change_with_a_full_window(map_file, route):
     engine = localizing(map_file, candidates=3)
     outcome = show(engine, route[:LENGTH])[-1]

@@ -14,17 +14,9 @@ from std_msgs.msg import Float32, Int32
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.evaluation.offline import recognise_all
-from stavpr_ros.mapping import save_map
 from stavpr_ros.recognition import Recogniser, RecognitionSettings
 
 LENGTH, THRESHOLD = 5, 0.2
-
-
-@pytest.fixture(scope='module')
-def map_file(small_map, tmp_path_factory):
-    path = tmp_path_factory.mktemp('map') / 'route.stavpr'
-    save_map(small_map, path)
-    return path
 
 
 def start(log, map_file=None, threshold=None, **parameters):
@@ -184,7 +176,7 @@ def test_what_is_missing_is_said_and_can_be_set_later(bench, run, map_file, rout
     done, reason = bench.set_parameter('map_path', str(tmp_path / 'missing.stavpr'))
     assert not done
     assert 'does not exist' in reason
-    assert bench.set_parameter('map_path', str(map_file)) == (True, '')
+    assert bench.set_parameter('map_path', map_file) == (True, '')
     answer = bench.ask(image_message(route[0], 2))
     assert answer.verdict == PlaceMatch.NOT_READY
     assert 'threshold' in answer.reason
@@ -232,7 +224,7 @@ def test_a_damaged_map_is_said_and_a_good_one_starts_the_node(bench, run, map_fi
     bench.until_diagnosed('map', DiagnosticStatus.ERROR, 'bad.stavpr')
     assert bench.state() == 'unconfigured'
     assert 'cannot configure' in process.output()
-    assert bench.set_parameter('map_path', str(map_file)) == (True, '')
+    assert bench.set_parameter('map_path', map_file) == (True, '')
     bench.wait_for_node()
     for i in range(LENGTH):
         answer = bench.ask(image_message(route[i], 3 + i))

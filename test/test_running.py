@@ -32,13 +32,6 @@ def bench():
     bench.close()
 
 
-@pytest.fixture(scope='module')
-def map_file(small_map, tmp_path_factory):
-    path = tmp_path_factory.mktemp('running') / 'route.stavpr'
-    save_map(small_map, path)
-    return str(path)
-
-
 @pytest.fixture
 def run(bench, tmp_path):
     """Start a node; it is ended with the test."""

@@ -44,6 +44,16 @@ class ManagedNode(LifecycleNodeMixin, Node):
         """
         return self._guarded('this', lambda: trigger() == TransitionCallbackReturn.SUCCESS)
 
+    def destroy_node(self) -> None:
+        """
+        Take the node down, and the services of its life cycle.
+
+        rclpy leaves those to Python's collector, and until then others see them, and ask in vain.
+        """
+        if not self.left_behind:  # else a transition may still be under way
+            self._state_machine.destroy_when_not_in_use()
+        super().destroy_node()
+
     def _change_or_refuse(self, request: Any, response: Any) -> Any:
         wish = request.transition.label or request.transition.id
         response.success = self._guarded(wish, lambda: self._change_as_asked(request, response).success)

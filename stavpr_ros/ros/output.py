@@ -5,6 +5,7 @@ from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float32, Header, Int32
@@ -67,8 +68,24 @@ class Output:
         :param frame: of the poses.
         """
         answer = match_message(header, outcome)
-        if not self._node.context.ok():  # ROS was shut down before the node
-            return answer
+        try:
+            self._publish(answer, header, outcome, frame)
+        except rclpy_implementation.RCLError:
+            if self._node.context.ok():  # else ROS was shut down before the node: nobody hears anything
+                raise
+        return answer
+
+    @property
+    def wants_candidates(self) -> bool:
+        """Somebody listens to them."""
+        try:
+            return bool(self.candidates.get_subscription_count())
+        except rclpy_implementation.RCLError:
+            if self._node.context.ok():
+                raise
+            return False
+
+    def _publish(self, answer: PlaceMatch, header: Header, outcome: Outcome, frame: str) -> None:
         if outcome.answer is Answer.MATCH:
             self.place_index.publish(Int32(data=answer.place_index))
             self.distance.publish(Float32(data=answer.distance))
@@ -82,7 +99,6 @@ class Output:
         if outcome.image is not None and self.match_image.get_subscription_count():
             self.match_image.publish(image_message(header, drawn(outcome)))
         self.match.publish(answer)
-        return answer
 
     def close(self) -> None:
         """Destroy the publishers."""

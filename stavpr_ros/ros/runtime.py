@@ -282,7 +282,7 @@ class Runtime:
         # poses of a map are in the map's frame, those of a route that grows in the odometry's
         grows = odometry is not None and self.engine.operation != 'localization'
         frame = odometry.frame if grows and odometry is not None else self._settings.map_frame
-        self.engine.ranking = self._output.candidates.get_subscription_count() > 0
+        self.engine.ranking = self._output.wants_candidates
         try:
             outcome = self.engine.process(item.message, stamp, pose)
         except Exception as error:
