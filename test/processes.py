@@ -207,6 +207,10 @@ class Bench:
         """Label of the node's life-cycle state."""
         return str(self.call(GetState, 'get_state').current_state.label)
 
+    def until_state(self, label: str) -> None:
+        """Wait until the node is in a state; what leads there may still be under way."""
+        self.until(lambda: self.state() == label, f'state {label}')
+
     def transition(self, label: str) -> bool:
         """Ask for a transition: configure, activate, deactivate, cleanup, shutdown."""
         return bool(self.call(ChangeState, 'change_state', transition=Transition(label=label)).success)

@@ -222,7 +222,7 @@ def test_a_damaged_map_is_said_and_a_good_one_starts_the_node(bench, run, map_fi
     bad.write_bytes(b'no map')
     process = run(bad, THRESHOLD, wait=False)
     bench.until_diagnosed('map', DiagnosticStatus.ERROR, 'bad.stavpr')
-    assert bench.state() == 'unconfigured'
+    bench.until_state('unconfigured')
     assert 'cannot configure' in process.output()
     assert bench.set_parameter('map_path', map_file) == (True, '')
     bench.wait_for_node()

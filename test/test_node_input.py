@@ -313,7 +313,7 @@ def test_overrides_that_do_not_do(bench, start):
     process = start('-p', 'qos_overrides./image.subscription.reliability:=certain')
     try:
         bench.until_diagnosed('map', ERROR, 'correct qos_overrides./image.subscription')
-        assert bench.state() == 'unconfigured'
+        bench.until_state('unconfigured')
         assert 'certain' in process.output()
         assert 'Traceback' not in process.output()
     finally:
