@@ -19,7 +19,6 @@ SETUP = $(PYTHON) -E tools/setup_venv.py
 RUN = $(SETUP) run
 OPTIONS = --torch-index '$(TORCH_INDEX)' --with
 TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN) pytest test
-BUILT := build install log
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 
 .PHONY: help setup build demo evaluate test test-long lint docs bench bench-quick accuracy shell \
@@ -57,7 +56,7 @@ test-long: development ## run the tests that take minutes each (ARGS=)
 	@$(TEST) -m long $(ARGS)
 
 lint: development ## check style and types with ruff and mypy
-	@$(RUN) ruff check $(addprefix --extend-exclude ,$(BUILT)) .
+	@$(RUN) ruff check .
 	@$(RUN) mypy
 
 docs: development ## build the documentation into docs/_build; warnings are errors
@@ -78,7 +77,7 @@ shell: build ## open a bash in which the built packages are found
 	@$(RUN) env PS1='(stavpr_ros) \w\$$ ' bash --norc -i || true
 
 clean: ## remove build/ install/ log/ docs/_build/
-	@rm -rf $(BUILT) docs/_build
+	@rm -rf build install log docs/_build
 
 distclean: clean ## also remove .venv, .venv-peers and the caches of tools
 	@rm -rf .venv .venv-peers .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -34,18 +34,19 @@ EXTRAS = ('onnx', 'cuda', 'evaluation', 'dev', 'docs')
 SOURCES = {
     'stavpr_msgs': ('stavpr_msgs',),
     'stavpr_ros': (
-        *('package.xml', 'setup.py', 'setup.cfg', 'pyproject.toml'),
-        *('resource', 'config', 'launch', 'stavpr_ros'),
+        'package.xml', 'setup.py', 'setup.cfg', 'pyproject.toml',
+        'resource', 'config', 'launch', 'scripts', 'stavpr_ros',
     ),
-}
+}  # fmt: skip
 
 # Variables of another ROS, of another Python, or of the make that runs this program.
 FOREIGN = (
-    *('PYTHONPATH', 'PYTHONHOME', 'CONDA_PREFIX', 'PIP_TARGET', 'PIP_PREFIX', 'DESTDIR'),
-    *('AMENT_CURRENT_PREFIX', 'RMW_IMPLEMENTATION', '_ROS_WHEELS_BOOTSTRAP_COMPLETE'),
-    *('ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION'),
-    *('MAKEFLAGS', 'MFLAGS', 'MAKEOVERRIDES', 'MAKELEVEL'),
-)
+    'PYTHONPATH', 'PYTHONHOME', 'CONDA_PREFIX', 'PIP_TARGET', 'PIP_PREFIX', 'DESTDIR',
+    'AMENT_CURRENT_PREFIX', 'RMW_IMPLEMENTATION', '_ROS_WHEELS_BOOTSTRAP_COMPLETE',
+    'ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION',
+    'MAKEFLAGS', 'MFLAGS', 'MAKEOVERRIDES', 'MAKELEVEL',
+)  # fmt: skip
+
 # Roots of the build machine in the CMake files of the wheels.
 WHEEL_INCLUDE = re.compile(r'/opt/python/cp3\d+-cp3\d+/include/python3\.\d+')
 WHEEL_PACKAGES = re.compile(r'/opt/python/cp3\d+-cp3\d+/lib/python3\.\d+/site-packages')
@@ -245,22 +246,25 @@ def install(extras: list, torch_index: str) -> None:
 def build() -> None:
     """Build both packages from nothing, unless they were built from the same sources."""
     python = ROOT / '.venv' / 'bin' / 'python3'
-    for package, names in SOURCES.items():
+    requirements = [f'requirements/{name}.txt' for name in ('ros', 'build', 'constraints')]
+    for package, sources in SOURCES.items():
         stamp = ROOT / 'install' / package / '.setup.sha256'
-        # A change of what is installed in .venv is a change of what the packages are built with.
-        sources = digest([ROOT / name for name in names] + [ROOT / '.venv' / 'setup.json'])
-        if stamp.is_file() and stamp.read_text() == sources:
+        # pyvenv.cfg names the Python and the folder of .venv; extras have no effect on a build.
+        inputs = digest([ROOT / name for name in (*sources, *requirements, '.venv/pyvenv.cfg')])
+        if stamp.is_file() and stamp.read_text() == inputs:
             continue
         for folder in (ROOT / 'build' / package, ROOT / 'install' / package):
             if folder.exists():
                 shutil.rmtree(folder)
-        command = [python, '-m', 'colcon', '--log-base', 'log', 'build']
+        # colcon's own flags for make include -l, which stalls a build on a loaded machine.
+        command = ['env', f'MAKEFLAGS=-j{os.cpu_count()}']
+        command += [python, '-m', 'colcon', '--log-base', 'log', 'build']
         # colcon does not look for packages inside a package, so both folders are named.
         command += ['--base-paths', '.', 'stavpr_msgs', '--packages-select', package]
         command += ['--cmake-args', '-DCMAKE_BUILD_TYPE=Release', '-DBUILD_TESTING=OFF']
         command += [f'-DPython3_EXECUTABLE={python}']
         run_logged(package, f'Building {package}', command)
-        stamp.write_text(sources)
+        stamp.write_text(inputs)
 
 
 def run(command: list) -> None:
