@@ -30,10 +30,10 @@ help: ## list the targets (the default)
 	@echo 'Names and values:'
 	@echo '  PYTHON=python3.12          the Python to use, 3.11 to 3.13 (default: python3)'
 	@echo '  TORCH_INDEX=URL            package index for torch, for example one of CPU wheels'
-	@echo '  EXTRAS="onnx cuda"         optional packages to install: onnx, cuda, evaluation, dev, docs'
+	@echo '  EXTRAS="onnx cuda"         optional packages: onnx, cuda, evaluation, dev, docs'
 	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your folders of images, bags or saved maps'
-	@echo '  LOOP=PATH                  demo: your sequence with loops (LOOP=synthetic: the synthetic street)'
-	@echo '  ARGS="..."                 options for the program that the target runs (test: pytest)'
+	@echo '  LOOP=PATH                  demo: your sequence with loops (synthetic: the synthetic street)'
+	@echo '  ARGS="..."                 options for the program of the target (test: pytest)'
 
 setup: ## create .venv with the pinned Python packages and the ROS 2 Jazzy wheels
 	@$(SETUP) setup $(OPTIONS) $(EXTRAS)
@@ -47,7 +47,8 @@ demo: build ## run the node on the synthetic street, or on your images (MAP= QUE
 
 evaluate: override EXTRAS += evaluation
 evaluate: build ## evaluate the recognition of QUERY= on MAP=: metrics, plots, a report (ARGS=)
-	@$(RUN) $(EXECUTABLES)/evaluate $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") $(ARGS)
+	@$(RUN) $(EXECUTABLES)/evaluate $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
+		$(ARGS)
 
 test: lint docs ## lint, build the documentation, and run the tests but the long ones (ARGS=)
 	@$(TEST) -m 'not long' $(ARGS)
@@ -62,14 +63,14 @@ lint: development ## check style and types with ruff and mypy
 docs: development ## build the documentation into docs/_build; warnings are errors
 	@$(RUN) sphinx-build -E -W --keep-going -q -b html docs docs/_build
 
-bench: build ## measure speed and memory beside lower bounds and peers; see benchmarks/README.md (ARGS=)
+bench: build ## measure speed and memory beside lower bounds and peers (ARGS=)
 	@$(RUN) python benchmarks/matching.py $(ARGS)
 
 bench-quick: build ## the same for up to 20,000 places, in under two minutes (ARGS=)
 	@$(RUN) python benchmarks/matching.py --quick $(ARGS)
 
 accuracy: override EXTRAS += evaluation
-accuracy: build ## measure the accuracy on the data sets; see benchmarks/README.md (ARGS=)
+accuracy: build ## measure the accuracy on the data sets (ARGS=)
 	@$(RUN) python benchmarks/accuracy.py $(ARGS)
 
 shell: build ## open a bash in which the built packages are found
