@@ -32,7 +32,7 @@ help: ## list the targets (the default)
 	@echo '  TORCH_INDEX=URL            package index for torch, for example one of CPU wheels'
 	@echo '  EXTRAS="onnx cuda"         optional packages: onnx, cuda, evaluation, dev, docs'
 	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your folders of images, bags or saved maps'
-	@echo '  LOOP=PATH                  demo: your sequence with loops (synthetic: the synthetic street)'
+	@echo '  LOOP=PATH                  demo: your sequence with loops, or synthetic for the street'
 	@echo '  ARGS="..."                 options for the program of the target (test: pytest)'
 
 setup: ## create .venv with the pinned Python packages and the ROS 2 Jazzy wheels

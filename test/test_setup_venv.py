@@ -74,8 +74,10 @@ def recorder(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> Recorder:
 
 @pytest.mark.parametrize(
     ('version', 'implementation', 'status'),
-    [('3.10', 'CPython', 1), ('3.11', 'CPython', 0), ('3.13', 'CPython', 0)]
-    + [('3.14', 'CPython', 1), ('3.11', 'PyPy', 1)],
+    [
+        *[('3.11', 'CPython', 0), ('3.12', 'CPython', 0), ('3.13', 'CPython', 0)],
+        *[('3.10', 'CPython', 1), ('3.14', 'CPython', 1), ('3.11', 'PyPy', 1)],
+    ],
 )
 def test_python_unsupported_is_rejected_by_name(
     recorder, monkeypatch, capsys, version, implementation, status
