@@ -3,11 +3,11 @@
 """
 Package description for both ways to install: ``colcon build`` and ``pip install .``.
 
-Every way installs the command ``stavpr`` on the PATH and the executables of ``ros2 run`` as plain
-scripts in ``lib/stavpr_ros``. They are data files, not entry points: pip writes entry points of any
+Both install the command ``stavpr`` on the PATH, and the executables of ``ros2 run`` as plain
+scripts in ``lib/stavpr_ros``. The latter are data files, not entry points: pip writes entry points of any
 name into ``bin``, where ``node`` or ``record`` would be too generic, and the scripts that
-setuptools generates for entry points name the distribution ``stavpr_ros`` with its requirements,
-which Debian's packages satisfy under other distribution names.
+setuptools generates for entry points require the distributions below by name, which Debian's
+packages provide under other names.
 """
 
 from glob import glob

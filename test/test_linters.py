@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Every Python file: license header, line length, and the rules of ament_flake8 and ament_pep257."""
+"""Every Python file: license header, line length, rules of ament_flake8 and ament_pep257."""
 
 from collections.abc import Iterator
 import os

@@ -14,7 +14,6 @@ from xml.etree import ElementTree
 
 import pytest
 import setuptools
-
 import stavpr_ros
 from stavpr_ros.commands import stavpr
 
@@ -61,6 +60,16 @@ def setup_arguments() -> dict:
     return passed
 
 
+def literal_import(node: ast.Call) -> set[str]:
+    """Return the top-level name that a call of import_module imports, if it is a literal."""
+    if not ast.unparse(node.func).endswith('import_module') or not node.args:
+        return set()
+    module = node.args[0]
+    if not isinstance(module, ast.Constant):
+        return set()
+    return {str(module.value).partition('.')[0]}
+
+
 def imported(folder: Path) -> set[str]:
     """Return the top-level names that the Python files of a folder import, wherever they do."""
     names = set()
@@ -70,9 +79,8 @@ def imported(folder: Path) -> set[str]:
                 names |= {alias.name.partition('.')[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 names.add((node.module or '').partition('.')[0])
-            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith('import_module'):
-                if node.args and isinstance(node.args[0], ast.Constant):
-                    names.add(str(node.args[0].value).partition('.')[0])
+            elif isinstance(node, ast.Call):
+                names |= literal_import(node)
     return names - set(sys.stdlib_module_names) - {'stavpr_ros', 'numba_cuda', 'cuda'}
 
 

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """``stavpr COMMAND``: all executables of the package behind one name on the PATH."""
 
+from dataclasses import dataclass
 import importlib
 import importlib.util
 import sys
-from dataclasses import dataclass
 
 import stavpr_ros
 
@@ -64,8 +64,8 @@ def forget_requirements() -> None:
     """
     Keep ``pkg_resources`` from checking the requirements of this distribution.
 
-    It does so when a library imports it in a script that setuptools generated for colcon, and fails
-    where Debian's packages satisfy a requirement under another distribution name.
+    It does so when a library imports it in a script that setuptools generated for colcon, and
+    fails where a Debian package provides a requirement under another distribution name.
     """
     vars(sys.modules['__main__']).pop('__requires__', None)
 
