@@ -4,10 +4,10 @@
 Package description for both ways to install: ``colcon build`` and ``pip install .``.
 
 Both install the command ``stavpr`` on the PATH, and the executables of ``ros2 run`` as plain
-scripts in ``lib/stavpr_ros``. The latter are data files, not entry points: pip writes entry points of any
-name into ``bin``, where ``node`` or ``record`` would be too generic, and the scripts that
-setuptools generates for entry points require the distributions below by name, which Debian's
-packages provide under other names.
+scripts in ``lib/stavpr_ros``. The latter are data files, not entry points: pip writes entry
+points of any name into ``bin``, where ``node`` or ``record`` would be too generic, and the
+scripts that setuptools generates for entry points require the distributions below by name, which
+Debian's packages provide under other names.
 """
 
 from glob import glob
