@@ -25,7 +25,6 @@ LINT = [
     'flake8>=7.0',
     'flake8-builtins>=2.1',
     'flake8-comprehensions>=3.14',
-    'flake8-docstrings>=1.6',
     'flake8-import-order>=0.18',
     'flake8-quotes>=3.3',
     'mypy>=1.11',
