@@ -86,7 +86,7 @@ def test_violations_are_reported(tmp_path):
 
 
 def test_flake8_with_the_configuration_of_ament_passes():
-    for plugin in ('flake8', 'flake8_builtins', 'flake8_comprehensions', 'flake8_docstrings'):
+    for plugin in PLUGINS:
         pytest.importorskip(plugin, reason=f'{plugin} is not installed (extra dev)')
     command = [sys.executable, '-m', 'flake8', '--config', 'setup.cfg', '.']
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
