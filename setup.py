@@ -73,7 +73,7 @@ setup(
     extras_require={
         'cuda': ['numba-cuda>=0.30'],
         'dev': [*TEST, *LINT],
-        'docs': ['myst-parser>=2.0', 'sphinx>=7.2', 'sphinx-rtd-theme>=2.0'],
+        'docs': ['myst-parser>=2.0', 'sphinx>=7.2'],
         'evaluation': EVALUATION,
         'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
         'test': TEST,
