@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from floors import ITEM_BYTES, Ceilings
-from timing import synchroniser, timed
+from timing import synchronizer, timed
 
 SIDE = 4096  # of the large matrix product
 READ_MB = {'cpu': 1024, 'cuda': 8192}
@@ -15,7 +15,7 @@ READ_MB = {'cpu': 1024, 'cuda': 8192}
 
 def best_seconds(call: Callable[[], Any], device: str, seconds: float) -> float:
     """Return the least time of a call, of as many runs as fit, but at least three after one to warm up."""
-    job = timed(call, synchroniser(device))
+    job = timed(call, synchronizer(device))
     job()
     end = time.perf_counter() + seconds
     taken = [job() for _ in range(3)]

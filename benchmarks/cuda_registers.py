@@ -33,15 +33,15 @@ def kernels() -> list[tuple[str, Any, Any]]:
     """List name, Python function and argument types of each kernel."""
     from numba import float32, int32, int64
 
-    from stavpr_ros.alignment.kernels.cuda import spatial, temporal
+    from stavpr_ros.alignment.cuda import dtw, lm_dtw
 
     images = (float32[:, :, :], float32, int64, int64, float32[:, ::1])
     floats, whole = float32[::1], int32[::1]
     window = (float32[:, ::1], int64, int64, floats, whole, floats, whole, whole, whole, floats)
-    found = [(f'spatial_dtw W={W} xi={xi}', spatial.spatial_dtw(W, xi).py_func, images) for W, xi in SPATIAL]
-    found.append(('sliding_window W=7', spatial.sliding_window(7, 4, 7).py_func, images))
+    found = [(f'spatial_dtw W={W} xi={xi}', dtw.spatial_dtw(W, xi).py_func, images) for W, xi in SPATIAL]
+    found.append(('sliding_window W=7', dtw.sliding_window(7, 4, 7).py_func, images))
     found += [
-        (f'lm_dtw l={l} k={k}', temporal.lm_dtw(l, k, temporal.BLOCK).py_func, window) for l, k in SEQUENCES
+        (f'lm_dtw l={l} k={k}', lm_dtw.lm_dtw(l, k, lm_dtw.BLOCK).py_func, window) for l, k in SEQUENCES
     ]
     return found
 

@@ -65,12 +65,12 @@ def plain(images: Sequence[np.ndarray]) -> Any:
     import torch
 
     from stavpr_ros.features.gradient import GradientSettings, feature_maps_by_torch
-    from stavpr_ros.features.strips import cut_strips, normalise
+    from stavpr_ros.features.strips import cut_strips, normalize
 
     s = GradientSettings()
     square = partial(cv2.resize, dsize=(s.size, s.size), interpolation=cv2.INTER_AREA)
-    grey = np.stack([square(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in images])
-    return normalise(cut_strips(feature_maps_by_torch(torch.from_numpy(grey), s), 7))
+    gray = np.stack([square(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in images])
+    return normalize(cut_strips(feature_maps_by_torch(torch.from_numpy(gray), s), 7))
 
 
 def raw_messages(frames: Sequence[np.ndarray], encoding: str) -> list[np.ndarray]:
@@ -88,13 +88,13 @@ class FeatureBenchmark:
     """
 
     def __init__(self, width: int, height: int, batch: int, seconds: float) -> None:
-        from stavpr_ros.features import Describer
+        from stavpr_ros.features import FeatureExtractor
 
         self.width, self.height = width, height
         self.batch, self.seconds = batch, seconds
         self.frames = make_frames(width, height)
-        self.describer = Describer()
-        self.dim = self.describer.describe(self.frames[:1]).strips.shape[2]
+        self.extractor = FeatureExtractor()
+        self.dim = self.extractor.extract(self.frames[:1]).strips.shape[2]
         self.bandwidth = max(read_bandwidth(256, n, seconds) for n in {1, os.cpu_count() or 1})
 
     def stages(self, threads: int) -> Iterator[Record]:
@@ -109,7 +109,7 @@ class FeatureBenchmark:
     def _described(self, n: int, threads: int) -> Record:
         batches = [self.frames[i : i + n] for i in range(0, len(self.frames), n)]
         ours, peers = itertools.cycle(batches), itertools.cycle(batches)
-        calls = {'ours': lambda: self.describer.describe(next(ours)), PEER: lambda: plain(next(peers))}
+        calls = {'ours': lambda: self.extractor.extract(next(ours)), PEER: lambda: plain(next(peers))}
         took = measure({name: timed(call) for name, call in calls.items()}, self.seconds)
         read = n * self.frames[0].nbytes
         return self._record('features' if n == 1 else 'features_batch', n, threads, took, read)
@@ -122,7 +122,7 @@ class FeatureBenchmark:
 
         def call() -> None:
             data = next(messages)
-            self.describer.describe([decode_image(self.height, self.width, encoding, False, step, data)])
+            self.extractor.extract([decode_image(self.height, self.width, encoding, False, step, data)])
 
         return self._record(f'features_raw_{encoding}', 1, threads, self._alone(call), self.height * step)
 

@@ -151,7 +151,7 @@ def sequence(sizes: Sizes) -> Part:
 
 
 def selection(sizes: Sizes) -> Part:
-    """Nearest and runner-up: the distance and the length of each start are read once."""
+    """Nearest and second best: the distance and the length of each start are read once."""
     return Part(8 * sizes.n, 6 * sizes.n)  # two minima; the midpoint, its difference, the comparison
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from floors import STAGES, Ceilings, Part, Sizes, floor_seconds
 from records import Record
-from timing import Job, Timing, events_seconds, measure, synchroniser, timed
+from timing import Job, Timing, events_seconds, measure, synchronizer, timed
 from tqdm import tqdm
 
 PRODUCTS = ('product', 'image_distances', 'distance_matrix')  # their first part is a product with the map
@@ -72,7 +72,7 @@ class Run:
         """
         dim = sizes.d if dim is None else dim
         self._bar.set_description(f'{name} n={sizes.n:,} d={dim} {dtype}')
-        jobs = {'': timed(call, synchroniser(self.device))} | {peer.name: peer.job for peer in peers}
+        jobs = {'': timed(call, synchronizer(self.device))} | {peer.name: peer.job for peer in peers}
         timings = measure(jobs, self.seconds)
         own = timings['']
         if self.device == 'cuda':

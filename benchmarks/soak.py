@@ -32,12 +32,12 @@ def texture_route(count: int, height: int, width: int, step: int = 41) -> Iterat
 
 def make_map(path: Path, places: int, height: int, width: int) -> None:
     """Save a map with so many places of made-up images."""
-    from stavpr_ros.features import Describer
+    from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import build_map, save_map
     from stavpr_ros.sources.frame import Frame
 
     frames = (Frame(image, 0, '') for image in texture_route(places, height, width))
-    save_map(build_map(frames, Describer(), thumbnails=False), path)
+    save_map(build_map(frames, FeatureExtractor(), thumbnails=False), path)
 
 
 def memory(pid: int) -> float:
@@ -54,26 +54,26 @@ class Listener:
     def __init__(self) -> None:
         self.sent: dict[int, float] = {}
         self.latencies: list[float] = []
-        self.verdicts: Counter[int] = Counter()
+        self.statuses: Counter[int] = Counter()
 
     def on_match(self, match: Any) -> None:
         """Take in one answer."""
         stamp = match.header.stamp.sec * 10**9 + match.header.stamp.nanosec
         if stamp not in self.sent:
             return
-        self.verdicts[match.verdict] += 1
-        if match.verdict != match.DROPPED:
+        self.statuses[match.status] += 1
+        if match.status != match.DROPPED:
             self.latencies.append(time.monotonic() - self.sent[stamp])
 
-    def figures(self, published: int, dropped_verdict: int) -> dict[str, Any]:
+    def figures(self, published: int, dropped_status: int) -> dict[str, Any]:
         """Return what came of so many published images."""
         milliseconds = np.array(self.latencies) * 1e3
         return {
-            'verdicts': dict(self.verdicts),
+            'statuses': dict(self.statuses),
             'images_published': published,
             'processed': len(self.latencies),
-            'dropped': self.verdicts[dropped_verdict],
-            'lost_in_transport': published - self.verdicts.total(),
+            'dropped': self.statuses[dropped_status],
+            'lost_in_transport': published - self.statuses.total(),
             'latency_ms_p50': float(np.percentile(milliseconds, 50)),
             'latency_ms_p99': float(np.percentile(milliseconds, 99)),
             'latency_ms_max': float(milliseconds.max()),
@@ -129,7 +129,7 @@ def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
         node.destroy_timer(timer)
         node.destroy_timer(minute)
         end = time.monotonic() + 2
-        spin_until(node, lambda: listener.verdicts.total() == total or time.monotonic() > end)
+        spin_until(node, lambda: listener.statuses.total() == total or time.monotonic() > end)
         figures = listener.figures(total, PlaceMatch.DROPPED)
         figures |= {'rate_hz': rate, 'memory_mb_start': memory_start, 'memory_mb_end': memory(pid)}
         return figures | {'memory_mb_by_minute': [round(value, 1) for value in by_minute]}

@@ -16,7 +16,7 @@ from floors import FRAMES, Sizes, product
 from peer_process import Peers
 from run import Peer, Run
 from subjects import (
-    NEIGHBOURHOOD,
+    NEIGHBORHOOD,
     Call,
     bare_product,
     largest_error,
@@ -24,7 +24,7 @@ from subjects import (
     selection,
     sequence_kernel,
 )
-from timing import Job, synchroniser, timed
+from timing import Job, synchronizer, timed
 
 from stavpr_ros.alignment import SequenceDistances, SequenceSettings, SpatialSettings
 from stavpr_ros.features import LocalFeatures
@@ -113,7 +113,7 @@ def _products(
         kind = getattr(torch, dtype)
         references = features.strips.to(kind)
         for frames in (1, FRAMES) if plan.has_matrix(sizes) else (1,):
-            wait = synchroniser(run.device)
+            wait = synchronizer(run.device)
             queries_rows = rows[: frames * sizes.W].to(references.device, kind)
             call, form = bare_product(queries_rows, references, wait)
             if frames == 1:
@@ -236,8 +236,8 @@ def _retrieval(plan: Plan, window: np.ndarray, device: str, ours: SequenceDistan
     matcher = make_matcher(features, SpatialSettings(), plan.sequence, device, 'float32')
     for row in window:
         matcher.push(torch.from_numpy(row).to(device))
-    call = partial(matcher.match, NEIGHBOURHOOD)
-    # as text: a runner-up that is not there has a distance of NaN, which equals nothing
+    call = partial(matcher.match, NEIGHBORHOOD)
+    # as text: a second best that is not there has a distance of NaN, which equals nothing
     np.testing.assert_equal(str(call()[0]), str(selection(ours)()))
     return call
 

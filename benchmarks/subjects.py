@@ -1,4 +1,4 @@
-"""What is measured: the matchers, the recogniser and the sequence kernels, ready to be called."""
+"""What is measured: the matchers, the recognizer and the sequence kernels, ready to be called."""
 
 from collections.abc import Callable
 from itertools import cycle
@@ -12,13 +12,13 @@ from stavpr_ros.alignment import SequenceDistances, SequenceSettings, SpatialSet
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.matcher import Matcher, make_matcher
 
-NEIGHBOURHOOD = 20
+NEIGHBORHOOD = 20
 CHECKED = 200  # places whose image distances are held against float64
 Call = Callable[[], Any]
 
 
 def bare_product(
-    rows: torch.Tensor, references: torch.Tensor, synchronise: Callable[[], None]
+    rows: torch.Tensor, references: torch.Tensor, synchronize: Callable[[], None]
 ) -> tuple[Call, str]:
     """
     Return torch's product of queries with the map at its best, and in words which form that is.
@@ -37,7 +37,7 @@ def bare_product(
     }
     taken = {}
     for form, call in forms.items():
-        job = timed(call, synchronise)
+        job = timed(call, synchronize)
         job()
         taken[form] = min(job() for _ in range(3))
     best = min(forms, key=taken.__getitem__)
@@ -60,7 +60,7 @@ def matcher_frames(matcher: Matcher, queries: LocalFeatures, length: int) -> Cal
     def call() -> Any:
         frame = next(frames)
         matcher.push(matcher.distances(queries.strips[:, frame], queries.weights[:, frame]))
-        return matcher.match(NEIGHBOURHOOD)
+        return matcher.match(NEIGHBORHOOD)
 
     return call
 
@@ -76,25 +76,25 @@ def online_frames(
     """Return a call for a whole online frame with a full window, and in words what it calls."""
     try:
         from stavpr_ros.mapping import PlaceMap
-        from stavpr_ros.recognition import Recogniser, RecognitionSettings
+        from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
     except ImportError as error:  # maps need more packages than the matching
         matcher = make_matcher(features, spatial, sequence, device, precision)
         call = matcher_frames(matcher, queries, sequence.length)
-        return call, f'distances, push, match; no Recogniser here ({error})'
+        return call, f'distances, push, match; no PlaceRecognizer here ({error})'
     n = len(features)
     places = PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
-    settings = RecognitionSettings(1.0, spatial, sequence, NEIGHBOURHOOD)
-    recogniser = Recogniser(places, settings, device, precision)
+    settings = RecognizerSettings(1.0, spatial, sequence, NEIGHBORHOOD)
+    recognizer = PlaceRecognizer(places, settings, device, precision)
     frames = [queries[i : i + 1] for i in range(len(queries))]
     for i in range(sequence.length):
-        recogniser.add(frames[i % len(frames)])
+        recognizer.add(frames[i % len(frames)])
     following = cycle(frames)
-    return lambda: recogniser.add(next(following)), 'Recogniser.add'
+    return lambda: recognizer.add(next(following)), 'PlaceRecognizer.add'
 
 
 def sequence_kernel(window: np.ndarray, k: int) -> Callable[[], SequenceDistances]:
     """Return a call of the CPU's LM-DTW on a window, shape (l, n), that lies ready for the kernel."""
-    from stavpr_ros.alignment.temporal import match_padded, padded_width
+    from stavpr_ros.alignment.lm_dtw import match_padded, padded_width
 
     l, n = window.shape
     padded = np.full((l, padded_width(n, k)), np.inf, np.float32)
@@ -103,10 +103,10 @@ def sequence_kernel(window: np.ndarray, k: int) -> Callable[[], SequenceDistance
 
 
 def selection(matches: SequenceDistances) -> Call:
-    """Return a call that selects the nearest sequence and the runner-up."""
+    """Return a call that selects the nearest sequence and the second best."""
     from stavpr_ros.alignment import best_match
 
-    return lambda: best_match(matches, NEIGHBOURHOOD)
+    return lambda: best_match(matches, NEIGHBORHOOD)
 
 
 def largest_error(

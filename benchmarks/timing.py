@@ -30,7 +30,7 @@ class Timing:
 
     @classmethod
     def of(cls, seconds: list[float]) -> 'Timing':
-        """Summarise the seconds of at least two runs."""
+        """Summarize the seconds of at least two runs."""
         low, median, high = statistics.quantiles(seconds, n=4, method='inclusive')
         return cls(median, high - low, len(seconds))
 
@@ -39,7 +39,7 @@ def nothing() -> None:
     """Wait for nothing: the CPU's calls are done when they return."""
 
 
-def synchroniser(device: str) -> Callable[[], None]:
+def synchronizer(device: str) -> Callable[[], None]:
     """Return what waits until everything that was asked of the device is done."""
     if device == 'cpu':
         return nothing
@@ -48,14 +48,14 @@ def synchroniser(device: str) -> Callable[[], None]:
     return torch.cuda.synchronize
 
 
-def timed(call: Callable[[], Any], synchronise: Callable[[], None] = nothing) -> Job:
+def timed(call: Callable[[], Any], synchronize: Callable[[], None] = nothing) -> Job:
     """Return a job that takes the time of a call by the wall clock, as its user has it."""
 
     def job() -> float:
-        synchronise()
+        synchronize()
         began = time.perf_counter()
         call()
-        synchronise()
+        synchronize()
         return time.perf_counter() - began
 
     return job

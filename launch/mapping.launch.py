@@ -14,9 +14,9 @@ from stavpr_ros.ros.launching import node_launch
 PARAMETERS = (
     'map_path',
     'features',
-    'keyframe_seconds',
-    'keyframe_metres',
-    'keyframe_degrees',
+    'keyframe_interval',
+    'keyframe_distance',
+    'keyframe_angle',
     'keyframe_change',
     'max_places',
     'save_path',

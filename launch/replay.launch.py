@@ -18,9 +18,9 @@ PARAMETERS = (
     'mode',
     'sequence_length',
     'exclude_places',
-    'keyframe_seconds',
-    'keyframe_metres',
-    'keyframe_degrees',
+    'keyframe_interval',
+    'keyframe_distance',
+    'keyframe_angle',
     'keyframe_change',
     'geometric_check',
 )

@@ -9,9 +9,9 @@ PARAMETERS = (
     'threshold',
     'mode',
     'sequence_length',
-    'keyframe_seconds',
-    'keyframe_metres',
-    'keyframe_degrees',
+    'keyframe_interval',
+    'keyframe_distance',
+    'keyframe_angle',
     'keyframe_change',
     'geometric_check',
 )

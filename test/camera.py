@@ -25,7 +25,7 @@ def start_node(folder: Path, *options: str) -> Process:
 
     :param folder: holds ``route.stavpr``, the map; the log goes there.
     """
-    values = {'map_path': folder / 'route.stavpr', 'threshold': 0.2, 'mode': 'paper', 'neighbourhood': 5}
+    values = {'map_path': folder / 'route.stavpr', 'threshold': 0.2, 'mode': 'paper', 'nms_radius': 5}
     values |= {'sequence_length': LENGTH, 'diagnostics_period': 0.2}
     words = [word for name, value in values.items() for word in ('-p', f'{name}:={value}')]
     return Process(folder / 'node.log', 'node', '--ros-args', *words, *options)
@@ -71,9 +71,9 @@ class Camera:
         assert self.bench.answers[-1].header == message.header
         return self.bench.answers[-1]
 
-    def verdicts(self, images: list, later: int = SECOND) -> list[int]:
+    def statuses(self, images: list, later: int = SECOND) -> list[int]:
         """Show several."""
-        return [self.show(image, later).verdict for image in images]
+        return [self.show(image, later).status for image in images]
 
     def counts(self, part: str) -> dict[str, str]:
         """Return the values of the diagnostics of a part as they are now, by the clock of the machine."""

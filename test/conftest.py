@@ -43,14 +43,14 @@ def route() -> list[np.ndarray]:
 @pytest.fixture(scope='session')
 def small_map(route):
     """A map of the made-up route, with everything that a map can have."""
-    from stavpr_ros.features import Describer
+    from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import build_map
     from stavpr_ros.sources.frame import Frame
 
     frames = [Frame(image, (i + 1) * 10**9, f'place {i}') for i, image in enumerate(route)]
     poses = np.zeros((len(route), 7))
     poses[:, 0], poses[:, 6] = np.arange(len(route)), 1
-    return build_map(frames, Describer(projection=64), poses, progress=False)
+    return build_map(frames, FeatureExtractor(projection=64), poses, progress=False)
 
 
 @pytest.fixture(scope='module')
@@ -100,7 +100,7 @@ def camera(stream):
 def squeezenet_settings(data_folder):
     """The real network of the data folder, as it works best: its layer fire6/concat, 13 x 13 x 384."""
     pytest.importorskip('onnxruntime', reason='the extra onnx is not installed')
-    from stavpr_ros.features.backbone import settings_class
+    from stavpr_ros.features.registry import settings_class
 
     return settings_class('onnx')(
         model=str(data_folder / 'squeezenet1_1_imagenet' / 'squeezenet_fp16.onnx'),

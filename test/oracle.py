@@ -58,8 +58,8 @@ class Answer(NamedTuple):
     last: int
     middle: int
     distance: Any
-    runner_up_index: int
-    runner_up_distance: float
+    second_best_index: int
+    second_best_distance: float
 
 
 # ------------------------------------------------ place description and distances (sections 1, 2)
@@ -256,13 +256,13 @@ def middle(first: int, last: int) -> int:
     return (first + last) // 2
 
 
-def best_match(q: Array, m: Array, neighbourhood: int) -> Answer | None:
-    """Start of the smallest distance (lowest index on a tie) and the best one outside its neighbourhood."""
+def best_match(q: Array, m: Array, nms_radius: int) -> Answer | None:
+    """Start of the smallest distance (lowest index on a tie) and the best one outside its nms_radius."""
     best = _first_minimum(q, range(len(q)))
     if best is None:
         return None
     middles = [middle(s, s + int(m[s]) - 1) for s in range(len(q))]
-    others = [s for s in range(len(q)) if abs(middles[s] - middles[best]) > neighbourhood]
+    others = [s for s in range(len(q)) if abs(middles[s] - middles[best]) > nms_radius]
     second = _first_minimum(q, others)
     return Answer(
         start=best,
@@ -270,8 +270,8 @@ def best_match(q: Array, m: Array, neighbourhood: int) -> Answer | None:
         last=best + int(m[best]) - 1,
         middle=middles[best],
         distance=q[best],
-        runner_up_index=-1 if second is None else middles[second],
-        runner_up_distance=math.nan if second is None else float(q[second]),
+        second_best_index=-1 if second is None else middles[second],
+        second_best_distance=math.nan if second is None else float(q[second]),
     )
 
 
@@ -298,7 +298,7 @@ def answers_by_sequence(
     """
     Place and score of every query frame of D (N, n), by windows that slide by one frame.
 
-    Frames that no window is centred on take their place off the first or last window's warping path, and its
+    Frames that no window is centered on take their place off the first or last window's warping path, and its
     distance as their score.
     """
     N = D.shape[0]

@@ -57,8 +57,8 @@ def mosaic(encoding, scene, big=False):
     seen = np.zeros((height, width), np.uint8)
     for y in range(height):
         for x in range(width):
-            colour = BAYER[encoding][2 * (y % 2) + x % 2]
-            seen[y, x] = scene[y, x, 'rgb'.index(colour)]
+            color = BAYER[encoding][2 * (y % 2) + x % 2]
+            seen[y, x] = scene[y, x, 'rgb'.index(color)]
     if not is_deep(encoding):
         return seen
     low = np.full_like(seen, 201)
@@ -66,7 +66,7 @@ def mosaic(encoding, scene, big=False):
 
 
 def packed_yuv(encoding, yuv, padding=0):
-    """YUV (height, width, 3) as a message's (step, bytes); shared colours are those of the first pixel."""
+    """YUV (height, width, 3) as a message's (step, bytes); shared colors are those of the first pixel."""
     height, width = yuv.shape[:2]
     if encoding in PAIRS:
         y0, y1, u, v = PAIRS[encoding]

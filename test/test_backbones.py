@@ -9,12 +9,12 @@ import pytest
 import torch
 from checkpoints import places365_file, random_parameters
 
-from stavpr_ros.commands.feature_options import add_feature_options, make_describer
+from stavpr_ros.commands.feature_options import add_feature_options, make_extractor
 from stavpr_ros.errors import SettingsError, UnavailableError
-from stavpr_ros.features import Describer, FeatureSettings
-from stavpr_ros.features.backbone import backbone_class, settings_class
+from stavpr_ros.features import FeatureExtractor, FeatureSettings
 from stavpr_ros.features.checkpoint import load_parameters
 from stavpr_ros.features.densenet import DenseNet161, DenseNet161Places365
+from stavpr_ros.features.registry import backbone_class, settings_class
 from stavpr_ros.features.vgg import VGG16, VGG16Pool4
 
 # Typed from the published files. The numbers of parameters are those that torchvision documents for its 1000
@@ -63,7 +63,7 @@ def test_every_parameter_has_its_published_name_and_shape(network):
 
 
 def test_nothing_after_the_layer_is_kept():
-    """VGG16: the first ten convolutions. DenseNet161: layer 10 of the last block only normalises."""
+    """VGG16: the first ten convolutions. DenseNet161: layer 10 of the last block only normalizes."""
     with torch.device('meta'):
         vgg, dense = VGG16Pool4.up_to_layer(VGG16()), DenseNet161Places365.up_to_layer(DenseNet161())
     shapes = networks.vgg16_shapes()
@@ -86,7 +86,7 @@ def one_thread():
     torch.set_num_threads(threads)
 
 
-def standardised(images: list[np.ndarray], size: int) -> torch.Tensor:
+def standardized(images: list[np.ndarray], size: int) -> torch.Tensor:
     """Prepare images as the networks were trained, step by step in float64: (n, 3, size, size)."""
     small = np.stack([cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR) for image in images])
     values = (small / 255 - np.array([0.485, 0.456, 0.406])) / np.array([0.229, 0.224, 0.225])
@@ -126,7 +126,7 @@ def vgg_file(vgg_parameters, tmp_path_factory):
 
 
 def pictures(*sizes: tuple[int, int]) -> list[np.ndarray]:
-    """Smooth random pictures: neighbours alike, as in photographs, so that resizing keeps most of it."""
+    """Smooth random pictures: neighbors alike, as in photographs, so that resizing keeps most of it."""
     rng = np.random.default_rng(0)
     coarse = [rng.integers(0, 256, (12, 12, 3), np.uint8) for _ in sizes]
     return [
@@ -141,7 +141,7 @@ def test_densenet161_as_a_second_implementation_has_it(densenet_file, densenet_p
     ours = backbone_class('densenet161_places365')(settings).feature_maps(images)
     doubles = {name: value.double() for name, value in densenet_parameters.items()}
     assert ours.shape == (2, 1488, 7, 7)
-    assert_same(ours, networks.densenet161_layer10(doubles, standardised(images, 224)))
+    assert_same(ours, networks.densenet161_layer10(doubles, standardized(images, 224)))
 
 
 def test_vgg16_as_a_second_implementation_has_it(vgg_file, vgg_parameters):
@@ -151,17 +151,17 @@ def test_vgg16_as_a_second_implementation_has_it(vgg_file, vgg_parameters):
     ours = backbone_class('vgg16')(settings).feature_maps(images)
     doubles = {name: value.double() for name, value in vgg_parameters.items() if 'features' in name}
     assert ours.shape == (3, 512, 6, 6)
-    assert_same(ours, networks.vgg16_pool4(doubles, standardised(images, 96)))
+    assert_same(ours, networks.vgg16_pool4(doubles, standardized(images, 96)))
 
 
 def test_vgg16_strips_at_full_size(vgg_file):
     """14 x 14 x 512 is cut into seven strips of two columns."""
-    describer = Describer('vgg16', settings_class('vgg16')(model=str(vgg_file)))
-    assert describer.describe(pictures((60, 80))).strips.shape == (7, 1, 14 * 2 * 512)
+    extractor = FeatureExtractor('vgg16', settings_class('vgg16')(model=str(vgg_file)))
+    assert extractor.extract(pictures((60, 80))).strips.shape == (7, 1, 14 * 2 * 512)
 
 
 def test_more_images_than_go_through_at_once(vgg_file, monkeypatch):
-    monkeypatch.setattr('stavpr_ros.features.published.PER_PASS', 2)
+    monkeypatch.setattr('stavpr_ros.features.paper_networks.PER_PASS', 2)
     backbone = backbone_class('vgg16')(settings_class('vgg16')(model=str(vgg_file), size=32))
     images = pictures((32, 32), (40, 40), (50, 32), (32, 50), (64, 64))
     together = backbone.feature_maps(images)
@@ -191,13 +191,13 @@ def test_half_is_no_part_of_the_identity_and_no_change_on_a_cpu(vgg_file):
 
 
 def test_a_map_knows_the_weights_wherever_they_are(vgg_file, tmp_path):
-    settings = Describer('vgg16', settings_class('vgg16')(model=str(vgg_file), size=112)).settings
+    settings = FeatureExtractor('vgg16', settings_class('vgg16')(model=str(vgg_file), size=112)).settings
     settings = FeatureSettings.from_json(settings.to_json().replace(str(vgg_file), '/gone/vgg16.pth'))
     with pytest.raises(UnavailableError, match=r'/gone/vgg16\.pth.*cannot be read'):
-        Describer.from_settings(settings, None)
+        FeatureExtractor.from_settings(settings, None)
     moved = tmp_path / 'moved.pth'
     moved.hardlink_to(vgg_file)
-    assert Describer.from_settings(settings, None, model=str(moved)).settings == settings
+    assert FeatureExtractor.from_settings(settings, None, model=str(moved)).settings == settings
 
 
 def test_other_networks_weights_are_refused(densenet_parameters):
@@ -239,8 +239,8 @@ def test_options_of_the_command_line(vgg_file):
     parser = argparse.ArgumentParser()
     add_feature_options(parser)
     words = ['--features', 'vgg16', '--vgg16-model', str(vgg_file), '--vgg16-size', '112', '--device', 'cpu']
-    describer = make_describer(parser.parse_args([*words, '--vgg16-half', 'true']))
-    assert (describer.settings.backbone.size, describer.settings.backbone.half) == (112, True)
+    extractor = make_extractor(parser.parse_args([*words, '--vgg16-half', 'true']))
+    assert (extractor.settings.backbone.size, extractor.settings.backbone.half) == (112, True)
     words = ['--features', 'densenet161_places365', '--densenet161_places365-model', '/gone']
     with pytest.raises(UnavailableError, match='/gone'):
-        make_describer(parser.parse_args([*words, '--device', 'cpu']))
+        make_extractor(parser.parse_args([*words, '--device', 'cpu']))

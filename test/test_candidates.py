@@ -1,4 +1,4 @@
-"""Candidates: non-maximum suppression against a plain loop, and what a recogniser answers with them."""
+"""Candidates: non-maximum suppression against a plain loop, and what a recognizer answers with them."""
 
 import math
 
@@ -8,20 +8,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.alignment.temporal import SequenceMatch
+from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.errors import InputError
-from stavpr_ros.recognition import Candidate, Recogniser, RecognitionSettings
+from stavpr_ros.recognition import Candidate, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.candidates import ranked_candidates
-from stavpr_ros.recognition.cures import ROBUST, evidence, relative_distance
+from stavpr_ros.recognition.robust.options import ROBUST, evidence, relative_distance
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 
 
-def plain(costs, places, count, neighbourhood):
+def plain(costs, places, count, nms_radius):
     """Return the indices of the sequences that are taken, one after the other."""
     taken = []
     for index in sorted(range(len(costs)), key=lambda i: (costs[i], i)):
-        apart = all(abs(places[index] - places[other]) > neighbourhood for other in taken)
+        apart = all(abs(places[index] - places[other]) > nms_radius for other in taken)
         if apart and len(taken) < count and math.isfinite(costs[index]):
             taken.append(index)
     return taken
@@ -45,12 +45,12 @@ cases = st.integers(1, 40).flatmap(
 @given(cases)
 def test_candidates_are_those_of_a_plain_loop(case):
     """Few different costs: most of them are ties."""
-    costs, places, count, neighbourhood = case
+    costs, places, count, nms_radius = case
     costs, places = np.array(costs, np.float32), np.array(places, np.int32)
     nearest = nearest_of(costs, places, float(costs.min())) if np.isfinite(costs).any() else None
     before = costs.copy()
-    found = ranked_candidates(nearest, (costs, places), count, neighbourhood, relative=False)
-    expected = plain(costs.tolist(), places.tolist(), count, neighbourhood)
+    found = ranked_candidates(nearest, (costs, places), count, nms_radius, relative=False)
+    expected = plain(costs.tolist(), places.tolist(), count, nms_radius)
     assert found == [Candidate(int(places[i]), float(costs[i])) for i in expected]
     np.testing.assert_array_equal(costs, before)
 
@@ -77,23 +77,23 @@ def test_relative_distances_are_evidence_against_the_nearest():
 
 @pytest.mark.parametrize('mode', ['paper', 'robust', 'dtw'])
 def test_the_first_two_are_the_nearest_and_the_runner_up(small_map, mode):
-    settings = RecognitionSettings(
+    settings = RecognizerSettings(
         1.0,
         sequence=SHORT,
-        neighbourhood=5,
+        nms_radius=5,
         mode='paper' if mode == 'paper' else 'robust',
-        cures=ROBUST.without('speeds') if mode == 'dtw' else None,
+        robust_options=ROBUST.without('velocity_search') if mode == 'dtw' else None,
     )
-    one = Recogniser(small_map, settings)
+    one = PlaceRecognizer(small_map, settings)
     assert one.ranked(3) == []
     for i in [*range(10, 30), *range(0, 12)]:
-        nearest = one.add(small_map.features[i : i + 1]).nearest
+        nearest = one.update(small_map.features[i : i + 1]).sequence
         ranked = one.ranked(4)
         if nearest is None:
             assert ranked == []
             continue
         assert (ranked[0].place, ranked[0].distance) == (nearest.middle, nearest.distance)
-        assert (ranked[1].place, ranked[1].distance) == (nearest.runner_up_index, nearest.runner_up_distance)
+        assert (ranked[1].place, ranked[1].distance) == (nearest.second_best_index, nearest.second_best_distance)
         assert len(ranked) == 4
         places = sorted(c.place for c in ranked)
         assert min(np.diff(places)) > 5
@@ -106,10 +106,10 @@ def test_the_first_two_are_the_nearest_and_the_runner_up(small_map, mode):
 
 
 def test_all_candidates_of_a_window(small_map):
-    """Against a plain loop over the places that the recogniser lists."""
-    one = Recogniser(small_map, RecognitionSettings(1.0, sequence=SHORT, neighbourhood=3))
+    """Against a plain loop over the places that the recognizer lists."""
+    one = PlaceRecognizer(small_map, RecognizerSettings(1.0, sequence=SHORT, nms_radius=3))
     for i in range(20, 30):
-        one.add(small_map.features[i : i + 1])
+        one.update(small_map.features[i : i + 1])
     places, distances = one.candidates(60)
     expected = plain(distances.tolist(), places.tolist(), 60, 3)
     found = one.ranked(60)
@@ -123,12 +123,12 @@ def test_an_empty_map_has_no_candidates(small_map):
 
     like = small_map
     empty = PlaceMap(like.features[0:0], like.projection, like.stamps[:0], (), None, ())
-    one = Recogniser(empty, RecognitionSettings(1.0, sequence=SHORT))
+    one = PlaceRecognizer(empty, RecognizerSettings(1.0, sequence=SHORT))
     for i in range(6):
-        one.add(small_map.features[i : i + 1])
+        one.update(small_map.features[i : i + 1])
     assert one.ranked(5) == []
 
 
 def test_a_negative_count_is_refused(small_map):
     with pytest.raises(InputError, match='-1'):
-        Recogniser(small_map, RecognitionSettings(1.0, sequence=SHORT)).ranked(-1)
+        PlaceRecognizer(small_map, RecognizerSettings(1.0, sequence=SHORT)).ranked(-1)

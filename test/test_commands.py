@@ -18,11 +18,11 @@ from stavpr_ros.commands import build_map as build_map_command
 from stavpr_ros.commands import record as record_command
 from stavpr_ros.commands.demo import TOPIC, make_room
 from stavpr_ros.commands.loop_demo import read_result
-from stavpr_ros.commands.loop_demo_pictures import choose_closures
 from stavpr_ros.commands.record import loop_closure_record, match_record
+from stavpr_ros.demonstration.loop_plots import choose_closures
 from stavpr_ros.errors import SourceError
 from stavpr_ros.evaluation.drive import judge
-from stavpr_ros.evaluation.truth import GroundTruth
+from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.mapping import load_map
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
@@ -67,11 +67,11 @@ def test_build_map(drive, tmp_path):
 
 
 def test_build_map_of_keyframes(drive, tmp_path):
-    """Every second image, two metres on; the rule of three metres leaves every fourth."""
+    """Every second image, two meters on; the rule of three meters leaves every fourth."""
     poses = tmp_path / 'poses.csv'
     poses.write_text(''.join(f'{i}, 0, 0\n' for i in range(24)))
     output = tmp_path / 'map.stavpr'
-    options = ['--poses', poses, '--every', 2, '--keyframe-metres', 3, '--keyframe-change', 0.01]
+    options = ['--poses', poses, '--every', 2, '--keyframe-distance', 3, '--keyframe-change', 0.01]
     result = run('build_map', '--input', drive, '--output', output, *options, '--thumbnail-width', 64)
     assert result.returncode == 0, result.stderr
     assert '6 of 12 images became places, 6 of them with a pose' in result.stdout
@@ -85,7 +85,7 @@ def test_build_map_of_keyframes(drive, tmp_path):
 
 
 def test_build_map_with_the_odometry_of_the_bag(tmp_path):
-    """Ten images, one a second from 100 s on; odometry from 102 s on, a metre a second."""
+    """Ten images, one a second from 100 s on; odometry from 102 s on, a meter a second."""
     images = [ImageRecord.of_image(image, (100 + i) * 10**9) for i, image in enumerate(route_images(10))]
     bag = write_odometry(tmp_path / 'bag', [(102 + i) * 10**9 for i in range(8)], images=images)
     output = tmp_path / 'map.stavpr'
@@ -94,7 +94,7 @@ def test_build_map_with_the_odometry_of_the_bag(tmp_path):
     assert '10 of 10 images became places, 8 of them with a pose' in result.stdout
     assert load_map(output).pose(1) is None
     assert load_map(output).pose(5)[0] == 3
-    options = ['--odometry', '/odom', '--keyframe-metres', '1.5', '--keyframe-seconds', '2.5']
+    options = ['--odometry', '/odom', '--keyframe-distance', '1.5', '--keyframe-interval', '2.5']
     result = run('build_map', '--input', bag, '--output', output, *options)
     assert result.returncode == 0, result.stderr
     assert '3 of 10 images became places, 3 of them' in result.stdout
@@ -123,9 +123,9 @@ def test_build_map_with_odometry_of_another_clock(tmp_path):
         (['--gradient-cell', '7'], 0, ''),
         (['--gradient-cell', '9'], 2, 'multiple'),
         (['--poses', '/missing.csv'], 1, '/missing.csv'),
-        (['--keyframe-metres', '1'], 2, 'need --odometry or --poses'),
-        (['--keyframe-degrees', '1'], 2, 'need --odometry or --poses'),
-        (['--keyframe-seconds', '1'], 2, 'have no times'),
+        (['--keyframe-distance', '1'], 2, 'need --odometry or --poses'),
+        (['--keyframe-angle', '1'], 2, 'need --odometry or --poses'),
+        (['--keyframe-interval', '1'], 2, 'have no times'),
         (['--keyframe-change', '-1'], 2, 'change = -1'),
         (['--odometry', '/odom'], 2, 'is no bag'),
         (['--odometry', '/odom', '--poses', 'x.csv'], 2, 'give one'),
@@ -266,7 +266,7 @@ def test_demo_on_a_bag_and_a_folder(drive, tmp_path):
     assert '24.png' in result.stdout
     assert '24 of 24 images matched' in result.stdout
     records = [json.loads(line) for line in (output / 'matches.jsonl').read_text().splitlines()]
-    assert [record['verdict'] for record in records] == ['WARMING_UP'] * 19 + ['MATCH'] * 5
+    assert [record['status'] for record in records] == ['WARMING_UP'] * 19 + ['MATCH'] * 5
     assert records[-1]['newest_index'] == 23
     for name in ('demo.png', 'matches.png', 'distance_matrix.png', 'distance_over_time.png'):
         assert cv2.imread(str(output / name)).std() > 5
@@ -285,9 +285,9 @@ def test_demo_of_loop_closure(tmp_path):
     result = run('demo', '--loop', drive, *options, '--output', output)
     assert result.returncode == 0, result.stdout + result.stderr
     records = [json.loads(line) for line in (output / 'matches.jsonl').read_text().splitlines()]
-    assert [i for i, record in enumerate(records) if record['verdict'] == 'SKIPPED'] == [36]
+    assert [i for i, record in enumerate(records) if record['status'] == 'SKIPPED'] == [36]
     closures = [json.loads(line) for line in (output / 'loop_closures.jsonl').read_text().splitlines()]
-    assert len(closures) == sum(record['verdict'] == 'MATCH' for record in records) > 20
+    assert len(closures) == sum(record['status'] == 'MATCH' for record in records) > 20
     last = closures[-1]
     assert (last['query_index'], last['place_index']) == (67, 31)  # the fourth of the places 64 to 71
     assert [pair[0] - pair[2] for pair in last['pairs']] == [36] * len(last['pairs'])
@@ -305,13 +305,13 @@ def test_demo_of_loop_closure(tmp_path):
 
 def test_the_numbers_of_loop_closures():
     """Windows of one; of six images, image 1 is no place: place 3 is image 4, place 4 image 5."""
-    verdicts = ['WARMING_UP', 'SKIPPED', 'NO_MATCH', 'NO_MATCH', 'MATCH', 'MATCH']
+    statuses = ['WARMING_UP', 'SKIPPED', 'NO_MATCH', 'NO_MATCH', 'MATCH', 'MATCH']
     truth = GroundTruth.from_pairs([4, 5], [0, 3], 6, 6)
     closures = [
         {'query_index': 3, 'place_index': 0, 'distance': 0.5, 'pairs': [[3, 9, 0, 9], [2, 9, 0, 9]]},
         {'query_index': 4, 'place_index': 0, 'distance': 0.6, 'pairs': [[4, 9, 0, 9]]},
     ]
-    result = read_result([{'verdict': verdict} for verdict in verdicts], closures, truth, 2)
+    result = read_result([{'status': status} for status in statuses], closures, truth, 2)
     assert result.closures.tolist() == [[4, 0], [5, 0]]
     assert result.right.tolist() == [True, False]
     assert result.pairs.tolist() == [[3, 0], [4, 0], [5, 0]]
@@ -320,7 +320,7 @@ def test_the_numbers_of_loop_closures():
     assert second == '1 of 2 loop closures are right, precision 0.500'
     assert third.startswith('1 of 2 images')
     assert third.endswith('recall 0.500')
-    nothing = read_result([{'verdict': verdict} for verdict in verdicts], [], None, 2)
+    nothing = read_result([{'status': status} for status in statuses], [], None, 2)
     assert nothing.lines() == ['0 loop closures in 6 images (1 were too like the one before)']
 
 
@@ -355,8 +355,8 @@ def test_loop_closures_as_json():
     ['WARMING_UP', 'NO_MATCH', 'MATCH', 'INVALID_IMAGE', 'NOT_READY', 'DROPPED', 'SKIPPED', 'MAPPED'],
 )
 def test_every_verdict_has_its_name(name):
-    record = match_record(PlaceMatch(verdict=getattr(PlaceMatch, name), inliers=12))
-    assert (record['verdict'], record['inliers']) == (name, 12)
+    record = match_record(PlaceMatch(status=getattr(PlaceMatch, name), inliers=12))
+    assert (record['status'], record['inliers']) == (name, 12)
 
 
 def test_demo_that_is_ended_leaves_nobody_behind(drive, tmp_path):
@@ -373,12 +373,12 @@ def test_demo_that_is_ended_leaves_nobody_behind(drive, tmp_path):
     assert str(output) not in running
 
 
-def record(verdict, place=-1):
+def record(status, place=-1):
     path = [[0, place - 1], [1, place], [2, place + 1]] if place >= 0 else []
-    return {'verdict': verdict, 'sequence_middle': place, 'distance': 0.1, 'path': path, 'received': 0}
+    return {'status': status, 'sequence_middle': place, 'distance': 0.1, 'path': path, 'received': 0}
 
 
-def test_an_invalid_image_does_not_shift_the_judgement():
+def test_an_invalid_image_does_not_shift_the_judgment():
     """Windows of 3; image 3 is in none, so the window that ends with image 4 holds images 1, 2 and 4."""
     records = [record('WARMING_UP'), record('WARMING_UP'), record('MATCH', 1), record('INVALID_IMAGE')]
     records += [record('MATCH', 2), record('MATCH', 4)]

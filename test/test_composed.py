@@ -35,7 +35,7 @@ def make(context):
     made = []
 
     def make(**parameters):
-        values = {'autostart': False, 'threads': 1, 'sequence_length': 5, 'neighbourhood': 5} | parameters
+        values = {'autostart': False, 'threads': 1, 'sequence_length': 5, 'nms_radius': 5} | parameters
         overrides = [Parameter(name, value=value) for name, value in values.items()]
         made.append(PlaceRecognitionNode(context=context, parameter_overrides=overrides))
         return made[-1]
@@ -53,7 +53,7 @@ def test_ros_may_be_shut_down_before_the_node_is_destroyed(make, context, route,
     for i, image in enumerate(route[:20]):
         node.configured.images._on_image(image_message(image, i + 1))
     end = time.monotonic() + PATIENCE
-    while not len(node.configured.engine.places) and time.monotonic() < end:
+    while not len(node.configured.pipeline.places) and time.monotonic() < end:
         time.sleep(0.001)
     rclpy.shutdown(context=context)
     node.destroy_node()
@@ -104,7 +104,7 @@ def test_a_parameter_that_is_set_while_the_start_fails_starts_it_again(make, sma
     assert not node._start.is_canceled()
     node._callbacks = {key: fail if value == fails else value for key, value in node._callbacks.items()}
     node._on_start()
-    assert (node.state, len(node.configured.engine.places)) == ('active', 60)
+    assert (node.state, len(node.configured.pipeline.places)) == ('active', 60)
 
 
 def test_a_file_that_cannot_be_written_is_refused_before_the_drive(make, tmp_path):

@@ -32,7 +32,7 @@ FILES = ('test_cuda_kernels.py', 'test_cuda_matcher.py')
 @pytest.fixture(scope='module')
 def runtime():
     """What kernels run on here; skips where there is nothing."""
-    from stavpr_ros.alignment.kernels.cuda import compilation
+    from stavpr_ros.alignment.cuda import compilation
 
     try:
         return compilation.runtime()
@@ -64,14 +64,14 @@ def test_everything_in_the_simulator():
 def test_without_a_device_there_is_an_error_that_says_so():
     if SIMULATOR or torch.cuda.is_available():
         pytest.skip('there is something to run kernels on')
-    from stavpr_ros.alignment.kernels.cuda import compilation
+    from stavpr_ros.alignment.cuda import compilation
 
     with pytest.raises(UnavailableError, match='no CUDA device'):
         compilation.runtime()
 
 
 def test_a_missing_numba_cuda_is_named(monkeypatch):
-    from stavpr_ros.alignment.kernels.cuda import compilation
+    from stavpr_ros.alignment.cuda import compilation
 
     monkeypatch.setattr(torch.cuda, 'is_available', lambda: True)
     monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
@@ -81,7 +81,7 @@ def test_a_missing_numba_cuda_is_named(monkeypatch):
 
 @pytest.mark.skipif(SIMULATOR, reason='the simulator compiles nothing')
 def test_the_compiler_keeps_everything_in_registers():
-    from stavpr_ros.alignment.kernels.cuda import temporal
+    from stavpr_ros.alignment.cuda import lm_dtw
 
     program = Path(__file__).resolve().parents[1] / 'benchmarks' / 'cuda_registers.py'
     done = subprocess.run([sys.executable, str(program)], capture_output=True, text=True, check=False)
@@ -94,7 +94,7 @@ def test_the_compiler_keeps_everything_in_registers():
         assert report['fused_multiply_adds'] == 0, name
         assert report['spill_store_bytes'] == report['spill_load_bytes'] == 0, name
         rows = re.search(r'l=(\d+)', name)
-        long = rows is not None and int(rows[1]) > temporal.REGISTER_ROWS
+        long = rows is not None and int(rows[1]) > lm_dtw.REGISTER_ROWS
         assert (report['stack_bytes'] > 0) == long, name
 
 
@@ -103,14 +103,14 @@ def test_the_compiler_keeps_everything_in_registers():
 
 def image_distances(runtime, products, strategy, sigma=1.0, xi=None, block=4):
     """Run a spatial kernel on products (queries, W, W, places)."""
-    from stavpr_ros.alignment.kernels.cuda import spatial
+    from stavpr_ros.alignment.cuda import dtw
 
     queries, W, _, n = products.shape
     band = W if xi is None else xi
     if strategy == 'sliding_window':
-        function = spatial.sliding_window(W, 4, band)
+        function = dtw.sliding_window(W, 4, band)
     else:
-        function = spatial.spatial_dtw(W, band)
+        function = dtw.spatial_dtw(W, band)
     device = runtime.torch_device
     block_of_products = torch.from_numpy(products).reshape(queries * W, W, n).to(device)
     # one row and two columns more than the kernel is to write
@@ -167,14 +167,14 @@ def test_cells_outside_the_band_are_not_read(runtime):
 
 
 def test_products_of_any_strides(runtime):
-    from stavpr_ros.alignment.kernels.cuda import spatial
+    from stavpr_ros.alignment.cuda import dtw
 
     products = random_products(5, 2, 5, 6)
     by_strip = np.ascontiguousarray(products.reshape(10, 5, 6).transpose(1, 0, 2))
     view = torch.from_numpy(by_strip).to(runtime.torch_device).permute(1, 0, 2)
     out = torch.zeros((2, 6), device=runtime.torch_device)
     arguments = runtime.array(view), np.float32(1), 0, 0, runtime.array(out)
-    runtime.launch(spatial.spatial_dtw(5, 5), (2, 2), 4, *arguments)
+    runtime.launch(dtw.spatial_dtw(5, 5), (2, 2), 4, *arguments)
     np.testing.assert_array_equal(out.cpu().numpy(), expected_images(products, 'adaptive'))
 
 
@@ -183,12 +183,12 @@ def test_products_of_any_strides(runtime):
 
 def run_sequences(runtime, D, k, apart, block=8, columns=None, first=0, launches=1):
     """Run the kernel on a window D (l, n); return distances, lengths and the selection."""
-    from stavpr_ros.alignment.kernels.cuda import selection, temporal
+    from stavpr_ros.alignment.cuda import lm_dtw, selection
 
     l, n = D.shape
     device = runtime.torch_device
     blocks = -(-n // block)
-    rows = torch.full((first + l, temporal.row_pitch(n, k, block)), INF)
+    rows = torch.full((first + l, lm_dtw.row_pitch(n, k, block)), INF)
     rows[:first] = -1  # rows that are not of the window
     rows[first:, :n] = torch.from_numpy(D)
     rows = rows.to(device)
@@ -199,7 +199,7 @@ def run_sequences(runtime, D, k, apart, block=8, columns=None, first=0, launches
     buffer = selection.SelectionBuffer(runtime, l, k)
     scratch = (distances, lengths, block_distances, block_starts, finished)
     arrays = [runtime.array(tensor) for tensor in scratch]
-    function = temporal.lm_dtw(l, k, block, columns)
+    function = lm_dtw.lm_dtw(l, k, block, columns)
     for _ in range(launches):
         window = runtime.array(rows), first, apart
         runtime.launch(function, (blocks, 1), block, *window, *arrays, *buffer.arguments)
@@ -223,12 +223,12 @@ def check_sequences(runtime, D, beta, apart=3, **launch):
     if answer is None:
         return
     assert (found.start, found.length, found.distance) == (answer.start, answer.length, answer.distance)
-    if answer.runner_up_index == -1:
-        assert found.runner_up_start == twin.runner_up_index == -1
+    if answer.second_best_index == -1:
+        assert found.second_best_start == twin.second_best_index == -1
     else:
-        middle = (2 * found.runner_up_start + found.runner_up_length - 1) // 2
-        assert middle == answer.runner_up_index == twin.runner_up_index
-        assert found.runner_up_distance == answer.runner_up_distance == twin.runner_up_distance
+        middle = (2 * found.second_best_start + found.second_best_length - 1) // 2
+        assert middle == answer.second_best_index == twin.second_best_index
+        assert found.second_best_distance == answer.second_best_distance == twin.second_best_distance
     seen = D[:, found.start : found.start + k]
     np.testing.assert_array_equal(found.cells[:, : seen.shape[1]], seen)
     assert np.isinf(found.cells[:, seen.shape[1] :]).all()
@@ -274,7 +274,7 @@ def test_nothing_is_finite(runtime):
     distances, lengths, found = run_sequences(runtime, D, 6, 2)
     assert np.isinf(distances).all()
     assert not lengths.any()
-    assert (found.start, found.runner_up_start) == (-1, -1)
+    assert (found.start, found.second_best_start) == (-1, -1)
 
 
 def test_the_lowest_start_wins_across_blocks(runtime):
@@ -282,11 +282,11 @@ def test_the_lowest_start_wins_across_blocks(runtime):
     found = run_sequences(runtime, D, 6, 4)[2]
     # every start is as good as every other: a path down the first column has m = 1
     assert (found.start, found.length) == (0, 1)
-    assert found.runner_up_start == 5
+    assert found.second_best_start == 5
 
 
 @pytest.mark.parametrize('apart', [0, 1, 7, 8, 20, 39, 1000])
-def test_the_runner_up_lies_outside_the_neighbourhood(runtime, apart):
+def test_the_runner_up_lies_outside_the_neighborhood(runtime, apart):
     D = random_window(11, 3, 40, levels=4)
     check_sequences(runtime, D, 2.0, apart=apart, block=4)
 
@@ -298,7 +298,7 @@ def test_the_window_may_start_at_any_row_and_be_matched_again(runtime):
     again = run_sequences(runtime, D, k, 2, first=3, launches=3)
     for a, b in zip(once[:2], again[:2], strict=True):
         np.testing.assert_array_equal(a, b)
-    assert (once[2].start, once[2].runner_up_start) == (again[2].start, again[2].runner_up_start)
+    assert (once[2].start, once[2].second_best_start) == (again[2].start, again[2].second_best_start)
 
 
 @settings(max_examples=12)
@@ -319,14 +319,14 @@ def test_any_window(runtime, seed, l, n, beta, levels, banned, apart, block, col
 
 
 def test_the_default_window_is_staged_at_once_and_long_ones_not_at_all():
-    from stavpr_ros.alignment.kernels.cuda import temporal
+    from stavpr_ros.alignment.cuda import lm_dtw
 
-    assert temporal.staged_columns(20, 40, temporal.BLOCK) == 40
-    for l in range(2, temporal.REGISTER_ROWS + 1):
-        columns = temporal.staged_columns(l, 2 * l, temporal.BLOCK)
+    assert lm_dtw.staged_columns(20, 40, lm_dtw.BLOCK) == 40
+    for l in range(2, lm_dtw.REGISTER_ROWS + 1):
+        columns = lm_dtw.staged_columns(l, 2 * l, lm_dtw.BLOCK)
         assert columns >= 1
-        assert 4 * l * (temporal.BLOCK + columns - 1) + 8 * temporal.BLOCK <= 48 * 1024
-    assert temporal.staged_columns(1000, 2000, temporal.BLOCK) == 0
+        assert 4 * l * (lm_dtw.BLOCK + columns - 1) + 8 * lm_dtw.BLOCK <= 48 * 1024
+    assert lm_dtw.staged_columns(1000, 2000, lm_dtw.BLOCK) == 0
 
 
 @pytest.mark.skipif(SIMULATOR, reason='sizes of a real map take a real device')
@@ -337,10 +337,10 @@ def test_many_places_on_the_device(runtime):
         D = random_window(l, l, n)
         sequence = SequenceSettings(length=l, beta=beta)
         expected = match_sequence(D, sequence)
-        from stavpr_ros.alignment.kernels.cuda import temporal
+        from stavpr_ros.alignment.cuda import lm_dtw
 
-        distances, lengths, found = run_sequences(runtime, D, sequence.k, 20, block=temporal.BLOCK)
+        distances, lengths, found = run_sequences(runtime, D, sequence.k, 20, block=lm_dtw.BLOCK)
         np.testing.assert_array_equal(distances, expected.distances)
         np.testing.assert_array_equal(lengths, expected.lengths)
         assert found.start == best_match(expected, 20).first
-        assert found.runner_up_distance == best_match(expected, 20).runner_up_distance
+        assert found.second_best_distance == best_match(expected, 20).second_best_distance

@@ -10,7 +10,7 @@ import torch
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.features.description import FeatureSettings
+from stavpr_ros.features.extractor import FeatureSettings
 
 SIMULATOR = os.environ.get('NUMBA_ENABLE_CUDASIM') == '1'
 SHORT = SequenceSettings(length=3, beta=2.0)
@@ -23,18 +23,17 @@ TOLERANCE = 1e-5
 @pytest.fixture(scope='module')
 def matcher_class():
     """The class, with small blocks; skips where there is nothing that kernels could run on."""
-    from stavpr_ros.alignment.kernels.cuda.compilation import runtime
+    from stavpr_ros.alignment.cuda.compilation import runtime
     from stavpr_ros.recognition.cuda_matcher import CudaMatcher
 
     try:
         runtime()
     except UnavailableError as error:
         pytest.skip(f'{error}; the same test runs in the simulator')
-    from stavpr_ros.alignment.kernels.cuda import spatial, temporal
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(spatial, 'BLOCK', 4)
-        patch.setattr(temporal, 'BLOCK', 8)
+        patch.setattr(dtw, 'BLOCK', 4)
+        patch.setattr(lm_dtw, 'BLOCK', 8)
         yield CudaMatcher
 
 
@@ -119,15 +118,15 @@ def same(a, b):
     if a[0] is None or b[0] is None:
         return a[0] is b[0] and a[1].shape == b[1].shape == (0, 2)
     (match, path), (twin, twin_path) = a, b
-    fields = ('first', 'last', 'distance', 'runner_up_index')
+    fields = ('first', 'last', 'distance', 'second_best_index')
     equal = all(getattr(match, name) == getattr(twin, name) for name in fields)
-    runners = np.array_equal(match.runner_up_distance, twin.runner_up_distance, equal_nan=True)
+    runners = np.array_equal(match.second_best_distance, twin.second_best_distance, equal_nan=True)
     return equal and runners and np.array_equal(path, twin_path) and path.dtype == twin_path.dtype
 
 
 @pytest.mark.parametrize(('n', 'length', 'beta'), [(19, 3, 2.0), (1, 2, 1.5), (4, 3, 3.0)])
-@pytest.mark.parametrize('neighbourhood', [0, 3])
-def test_the_window_rolls_like_the_one_of_the_cpu(matcher_class, n, length, beta, neighbourhood):
+@pytest.mark.parametrize('nms_radius', [0, 3])
+def test_the_window_rolls_like_the_one_of_the_cpu(matcher_class, n, length, beta, nms_radius):
     from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 
     sequence = SequenceSettings(length=length, beta=beta)
@@ -142,24 +141,24 @@ def test_the_window_rolls_like_the_one_of_the_cpu(matcher_class, n, length, beta
         twin.push(torch.from_numpy(row))
         assert len(matcher) == len(twin) == min(t + 1, length)
         if t + 1 >= length:
-            answer, expected = matcher.match(neighbourhood), twin.match(neighbourhood)
+            answer, expected = matcher.match(nms_radius), twin.match(nms_radius)
             assert same(answer, expected), (answer, expected)
     matcher.reset()
     assert len(matcher) == 0
-    assert matcher.match(neighbourhood)[0] is None
+    assert matcher.match(nms_radius)[0] is None
 
 
 def first_image(x):
     return x.strips[:, 0], x.weights[:, 0]
 
 
-def test_a_drive_is_recognised_with_cures_between(matcher_class):
+def test_a_drive_is_recognized_with_cures_between(matcher_class):
     reference = features(12)
     matcher = matcher_class(reference, SpatialSettings(xi=2), SHORT)
     for place in range(5, 8):
         row = matcher.distances(reference.strips[:, place], reference.weights[:, place])
         matcher.push((row - row.mean()) / row.std())
-    match, path = matcher.match(neighbourhood=2)
+    match, path = matcher.match(nms_radius=2)
     assert (match.first, match.last) == (5, 7)
     assert path.tolist() == [[0, 5], [1, 6], [2, 7]]
 
@@ -197,11 +196,10 @@ def test_settings_that_do_not_fit_the_map(matcher_class):
 @pytest.mark.skipif(SIMULATOR, reason='sizes of a real map take a real device')
 @pytest.mark.parametrize('precision', ['float32', 'float16'])
 def test_a_large_map_on_the_device(matcher_class, monkeypatch, precision):
-    from stavpr_ros.alignment.kernels.cuda import spatial, temporal
     from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 
-    monkeypatch.setattr(spatial, 'BLOCK', 128)
-    monkeypatch.setattr(temporal, 'BLOCK', 128)
+    monkeypatch.setattr(dtw, 'BLOCK', 128)
+    monkeypatch.setattr(lm_dtw, 'BLOCK', 128)
     reference, query = features(30_000, strips=7), features(25, seed=1, strips=7)
     settings, sequence = SpatialSettings(xi=3), SequenceSettings()
     matcher = matcher_class(reference, settings, sequence, precision)

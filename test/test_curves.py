@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stavpr_ros.errors import InputError, UnavailableError
-from stavpr_ros.evaluation.curves import Ranking, false_alarm_rate, judge_ranking, nearest_places
-from stavpr_ros.evaluation.truth import GroundTruth
+from stavpr_ros.evaluation.curves import Ranking, evaluate_ranking, false_alarm_rate, nearest_places
+from stavpr_ros.evaluation.ground_truth import GroundTruth
 
 pytest.importorskip('sklearn', reason='the extra evaluation is not installed')
 
@@ -30,7 +30,7 @@ def test_a_curve_by_hand():
     more    4          2  2  1  1/2        2/3
     """
     truth = GroundTruth.from_pairs([0, 1, 2, 3], [0, 1, 2, 3], N=5, n=9)
-    judged = judge_ranking(ranking([0, 8, 2, -1, 4], [0.1, 0.2, 0.3, np.inf, 0.4]), truth)
+    judged = evaluate_ranking(ranking([0, 8, 2, -1, 4], [0.1, 0.2, 0.3, np.inf, 0.4]), truth)
     np.testing.assert_allclose(judged.curve.precision, [1, 1, 1 / 2, 2 / 3, 1 / 2])
     np.testing.assert_allclose(judged.curve.recall, [0, 1 / 4, 1 / 3, 2 / 3, 2 / 3])
     assert judged.best.threshold == 0.4
@@ -51,27 +51,27 @@ def test_recall_at_counts_any_of_the_first_k():
     places[1, :7] = 1, 2, 4, 5, 6, 7, 3
     places[2, :1] = 8
     places[3, :1] = 3  # of no place in the map: does not count
-    found = judge_ranking(ranking(places, np.arange(4)), truth).recall_at
+    found = evaluate_ranking(ranking(places, np.arange(4)), truth).recall_at
     assert found == {1: 0, 5: pytest.approx(1 / 3), 10: pytest.approx(2 / 3), 20: pytest.approx(2 / 3)}
 
 
 def test_only_some_frames_are_judged():
     truth = GroundTruth.identity(6, 6)
     answers = ranking([9 % 6, 1, 2, 3, 0, 0], np.arange(6))
-    assert judge_ranking(answers, truth, slice(1, 4)).best.f1 == 1
-    assert judge_ranking(answers, truth, slice(1, 4)).queries == 3
-    assert judge_ranking(answers, truth).best.f1 < 1
+    assert evaluate_ranking(answers, truth, slice(1, 4)).best.f1 == 1
+    assert evaluate_ranking(answers, truth, slice(1, 4)).queries == 3
+    assert evaluate_ranking(answers, truth).best.f1 < 1
     with pytest.raises(InputError, match='no queries'):
-        judge_ranking(answers, truth, slice(6, 6))
+        evaluate_ranking(answers, truth, slice(6, 6))
 
 
 def test_no_answer_is_not_near():
     truth = GroundTruth.identity(3, 3)
-    judged = judge_ranking(ranking([0, 1, 2], [np.nan, np.inf, 0.5]), truth)
+    judged = evaluate_ranking(ranking([0, 1, 2], [np.nan, np.inf, 0.5]), truth)
     assert judged.best.true_positives == 1
     assert judged.best.false_negatives == 2
     assert judged.average_precision > 0.5
-    nothing = judge_ranking(ranking([-1, -1, -1], [np.inf] * 3), truth)
+    nothing = evaluate_ranking(ranking([-1, -1, -1], [np.inf] * 3), truth)
     assert (nothing.best.f1, nothing.average_precision, nothing.recall_at_full_precision) == (0, 0, 0)
 
 
@@ -84,7 +84,7 @@ def test_f1_is_the_paper_s_and_average_precision_scikit_learn_s():
         scores, places = rng.integers(0, 9, 15) / 8, rng.integers(0, 6, 15)
         right = rng.integers(0, 6, 15)
         truth = GroundTruth.from_pairs(np.arange(15), right, N=15, n=6, tolerance=1)
-        judged = judge_ranking(ranking(places, scores), truth)
+        judged = evaluate_ranking(ranking(places, scores), truth)
         answers = list(zip(places.tolist(), scores.tolist(), strict=True))
         assert judged.best.f1 == pytest.approx(oracle.best_f1(answers, [[p] for p in right.tolist()], 1))
         correct = np.abs(places - right) <= 1
@@ -93,7 +93,7 @@ def test_f1_is_the_paper_s_and_average_precision_scikit_learn_s():
 
 def test_scores_of_mode_robust_may_be_negative():
     truth = GroundTruth.identity(4, 4)
-    judged = judge_ranking(ranking([0, 1, 0, 3], [-3.0, -2.0, -1.0, np.inf]), truth)
+    judged = evaluate_ranking(ranking([0, 1, 0, 3], [-3.0, -2.0, -1.0, np.inf]), truth)
     # -3 and -2 right, -1 wrong, the last one unanswered
     assert judged.best.f1 == pytest.approx(2 * 2 / (2 * 2 + 2))
     assert judged.average_precision == pytest.approx(1 / 3 + 1 / 3 + 1 / 3 * 3 / 4)
@@ -124,4 +124,4 @@ def test_a_ranking_has_a_score_a_query():
 def test_without_scikit_learn(monkeypatch):
     monkeypatch.setitem(sys.modules, 'sklearn.metrics', None)
     with pytest.raises(UnavailableError, match='pip install scikit-learn'):
-        judge_ranking(ranking([0], [0.1]), GroundTruth.identity(1, 1))
+        evaluate_ranking(ranking([0], [0.1]), GroundTruth.identity(1, 1))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stavpr_ros.errors import InputError, SettingsError, SourceError
-from stavpr_ros.evaluation.datasets import NAMES, open_dataset
+from stavpr_ros.evaluation.paper.datasets import NAMES, open_dataset
 
 
 def fill(folder, count, value=0):

@@ -8,9 +8,9 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.serialization import deserialize_message, serialize_message
 
+from stavpr_ros.pipeline.health import Health
+from stavpr_ros.pipeline.statistics import Snapshot, StageTime
 from stavpr_ros.ros.diagnostics import diagnostic_array
-from stavpr_ros.ros.health import Health
-from stavpr_ros.ros.statistics import Snapshot, StageTime
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 PARTS = ('input', 'map', 'recognition', 'processing')
@@ -25,9 +25,9 @@ SNAPSHOT = Snapshot(
     answered_age=0.03,
     drops={},
     recent_drops={},
-    verdicts={'warming up': 19, 'no match': 971, 'match': 2000},
-    recent_verdicts={'no match': 99, 'match': 200},
-    verdict='match',
+    statuses={'warming up': 19, 'no match': 971, 'match': 2000},
+    recent_statuses={'no match': 99, 'match': 200},
+    status='match',
     reason='',
     place=17,
     distance=0.4217,
@@ -103,8 +103,8 @@ def test_healthy():
 
 
 def test_just_activated():
-    new = {'uptime': 1.9, 'received': 0, 'received_age': None, 'rate_in': 0.0, 'recent_verdicts': {}}
-    new |= {'verdict': '', 'place': -1, 'distance': math.nan, 'work': None, 'total': None, 'stages': {}}
+    new = {'uptime': 1.9, 'received': 0, 'received_age': None, 'rate_in': 0.0, 'recent_statuses': {}}
+    new |= {'status': '', 'place': -1, 'distance': math.nan, 'work': None, 'total': None, 'stages': {}}
     check('input', OK, 'waiting for the first image on /camera/image', **new)
     check('processing', OK, 'no image in the last 10 s', **new)
     check('recognition', OK, 'warming up: 0 of 20 images', window=0, **new)
@@ -187,22 +187,22 @@ class TestInput:
         message = '3 images in the last 10 s were invalid (size 2, encoding 1): see the log'
         check('input', WARN, message, recent_drops=drops)
 
-    @pytest.mark.parametrize('verdict', ['match', 'no match', 'warming up', 'mapped'])
-    def test_one_valid_image_is_enough(self, verdict):
-        mixed = {'invalid image': 30, verdict: 1}
-        found, _ = status('input', recent_drops={'invalid: size': 30}, recent_verdicts=mixed)
+    @pytest.mark.parametrize('status', ['match', 'no match', 'warming up', 'mapped'])
+    def test_one_valid_image_is_enough(self, status):
+        mixed = {'invalid image': 30, status: 1}
+        found, _ = status('input', recent_drops={'invalid: size': 30}, recent_statuses=mixed)
         assert found.level == WARN
 
-    @pytest.mark.parametrize('verdict', ['invalid image', 'dropped', 'not ready', 'skipped'])
-    def test_all_images_are_invalid(self, verdict):
+    @pytest.mark.parametrize('status', ['invalid image', 'dropped', 'not ready', 'skipped'])
+    def test_all_images_are_invalid(self, status):
         message = (
             'all images in the last 10 s were invalid (depth 30): see the log, and '
             'docs/node.md for what is read'
         )
         drops = {'invalid: depth': 30, 'max_rate': 5}
-        check('input', ERROR, message, recent_drops=drops, recent_verdicts={verdict: 30})
+        check('input', ERROR, message, recent_drops=drops, recent_statuses={status: 30})
         standing = drops | {'not a keyframe': 5}
-        assert status('input', recent_drops=standing, recent_verdicts={verdict: 30})[0].level == WARN
+        assert status('input', recent_drops=standing, recent_statuses={status: 30})[0].level == WARN
 
     def test_odometry(self):
         rest = 'start it, compare its topic and its stamps'
@@ -214,7 +214,7 @@ class TestInput:
 
     def test_several_faults_are_all_told_the_worst_first(self):
         drops = {'lost in transport': 1, 'invalid: size': 2}
-        found, _ = status('input', recent_drops=drops, recent_verdicts={}, odometry='stale')
+        found, _ = status('input', recent_drops=drops, recent_statuses={}, odometry='stale')
         assert found.level == ERROR
         said = found.message.split('; ')
         assert [text.split()[0] for text in said] == ['all', '1', 'odometry,']
@@ -265,8 +265,8 @@ class TestRecognition:
         old = {'map_state': 'loading', 'missing': "parameter 'threshold' is not set"}
         assert status('recognition', **old)[0].level == WARN
 
-    def test_mapping_recognises_nothing(self):
-        message = 'mapping: images become places, none is recognised'
+    def test_mapping_recognizes_nothing(self):
+        message = 'mapping: images become places, none is recognized'
         check('recognition', OK, message, operation='mapping', missing='threshold', window=0)
 
     def test_warming_up(self):
@@ -276,11 +276,11 @@ class TestRecognition:
         message = (
             '200 of 299 images matched in the last 10 s; last answer: no match, distance 0.422 (too far)'
         )
-        check('recognition', OK, message, verdict='no match', place=-1, reason='too far')
+        check('recognition', OK, message, status='no match', place=-1, reason='too far')
 
     def test_only_judged_images_count(self):
-        verdicts = {'match': 1, 'no match': 1, 'skipped': 90, 'warming up': 8}
-        found, _ = status('recognition', recent_verdicts=verdicts)
+        statuses = {'match': 1, 'no match': 1, 'skipped': 90, 'warming up': 8}
+        found, _ = status('recognition', recent_statuses=statuses)
         assert found.message.startswith('1 of 2 images matched')
 
 
@@ -360,7 +360,7 @@ def test_values_of_recognition():
         'threshold': '1.000',
         'window': '20',
         'length': '20',
-        'last_verdict': 'match',
+        'last_status': 'match',
         'last_reason': 'none',
         'last_place': '17',
         'last_distance': '0.422',
@@ -369,8 +369,8 @@ def test_values_of_recognition():
         'verdicts_no_match': '971',
         'verdicts_match': '2000',
     }
-    nothing = values('recognition', place=-1, distance=math.nan, threshold=None, verdict='')
-    assert {nothing[key] for key in ('last_place', 'last_distance', 'threshold', 'last_verdict')} == {'none'}
+    nothing = values('recognition', place=-1, distance=math.nan, threshold=None, status='')
+    assert {nothing[key] for key in ('last_place', 'last_distance', 'threshold', 'last_status')} == {'none'}
 
 
 def test_values_of_processing():

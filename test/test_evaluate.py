@@ -15,10 +15,10 @@ from conftest import route_images
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.commands import evaluate
 from stavpr_ros.evaluation.metrics import best_f1, frame_answers
-from stavpr_ros.evaluation.offline import recognise_all, window_answers
-from stavpr_ros.features import Describer
+from stavpr_ros.evaluation.offline import recognize_all, window_answers
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, save_map
-from stavpr_ros.recognition import Recogniser, RecognitionSettings
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
 
 pytest.importorskip('sklearn', reason='the extra evaluation is not installed')
@@ -117,22 +117,22 @@ def test_a_plain_run(drives, judged):
         (['--sigma', 0], SpatialSettings(sigma=0)),
     ],
 )
-def test_the_numbers_are_those_of_the_recogniser(drives, judged, options, spatial):
-    """Against the plain way: every image through the recogniser, windows to their middles, best F1."""
+def test_the_numbers_are_those_of_the_recognizer(drives, judged, options, spatial):
+    """Against the plain way: every image through the recognizer, windows to their middles, best F1."""
     options = [*options, '--length', 8, '--beta', 1.5, '--warp', '2x', '--tolerance', 2]
     found = judged('--map', drives / 'map', '--query', drives / 'aside', *options)
-    describer = Describer()
-    place_map = build_map(open_source(drives / 'map'), describer, progress=False)
-    query = build_map(open_source(drives / 'aside'), describer, progress=False).features[::2]
-    settings = RecognitionSettings(1.0, spatial=spatial, sequence=SequenceSettings(8, 1.5))
-    recogniser = Recogniser(place_map, settings)
-    answers = frame_answers(window_answers(recognise_all(recogniser, query)), 8)
+    extractor = FeatureExtractor()
+    place_map = build_map(open_source(drives / 'map'), extractor, progress=False)
+    query = build_map(open_source(drives / 'aside'), extractor, progress=False).features[::2]
+    settings = RecognizerSettings(1.0, spatial=spatial, sequence=SequenceSettings(8, 1.5))
+    recognizer = PlaceRecognizer(place_map, settings)
+    answers = frame_answers(window_answers(recognize_all(recognizer, query)), 8)
     right = np.abs(answers.places - np.arange(0, PLACES, 2)) <= 2
     best = best_f1(answers.distances, right)
     assert found['sequence']['f1'] == best.f1
     assert found['sequence']['threshold'] == pytest.approx(best.threshold, abs=1e-6)
     assert found['sequence']['recall_at_1'] == np.mean(right)
-    distances = recogniser.distances(query)
+    distances = recognizer.distances(query)
     single = best_f1(distances.min(axis=1), np.abs(distances.argmin(axis=1) - np.arange(0, PLACES, 2)) <= 2)
     assert found['single']['f1'] == single.f1
     assert found['single']['threshold'] == pytest.approx(single.threshold, abs=1e-6)
@@ -227,9 +227,9 @@ def test_false_alarms(drives, judged):
 
 
 def test_saved_maps_are_drives_too(drives, tmp_path, judged, run):
-    describer = Describer(projection=32)
+    extractor = FeatureExtractor(projection=32)
     for name in ('map', 'query'):
-        place_map = build_map(open_source(drives / name), describer, progress=False)
+        place_map = build_map(open_source(drives / name), extractor, progress=False)
         save_map(place_map, tmp_path / f'{name}.stavpr')
     saved, options = tmp_path / 'map.stavpr', ['--tolerance', 0]
     folders = judged(*pair(drives), '--projection', 32, *options)
@@ -286,9 +286,9 @@ def test_truth_from_poses(drives, judged, run, tmp_path):
     poses['map'].write_text(''.join(f'{i},0,0\n' for i in range(PLACES)))
     poses['query'].write_text(''.join(f'{i + 2.2},0,0\n' for i in range(PLACES)))
     options = [*pair(drives), '--truth', 'poses', '--query-poses', poses['query']]
-    found = judged(*options, '--map-poses', poses['map'], '--metres', 2.3)
+    found = judged(*options, '--map-poses', poses['map'], '--meters', 2.3)
     assert found['single']['recall_at_1'] == pytest.approx(1)
-    near = judged(*options, '--map-poses', poses['map'], '--metres', 1)
+    near = judged(*options, '--map-poses', poses['map'], '--meters', 1)
     assert near['single']['recall_at_1'] == 0
     code, _, errors = run(*options)
     assert (code, '--map-poses' in errors) == (2, True)
@@ -320,7 +320,7 @@ def test_a_known_data_set(tmp_path, judged, run):
     assert found['settings']['tolerance'] == 3
     assert found['sequence']['f1'] == 1
     source, saved = open_source(tmp_path / 'nordland' / 'winter'), tmp_path / 'unknown.stavpr'
-    save_map(build_map(source, Describer(projection=32), progress=False), saved)
+    save_map(build_map(source, FeatureExtractor(projection=32), progress=False), saved)
     options = ['--dataset', f'nordland={tmp_path}', '--projection', 32, '--unknown', saved]
     assert judged(*options)['unknown_images'] == 24
     code, _, errors = run(*options, '--seed', 1)

@@ -5,20 +5,20 @@ import numpy as np
 import pytest
 
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.alignment.temporal import SequenceMatch
+from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.errors import InputError
 from stavpr_ros.evaluation.curves import Ranking
+from stavpr_ros.evaluation.evaluate import (
+    DistancePicture,
+    TraverseResults,
+    centered_images,
+    evaluate_answers,
+    recognize_traverse,
+)
+from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.report import worst_mistakes
 from stavpr_ros.evaluation.report_figures import matrix_png, runs
-from stavpr_ros.evaluation.run import (
-    DistancePicture,
-    DriveAnswers,
-    answer_drive,
-    centred_images,
-    evaluate_answers,
-)
-from stavpr_ros.evaluation.truth import GroundTruth
-from stavpr_ros.recognition import Recognition, RecognitionSettings, Verdict
+from stavpr_ros.recognition import Match, RecognizerSettings, Status
 
 
 class Scripted:
@@ -32,11 +32,11 @@ class Scripted:
         self.at += 1
         found = self.answers[self.at]
         if found is None:
-            return Recognition(Verdict.WARMING_UP, '', None, np.empty((0, 2), np.int32), 1.0)
+            return Match(Status.WARMING_UP, '', None, np.empty((0, 2), np.int32), 1.0)
         path = np.array(found, np.int32)
         middle = int(path[1, 1])
         nearest = SequenceMatch(int(path[0, 1]), int(path[-1, 1]), middle, 0.25, -1, float('nan'))
-        return Recognition(Verdict.MATCH, '', nearest, path, 1.0)
+        return Match(Status.MATCH, '', nearest, path, 1.0)
 
     def newest_row(self):
         return np.array(self.rows[self.at], np.float32)
@@ -53,8 +53,8 @@ def test_every_image_gets_its_answers(small_map):
         answers=[None, None, [(0, 0), (1, 1), (2, 3)], [(0, 2), (1, 4), (2, 5)]],
         candidates=[None, None, [1, 5, 0], [3, 4]],
     )
-    settings = RecognitionSettings(1.0, sequence=SequenceSettings(length=3))
-    found = answer_drive(online, small_map.features[:4], 6, settings)
+    settings = RecognizerSettings(1.0, sequence=SequenceSettings(length=3))
+    found = recognize_traverse(online, small_map.features[:4], 6, settings)
     assert found.sequence.best.tolist() == [0, 1, 4, 5]
     assert found.sequence.places[:, :4].tolist() == [
         [0, -1, -1, -1], [1, 5, 0, -1], [4, 3, -1, -1], [5, -1, -1, -1],
@@ -71,22 +71,22 @@ def test_every_image_gets_its_answers(small_map):
 
 
 def test_long_drives_are_pictured_by_the_smallest_of_each_block(monkeypatch, small_map):
-    from stavpr_ros.evaluation import run as module
+    from stavpr_ros.evaluation import evaluate as module
 
     monkeypatch.setattr(module, 'MATRIX_SIDE', 2)
     rows = [[5, 4, 9], [3, 8, 7], [6, 6, 1], [2, 6]]  # the last one knows two places only
     online = Scripted(rows, [None] * 4, [None] * 4)
-    settings = RecognitionSettings(1.0, sequence=SequenceSettings(length=3))
-    picture = answer_drive(online, small_map.features[:4], 3, settings).picture
+    settings = RecognizerSettings(1.0, sequence=SequenceSettings(length=3))
+    picture = recognize_traverse(online, small_map.features[:4], 3, settings).picture
     assert picture.block == (2, 2)
     assert picture.values.tolist() == [[3, 7], [2, 1]]
 
 
-def test_centred_images():
-    assert centred_images(200, 20) == slice(9, 190)
-    assert centred_images(5, 5) == slice(2, 3)
+def test_centered_images():
+    assert centered_images(200, 20) == slice(9, 190)
+    assert centered_images(5, 5) == slice(2, 3)
     with pytest.raises(InputError, match='at least l = 6'):
-        centred_images(5, 6)
+        centered_images(5, 6)
 
 
 def test_figures():
@@ -105,7 +105,7 @@ def test_the_worst_mistakes():
     for image, place, score in ((10, 40, 0.5), (12, 41, 0.6), (30, 33, 0.1), (50, 5, 0.2), (55, 6, np.inf)):
         places[image], scores[image] = place, score
     answers = Ranking(places[:, None], scores)
-    drive = DriveAnswers(answers, answers, np.zeros(60), (), DistancePicture(np.zeros((1, 1)), (60, 60)))
+    drive = TraverseResults(answers, answers, np.zeros(60), (), DistancePicture(np.zeros((1, 1)), (60, 60)))
     evaluation = evaluate_answers(drive, GroundTruth.identity(60, 60, 1), 20)
     assert worst_mistakes(evaluation, 9) == [50, 10, 30]
     assert worst_mistakes(evaluation, 1) == [50]

@@ -9,14 +9,14 @@ from conftest import route_images
 
 from stavpr_ros.commands import experiments
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.evaluation.datasets import Dataset
-from stavpr_ros.evaluation.experiments import PRESETS, Bench, sweep_configurations
-from stavpr_ros.evaluation.published import published_f1
-from stavpr_ros.evaluation.run import evaluate_on_map
-from stavpr_ros.evaluation.truth import GroundTruth
-from stavpr_ros.features import Describer
+from stavpr_ros.evaluation.evaluate import evaluate_on_map
+from stavpr_ros.evaluation.ground_truth import GroundTruth
+from stavpr_ros.evaluation.paper.datasets import Dataset
+from stavpr_ros.evaluation.paper.experiments import PRESETS, Bench, sweep_configurations
+from stavpr_ros.evaluation.paper.published import published_f1
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map
-from stavpr_ros.recognition import RecognitionSettings
+from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.sources.folder import FolderSource
 
 pytest.importorskip('sklearn', reason='the extra evaluation is not installed')
@@ -98,7 +98,7 @@ def test_a_table(tmp_path, run):
 
 
 def test_a_column_is_one_evaluation(tmp_path):
-    """Whatever a configuration says reaches the recogniser; views that look aside tell the columns apart."""
+    """Whatever a configuration says reaches the recognizer; views that look aside tell the columns apart."""
     images = route_images(40)
     drives = [
         FolderSource(write_images(tmp_path / name, [np.roll(image, shift, axis=1) for image in images]))
@@ -106,8 +106,8 @@ def test_a_column_is_one_evaluation(tmp_path):
     ]
     truth = GroundTruth.identity(40, 40, 1)
     bench = Bench(Dataset(*drives, truth, 1), 'gradient', None)
-    place_map, query = (build_map(drive, Describer(), progress=False) for drive in drives)
-    plain = evaluate_on_map(place_map, query.features, truth, RecognitionSettings(1.0))
+    place_map, query = (build_map(drive, FeatureExtractor(), progress=False) for drive in drives)
+    plain = evaluate_on_map(place_map, query.features, truth, RecognizerSettings(1.0))
     columns = {column.name: column for preset in PRESETS.values() for column in preset}
     found = {name: bench.judge(column).to_json() for name, column in columns.items()}
     assert found['sta_vpr'] == plain.sequence.to_json()

@@ -1,13 +1,13 @@
-"""The kinds of features, the describer, and the table that they are rows of."""
+"""The kinds of features, the extractor, and the table that they are rows of."""
 
 import numpy as np
 import pytest
 import torch
 
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
-from stavpr_ros.features import KINDS, Describer, FeatureSettings
-from stavpr_ros.features.backbone import backbone_class, settings_class
+from stavpr_ros.features import KINDS, FeatureExtractor, FeatureSettings
 from stavpr_ros.features.gradient import Gradient, GradientSettings
+from stavpr_ros.features.registry import backbone_class, settings_class
 
 
 @pytest.mark.parametrize('kind', list(KINDS))
@@ -23,7 +23,7 @@ def test_every_row_of_the_table_is_complete(kind):
 
 def test_unknown_kind():
     with pytest.raises(SettingsError, match=r'teleport.*gradient'):
-        Describer('teleport')
+        FeatureExtractor('teleport')
 
 
 def edge(angle: float, size: int = 224) -> np.ndarray:
@@ -49,28 +49,28 @@ def test_unsigned_gradients_do_not_tell_polarity():
 def test_an_edge_stays_in_its_strip():
     image = np.zeros((224, 224, 3), np.uint8)
     image[:, 3 * 32 + 16 :] = 255  # the edge is in the middle of strip 4 of 7
-    features = Describer().describe([image])
+    features = FeatureExtractor().extract([image])
     assert int(features.weights[:, 0].argmax()) == 3
 
 
 def test_contrast_hardly_matters(route):
     """Half the contrast, other brightness: nearly the same direction in feature space."""
     dim = [(image.astype(float) * 0.5 + 30).astype(np.uint8) for image in route[:4]]
-    describer = Describer()
-    a, b = describer.describe(route[:4]), describer.describe(dim)
+    extractor = FeatureExtractor()
+    a, b = extractor.extract(route[:4]), extractor.extract(dim)
     assert float((a.strips * b.strips).sum(dim=2).min()) > 0.97
 
 
 def test_a_batch_is_its_images_one_by_one(route):
-    describer = Describer()
+    extractor = FeatureExtractor()
     mixed = [route[0], np.ascontiguousarray(route[1][:50]), route[2].repeat(3, axis=0)]  # sizes differ
-    together = describer.describe(mixed)
+    together = extractor.extract(mixed)
     for i, image in enumerate(mixed):
-        torch.testing.assert_close(describer.describe([image]).strips[:, 0], together.strips[:, i])
+        torch.testing.assert_close(extractor.extract([image]).strips[:, 0], together.strips[:, i])
 
 
 def test_a_black_image_has_zero_features():
-    features = Describer().describe([np.zeros((10, 10, 3), np.uint8)])
+    features = FeatureExtractor().extract([np.zeros((10, 10, 3), np.uint8)])
     assert not features.strips.any()
     assert not features.weights.any()
 
@@ -82,7 +82,7 @@ def test_gradient_settings_out_of_range(bad):
 
 
 def test_settings_survive_json():
-    for settings in (Describer().settings, Describer(strips=5, projection=32, seed=3).settings):
+    for settings in (FeatureExtractor().settings, FeatureExtractor(strips=5, projection=32, seed=3).settings):
         assert FeatureSettings.from_json(settings.to_json()) == settings
     with pytest.raises(SettingsError, match='cannot be read'):
         FeatureSettings.from_json('{"kind": "gradient", "backbone": {"teleport": 1}, "strips": 7}')
@@ -140,33 +140,33 @@ def test_onnx_mean_std_and_channel_order(tiny_onnx):
 
 def test_onnx_errors_say_what_to_do(tiny_onnx, tmp_path):
     with pytest.raises(UnavailableError, match='cannot be read'):
-        Describer('onnx', onnx_settings(tmp_path / 'missing.onnx'))
+        FeatureExtractor('onnx', onnx_settings(tmp_path / 'missing.onnx'))
     (tmp_path / 'broken.onnx').write_bytes(b'no model')
     with pytest.raises(UnavailableError, match='no usable ONNX model'):
-        Describer('onnx', onnx_settings(tmp_path / 'broken.onnx'))
+        FeatureExtractor('onnx', onnx_settings(tmp_path / 'broken.onnx'))
     with pytest.raises(SettingsError, match=r"no layer 'fire'.*block, relu, y"):
-        Describer('onnx', onnx_settings(tiny_onnx, layer='fire'))
+        FeatureExtractor('onnx', onnx_settings(tiny_onnx, layer='fire'))
     with pytest.raises(SettingsError, match='must be'):
         onnx_settings(tiny_onnx, channels='hsv')
     with pytest.raises(FeatureMismatchError, match='sha256'):
-        Describer('onnx', onnx_settings(tiny_onnx, sha256='0' * 64))
+        FeatureExtractor('onnx', onnx_settings(tiny_onnx, sha256='0' * 64))
 
 
 def test_a_map_remembers_the_network_not_its_place(tiny_onnx, tmp_path):
     """The same file elsewhere gives the same features; another file under the same name is refused."""
-    settings = Describer('onnx', onnx_settings(tiny_onnx)).settings
+    settings = FeatureExtractor('onnx', onnx_settings(tiny_onnx)).settings
     moved = tmp_path / 'moved.onnx'
     moved.write_bytes(tiny_onnx.read_bytes())
-    assert Describer.from_settings(settings, None, model=str(moved)).settings == settings
+    assert FeatureExtractor.from_settings(settings, None, model=str(moved)).settings == settings
     moved.write_bytes(tiny_onnx.read_bytes() + b'\x00')
     with pytest.raises((FeatureMismatchError, UnavailableError)):
-        Describer.from_settings(settings, None, model=str(moved))
+        FeatureExtractor.from_settings(settings, None, model=str(moved))
 
 
 def test_squeezenet(squeezenet_settings):
     """The real network's inner layer: 13 x 13 x 384, cropped to seven strips of one column."""
-    describer = Describer('onnx', squeezenet_settings)
+    extractor = FeatureExtractor('onnx', squeezenet_settings)
     rng = np.random.default_rng(0)
-    features = describer.describe([rng.integers(0, 256, (60, 80, 3), np.uint8) for _ in range(3)])
+    features = extractor.extract([rng.integers(0, 256, (60, 80, 3), np.uint8) for _ in range(3)])
     assert features.strips.shape == (7, 3, 13 * 384)
     torch.testing.assert_close(torch.linalg.vector_norm(features.strips, dim=2), torch.ones(7, 3))

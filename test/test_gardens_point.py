@@ -5,10 +5,10 @@ import pytest
 
 from stavpr_ros.evaluation.drive import judge
 from stavpr_ros.evaluation.metrics import best_f1, frame_answers
-from stavpr_ros.evaluation.offline import recognise_all, window_answers
-from stavpr_ros.features import Describer
-from stavpr_ros.mapping import build_map, describe_frames, save_map
-from stavpr_ros.recognition import Recogniser, RecognitionSettings
+from stavpr_ros.evaluation.offline import recognize_all, window_answers
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import build_map, extract_features, save_map
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.ros.live import run_live
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag_writer import write_bag
@@ -36,13 +36,13 @@ def test_the_node_is_the_core(bags, request, tmp_path, kind, mode, known_f1, rec
     """In the defaults of both modes; the F1 that is asserted is the one measured, a little below."""
     threshold = ACCEPT_ALL if mode == 'paper' else 1.0
     settings = request.getfixturevalue('squeezenet_settings') if kind == 'onnx' else None
-    describer = Describer(kind, settings)
-    place_map = build_map(open_source(bags / 'day_left'), describer, progress=False)
+    extractor = FeatureExtractor(kind, settings)
+    place_map = build_map(open_source(bags / 'day_left'), extractor, progress=False)
     map_path = tmp_path / 'day_left.stavpr'
     save_map(place_map, map_path)
 
-    query = describe_frames(open_source(bags / 'day_right'), describer, progress=False)
-    offline = recognise_all(Recogniser(place_map, RecognitionSettings(threshold, mode=mode)), query)
+    query = extract_features(open_source(bags / 'day_right'), extractor, progress=False)
+    offline = recognize_all(PlaceRecognizer(place_map, RecognizerSettings(threshold, mode=mode)), query)
     expected = frame_answers(window_answers(offline), 20)
 
     parameters = {'map_path': map_path, 'threshold': threshold, 'mode': mode}
@@ -53,11 +53,11 @@ def test_the_node_is_the_core(bags, request, tmp_path, kind, mode, known_f1, rec
     np.testing.assert_array_equal(live.places, expected.places)
     np.testing.assert_allclose(live.distances, expected.distances, atol=2e-6)
     for record, core in zip(records, offline, strict=True):
-        assert record['place_index'] == core.place
-        assert record['newest_index'] == core.newest
+        assert record['place_index'] == core.place_index
+        assert record['newest_index'] == core.newest_index
         assert record['path'] == core.path.tolist()
-        if core.nearest is not None:
-            assert record['runner_up_index'] == core.nearest.runner_up_index
+        if core.sequence is not None:
+            assert record['second_best_index'] == core.sequence.second_best_index
     f1 = best_f1(live.distances, live.within(truth, TOLERANCE)).f1
     record_property('f1', f1)
     print(f'Gardens Point day left / day right, {kind}, {mode}: F1 {f1:.4f}')

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stavpr_ros.features import Describer
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.gradient import (
     FLOOR,
     PER_THREAD,
@@ -19,13 +19,13 @@ from stavpr_ros.features.gradient import (
     feature_maps_by_torch,
 )
 from stavpr_ros.features.gradient_kernel import _to_polar, describe_picture
-from stavpr_ros.features.resize import METHODS, resize_square
-from stavpr_ros.features.strips import cut_strips, normalise
+from stavpr_ros.features.preprocessing import METHODS, resize_square
+from stavpr_ros.features.strips import cut_strips, normalize
 
 
-def reference_maps(grey: np.ndarray, settings: GradientSettings) -> np.ndarray:
+def reference_maps(gray: np.ndarray, settings: GradientSettings) -> np.ndarray:
     """The features of one square picture as they are defined, float64, a cell after the other."""
-    s, pixels = settings, np.pad(grey / 255, 1, mode='edge')
+    s, pixels = settings, np.pad(gray / 255, 1, mode='edge')
     dx, dy = pixels[1:-1, 2:] - pixels[1:-1, :-2], pixels[2:, 1:-1] - pixels[:-2, 1:-1]
     position = np.arctan2(dy, dx) / (2 * np.pi if s.signed else np.pi) * s.orientations
     # a pixel's share in an orientation falls linearly to 0 at the next one, round the circle
@@ -41,10 +41,10 @@ def reference_maps(grey: np.ndarray, settings: GradientSettings) -> np.ndarray:
     return histograms * (blocks[1:, 1:] + blocks[1:, :-1] + blocks[:-1, 1:] + blocks[:-1, :-1]) / 4
 
 
-def kernel_maps(grey: np.ndarray, settings: GradientSettings) -> np.ndarray:
+def kernel_maps(gray: np.ndarray, settings: GradientSettings) -> np.ndarray:
     """What the compiled kernel makes of a square picture."""
     maps = np.full((settings.orientations, settings.cells, settings.cells), np.nan, np.float32)
-    describe_picture(grey, settings.cell, settings.signed, FLOOR, maps)
+    describe_picture(gray, settings.cell, settings.signed, FLOOR, maps)
     return maps
 
 
@@ -53,7 +53,7 @@ def assert_same_features(maps, expected) -> None:
     maps, expected = torch.as_tensor(maps), torch.as_tensor(expected)
     assert maps.shape == expected.shape
     batches = (m.reshape(-1, *m.shape[-3:]) for m in (maps, expected))
-    for a, b in zip(*(normalise(cut_strips(batch, 1)) for batch in batches), strict=True):
+    for a, b in zip(*(normalize(cut_strips(batch, 1)) for batch in batches), strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-5)
     torch.testing.assert_close(maps.double(), expected.double(), rtol=0, atol=1e-5)
 
@@ -70,10 +70,10 @@ def gradient_settings(draw):
 def picture(seed: int, contrast: int, shape: tuple[int, int]) -> np.ndarray:
     """Noise of a contrast, its left half smoothed: strong and weak gradients, and none."""
     rng = np.random.default_rng(seed)
-    grey = (rng.integers(0, contrast + 1, shape) + (255 - contrast) // 2).astype(np.uint8)
+    gray = (rng.integers(0, contrast + 1, shape) + (255 - contrast) // 2).astype(np.uint8)
     half = (shape[1] + 1) // 2
-    grey[:, :half] = cv2.blur(grey[:, :half], (5, 5))
-    return grey
+    gray[:, :half] = cv2.blur(gray[:, :half], (5, 5))
+    return gray
 
 
 pictures = {'seed': st.integers(0, 2**32 - 1), 'contrast': st.sampled_from([0, 1, 3, 60, 255])}
@@ -81,33 +81,33 @@ pictures = {'seed': st.integers(0, 2**32 - 1), 'contrast': st.sampled_from([0, 1
 
 @given(settings=gradient_settings(), **pictures)
 def test_the_kernel_is_the_definition(settings, seed, contrast):
-    grey = picture(seed, contrast, (settings.size, settings.size))
-    assert_same_features(kernel_maps(grey, settings), reference_maps(grey, settings))
+    gray = picture(seed, contrast, (settings.size, settings.size))
+    assert_same_features(kernel_maps(gray, settings), reference_maps(gray, settings))
 
 
 @given(settings=gradient_settings(), **pictures)
 def test_torch_operators_are_the_definition(settings, seed, contrast):
     """What runs on a GPU, here on a CPU."""
-    grey = picture(seed, contrast, (settings.size, settings.size))
-    maps = feature_maps_by_torch(torch.from_numpy(grey[None]), settings)[0]
-    assert_same_features(maps, reference_maps(grey, settings))
+    gray = picture(seed, contrast, (settings.size, settings.size))
+    maps = feature_maps_by_torch(torch.from_numpy(gray[None]), settings)[0]
+    assert_same_features(maps, reference_maps(gray, settings))
 
 
 @given(settings=gradient_settings(), height=st.integers(1, 150), width=st.integers(1, 150), **pictures)
 def test_features_of_images_of_any_size(settings, height, width, seed, contrast):
-    """Colour, resizing, kernel: what OpenCV and the definition make of the same image."""
+    """Color, resizing, kernel: what OpenCV and the definition make of the same image."""
     image = np.dstack([picture(seed + channel, contrast, (height, width)) for channel in range(3)])
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     averages = settings.resize == 'area' and min(height, width) >= settings.size
     method = cv2.INTER_AREA if averages else cv2.INTER_LINEAR
-    square = cv2.resize(grey, (settings.size, settings.size), interpolation=method)
+    square = cv2.resize(gray, (settings.size, settings.size), interpolation=method)
     assert_same_features(Gradient(settings).feature_maps([image])[0], reference_maps(square, settings))
 
 
 @pytest.mark.parametrize('signed', [True, False])
 @pytest.mark.parametrize('bins', [2, 8, 9])
 def test_every_gradient_there_is(bins, signed):
-    """All 511 x 511 differences of grey levels: the angle to a millionth of a turn, the length exactly."""
+    """All 511 x 511 differences of gray levels: the angle to a millionth of a turn, the length exactly."""
     dx = np.arange(-255, 256)
     here = np.zeros(3 * dx.size, np.uint8)  # pixels 0 and 2 of each three make one difference
     here[0::3], here[2::3] = np.maximum(0, -dx), np.maximum(0, dx)
@@ -131,10 +131,10 @@ def test_odd_cells_leave_no_half_cell():
 
 def test_area_worked_by_hand():
     """Three pixels to two: the first takes the first and half of the second."""
-    grey = np.array([[0, 90, 180], [45, 90, 135], [225, 0, 9]], np.uint8)
+    gray = np.array([[0, 90, 180], [45, 90, 135], [225, 0, 9]], np.uint8)
     expected = [[(4 * 0 + 2 * 90 + 2 * 45 + 90) / 9, (4 * 180 + 2 * 90 + 2 * 135 + 90) / 9]]
     expected += [[(4 * 225 + 2 * 45 + 2 * 0 + 90) / 9, (4 * 9 + 2 * 135 + 2 * 0 + 90) / 9]]
-    np.testing.assert_array_equal(resize_square(grey, 2, 'area'), np.round(expected))
+    np.testing.assert_array_equal(resize_square(gray, 2, 'area'), np.round(expected))
 
 
 @pytest.fixture
@@ -191,5 +191,5 @@ def test_other_devices_than_cpu_take_torch_operators(route):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='no GPU')
 def test_gpu_and_cpu_agree(route):
-    on_gpu, on_cpu = Describer(device='cuda').describe(route).to('cpu'), Describer().describe(route)
+    on_gpu, on_cpu = FeatureExtractor(device='cuda').extract(route).to('cpu'), FeatureExtractor().extract(route)
     torch.testing.assert_close(on_gpu.strips, on_cpu.strips, rtol=0, atol=1e-5)

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.features import Describer
-from stavpr_ros.mapping import KeyframeSelector, KeyframeSettings, build_map, image_change, small_grey
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import KeyframeSelector, KeyframeSettings, build_map, image_change, small_gray
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.frame import Frame
 
@@ -50,10 +50,10 @@ def test_settings_out_of_reach():
 
 def test_any():
     assert not KeyframeSettings().any
-    for name in ('seconds', 'metres', 'degrees', 'change'):
+    for name in ('seconds', 'meters', 'degrees', 'change'):
         assert KeyframeSettings(**{name: 0.1}).any
     assert KeyframeSettings(degrees=1).needs_poses
-    assert KeyframeSettings(metres=1).needs_poses
+    assert KeyframeSettings(meters=1).needs_poses
     assert not KeyframeSettings(seconds=1, change=1).needs_poses
 
 
@@ -75,24 +75,24 @@ def test_time():
 
 
 def test_motion_is_one_rule():
-    made = selector(where=pose(), metres=1, degrees=10)
+    made = selector(where=pose(), meters=1, degrees=10)
     reason = made.too_soon(0, pose(0.999, -9.99))
     assert reason == 'moved 0.999 m of 1 m and turned 9.99 of 10 degrees since the last keyframe'
     assert made.too_soon(0, pose(1)) == ''
     assert made.too_soon(0, pose(0, -10.001)) == ''
-    assert 'degrees' not in selector(where=pose(), metres=1).too_soon(0, pose(0, 90))
+    assert 'degrees' not in selector(where=pose(), meters=1).too_soon(0, pose(0, 90))
     assert 'm of' not in selector(where=pose(), degrees=10).too_soon(0, pose(5, 9))
 
 
 def test_motion_without_odometry():
-    for made in (KeyframeSelector(KeyframeSettings(degrees=5)), selector(where=pose(), metres=1)):
+    for made in (KeyframeSelector(KeyframeSettings(degrees=5)), selector(where=pose(), meters=1)):
         assert 'no odometry' in made.too_soon(20 * SECOND, None)
     # the rule came on after the last keyframe, of which no pose is known
-    assert selector(metres=1).too_soon(20 * SECOND, pose()) == ''
+    assert selector(meters=1).too_soon(20 * SECOND, pose()) == ''
 
 
 def test_all_rules_must_agree():
-    made = selector(where=pose(), seconds=1, metres=1)
+    made = selector(where=pose(), seconds=1, meters=1)
     assert 's after' in made.too_soon(10_500_000_000, pose(5))
     assert 'moved' in made.too_soon(12 * SECOND, pose(0.5))
     assert made.too_soon(12 * SECOND, pose(5)) == ''
@@ -108,7 +108,7 @@ def test_change_of_the_picture(route):
 
 
 def test_asking_changes_nothing(route):
-    made = selector(where=pose(), image=route[0], seconds=1, metres=1, change=0.1)
+    made = selector(where=pose(), image=route[0], seconds=1, meters=1, change=0.1)
     for _ in range(2):
         assert made.too_soon(20 * SECOND, pose(9)) == ''
         assert made.too_alike(route[9]) == ''
@@ -119,19 +119,19 @@ def test_asking_changes_nothing(route):
 def test_settings_change_while_it_runs(route):
     """The last keyframe is kept, also what no rule asked for when it came."""
     made = selector(where=pose(), image=route[0])
-    for rules in ({'seconds': 1}, {'metres': 1}):
+    for rules in ({'seconds': 1}, {'meters': 1}):
         made.settings = KeyframeSettings(**rules)
         assert made.too_soon(10 * SECOND, pose())
     made.settings = KeyframeSettings(change=0.1)
     assert made.too_alike(route[0])
     made.reset()
     assert made.too_alike(route[0]) == ''
-    made.settings = KeyframeSettings(seconds=1, metres=1)
+    made.settings = KeyframeSettings(seconds=1, meters=1)
     assert made.too_soon(10 * SECOND, pose()) == ''
 
 
 def test_a_pose_that_is_none():
-    made = selector(where=pose(), metres=1)
+    made = selector(where=pose(), meters=1)
     for call in (lambda wrong: made.too_soon(1, wrong), lambda wrong: made.accept(1, wrong, PICTURE)):
         with pytest.raises(InputError):
             call(np.full(7, np.nan))
@@ -140,7 +140,7 @@ def test_a_pose_that_is_none():
 
 def test_a_keyframe_is_kept_though_its_arrays_are_reused(route):
     where, image = pose(), route[0].copy()
-    made = selector(where=where, image=image, metres=1, change=0.1)
+    made = selector(where=where, image=image, meters=1, change=0.1)
     where[0], image[:] = 50, route[9]
     assert made.too_soon(0, pose(0.5))
     assert made.too_alike(route[0])
@@ -160,7 +160,7 @@ STEPS = st.tuples(st.integers(0, 4), st.integers(-3, 9), st.integers(-9, 9), st.
 )
 def test_kept_images_are_those_of_a_plain_loop(steps, rules):
     """Stamps (0 = unknown, some earlier), poses (some unknown) and pictures, with any rules."""
-    seconds, metres, degrees, change = rules
+    seconds, meters, degrees, change = rules
     pictures = [np.random.default_rng(i).integers(0, 256, (24, 32, 3), np.uint8) for i in range(5)]
     made = KeyframeSelector(KeyframeSettings(*rules))
     kept, expected, last = [], [], None
@@ -174,13 +174,13 @@ def test_kept_images_are_those_of_a_plain_loop(steps, rules):
             made.accept(stamp * SECOND, where, pictures[picture])
             kept.append(i)
         # the plain loop
-        fine = not ((metres or degrees) and not known)
+        fine = not ((meters or degrees) and not known)
         if fine and last is not None:
             last_stamp, last_x, last_angle, last_known, last_picture = last
             if seconds and stamp and last_stamp and last_stamp <= stamp < last_stamp + seconds:
                 fine = False
-            if (metres or degrees) and last_known:
-                moved = bool(metres) and abs(x - last_x) >= metres
+            if (meters or degrees) and last_known:
+                moved = bool(meters) and abs(x - last_x) >= meters
                 apart = abs(angle - last_angle) % 360  # whole degrees, the rule is between them
                 turned = bool(degrees) and min(apart, 360 - apart) > degrees
                 fine = fine and (moved or turned)
@@ -195,9 +195,9 @@ def test_kept_images_are_those_of_a_plain_loop(steps, rules):
 # ------------------------------------------------------------------------------------------ pictures
 
 
-def test_small_grey():
+def test_small_gray():
     image = np.full((480, 640, 3), (255, 0, 0), np.uint8)
-    small = small_grey(image)
+    small = small_gray(image)
     assert (small.shape, small.dtype) == ((24, 32), np.float32)
     np.testing.assert_allclose(small, 76, atol=1)  # 0.299 of red
 
@@ -218,7 +218,7 @@ def test_change_by_hand():
 def test_darkness_is_flat():
     """What a covered camera sends is noise, and noise has changed every time."""
     rng = np.random.default_rng(0)
-    dark = [small_grey(rng.integers(0, 20, (480, 640, 3), np.uint8)) for _ in range(2)]
+    dark = [small_gray(rng.integers(0, 20, (480, 640, 3), np.uint8)) for _ in range(2)]
     assert image_change(*dark) == 0
 
 
@@ -228,7 +228,7 @@ def test_darkness_is_flat():
 )
 def test_a_moving_camera_is_told_from_a_standing_one(data_folder, drive):
     frames = list(open_source(data_folder / drive))
-    small = [small_grey(frame.image) for frame in frames]
+    small = [small_gray(frame.image) for frame in frames]
     moving = min(image_change(a, b) for a, b in pairwise(small))
     assert moving > 1.2 * CHANGE
     standing = [change for frame in frames[::10] for change in standing_changes(frame.image)]
@@ -242,7 +242,7 @@ def standing_changes(image):
     def taken(noise=10.0, gain=1.0, quality=50):
         seen = np.clip(gain * image + rng.normal(0, noise, image.shape), 0, 255).astype(np.uint8)
         coded = cv2.imencode('.jpg', seen, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-        return small_grey(np.ascontiguousarray(cv2.imdecode(coded, cv2.IMREAD_COLOR)))
+        return small_gray(np.ascontiguousarray(cv2.imdecode(coded, cv2.IMREAD_COLOR)))
 
     first = taken(noise=3)
     yield from (image_change(first, taken(noise=noise)) for noise in (3, 6, 10))
@@ -250,7 +250,7 @@ def standing_changes(image):
 
 
 def test_the_made_up_route_moves():
-    small = [small_grey(image) for image in route_images(20)]
+    small = [small_gray(image) for image in route_images(20)]
     assert min(image_change(a, b) for a, b in pairwise(small)) > 0.1
 
 
@@ -267,14 +267,14 @@ def test_keyframes_in_time_and_picture(route):
     """Standing three seconds at every view: one place for each."""
     frames = drive(route[:20], shown=3)
     settings = KeyframeSettings(change=0.1)
-    built = build_map(frames, Describer(), progress=False, keyframes=settings)
+    built = build_map(frames, FeatureExtractor(), progress=False, keyframes=settings)
     assert built.ids == tuple(str(i) for i in range(0, 60, 3))
     assert built.stamps.tolist() == [(i + 1) * SECOND for i in range(0, 60, 3)]
     assert built.poses is None
-    alone = build_map(frames[57:58], Describer(), progress=False)
+    alone = build_map(frames[57:58], FeatureExtractor(), progress=False)
     np.testing.assert_allclose(built.features.strips[:, 19], alone.features.strips[:, 0], atol=1e-6)
     assert built.thumbnails[19] == alone.thumbnails[0]
-    slow = build_map(frames, Describer(), progress=False, keyframes=KeyframeSettings(seconds=7))
+    slow = build_map(frames, FeatureExtractor(), progress=False, keyframes=KeyframeSettings(seconds=7))
     assert slow.ids == tuple(str(i) for i in range(0, 60, 7))
 
 
@@ -286,5 +286,5 @@ def test_the_selector_decides(route):
         if not selector.too_soon(frame.stamp, None) and not selector.too_alike(frame.image):
             selector.accept(frame.stamp, None, frame.image)
             expected.append(frame.identifier)
-    assert build_map(frames, Describer(), progress=False, keyframes=settings).ids == tuple(expected)
+    assert build_map(frames, FeatureExtractor(), progress=False, keyframes=settings).ids == tuple(expected)
     assert 16 < len(expected) < 50

@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
-from stavpr_ros.features.backbone import settings_class
+from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import PlaceMap, save_map
 
 LENGTH = 5
@@ -68,7 +68,7 @@ def managed(bench, folder):
         **PARAMETERS | TAKEN_RELIABLY,
         autostart=False,
         mode='paper',
-        neighbourhood=5,
+        nms_radius=5,
         keyframe_change=0.0,
         diagnostics_period=0.1,
     )
@@ -111,8 +111,8 @@ def configure(bench, path, *, activate=False):
         bench.wait_for_node()
 
 
-def verdicts(bench, images, stamp=1):
-    return [bench.ask(image_message(image, stamp + i)).verdict for i, image in enumerate(images)]
+def statuses(bench, images, stamp=1):
+    return [bench.ask(image_message(image, stamp + i)).status for i, image in enumerate(images)]
 
 
 def refusals(bench):
@@ -147,9 +147,9 @@ def test_through_all_states(bench, node, hear, map_file, route):
         assert bench.transition('activate')
         assert bench.state() == 'active'
         bench.wait_for_node()
-        assert verdicts(bench, route[first : first + LENGTH - 1], first) == warming
+        assert statuses(bench, route[first : first + LENGTH - 1], first) == warming
         answer = bench.ask(image_message(route[first + LENGTH - 1], 99))
-        assert (answer.verdict, answer.newest_index) == (PlaceMatch.MATCH, first + LENGTH - 1)
+        assert (answer.status, answer.newest_index) == (PlaceMatch.MATCH, first + LENGTH - 1)
         bench.until_diagnosed('processing', DiagnosticStatus.OK, 'ms an image')
 
         assert bench.transition('deactivate')
@@ -239,9 +239,9 @@ def test_other_parameters_for_the_next_configuration(bench, node, map_file, late
     assert bench.transition('cleanup')
     assert bench.set_parameter('sequence_length', 3) == (True, '')
     configure(bench, late_map_file, activate=True)
-    assert verdicts(bench, route[40:42]) == [PlaceMatch.WARMING_UP] * 2
+    assert statuses(bench, route[40:42]) == [PlaceMatch.WARMING_UP] * 2
     answer = bench.ask(image_message(route[42], 9))
-    assert (answer.verdict, answer.newest_index) == (PlaceMatch.MATCH, 12)
+    assert (answer.status, answer.newest_index) == (PlaceMatch.MATCH, 12)
 
 
 def with_missing_model(whole: PlaceMap) -> PlaceMap:
@@ -279,7 +279,7 @@ def test_a_configuration_that_fails(bench, node, map_file, small_map, route, tmp
     assert not bench.transition('activate')
     assert bench.set_parameter('xi', 0)[0]
     configure(bench, map_file, activate=True)
-    assert verdicts(bench, route[:LENGTH])[-1] == PlaceMatch.MATCH
+    assert statuses(bench, route[:LENGTH])[-1] == PlaceMatch.MATCH
     bench.until_diagnosed('map', DiagnosticStatus.OK, '60 places of')
     assert 'Traceback' not in node.output()
 
@@ -342,10 +342,10 @@ def test_who_comes_late_hears_of_the_map_and_the_health(bench, node, map_file):
 
 def test_another_publisher_goes_on_where_the_first_stopped(bench, node, map_file, route):
     configure(bench, map_file, activate=True)
-    verdicts(bench, route[:3])
+    statuses(bench, route[:3])
     bench.node.destroy_publisher(bench.publisher)
     bench.until_diagnosed('input', DiagnosticStatus.WARN, 'no publisher')
     bench.publish_anew()
     bench.wait_for_node()
-    assert verdicts(bench, route[3:5], 4) == [PlaceMatch.WARMING_UP, PlaceMatch.MATCH]
+    assert statuses(bench, route[3:5], 4) == [PlaceMatch.WARMING_UP, PlaceMatch.MATCH]
     bench.until_diagnosed('recognition', DiagnosticStatus.OK, '1 of 1 image matched')

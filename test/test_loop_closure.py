@@ -8,17 +8,17 @@ import pytest
 import torch
 
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.alignment.settings import SpeedSettings
+from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
+from stavpr_ros.alignment.settings import VelocitySettings
 from stavpr_ros.alignment.similarity import tiled
 from stavpr_ros.alignment.spatial import adaptive_weights
-from stavpr_ros.alignment.speeds import best_speed_match, match_speeds
-from stavpr_ros.alignment.temporal import best_match, match_sequence
+from stavpr_ros.alignment.velocity import best_velocity_match, match_velocities
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.recognition import RecognitionSettings, Verdict
-from stavpr_ros.recognition.calibration import FLAT, MEMORY, PRIOR
-from stavpr_ros.recognition.cures import PAPER, ROBUST, Track, evidence, relative_distance
-from stavpr_ros.recognition.loop_closure import FORGOTTEN, LEAST_PLACES, ROOM, LoopCloser
+from stavpr_ros.recognition import RecognizerSettings, Status
+from stavpr_ros.recognition.loop_closer import FORGOTTEN, LEAST_PLACES, ROOM, LoopCloser
+from stavpr_ros.recognition.robust.options import PAPER, ROBUST, Track, evidence, relative_distance
+from stavpr_ros.recognition.robust.znorm import FLAT, MEMORY, PRIOR
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 SECOND = 10**9
@@ -46,19 +46,19 @@ def laps():
     return laps_of(375, 60)
 
 
-def settings_of(cures, **changes):
-    mode = 'robust' if cures.contrast else 'paper'
-    return RecognitionSettings(1.0, sequence=SHORT, neighbourhood=5, mode=mode, cures=cures, **changes)
+def settings_of(robust_options, **changes):
+    mode = 'robust' if robust_options.second_best_margin else 'paper'
+    return RecognizerSettings(1.0, sequence=SHORT, nms_radius=5, mode=mode, robust_options=robust_options, **changes)
 
 
 def drive(closer, features, stamps=None):
     stamps = [0] * len(features) if stamps is None else stamps
-    return [closer.add(features[i : i + 1], stamps[i]) for i in range(len(features))]
+    return [closer.update(features[i : i + 1], stamps[i]) for i in range(len(features))]
 
 
 def same(one, other):
-    assert (one.verdict, one.reason) == (other.verdict, other.reason)
-    assert repr(one.nearest) == repr(other.nearest)  # to the last bit, and NaN like NaN
+    assert (one.status, one.reason) == (other.status, other.reason)
+    assert repr(one.sequence) == repr(other.sequence)  # to the last bit, and NaN like NaN
     np.testing.assert_array_equal(one.path, other.path)
 
 
@@ -79,31 +79,31 @@ class PlainCloser:
         self.rows, self.track = [], Track()
 
     def distances(self, image, last):
-        from stavpr_ros.alignment.kernels.cpu import products
+        from stavpr_ros.alignment.cpu import dot
 
         out = np.empty((1, last), np.float32)
-        products.image_distances(
+        dot.image_distances(
             self.all[:, :last].contiguous().numpy(), tiled(self.all[:, image : image + 1]), self.a, 7, out
         )
         return out[0]
 
     def add(self, image, first, last):
         """Answer for an image that may be matched with places first..last-1: the sequence, and all costs."""
-        cures = self.settings.applied_cures
+        robust_options = self.settings.applied_options
         row = np.full(self.all.shape[1], np.inf, np.float32)
         if last - first >= LEAST_PLACES:
             live = self.distances(image, last)[first:]
-            if cures.row_normalisation:
+            if robust_options.query_znorm:
                 live = (live - live.mean()) / np.float32(max(live.std(), FLAT))
             row[first:last] = live
-            if cures.place_calibration:
+            if robust_options.reference_znorm:
                 self.learn(slice(first, last), live)
         self.rows = [*self.rows, row][-self.settings.sequence.length :]
         if len(self.rows) < self.settings.sequence.length:
             return None
         window = np.stack(self.rows)
         window[:, :first] = np.inf
-        return self.match(window, cures)
+        return self.match(window, robust_options)
 
     def learn(self, live, row):
         self.seen[live] = np.minimum(self.seen[live] + 1, MEMORY)
@@ -111,34 +111,34 @@ class PlainCloser:
         self.mean[live] += off / self.seen[live]
         self.variance[live] += (off * (row - self.mean[live]) - self.variance[live]) / self.seen[live]
 
-    def match(self, window, cures):
+    def match(self, window, robust_options):
         scale = np.ones_like(self.mean)
-        if cures.place_calibration:
+        if robust_options.reference_znorm:
             scale = 1 / np.sqrt(np.maximum(self.variance, 1e-6))
-        if not cures.speeds:
+        if not robust_options.velocity_search:
             self.found = found = match_sequence((window - self.mean) * scale, self.settings.sequence)
-            return best_match(found, self.settings.neighbourhood)
-        if not (cures.row_normalisation or cures.place_calibration):
+            return best_match(found, self.settings.nms_radius)
+        if not (robust_options.query_znorm or robust_options.reference_znorm):
             known = window[np.isfinite(window)]
             scale = scale / np.float32(max(known.std() if known.size else 0, FLAT))
-        self.found = found = match_speeds(window, SpeedSettings(), self.mean, scale)
-        return best_speed_match(found, self.settings.neighbourhood)
+        self.found = found = match_velocities(window, VelocitySettings(), self.mean, scale)
+        return best_velocity_match(found, self.settings.nms_radius)
 
     def judged(self, nearest):
         """The distances of an answer: those of the sequence and its rival."""
-        if nearest is None or not self.settings.applied_cures.contrast:
-            return nearest and (nearest.distance, nearest.runner_up_distance)
-        cost, other = nearest.distance, nearest.runner_up_distance
+        if nearest is None or not self.settings.applied_options.second_best_margin:
+            return nearest and (nearest.distance, nearest.second_best_distance)
+        cost, other = nearest.distance, nearest.second_best_distance
         far = [
-            abs(int(middle) - nearest.middle) > self.settings.neighbourhood
+            abs(int(middle) - nearest.middle) > self.settings.nms_radius
             for distance, middle in zip(self.found.distances, self.found.middles, strict=True)
             if distance < math.inf
         ]
         if sum(far) < 20:
             other = -0.8 if math.isnan(other) else min(other, -0.8)
         seen = evidence(cost, other)
-        other = nearest.runner_up_distance
-        if self.settings.applied_cures.persistence:
+        other = nearest.second_best_distance
+        if self.settings.applied_options.hysteresis:
             seen = self.track.follow(nearest.middle, seen)
         rival = other if math.isnan(other) else relative_distance(evidence(other, cost))
         return relative_distance(seen), rival
@@ -146,10 +146,10 @@ class PlainCloser:
 
 CHOICES = {
     'paper': PAPER,
-    'robust': ROBUST.without('centring'),
-    'lm_dtw': ROBUST.without('centring', 'speeds'),
-    'speeds alone': PAPER.only('speeds'),
-    'no track': ROBUST.without('centring', 'persistence'),
+    'robust': ROBUST.without('mean_centering'),
+    'lm_dtw': ROBUST.without('mean_centering', 'velocity_search'),
+    'speeds alone': PAPER.only('velocity_search'),
+    'no track': ROBUST.without('mean_centering', 'hysteresis'),
 }
 
 
@@ -165,17 +165,17 @@ def test_forgetting_is_banning(laps, choice, limit, exclude, sequence):
     plain = PlainCloser(settings, exclude, laps)
     answered = 0
     for i in range(len(laps)):
-        answer = closer.add(laps[i : i + 1])
+        answer = closer.update(laps[i : i + 1])
         assert closer.first + len(closer) == i + 1
         expected = plain.add(i, closer.first, max(closer.first, i + 1 - exclude))
         if expected is None:
-            assert answer.nearest is None
+            assert answer.sequence is None
             continue
         answered += 1
-        found = answer.nearest
+        found = answer.sequence
         assert (found.first, found.last, found.middle) == (expected.first, expected.last, expected.middle)
-        assert found.runner_up_index == expected.runner_up_index
-        np.testing.assert_array_equal([found.distance, found.runner_up_distance], plain.judged(expected))
+        assert found.second_best_index == expected.second_best_index
+        np.testing.assert_array_equal([found.distance, found.second_best_distance], plain.judged(expected))
         assert answer.path[:, 1].min() == found.first >= closer.first
         assert answer.path[-1].tolist() == [sequence.length - 1, found.last]
         assert found.last < i + 1 - exclude
@@ -186,7 +186,7 @@ def test_forgetting_is_banning(laps, choice, limit, exclude, sequence):
 @pytest.mark.parametrize('mode', ['paper', 'robust'])
 @pytest.mark.parametrize('limit', [376, 5000])
 def test_a_limit_that_is_never_reached_changes_nothing(laps, mode, limit):
-    settings = RecognitionSettings(1.0, sequence=SHORT, neighbourhood=5, mode=mode)
+    settings = RecognizerSettings(1.0, sequence=SHORT, nms_radius=5, mode=mode)
     bounded, unbounded = (LoopCloser(settings, 12, laps.settings, limit=value) for value in (limit, None))
     for i in range(len(laps)):
         same(bounded.add(laps[i : i + 1]), unbounded.add(laps[i : i + 1]))
@@ -202,16 +202,16 @@ def test_laps_are_closed_with_bounded_memory(laps, limit):
     closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit)
     answers = drive(closer, laps)
     for i in range(90, 375):
-        assert answers[i].verdict is Verdict.MATCH
-        assert (i - answers[i].newest) % 60 == 0
-        assert answers[i].newest >= i - limit
-    assert np.mean([answer.verdict is Verdict.MATCH for answer in answers[:55]]) < 0.1
+        assert answers[i].status is Status.MATCH
+        assert (i - answers[i].newest_index) % 60 == 0
+        assert answers[i].newest_index >= i - limit
+    assert np.mean([answer.status is Status.MATCH for answer in answers[:55]]) < 0.1
 
 
 def test_memory_is_bounded_and_an_eighth_is_forgotten_at_a_time(laps):
     closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=80)
     for i in range(len(laps)):
-        closer.add(laps[i : i + 1])
+        closer.update(laps[i : i + 1])
         forgotten = max(0, -(-(i + 1 - 80) // (80 // FORGOTTEN))) * (80 // FORGOTTEN)
         assert (closer.first, len(closer)) == (forgotten, i + 1 - forgotten)
         assert len(closer) <= 80
@@ -227,7 +227,7 @@ def test_what_is_kept_is_what_came_less_its_mean(laps, limit):
     moved = 0
     for i in range(len(laps)):
         before = closer._route._mean
-        closer.add(laps[i : i + 1])
+        closer.update(laps[i : i + 1])
         moved += closer._route._mean is not before
         if limit and closer.first and closer._route._mean is not before:
             # before the newest image was taken in
@@ -242,8 +242,8 @@ def test_what_is_kept_is_what_came_less_its_mean(laps, limit):
     torch.testing.assert_close(closer._route.strips[:, : len(closer)], expected, atol=2e-6, rtol=0)
 
 
-def test_without_centring_features_are_kept_as_they_came(laps):
-    closer = LoopCloser(settings_of(ROBUST.without('centring')), 12, laps.settings, limit=83)
+def test_without_centering_features_are_kept_as_they_came(laps):
+    closer = LoopCloser(settings_of(ROBUST.without('mean_centering')), 12, laps.settings, limit=83)
     drive(closer, laps)
     assert closer.first == 300
     torch.testing.assert_close(closer._route.strips[:, :75], laps.strips[:, 300:], atol=0, rtol=0)
@@ -257,8 +257,8 @@ def blurred(features, seed=0, noise=0.25):
 def test_a_track_goes_on_over_the_shift(laps):
     """What was certain stays so for some images, also in the very image in which places are forgotten."""
     persistent, alone = (
-        LoopCloser(settings_of(cures), 12, laps.settings, limit=160)
-        for cures in (ROBUST, ROBUST.without('persistence'))
+        LoopCloser(settings_of(robust_options), 12, laps.settings, limit=160)
+        for robust_options in (ROBUST, ROBUST.without('hysteresis'))
     )
     drive(persistent, laps[:157])
     drive(alone, laps[:157])
@@ -267,8 +267,8 @@ def test_a_track_goes_on_over_the_shift(laps):
         assert persistent.first == (20 if i > 3 else 0)
         one, other = persistent.add(blur[i : i + 1]), alone.add(blur[i : i + 1])
     assert persistent.first == 20
-    assert one.nearest.middle == other.nearest.middle
-    assert one.nearest.distance < other.nearest.distance
+    assert one.sequence.middle == other.sequence.middle
+    assert one.sequence.distance < other.sequence.distance
 
 
 # ------------------------------------------------ seconds
@@ -284,7 +284,7 @@ def test_places_younger_than_so_many_seconds_are_left_out(laps):
     closer = LoopCloser(settings_of(ROBUST), 7, laps.settings, exclude_seconds=9.5)
     old = 0
     for i in range(375):
-        closer.add(laps[i : i + 1], int(stamps[i]))
+        closer.update(laps[i : i + 1], int(stamps[i]))
         while old <= i and (not stamps[old] or (stamps[i] and stamps[i] - stamps[old] >= 9.5 * SECOND)):
             old += 1
         expected = min(i + 1 - 7, old) if stamps[i] else i + 1 - 7
@@ -314,11 +314,11 @@ def test_seconds_and_a_limit(laps):
     """A standing clock keeps everything young: nothing is answered, and nothing grows without bound."""
     closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=80, exclude_seconds=5.0)
     answers = drive(closer, laps, [SECOND] * 375)
-    assert all(answer.nearest is None for answer in answers)
-    assert answers[-1].verdict is Verdict.NO_MATCH
+    assert all(answer.sequence is None for answer in answers)
+    assert answers[-1].status is Status.NO_MATCH
     assert 'old enough' in answers[-1].reason
     assert len(closer._young) == len(closer) <= 80
-    closer.add(laps[:1], 6 * SECOND)
+    closer.update(laps[:1], 6 * SECOND)
     assert len(closer._young) == 1
     assert len(closer.newest_row()) == len(closer) - 12
 
@@ -330,7 +330,7 @@ def test_a_reset_begins_a_new_window_and_keeps_the_route(laps):
     closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, exclude_seconds=8.0)
     stamps = [10_000 * SECOND + i * SECOND for i in range(150)]
     for i in range(100):
-        closer.add(laps[i : i + 1], stamps[i])
+        closer.update(laps[i : i + 1], stamps[i])
     shift, scale = closer._window.calibration.shift_and_scale(80)
     assert closer.ranked(2)
     closer.reset()
@@ -340,14 +340,14 @@ def test_a_reset_begins_a_new_window_and_keeps_the_route(laps):
     for after, kept in zip(closer._window.calibration.shift_and_scale(80), (shift, scale), strict=True):
         np.testing.assert_array_equal(after, kept)
     for i in range(100, 150):  # the clock jumped back
-        answer = closer.add(laps[i : i + 1], stamps[i] - 9_900 * SECOND)
+        answer = closer.update(laps[i : i + 1], stamps[i] - 9_900 * SECOND)
         young = min(i + 1 - 100, 8)
         assert len(closer.newest_row()) == i + 1 - max(12, young)
         if i < 104:
-            assert answer.verdict is Verdict.WARMING_UP
+            assert answer.status is Status.WARMING_UP
         else:
-            assert answer.verdict is Verdict.MATCH
-            assert (i - answer.newest) % 60 == 0
+            assert answer.status is Status.MATCH
+            assert (i - answer.newest_index) % 60 == 0
 
 
 def test_a_reset_ends_the_track(laps):
@@ -358,19 +358,19 @@ def test_a_reset_ends_the_track(laps):
     other._window.clear()  # the window alone
     again = blurred(laps[96:101])  # one place ahead of the last window
     fresh, tracked = drive(one, again)[-1], drive(other, again)[-1]
-    assert fresh.nearest.middle == tracked.nearest.middle == 38
-    assert fresh.nearest.distance > tracked.nearest.distance
+    assert fresh.sequence.middle == tracked.sequence.middle == 38
+    assert fresh.sequence.distance > tracked.sequence.distance
 
 
 # ------------------------------------------------ candidates, errors
 
 
-@pytest.mark.parametrize('cures', [PAPER, ROBUST, ROBUST.without('speeds')])
-def test_candidates_are_numbered_from_the_start(laps, cures):
-    closer = LoopCloser(settings_of(cures), 12, laps.settings, limit=200)
+@pytest.mark.parametrize('robust_options', [PAPER, ROBUST, ROBUST.without('velocity_search')])
+def test_candidates_are_numbered_from_the_start(laps, robust_options):
+    closer = LoopCloser(settings_of(robust_options), 12, laps.settings, limit=200)
     assert closer.ranked(5) == []
     for i in range(300):
-        nearest = closer.add(laps[i : i + 1]).nearest
+        nearest = closer.update(laps[i : i + 1]).sequence
         ranked = closer.ranked(3)
         if nearest is None:
             assert ranked == []
@@ -378,8 +378,8 @@ def test_candidates_are_numbered_from_the_start(laps, cures):
         assert (ranked[0].place, ranked[0].distance) == (nearest.middle, nearest.distance)
         assert closer.candidates(1)[0].tolist() == [nearest.middle]
         if len(ranked) > 1:
-            assert ranked[1].place == nearest.runner_up_index
-            assert ranked[1].distance == nearest.runner_up_distance
+            assert ranked[1].place == nearest.second_best_index
+            assert ranked[1].distance == nearest.second_best_distance
         if i > 220:
             assert {i - 2 - c.place for c in ranked[:2]} < {60, 120, 180}
             assert closer.first > 0
@@ -390,23 +390,23 @@ def test_an_error_leaves_everything_as_it_was(laps):
     broken = features_of(torch.full((7, 1, 16), math.nan))
     for i in range(200):
         with pytest.raises(InputError):
-            other.add(broken, 5)
-        same(one.add(laps[i : i + 1]), other.add(laps[i : i + 1]))
+            other.update(broken, 5)
+        same(one.update(laps[i : i + 1]), other.update(laps[i : i + 1]))
         assert (one.first, len(one)) == (other.first, len(other))
 
 
 def test_a_threshold_is_changed_while_driving(laps):
     closer = LoopCloser(settings_of(ROBUST), 12, laps.settings)
-    assert drive(closer, laps[:120])[-1].verdict is Verdict.MATCH
+    assert drive(closer, laps[:120])[-1].status is Status.MATCH
     closer.set_threshold(1e-9)
-    assert closer.add(laps[120:121]).verdict is Verdict.NO_MATCH
+    assert closer.update(laps[120:121]).status is Status.NO_MATCH
     assert closer.settings.threshold == 1e-9
 
 
 @pytest.mark.parametrize('exclude', [1, 2, 12, 30])
 def test_the_smallest_limit_that_is_allowed_works(exclude):
     features = laps_of(200, 9)
-    settings = settings_of(ROBUST.without('centring'))
+    settings = settings_of(ROBUST.without('mean_centering'))
     with pytest.raises(SettingsError, match=r'limit = 0 .* take at least \d+') as refused:
         LoopCloser(settings, exclude, features.settings, limit=0)
     least = int(str(refused.value).split()[-1])
@@ -415,7 +415,7 @@ def test_the_smallest_limit_that_is_allowed_works(exclude):
     closer = LoopCloser(settings, exclude, features.settings, limit=least)
     answers = drive(closer, features)
     assert least <= exclude + 2 * SHORT.length + 8
-    assert all(answer.nearest is not None for answer in answers[60:])
+    assert all(answer.sequence is not None for answer in answers[60:])
 
 
 @pytest.mark.parametrize('seconds', [-1.0, math.nan, math.inf])

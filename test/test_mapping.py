@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, MapFileError, SettingsError
-from stavpr_ros.features import Describer
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import (
     KeyframeSettings,
     PlaceMap,
@@ -53,12 +53,12 @@ def test_round_trip(small_map, saved, route):
     assert_same(small_map, loaded)
     assert loaded.projection.identity == small_map.projection.identity
     assert loaded.thumbnail(3).shape == (96, 128, 3)
-    query = loaded.describer().describe([route[5]])
+    query = loaded.extractor().extract([route[5]])
     np.testing.assert_allclose(query.strips[:, 0], small_map.features.strips[:, 5], atol=1e-6)
 
 
 def test_map_without_extras(route, tmp_path):
-    plain = build_map([Frame(route[0], 0, '')], Describer(), thumbnails=False, progress=False)
+    plain = build_map([Frame(route[0], 0, '')], FeatureExtractor(), thumbnails=False, progress=False)
     save_map(plain, tmp_path / 'plain.stavpr')
     loaded = load_map(tmp_path / 'plain.stavpr')
     assert_same(plain, loaded)
@@ -68,20 +68,20 @@ def test_map_without_extras(route, tmp_path):
 
 
 def test_projected_otherwise_is_refused(small_map, route):
-    from stavpr_ros.recognition import Recogniser, RecognitionSettings
+    from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
-    recogniser = Recogniser(small_map, RecognitionSettings(threshold=1.0))
-    for other in (Describer(projection=64, seed=1), Describer(), Describer(projection=64, strips=6)):
+    recognizer = PlaceRecognizer(small_map, RecognizerSettings(threshold=1.0))
+    for other in (FeatureExtractor(projection=64, seed=1), FeatureExtractor(), FeatureExtractor(projection=64, strips=6)):
         with pytest.raises(FeatureMismatchError) as caught:
-            recogniser.add(other.describe(route[:1]))
+            recognizer.add(other.extract(route[:1]))
         assert small_map.settings.to_json() in str(caught.value)
         assert other.settings.to_json() in str(caught.value)
-    assert recogniser.window_fill == 0
+    assert recognizer.window_fill == 0
 
 
 def test_empty_source_is_refused():
     with pytest.raises(InputError, match='no images'):
-        build_map([], Describer(), progress=False)
+        build_map([], FeatureExtractor(), progress=False)
 
 
 # ------------------------------------------------------------------------------------------ poses
@@ -131,7 +131,7 @@ def test_a_place_without_its_picture(small_map):
 
 
 def drive(images):
-    """Frames of a drive, a second and a metre each."""
+    """Frames of a drive, a second and a meter each."""
     return [Frame(image, (i + 1) * SECOND, f'{i}') for i, image in enumerate(images)]
 
 
@@ -151,45 +151,45 @@ def test_keyframes_in_space(route, known):
             if not np.isnan(pose[0]):
                 trajectory.add(frame.stamp, pose)
         poses = trajectory
-    built = build_map(frames, Describer(), poses, progress=False, keyframes=KeyframeSettings(metres=2))
+    built = build_map(frames, FeatureExtractor(), poses, progress=False, keyframes=KeyframeSettings(meters=2))
     assert built.ids == ('0', '2', *map(str, range(5, 20, 2)))  # of 4 nothing is known
     assert built.poses[:, 0].tolist() == [0, 2, *range(5, 20, 2)]
-    every = build_map(frames, Describer(), poses, progress=False)
+    every = build_map(frames, FeatureExtractor(), poses, progress=False)
     assert len(every) == 20
     assert every.pose(4) is None
     assert every.pose(5)[0] == 5
 
 
 def test_poses_that_do_not_fit(route):
-    frames, describer = drive(route[:20]), Describer()
+    frames, extractor = drive(route[:20]), FeatureExtractor()
     for count in (19, 21):
         with pytest.raises(InputError, match=f'{count} poses for 20 images'):
-            build_map(frames, describer, straight(count), progress=False)
+            build_map(frames, extractor, straight(count), progress=False)
     with pytest.raises(InputError, match='shape'):
-        build_map(frames, describer, straight(20)[:, :6], progress=False)
+        build_map(frames, extractor, straight(20)[:, :6], progress=False)
     for bad in ([1, 2, 0, 0, 0, 0, 0], [1, 2, 0, 0, 0, 0, np.nan]):
         poses = straight(20)
         poses[7] = bad
         with pytest.raises(InputError, match=r"image 7 '7': pose \[1.0, 2.0"):
-            build_map(frames, describer, poses, progress=False)
-    built = build_map(frames, describer, straight(20) * 2, progress=False)
+            build_map(frames, extractor, poses, progress=False)
+    built = build_map(frames, extractor, straight(20) * 2, progress=False)
     assert built.pose(3).tolist() == [6, 0, 0, 0, 0, 0, 1]
     with pytest.raises(SettingsError, match='without poses'):
-        build_map(frames, describer, progress=False, keyframes=KeyframeSettings(degrees=1))
+        build_map(frames, extractor, progress=False, keyframes=KeyframeSettings(degrees=1))
     nowhere = Trajectory()
     with pytest.raises(InputError, match=r'none of 20 images became a place.*no odometry'):
-        build_map(frames, describer, nowhere, progress=False, keyframes=KeyframeSettings(metres=1))
-    assert build_map(frames, describer, nowhere, progress=False).poses is None
+        build_map(frames, extractor, nowhere, progress=False, keyframes=KeyframeSettings(meters=1))
+    assert build_map(frames, extractor, nowhere, progress=False).poses is None
 
 
 def test_width_of_the_thumbnails(route):
     image = cv2.resize(route[0], (640, 480))
-    built = build_map(drive([image]), Describer(), progress=False, thumbnail_width=320)
+    built = build_map(drive([image]), FeatureExtractor(), progress=False, thumbnail_width=320)
     assert built.thumbnail(0).shape == (240, 320, 3)
     assert built.thumbnails[0] == encode_thumbnail(image, 320)
-    assert build_map(drive([image]), Describer(), progress=False).thumbnail(0).shape == (144, 192, 3)
+    assert build_map(drive([image]), FeatureExtractor(), progress=False).thumbnail(0).shape == (144, 192, 3)
     with pytest.raises(SettingsError, match='width 0'):
-        build_map(drive([image]), Describer(), progress=False, thumbnail_width=0)
+        build_map(drive([image]), FeatureExtractor(), progress=False, thumbnail_width=0)
 
 
 class Watched:
@@ -213,12 +213,12 @@ class Watched:
 def test_images_are_decoded_by_one_thread_that_also_closes_the_source(route):
     """What a bag needs; also when the images, or their features, fail."""
     whole = Watched(drive(route))
-    assert len(build_map(whole, Describer(), progress=False)) == 60
+    assert len(build_map(whole, FeatureExtractor(), progress=False)) == 60
     damaged = Watched(drive(route), fails_at=40)
     with pytest.raises(ImageError, match='40'):
-        build_map(damaged, Describer(), progress=False)
+        build_map(damaged, FeatureExtractor(), progress=False)
     given_up = Watched(drive(route))
-    broken = Describer()
+    broken = FeatureExtractor()
     broken.describe = lambda images: 1 / 0
     with pytest.raises(ZeroDivisionError):
         build_map(given_up, broken, progress=False)

@@ -18,11 +18,11 @@ from stavpr_ros.alignment import (
     strip_distances,
 )
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.evaluation.offline import recognise_all
-from stavpr_ros.features import Describer, FeatureSettings, LocalFeatures
+from stavpr_ros.evaluation.offline import recognize_all
+from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.mapping import build_map, describe_frames
-from stavpr_ros.recognition import Recogniser, RecognitionSettings
+from stavpr_ros.mapping import build_map, extract_features
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.sources import open_source
@@ -117,7 +117,7 @@ def test_window_and_match(n):
             nearest, path = matcher.match(3)
             window = rows[i - 4 : i + 1]
             expected = best_match(match_sequence(window, SequenceSettings(5)), 3)
-            assert repr(nearest) == repr(expected)  # a runner-up's distance may be NaN
+            assert repr(nearest) == repr(expected)  # a second best's distance may be NaN
             aligned = align_sequence(window, expected.first, SequenceSettings(5))
             np.testing.assert_array_equal(path, aligned.path)
     matcher.reset()
@@ -154,17 +154,17 @@ def test_half_width_rounds_as_it_says(d):
 
 def test_half_width_answers_on_real_images(data_folder):
     """The same place, window for window, on a walk in the paper's configuration; distances within 1e-3."""
-    describer = Describer()
-    place_map = build_map(open_source(data_folder / 'gardens_point' / 'day_left'), describer, progress=False)
-    query = describe_frames(
-        open_source(data_folder / 'gardens_point' / 'day_right'), describer, progress=False
+    extractor = FeatureExtractor()
+    place_map = build_map(open_source(data_folder / 'gardens_point' / 'day_left'), extractor, progress=False)
+    query = extract_features(
+        open_source(data_folder / 'gardens_point' / 'day_right'), extractor, progress=False
     )
     exact, half = (
-        recognise_all(Recogniser(place_map, RecognitionSettings(10.0), precision=p), query)[19:]
+        recognize_all(PlaceRecognizer(place_map, RecognizerSettings(10.0), precision=p), query)[19:]
         for p in ('float32', 'float16')
     )
-    assert [a.nearest.middle for a in half] == [a.nearest.middle for a in exact]
-    moved = [abs(a.nearest.distance - b.nearest.distance) for a, b in zip(half, exact, strict=True)]
+    assert [a.sequence.middle for a in half] == [a.sequence.middle for a in exact]
+    moved = [abs(a.sequence.distance - b.sequence.distance) for a, b in zip(half, exact, strict=True)]
     print(f'float16: {len(half)} windows, distances moved by {max(moved):.1e} at most')
     assert max(moved) < 1e-3
 

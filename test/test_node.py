@@ -13,14 +13,14 @@ from std_msgs.msg import Float32, Int32
 
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.evaluation.offline import recognise_all
-from stavpr_ros.recognition import Recogniser, RecognitionSettings
+from stavpr_ros.evaluation.offline import recognize_all
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
 LENGTH, THRESHOLD = 5, 0.2
 
 
 def start(log, map_file=None, threshold=None, **parameters):
-    values = {'sequence_length': LENGTH, 'neighbourhood': 5, 'mode': 'paper'} | parameters
+    values = {'sequence_length': LENGTH, 'nms_radius': 5, 'mode': 'paper'} | parameters
     if map_file is not None:
         values['map_path'] = map_file
     if threshold is not None:
@@ -64,14 +64,14 @@ def test_answers_are_the_cores_match_for_match(bench, node, small_map, route):
     ]
     rng = np.random.default_rng(0)
     images = route[20:34] + [rng.integers(0, 256, (96, 128, 3), np.uint8) for _ in range(6)]
-    settings = RecognitionSettings(THRESHOLD, sequence=SequenceSettings(LENGTH), neighbourhood=5)
-    expected = recognise_all(Recogniser(small_map, settings), small_map.describer().describe(images))
+    settings = RecognizerSettings(THRESHOLD, sequence=SequenceSettings(LENGTH), nms_radius=5)
+    expected = recognize_all(PlaceRecognizer(small_map, settings), small_map.extractor().extract(images))
     stamps = [10**9 * (100 + i) + i for i in range(len(images))]
     for i, image in enumerate(images):
         answer, core = bench.ask(image_message(image, stamps[i])), expected[i]
         stamp = answer.header.stamp
         assert (stamp.sec * 10**9 + stamp.nanosec, answer.header.frame_id) == (stamps[i], 'camera')
-        assert answer.verdict == {'warming up': 0, 'no match': 1, 'match': 2}[core.verdict.value]
+        assert answer.status == {'warming up': 0, 'no match': 1, 'match': 2}[core.status.value]
         assert (answer.place_index, answer.newest_index) == (core.place, core.newest)
         assert answer.threshold == pytest.approx(THRESHOLD)
         if core.nearest is None:
@@ -84,22 +84,22 @@ def test_answers_are_the_cores_match_for_match(bench, node, small_map, route):
         assert answer.distance == pytest.approx(nearest.distance, abs=1e-5)
         assert (answer.sequence_first, answer.sequence_last) == (nearest.first, nearest.last)
         assert answer.sequence_middle == nearest.middle
-        assert answer.runner_up_index == nearest.runner_up_index
-        assert answer.runner_up_distance == pytest.approx(nearest.runner_up_distance, abs=1e-5)
+        assert answer.second_best_index == nearest.second_best_index
+        assert answer.second_best_distance == pytest.approx(nearest.second_best_distance, abs=1e-5)
         assert [(p.query_index, p.map_index) for p in answer.path] == [tuple(p) for p in core.path.tolist()]
         window = [answer.window_first, answer.window_middle, answer.window_last]
         assert [t.sec * 10**9 + t.nanosec for t in window] == [stamps[i - 4], stamps[i - 2], stamps[i]]
-        if answer.verdict == PlaceMatch.MATCH:
+        if answer.status == PlaceMatch.MATCH:
             assert answer.reason == ''
             assert answer.place_stamp.sec == answer.place_index + 1
             assert answer.place_id == f'place {answer.place_index}'
             assert answer.newest_id == f'place {answer.newest_index}'
         else:
             assert 'threshold' in answer.reason
-    verdicts = [answer.verdict for answer in bench.answers[-len(images) :]]
-    assert verdicts.count(PlaceMatch.MATCH) >= 10
-    assert PlaceMatch.NO_MATCH in verdicts
-    matches = [a for a in bench.answers[-len(images) :] if a.verdict == PlaceMatch.MATCH]
+    statuses = [answer.status for answer in bench.answers[-len(images) :]]
+    assert statuses.count(PlaceMatch.MATCH) >= 10
+    assert PlaceMatch.NO_MATCH in statuses
+    matches = [a for a in bench.answers[-len(images) :] if a.status == PlaceMatch.MATCH]
     bench.until(lambda: len(places) == len(distances) == len(matches) and len(infos) == 1, 'the plain topics')
     assert places == [match.place_index for match in matches]
     assert distances == [match.distance for match in matches]
@@ -132,15 +132,15 @@ def test_broken_images_among_good_ones(bench, node, route):
         if i % 3 == 1:
             bad = broken[i // 3]
             answer = bench.ask(bad)
-            assert answer.verdict == PlaceMatch.INVALID_IMAGE
+            assert answer.status == PlaceMatch.INVALID_IMAGE
             assert answer.header == bad.header
             assert answer.reason
             assert answer.place_index == -1
         answer = bench.ask(image_message(route[i], 10 + i))
         if i < LENGTH - 1:
-            assert answer.verdict == PlaceMatch.WARMING_UP
+            assert answer.status == PlaceMatch.WARMING_UP
         else:
-            assert (answer.verdict, answer.newest_index) == (PlaceMatch.MATCH, i)
+            assert (answer.status, answer.newest_index) == (PlaceMatch.MATCH, i)
     assert node.stop(signal.SIGTERM) == 0
     assert f'{2 + bench.probes} invalid: encoding' in node.output()
     assert '1 invalid: depth' in node.output()
@@ -152,7 +152,7 @@ def test_encodings_and_padded_rows(bench, node, route):
     for encoding in ('rgb8', 'bgr8', 'rgba8', 'bgra8', 'mono8', 'mono16'):
         for i in range(30, 38):
             answer = bench.ask(image_message(route[i], 1000 + i, encoding, padding=5 if i % 2 else 0))
-        assert (answer.verdict, answer.newest_index) == (PlaceMatch.MATCH, 37), encoding
+        assert (answer.status, answer.newest_index) == (PlaceMatch.MATCH, 37), encoding
 
 
 def test_a_flood_is_answered_image_by_image(bench, node, route):
@@ -163,7 +163,7 @@ def test_a_flood_is_answered_image_by_image(bench, node, route):
         bench.publisher.publish(message)
     for i in range(40, 46):
         answer = bench.ask_until_answered(image_message(route[i], 5000 + i))
-    assert (answer.verdict, answer.newest_index) == (PlaceMatch.MATCH, 45)
+    assert (answer.status, answer.newest_index) == (PlaceMatch.MATCH, 45)
     stamps = [(a.header.stamp.sec, a.header.stamp.nanosec) for a in bench.answers[before:]]
     assert len(set(stamps)) == len(stamps)
 
@@ -171,23 +171,23 @@ def test_a_flood_is_answered_image_by_image(bench, node, route):
 def test_what_is_missing_is_said_and_can_be_set_later(bench, run, map_file, route, tmp_path):
     process = run()
     answer = bench.ask(image_message(route[0], 1))
-    assert answer.verdict == PlaceMatch.NOT_READY
+    assert answer.status == PlaceMatch.NOT_READY
     assert 'map_path' in answer.reason
     done, reason = bench.set_parameter('map_path', str(tmp_path / 'missing.stavpr'))
     assert not done
     assert 'does not exist' in reason
     assert bench.set_parameter('map_path', map_file) == (True, '')
     answer = bench.ask(image_message(route[0], 2))
-    assert answer.verdict == PlaceMatch.NOT_READY
+    assert answer.status == PlaceMatch.NOT_READY
     assert 'threshold' in answer.reason
     assert not bench.set_parameter('threshold', 0.0)[0]
     assert bench.set_parameter('threshold', THRESHOLD)[0]
     for i in range(LENGTH):
         answer = bench.ask(image_message(route[i], 3 + i))
-    assert (answer.verdict, answer.newest_index) == (PlaceMatch.MATCH, LENGTH - 1)
+    assert (answer.status, answer.newest_index) == (PlaceMatch.MATCH, LENGTH - 1)
     assert bench.set_parameter('threshold', 1e-7)[0]
     answer = bench.ask(image_message(route[7], 30))
-    assert (answer.verdict, answer.place_index) == (PlaceMatch.NO_MATCH, -1)
+    assert (answer.status, answer.place_index) == (PlaceMatch.NO_MATCH, -1)
     assert answer.sequence_middle >= 0
     assert not bench.set_parameter('beta', 3.0)[0]
     assert process.popen.poll() is None
@@ -197,15 +197,15 @@ def test_what_is_missing_is_said_and_can_be_set_later(bench, run, map_file, rout
 def test_mode_robust_needs_no_threshold(bench, run, map_file, small_map, route):
     """The default mode: answers are the core's, and 1 is the largest threshold there is."""
     run(map_file, mode='robust')
-    settings = RecognitionSettings(1.0, sequence=SequenceSettings(LENGTH), neighbourhood=5, mode='robust')
+    settings = RecognizerSettings(1.0, sequence=SequenceSettings(LENGTH), nms_radius=5, mode='robust')
     images = route[10:30]
-    expected = recognise_all(Recogniser(small_map, settings), small_map.describer().describe(images))
+    expected = recognize_all(PlaceRecognizer(small_map, settings), small_map.extractor().extract(images))
     for i, image in enumerate(images):
         answer, core = bench.ask(image_message(image, 1 + i)), expected[i]
         assert (answer.place_index, answer.newest_index) == (core.place, core.newest)
         assert answer.threshold == 1
         if core.nearest is not None:
-            assert answer.verdict == PlaceMatch.MATCH
+            assert answer.status == PlaceMatch.MATCH
             assert answer.distance == pytest.approx(core.nearest.distance, abs=1e-4)
             assert answer.sequence_middle == core.nearest.middle
     done, reason = bench.set_parameter('threshold', 1.5)
@@ -228,7 +228,7 @@ def test_a_damaged_map_is_said_and_a_good_one_starts_the_node(bench, run, map_fi
     bench.wait_for_node()
     for i in range(LENGTH):
         answer = bench.ask(image_message(route[i], 3 + i))
-    assert (answer.verdict, answer.newest_index) == (PlaceMatch.MATCH, LENGTH - 1)
+    assert (answer.status, answer.newest_index) == (PlaceMatch.MATCH, LENGTH - 1)
 
 
 @pytest.mark.parametrize(

@@ -38,8 +38,8 @@ def encoded(image, encoding):
         order = CHANNELS[encoding]
         wide = 'a' in encoding or encoding.endswith('4')
         values = np.full((height, width, 4 if wide else len(set(order))), 255, np.uint16)
-        for colour, channel in enumerate(order):
-            values[..., channel] = image[..., colour] if len(set(order)) > 1 else image.mean(axis=2)
+        for color, channel in enumerate(order):
+            values[..., channel] = image[..., color] if len(set(order)) > 1 else image.mean(axis=2)
         rows = (values << 8).astype('<u2') if is_deep(encoding) else values.astype(np.uint8)
         step, data = rows.nbytes // height, rows.tobytes()
     message = Image(height=height, width=width, encoding=encoding, step=step)
@@ -71,11 +71,11 @@ class TestImages:
     """One node with the defaults; what a test sets, it sets back."""
 
     @pytest.mark.parametrize('encoding', [*CHANNELS, *BAYER, *YUV])
-    def test_every_raw_encoding_is_recognised(self, stream, route, encoding):
+    def test_every_raw_encoding_is_recognized(self, stream, route, encoding):
         """Without a reset: after five images there are only these in the window."""
         for image in route[30:35]:
             answer = stream.show(encoded(image, encoding))
-        assert (answer.verdict, answer.newest_index) == (MATCH, 34)
+        assert (answer.status, answer.newest_index) == (MATCH, 34)
 
     def test_broken_images_are_counted_and_explained_once_a_kind(self, bench, process, camera, route):
         before = camera.counts('input')
@@ -83,12 +83,12 @@ class TestImages:
         for _ in range(2):
             for kind, message in broken_images(route[0]).items():
                 answer = camera.show(message)
-                assert answer.verdict == INVALID, kind
+                assert answer.status == INVALID, kind
                 assert answer.reason, kind
                 assert answer.place_index == answer.newest_index == -1
                 i = next(good)
                 answer = camera.show(route[i])
-                assert answer.verdict == (WARMING_UP if i < LENGTH - 1 else MATCH)
+                assert answer.status == (WARMING_UP if i < LENGTH - 1 else MATCH)
         assert answer.newest_index == 9
         after = camera.counts('input')
         for kind in broken_images(route[0]):
@@ -100,38 +100,38 @@ class TestImages:
 
     def test_a_robot_that_stands_still_does_not_fill_the_window(self, bench, camera, route):
         rng, change = np.random.default_rng(0), BY_NAME['keyframe_change'].default
-        assert camera.show(route[20]).verdict == WARMING_UP
+        assert camera.show(route[20]).status == WARMING_UP
         for _ in range(100):
             noisy = np.clip(route[20] + rng.normal(0, 3, route[20].shape), 0, 255).astype(np.uint8)
             answer = camera.show(noisy, SECOND // 10)
-            assert answer.verdict == SKIPPED
+            assert answer.status == SKIPPED
             assert f'less than {change:g}' in answer.reason
         assert camera.counts('recognition')['window'] == '1'
         assert int(camera.counts('processing')['dropped_not_a_keyframe']) >= 100
-        assert camera.verdicts(route[21:25]) == 3 * [WARMING_UP] + [MATCH]
+        assert camera.statuses(route[21:25]) == 3 * [WARMING_UP] + [MATCH]
         assert bench.answers[-1].newest_index == 24
         camera.set(keyframe_change=0.0)
         camera.reset()
-        assert camera.verdicts(4 * [route[20]]) == 4 * [WARMING_UP]
+        assert camera.statuses(4 * [route[20]]) == 4 * [WARMING_UP]
         assert camera.counts('recognition')['window'] == '4'
         camera.set(keyframe_change=change)
 
     def test_keyframes_by_odometry(self, bench, camera, route):
-        camera.set(keyframe_metres=1.0)
+        camera.set(keyframe_distance=1.0)
         answer = camera.show(route[0])
-        assert answer.verdict == SKIPPED
+        assert answer.status == SKIPPED
         assert 'no odometry' in answer.reason
         assert 'never' in bench.until_diagnosed('input', WARN, 'odometry').message
         assert int(camera.counts('input')['dropped_no_odometry']) >= 1
         wheels = bench.node.create_publisher(Odometry, '/wheels/odometry', 10)
         bench.until(lambda: wheels.get_subscription_count() > 0, 'the subscriber of odometry')
 
-        def moved(metres, degrees=0.0):
+        def moved(meters, degrees=0.0):
             """Show the next image of the route as taken there; poses hold for half a second only."""
             camera.stamp += SECOND
             odometry, half = Odometry(), np.radians(degrees) / 2
             odometry.header.stamp = Time(sec=camera.stamp // SECOND, nanosec=camera.stamp % SECOND)
-            odometry.pose.pose.position.x = metres
+            odometry.pose.pose.position.x = meters
             odometry.pose.pose.orientation.z, odometry.pose.pose.orientation.w = np.sin(half), np.cos(half)
             image = next(images)
 
@@ -143,12 +143,12 @@ class TestImages:
             return bench.answers[-1]
 
         images = iter(route)
-        assert moved(5.0).verdict == WARMING_UP
+        assert moved(5.0).status == WARMING_UP
         assert moved(5.4).reason == 'moved 0.400 m of 1 m since the last keyframe'
-        assert moved(6.1).verdict == WARMING_UP
-        assert moved(6.1, degrees=170).verdict == SKIPPED
-        camera.set(keyframe_degrees=30.0)
-        assert moved(6.1, degrees=40).verdict == WARMING_UP
+        assert moved(6.1).status == WARMING_UP
+        assert moved(6.1, degrees=170).status == SKIPPED
+        camera.set(keyframe_angle=30.0)
+        assert moved(6.1, degrees=40).status == WARMING_UP
         answer = moved(6.1, degrees=50)
         assert answer.reason == 'moved 0.000 m of 1 m and turned 10.00 of 30 degrees since the last keyframe'
         assert camera.counts('recognition')['window'] == '3'
@@ -161,8 +161,8 @@ class TestImages:
 
         bench.until(compared, 'a word on the stamps')
         bench.until_diagnosed('input', WARN, 'comes no more')
-        camera.set(keyframe_metres=0.0, keyframe_degrees=0.0)
-        assert camera.show(next(images)).verdict == WARMING_UP
+        camera.set(keyframe_distance=0.0, keyframe_angle=0.0)
+        assert camera.show(next(images)).status == WARMING_UP
         bench.until(lambda: wheels.get_subscription_count() == 0, 'the end of the subscription')
         assert camera.counts('input')['odometry'] == 'not needed'
         bench.node.destroy_publisher(wheels)
@@ -218,8 +218,8 @@ class TestCompressed:
     @pytest.mark.parametrize('suffix', ['.png', '.jpeg'])
     def test_pictures(self, packed, route, suffix):
         packed.reset()
-        verdicts = packed.verdicts(compressed_message(image, 0, suffix) for image in route[40:46])
-        assert verdicts == 4 * [WARMING_UP] + 2 * [MATCH]
+        statuses = packed.statuses(compressed_message(image, 0, suffix) for image in route[40:46])
+        assert statuses == 4 * [WARMING_UP] + 2 * [MATCH]
         assert packed.bench.answers[-1].newest_index == 45
 
     def test_what_is_no_picture(self, bench, packed, route):
@@ -230,9 +230,9 @@ class TestCompressed:
         text.data = array.array('B', b'no picture at all')
         for message, word in ((depth, 'compressedDepth'), (short, 'png'), (text, 'rgb8')):
             answer = packed.show(message)
-            assert answer.verdict == INVALID
+            assert answer.status == INVALID
             assert word in answer.reason
-        assert packed.show(compressed_message(route[0], 0)).verdict == WARMING_UP
+        assert packed.show(compressed_message(route[0], 0)).status == WARMING_UP
         bench.until_diagnosed('input', WARN, 'depth 1')
 
 
@@ -266,7 +266,7 @@ class TestQualityOfService:
         for image in route[:LENGTH]:
             bench.publisher.publish(image_message(route[50], 1))  # not heard: there is one answer only
             answer = reliable.show(image)
-        assert (answer.verdict, answer.newest_index) == (MATCH, LENGTH - 1)
+        assert (answer.status, answer.newest_index) == (MATCH, LENGTH - 1)
 
         def told():
             reliable.show(route[LENGTH])
@@ -290,9 +290,9 @@ class TestQualityOfService:
         assert bench.transition('deactivate')
         assert bench.transition('activate')
         reliable.connect()
-        assert reliable.show(route[0]).verdict == WARMING_UP
+        assert reliable.show(route[0]).status == WARMING_UP
         assert offered('/image') == [ReliabilityPolicy.RELIABLE]
-        reliable.set(keyframe_metres=1.0)
+        reliable.set(keyframe_distance=1.0)
         bench.until(lambda: bool(offered('/odom')), 'the subscriber of odometry')
         assert offered('/odom') == [ReliabilityPolicy.BEST_EFFORT]
 

@@ -12,13 +12,13 @@ from processes import RELIABLE, TAKEN_RELIABLY, Bench, node_process
 from stavpr_msgs.msg import LoopClosure, PlaceMatch
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.metrics import frame_answers, score_at
 from stavpr_ros.evaluation.offline import window_answers
-from stavpr_ros.evaluation.truth import GroundTruth
-from stavpr_ros.features import Describer
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import load_map
-from stavpr_ros.operation import EngineSettings
-from stavpr_ros.recognition import Verdict
+from stavpr_ros.pipeline import PipelineSettings
+from stavpr_ros.recognition import Status
 from stavpr_ros.sources import open_source
 
 SECOND = 10**9
@@ -79,14 +79,14 @@ def drive(bench, images, settings, x_of=None):
 
     With the rule of motion, an image whose pose has not arrived yet is skipped: both are sent once more.
     """
-    describer = Describer()
-    closer = settings.loop_closer(describer, settings.applied_threshold('loop_closure'))
+    extractor = FeatureExtractor()
+    closer = settings.loop_closer(extractor, settings.applied_threshold('loop_closure'))
     answers, core = [], []
     for i, image in enumerate(images):
         message = image_message(image, (i + 1) * SECOND)
         x = None if x_of is None else x_of(i)
         if x_of is not None:
-            assert bench.set_parameter('keyframe_metres', 0.0 if x is None else 0.001)[0]
+            assert bench.set_parameter('keyframe_distance', 0.0 if x is None else 0.001)[0]
         answer = None
         while answer is None or 'no odometry' in answer.reason:
             if x is not None:
@@ -95,29 +95,29 @@ def drive(bench, images, settings, x_of=None):
                 bench.odometry.publish(odometry)
             answer = bench.ask(message)
         answers.append(answer)
-        core.append(closer.add(describer.describe([image]), (i + 1) * SECOND))
-    matches = sum(answer.verdict == PlaceMatch.MATCH for answer in answers)
+        core.append(closer.update(extractor.extract([image]), (i + 1) * SECOND))
+    matches = sum(answer.status == PlaceMatch.MATCH for answer in answers)
     bench.until(lambda: len(bench.closures) >= matches, 'a loop closure for each match')
     assert len(bench.closures) == matches
     return Drive(answers, {closure.header.stamp.sec - 1: closure for closure in bench.closures}, core)
 
 
 def check_against_core(driven, length):
-    """Match for match: verdicts, places, distances, paths; and what a loop closure makes of them."""
+    """Match for match: statuses, places, distances, paths; and what a loop closure makes of them."""
     for i, (answer, core) in enumerate(zip(driven.answers, driven.core, strict=True)):
-        assert answer.verdict == {'warming up': 0, 'no match': 1, 'match': 2}[core.verdict.value]
-        assert (answer.place_index, answer.newest_index) == (core.place, core.newest)
-        assert (i in driven.closures) == (core.verdict is Verdict.MATCH)
-        if core.nearest is None:
+        assert answer.status == {'warming up': 0, 'no match': 1, 'match': 2}[core.status.value]
+        assert (answer.place_index, answer.newest_index) == (core.place_index, core.newest_index)
+        assert (i in driven.closures) == (core.status is Status.MATCH)
+        if core.sequence is None:
             continue
-        assert answer.distance == pytest.approx(core.nearest.distance, abs=1e-4)
+        assert answer.distance == pytest.approx(core.sequence.distance, abs=1e-4)
         if i not in driven.closures:
             continue
         closure, first = driven.closures[i], i - length + 1
         assert closure.header == answer.header
         assert (closure.distance, closure.threshold) == (answer.distance, answer.threshold)
-        assert (closure.query_index, closure.place_index) == (first + (length - 1) // 2, core.place)
-        assert (closure.query_stamp.sec, closure.place_stamp.sec) == (closure.query_index + 1, core.place + 1)
+        assert (closure.query_index, closure.place_index) == (first + (length - 1) // 2, core.place_index)
+        assert (closure.query_stamp.sec, closure.place_stamp.sec) == (closure.query_index + 1, core.place_index + 1)
         assert closure.query_stamp == answer.window_middle
         assert closure.inliers == -1
         pairs = [(pair.query_index, pair.place_index) for pair in closure.pairs]
@@ -133,7 +133,7 @@ def test_the_hallway_is_closed(bench, start, data_folder):
     truth_file = data_folder / 'rtabmap_hallway_loop' / 'samples_GT.bmp'
     truth = GroundTruth.from_file(truth_file, 84, 84, 0).loop_closures(19)
     start(exclude_places=20)
-    driven = drive(bench, images, EngineSettings(exclude_places=20))
+    driven = drive(bench, images, PipelineSettings(exclude_places=20))
     check_against_core(driven, 20)
     places = np.full(84, -1)
     for closure in driven.closures.values():
@@ -159,8 +159,8 @@ def test_the_hallway_is_closed(bench, start, data_folder):
 @pytest.fixture(scope='module')
 def loop(bench, start):
     """A made-up loop, driven twice and a half; odometry drifts, and is silent for places 10 to 14."""
-    start(sequence_length=LENGTH, exclude_places=10, neighbourhood=5, candidates=2, geometric_check='none')
-    settings = EngineSettings(sequence=SequenceSettings(LENGTH), exclude_places=10, neighbourhood=5)
+    start(sequence_length=LENGTH, exclude_places=10, nms_radius=5, candidates=2, geometric_check='none')
+    settings = PipelineSettings(sequence=SequenceSettings(LENGTH), exclude_places=10, nms_radius=5)
     images = (route_images(LAP) * 3)[: 2 * LAP + LAP // 2]
     return drive(bench, images, settings, lambda i: None if 10 <= i < 15 else i % LAP + 0.1 * (i // LAP))
 

@@ -23,7 +23,7 @@ from stavpr_ros.mapping import load_map, save_map
 
 LENGTH, SECOND = 5, 10**9
 LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-SHORT = {'sequence_length': LENGTH, 'neighbourhood': 5, 'candidates': 3, 'threads': 1, 'max_places': 100,
+SHORT = {'sequence_length': LENGTH, 'nms_radius': 5, 'candidates': 3, 'threads': 1, 'max_places': 100,
          'queue_size': 1000, 'keyframe_change': 0.0, 'diagnostics_period': 0.2}  # fmt: skip
 
 
@@ -179,7 +179,7 @@ def test_without_a_map_everything_says_what_is_missing(bare, robot, route, tmp_p
 def test_images_that_come_while_the_first_map_is_loaded_are_answered(bare, robot, route, tmp_path):
     with robot.while_loading(tmp_path / 'slow.stavpr') as slow:
         answers = robot.drive(route[:5])
-        assert {answer.verdict for answer in answers} == {PlaceMatch.NOT_READY}
+        assert {answer.status for answer in answers} == {PlaceMatch.NOT_READY}
         assert {answer.reason for answer in answers} == {f'map {slow} is being loaded'}
         robot.until_diagnosed('map', DiagnosticStatus.OK, 'loading')
     robot.until_told(state='none')
@@ -188,14 +188,14 @@ def test_images_that_come_while_the_first_map_is_loaded_are_answered(bare, robot
 
 
 def test_from_mapping_with_odometry_to_poses(bare, robot, route, folder):
-    """Mapping from nothing, saved, loaded by a service, recognised; and live from mapping to localization."""
+    """Mapping from nothing, saved, loaded by a service, recognized; and live from mapping to localization."""
     path = folder / 'grown.stavpr'
     robot.does(SetOperation, 'set_operation', operation='mapping')
-    assert robot.set_parameter('keyframe_metres', 0.5)[0]
-    assert 'mapping recognises nothing' in robot.refuses(Relocalize, 'relocalize')
+    assert robot.set_parameter('keyframe_distance', 0.5)[0]
+    assert 'mapping recognizes nothing' in robot.refuses(Relocalize, 'relocalize')
     assert 'no places' in robot.refuses(SaveMap, 'save_map', path=str(path))
     answers = robot.drive_with_odometry(route[:40])
-    assert {(answer.verdict, answer.reason, answer.place_index) for answer in answers} == {
+    assert {(answer.status, answer.reason, answer.place_index) for answer in answers} == {
         (PlaceMatch.MAPPED, '', -1)
     }
     assert [answer.newest_index for answer in answers] == list(range(40))
@@ -217,7 +217,7 @@ def test_from_mapping_with_odometry_to_poses(bare, robot, route, folder):
     assert [stamp // SECOND for stamp in saved.stamps] == [first + x for x in range(40)]
 
     poses = robot.listen(PoseWithCovarianceStamped, '/stavpr/pose')
-    assert robot.set_parameter('keyframe_metres', 0.0)[0]
+    assert robot.set_parameter('keyframe_distance', 0.0)[0]
     for load in (False, True):
         if load:
             assert robot.does(LoadMap, 'load_map', path=str(path)).map.places == 40
@@ -226,7 +226,7 @@ def test_from_mapping_with_odometry_to_poses(bare, robot, route, folder):
         robot.until(lambda: robot.node.count_publishers('/stavpr/pose') == 1, 'the poses')
         poses.clear()
         answers = robot.drive(route[10:20])
-        assert [answer.verdict for answer in answers] == [PlaceMatch.WARMING_UP] * 4 + [PlaceMatch.MATCH] * 6
+        assert [answer.status for answer in answers] == [PlaceMatch.WARMING_UP] * 4 + [PlaceMatch.MATCH] * 6
         assert [answer.newest_index for answer in answers[4:]] == list(range(14, 20))
         robot.until(lambda: len(poses) == 6, 'a pose for each match')
         for pose, answer in zip(poses, answers[4:], strict=True):
@@ -240,7 +240,7 @@ def test_a_map_that_is_full_says_so(bare, robot, route, folder):
     robot.does(SetOperation, 'set_operation', operation='mapping')
     places = robot.until_told(operation='mapping').places
     answers = robot.drive((route * 2)[: 100 - places + 2])
-    assert [answer.verdict for answer in answers[-3:]] == [PlaceMatch.MAPPED] + [PlaceMatch.NOT_READY] * 2
+    assert [answer.status for answer in answers[-3:]] == [PlaceMatch.MAPPED] + [PlaceMatch.NOT_READY] * 2
     assert 'max_places = 100' in answers[-1].reason
     robot.until_told(state='full', places=100)
     robot.until_diagnosed('map', DiagnosticStatus.WARN, 'full')
@@ -286,12 +286,12 @@ def test_a_map_is_swapped_under_a_stream(mapped, robot, small_map, route, folder
     robot.until(lambda: len(robot.answers) >= before + len(sent), 'all answers')
     answers = robot.answers[before:]
     assert [answer.header for answer in answers] == [image.header for image in sent]
-    warming = [i for i, answer in enumerate(answers) if answer.verdict == PlaceMatch.WARMING_UP]
+    warming = [i for i, answer in enumerate(answers) if answer.status == PlaceMatch.WARMING_UP]
     assert warming == list(range(warming[0], warming[0] + LENGTH - 1))
     assert 4 <= warming[0] <= during
     old, new = answers[: warming[0]], answers[warming[-1] + 1 :]
-    assert {answer.newest_id.split()[0] for answer in old if answer.verdict == PlaceMatch.MATCH} == {'place'}
-    assert {answer.newest_id.split()[0] for answer in new if answer.verdict == PlaceMatch.MATCH} == {'new'}
+    assert {answer.newest_id.split()[0] for answer in old if answer.status == PlaceMatch.MATCH} == {'place'}
+    assert {answer.newest_id.split()[0] for answer in new if answer.status == PlaceMatch.MATCH} == {'new'}
     assert max(answer.sequence_last for answer in old) < 60
     robot.until_told(state='loaded', places=n, has_poses=False, has_ids=True)
     told = [(info.state, info.places) for info in robot.infos[infos:]]
@@ -313,7 +313,7 @@ def test_a_damaged_map_leaves_the_old_one_in_use(mapped, robot, route, tmp_path)
     answers += robot.drive(route[14:15])
     assert [answer.newest_index for answer in answers[4:]] == list(range(4, 15))
     assert robot.does(Trigger, 'reset').message
-    assert robot.drive(route[:1])[0].verdict == PlaceMatch.WARMING_UP
+    assert robot.drive(route[:1])[0].status == PlaceMatch.WARMING_UP
 
 
 def test_relocalize(mapped, robot, route):
@@ -335,7 +335,7 @@ def test_relocalize(mapped, robot, route):
         distances = [candidate.distance for candidate in response.candidates]
         assert distances == sorted(distances)
     strange = robot.drive([np.random.default_rng(1).integers(0, 256, (96, 128, 3), np.uint8)] * LENGTH)[-1]
-    assert strange.verdict == PlaceMatch.NO_MATCH
+    assert strange.status == PlaceMatch.NO_MATCH
     response = robot.does(Relocalize, 'relocalize')  # an answer, though no match
     assert (response.match, response.message) == (strange, strange.reason)
 
@@ -350,7 +350,7 @@ def test_candidates_are_told_with_every_window(mapped, robot, route):
         assert len(told.candidates) == 3
         assert told.candidates[0].place_index == answer.sequence_middle
         assert told.candidates[0].distance == answer.distance
-        assert told.candidates[1].place_index == answer.runner_up_index
+        assert told.candidates[1].place_index == answer.second_best_index
     assert robot.set_parameter('candidates', 0)[0]
     robot.drive(route[18:20])
     assert robot.set_parameter('candidates', 2)[0]

@@ -44,44 +44,44 @@ class TestRates:
     def test_max_rate(self, bench, camera, route):
         camera.set(max_rate=5.0)
         before = camera.counts('processing')
-        verdicts = camera.verdicts((route[i % 60] for i in range(60)), SECOND // 30)
-        assert [i for i, verdict in enumerate(verdicts) if verdict != SKIPPED] == list(range(0, 60, 6))
+        statuses = camera.statuses((route[i % 60] for i in range(60)), SECOND // 30)
+        assert [i for i, status in enumerate(statuses) if status != SKIPPED] == list(range(0, 60, 6))
         assert 'max_rate = 5 Hz' in bench.answers[-1].reason
         dropped = int(camera.counts('processing')['dropped_max_rate'])
         assert dropped == int(before.get('dropped_max_rate', 0)) + 50
         camera.show(route[0])
-        assert camera.show(route[1], -SECOND // 30).verdict == SKIPPED  # was overtaken on its way
-        assert camera.show(route[2], SECOND // 10).verdict == SKIPPED
-        assert camera.show(route[3], SECOND // 5).verdict != SKIPPED
+        assert camera.show(route[1], -SECOND // 30).status == SKIPPED  # was overtaken on its way
+        assert camera.show(route[2], SECOND // 10).status == SKIPPED
+        assert camera.show(route[3], SECOND // 5).status != SKIPPED
         camera.set(max_rate=0.0)
-        assert SKIPPED not in camera.verdicts(route[10:20], SECOND // 30)
+        assert SKIPPED not in camera.statuses(route[10:20], SECOND // 30)
 
     def test_max_rate_goes_by_arrival_where_there_are_no_stamps(self, bench, camera, route):
         camera.set(max_rate=0.01)
         answers = [bench.ask(image_message(image, 0)) for image in route[:3]]
-        assert [answer.verdict for answer in answers] == [WARMING_UP, SKIPPED, SKIPPED]
+        assert [answer.status for answer in answers] == [WARMING_UP, SKIPPED, SKIPPED]
         camera.set(max_rate=5.0)
         late = image_message(route[3], 0)
-        bench.until(lambda: bench.ask(late).verdict == WARMING_UP, 'an image that is late enough')
+        bench.until(lambda: bench.ask(late).status == WARMING_UP, 'an image that is late enough')
         camera.set(max_rate=0.0)
-        assert bench.ask(image_message(route[4], 0)).verdict == WARMING_UP
+        assert bench.ask(image_message(route[4], 0)).status == WARMING_UP
 
     def test_keyframes_by_time(self, bench, camera, route):
-        camera.set(keyframe_seconds=1.0)
-        verdicts = camera.verdicts(route[:9], SECOND // 4)
-        assert [i for i, verdict in enumerate(verdicts) if verdict == WARMING_UP] == [0, 4, 8]
+        camera.set(keyframe_interval=1.0)
+        statuses = camera.statuses(route[:9], SECOND // 4)
+        assert [i for i, status in enumerate(statuses) if status == WARMING_UP] == [0, 4, 8]
         assert camera.show(route[9], SECOND // 2).reason == '0.500 s after the last keyframe: less than 1 s'
-        camera.set(keyframe_seconds=0.0)
-        assert camera.show(route[10], 1).verdict == WARMING_UP
+        camera.set(keyframe_interval=0.0)
+        assert camera.show(route[10], 1).status == WARMING_UP
         assert camera.counts('recognition')['window'] == '4'
 
 
 class TestStamps:
     def test_a_bag_that_loops(self, bench, process, camera, route):
         before = camera.counts('input')
-        assert camera.verdicts(route[:6]) == 4 * [WARMING_UP] + 2 * [MATCH]
-        assert camera.show(route[6], -60 * SECOND).verdict == WARMING_UP
-        assert camera.verdicts(route[7:11]) == 3 * [WARMING_UP] + [MATCH]
+        assert camera.statuses(route[:6]) == 4 * [WARMING_UP] + 2 * [MATCH]
+        assert camera.show(route[6], -60 * SECOND).status == WARMING_UP
+        assert camera.statuses(route[7:11]) == 3 * [WARMING_UP] + [MATCH]
         assert bench.answers[-1].newest_index == 10
         first = bench.answers[-1].window_first
         assert first.sec * SECOND + first.nanosec == camera.stamp - 4 * SECOND
@@ -93,44 +93,44 @@ class TestStamps:
 
     def test_images_that_overtake_each_other_are_no_jump(self, camera, route):
         before = camera.counts('input')
-        camera.verdicts(route[:5])
-        assert camera.show(route[5], -SECOND // 20).verdict == MATCH
-        assert camera.show(route[6], SECOND // 10).verdict == MATCH
+        camera.statuses(route[:5])
+        assert camera.show(route[5], -SECOND // 20).status == MATCH
+        assert camera.show(route[6], SECOND // 10).status == MATCH
         after = camera.counts('input')
         assert after['jumps_back'] == before['jumps_back']
 
     def test_gaps_are_counted_and_the_window_goes_on(self, camera, route):
-        camera.verdicts(route[:5])
+        camera.statuses(route[:5])
         before = int(camera.counts('input')['gaps'])
-        assert camera.show(route[5], 2 * SECOND).verdict == MATCH
-        assert camera.show(route[6], 3 * SECOND).verdict == MATCH
+        assert camera.show(route[5], 2 * SECOND).status == MATCH
+        assert camera.show(route[6], 3 * SECOND).status == MATCH
         after = camera.counts('input')
         assert int(after['gaps']) == before + 1
-        camera.set(max_gap=0.5)
-        assert camera.verdicts(route[7:9], SECOND) == 2 * [MATCH]
+        camera.set(max_stamp_gap=0.5)
+        assert camera.statuses(route[7:9], SECOND) == 2 * [MATCH]
         camera.show(route[9], SECOND // 2)
         assert int(camera.counts('input')['gaps']) == before + 3
-        camera.set(max_gap=2.0)
+        camera.set(max_stamp_gap=2.0)
 
     def test_images_without_stamps(self, bench, camera, route):
         before = camera.counts('input')
         answers = [bench.ask(image_message(image, 0)) for image in route[20:26]]
-        assert [answer.verdict for answer in answers] == 4 * [WARMING_UP] + 2 * [MATCH]
+        assert [answer.status for answer in answers] == 4 * [WARMING_UP] + 2 * [MATCH]
         assert answers[-1].newest_index == 25
         assert answers[-1].window_first == answers[-1].window_last == Time()
-        assert camera.show(route[26]).verdict == MATCH
+        assert camera.show(route[26]).status == MATCH
         after = camera.counts('input')
         assert (after['gaps'], after['jumps_back']) == (before['gaps'], before['jumps_back'])
 
     def test_simulated_time_begins_and_ends_while_the_node_runs(self, bench, process, camera, route):
         """Neither is a jump of the images."""
-        camera.verdicts(route[:LENGTH])
+        camera.statuses(route[:LENGTH])
         camera.set(use_sim_time=True)
         world = World(bench, camera)
         world.set(50)
-        assert camera.show(route[5]).verdict == MATCH
+        assert camera.show(route[5]).status == MATCH
         camera.set(use_sim_time=False)
-        assert camera.show(route[6]).verdict == MATCH
+        assert camera.show(route[6]).status == MATCH
         assert camera.counts('input')['rate_in_hz'] != '0.000'
         assert 'the clock jumped' not in process.output()
         bench.node.destroy_publisher(world.publisher)
@@ -158,15 +158,15 @@ class TestSimulatedTime:
         """The images' own stamps go on."""
         world = World(bench, camera)
         world.set(1000)
-        assert camera.verdicts(route[:6]) == 4 * [WARMING_UP] + 2 * [MATCH]
+        assert camera.statuses(route[:6]) == 4 * [WARMING_UP] + 2 * [MATCH]
         world.set(5000)
-        assert camera.show(route[6]).verdict == MATCH
+        assert camera.show(route[6]).status == MATCH
         world.set(4950)
         assert 'the window is emptied: the clock jumped back by 50.000 s' in process.output()
-        assert camera.verdicts(route[7:12]) == 4 * [WARMING_UP] + [MATCH]
+        assert camera.statuses(route[7:12]) == 4 * [WARMING_UP] + [MATCH]
         assert bench.answers[-1].newest_index == 11
         world.set(4951)
-        assert camera.show(route[12]).verdict == MATCH
+        assert camera.show(route[12]).status == MATCH
         assert self.value(camera.diagnostics[-1], 'input', 'jumps_back') == 0
         bench.node.destroy_publisher(world.publisher)
 

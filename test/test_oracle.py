@@ -98,7 +98,7 @@ def test_sequence_by_hand():
     assert answer is not None
     assert (answer.start, answer.last, answer.middle) == (2, 2, 2)
     # middles: 1, 1 (floor 1.5), 2, 3; more than 0 away from 2 and best: start 1
-    assert (answer.runner_up_index, answer.runner_up_distance) == (1, 1.0)
+    assert (answer.second_best_index, answer.second_best_distance) == (1, 1.0)
 
 
 def test_best_match_without_an_answer():
@@ -130,7 +130,7 @@ def test_first_and_last_frames_come_off_the_path():
     for frame in range(6):
         D[frame, frame + 1] = 0
     places = oracle.answers_by_sequence(D, length=4, beta=2.0)
-    # windows 0, 1, 2 are centred on frames 1, 2, 3; frame 0 comes off the first path, 4 and 5 off the last.
+    # windows 0, 1, 2 are centered on frames 1, 2, 3; frame 0 comes off the first path, 4 and 5 off the last.
     # A window's q is 0 only on the diagonal from its own place: first..last = t + 1..t + 4, middle t + 2.
     assert [place for place, _ in places] == [1, 2, 3, 4, 5, 6]
     assert [score for _, score in places] == [0] * 6

@@ -37,11 +37,11 @@ def test_rows_are_complete(row):
 
 
 def test_defaults_are_the_librarys():
-    """The node in its default configuration is the recogniser in its default configuration."""
+    """The node in its default configuration is the recognizer in its default configuration."""
     from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-    from stavpr_ros.recognition import RecognitionSettings
+    from stavpr_ros.recognition import RecognizerSettings
 
     values = {row.name: row.default for row in PARAMETERS}
     assert SpatialSettings(values['strategy'], values['sigma'], values['xi'] or None) == SpatialSettings()
     assert SequenceSettings(values['sequence_length'], values['beta']) == SequenceSettings()
-    assert values['neighbourhood'] == RecognitionSettings(1.0).neighbourhood
+    assert values['nms_radius'] == RecognizerSettings(1.0).nms_radius

@@ -1,4 +1,4 @@
-"""The Gaussian random projection: seeded, recognisable, and nearly keeping distances."""
+"""The Gaussian random projection: seeded, recognizable, and nearly keeping distances."""
 
 import numpy as np
 import oracle

@@ -1,4 +1,4 @@
-"""The recogniser frame by frame: the same as the whole matrix at once, and never a false 'place 0'."""
+"""The recognizer frame by frame: the same as the whole matrix at once, and never a false 'place 0'."""
 
 import numpy as np
 import pytest
@@ -6,76 +6,76 @@ import torch
 
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings, align_sequence, best_match, match_sequence
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
-from stavpr_ros.evaluation.offline import recognise_all
-from stavpr_ros.features import Describer, LocalFeatures
+from stavpr_ros.evaluation.offline import recognize_all
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition import Recogniser, RecognitionSettings, Verdict
-from stavpr_ros.recognition.window import DistanceWindow
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition.sequence_buffer import DistanceWindow
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 
 
-def recogniser(place_map: PlaceMap, threshold: float = 0.3, **changes) -> Recogniser:
-    changes = {'sequence': SHORT, 'neighbourhood': 5} | changes
-    return Recogniser(place_map, RecognitionSettings(threshold, **changes))
+def recognizer(place_map: PlaceMap, threshold: float = 0.3, **changes) -> PlaceRecognizer:
+    changes = {'sequence': SHORT, 'nms_radius': 5} | changes
+    return PlaceRecognizer(place_map, RecognizerSettings(threshold, **changes))
 
 
 def empty_map(like: PlaceMap) -> PlaceMap:
     return PlaceMap(like.features[0:0], like.projection, like.stamps[:0], (), None, ())
 
 
-def test_the_map_recognises_itself(small_map):
-    answers = recognise_all(recogniser(small_map), small_map.features)
+def test_the_map_recognizes_itself(small_map):
+    answers = recognize_all(recognizer(small_map), small_map.features)
     for i, answer in enumerate(answers):
         if i < 4:
-            assert answer.verdict is Verdict.WARMING_UP
-            assert answer.place == answer.newest == -1
+            assert answer.status is Status.WARMING_UP
+            assert answer.place_index == answer.newest_index == -1
             assert f'{i + 1} of 5' in answer.reason
         else:
-            assert answer.verdict is Verdict.MATCH
-            assert answer.place == i - 2
-            assert answer.newest == i
-            assert answer.nearest.distance == pytest.approx(0, abs=1e-5)
-            assert abs(answer.nearest.runner_up_index - (i - 2)) > 5
-            assert answer.nearest.runner_up_distance > answer.nearest.distance
+            assert answer.status is Status.MATCH
+            assert answer.place_index == i - 2
+            assert answer.newest_index == i
+            assert answer.sequence.distance == pytest.approx(0, abs=1e-5)
+            assert abs(answer.sequence.second_best_index - (i - 2)) > 5
+            assert answer.sequence.second_best_distance > answer.sequence.distance
 
 
 @pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'sliding_window', 'none'])
 def test_frame_by_frame_is_the_whole_matrix_at_once(small_map, strategy):
     """Exactly: the rolling buffer, whatever its turn, gives what the batch functions give."""
-    one = recogniser(small_map, spatial=SpatialSettings(strategy))
+    one = recognizer(small_map, spatial=SpatialSettings(strategy))
     query = small_map.features[7:40]
     D = one.distances(query)
-    answers = recognise_all(one, query)
+    answers = recognize_all(one, query)
     for end in range(4, len(query)):
         window = D[end - 4 : end + 1]
         expected = best_match(match_sequence(window, SHORT), 5)
-        assert answers[end].nearest == expected
+        assert answers[end].sequence == expected
         np.testing.assert_array_equal(answers[end].path, align_sequence(window, expected.first, SHORT).path)
 
 
 def test_a_threshold_is_a_strict_bound(small_map, route):
-    query = Describer(projection=64).describe([255 - image for image in route[3:8]])
-    distance = recognise_all(recogniser(small_map), query)[-1].nearest.distance
+    query = FeatureExtractor(projection=64).extract([255 - image for image in route[3:8]])
+    distance = recognize_all(recognizer(small_map), query)[-1].sequence.distance
     assert distance > 0.01
-    for threshold, verdict in ((distance, Verdict.NO_MATCH), (np.nextafter(distance, 1), Verdict.MATCH)):
-        assert recognise_all(recogniser(small_map, float(threshold)), query)[-1].verdict is verdict
+    for threshold, status in ((distance, Status.NO_MATCH), (np.nextafter(distance, 1), Status.MATCH)):
+        assert recognize_all(recognizer(small_map, float(threshold)), query)[-1].status is status
 
 
 def test_no_match_names_no_place(small_map):
     rng = np.random.default_rng(1)
     elsewhere = [rng.integers(0, 256, (96, 128, 3), np.uint8) for _ in range(8)]
-    answers = recognise_all(recogniser(small_map, 0.05), Describer(projection=64).describe(elsewhere))
-    assert answers[-1].verdict is Verdict.NO_MATCH
-    assert answers[-1].place == answers[-1].newest == -1
+    answers = recognize_all(recognizer(small_map, 0.05), FeatureExtractor(projection=64).extract(elsewhere))
+    assert answers[-1].status is Status.NO_MATCH
+    assert answers[-1].place_index == answers[-1].newest_index == -1
     assert 'threshold' in answers[-1].reason
-    assert answers[-1].nearest.distance > 0.05
+    assert answers[-1].sequence.distance > 0.05
 
 
 def test_an_empty_map_never_matches(small_map):
-    answers = recognise_all(recogniser(empty_map(small_map)), small_map.features[:7])
-    assert answers[-1].verdict is Verdict.NO_MATCH
-    assert answers[-1].place == -1
+    answers = recognize_all(recognizer(empty_map(small_map)), small_map.features[:7])
+    assert answers[-1].status is Status.NO_MATCH
+    assert answers[-1].place_index == -1
     assert 'empty' in answers[-1].reason
 
 
@@ -89,56 +89,56 @@ def test_a_map_shorter_than_the_window(small_map, places):
         None,
         small_map.thumbnails[:places],
     )
-    answer = recognise_all(recogniser(short, 2.0), small_map.features[:6])[-1]
-    assert answer.verdict is Verdict.MATCH
-    assert 0 <= answer.place < places
+    answer = recognize_all(recognizer(short, 2.0), small_map.features[:6])[-1]
+    assert answer.status is Status.MATCH
+    assert 0 <= answer.place_index < places
     assert answer.path[:, 1].max() < places
 
 
 @pytest.mark.parametrize('value', [np.nan, np.inf])
 def test_features_that_are_not_finite_are_refused_and_change_nothing(small_map, value):
-    one = recogniser(small_map)
-    recognise_all(one, small_map.features[:3])
+    one = recognizer(small_map)
+    recognize_all(one, small_map.features[:3])
     strips = small_map.features.strips[:, :1].clone()
     strips[2, 0, 0] = value
     with pytest.raises(InputError, match=r'not finite|NaN'):
-        one.add(LocalFeatures(strips, small_map.features.weights[:, :1], small_map.settings))
+        one.update(LocalFeatures(strips, small_map.features.weights[:, :1], small_map.settings))
     assert one.window_fill == 3
     for i in range(3, 5):
-        answer = one.add(small_map.features[i : i + 1])
-    assert answer.verdict is Verdict.MATCH
-    assert answer.newest == 4
+        answer = one.update(small_map.features[i : i + 1])
+    assert answer.status is Status.MATCH
+    assert answer.newest_index == 4
 
 
 def test_one_image_at_a_time(small_map):
     with pytest.raises(InputError, match='2 images'):
-        recogniser(small_map).add(small_map.features[:2])
+        recognizer(small_map).add(small_map.features[:2])
 
 
 def test_settings_out_of_range(small_map):
     for threshold in (0.0, -1.0, float('nan')):
         with pytest.raises(SettingsError, match='threshold'):
-            RecognitionSettings(threshold)
-    with pytest.raises(SettingsError, match='neighbourhood'):
-        RecognitionSettings(0.1, neighbourhood=-1)
+            RecognizerSettings(threshold)
+    with pytest.raises(SettingsError, match='nms_radius'):
+        RecognizerSettings(0.1, nms_radius=-1)
     with pytest.raises(SettingsError, match='xi = 8'):
-        recogniser(small_map, spatial=SpatialSettings(xi=8))
+        recognizer(small_map, spatial=SpatialSettings(xi=8))
     with pytest.raises(SettingsError, match='threshold'):
-        recogniser(small_map).set_threshold(0)
+        recognizer(small_map).set_threshold(0)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason='there is a CUDA device')
 def test_a_backend_that_is_not_there_is_an_error(small_map):
     with pytest.raises(UnavailableError, match='cuda'):
-        Recogniser(small_map, RecognitionSettings(0.1), backend='cuda')
+        PlaceRecognizer(small_map, RecognizerSettings(0.1), backend='cuda')
 
 
 def test_reset_empties_the_window(small_map):
-    one = recogniser(small_map)
-    recognise_all(one, small_map.features[:5])
+    one = recognizer(small_map)
+    recognize_all(one, small_map.features[:5])
     one.reset()
     assert one.window_fill == 0
-    assert one.add(small_map.features[:1]).verdict is Verdict.WARMING_UP
+    assert one.update(small_map.features[:1]).status is Status.WARMING_UP
 
 
 def test_the_window_is_the_last_rows_in_order():
@@ -157,10 +157,10 @@ def test_an_unseen_stretch_is_far(small_map, route):
     """Driving the route in another light matches it; driving elsewhere does not, at one threshold."""
     from conftest import route_images
 
-    describer = Describer(projection=64)
+    extractor = FeatureExtractor(projection=64)
     dim = [np.clip(image.astype(int) * 3 // 4 + 20, 0, 255).astype(np.uint8) for image in route[10:30]]
     other = route_images(20, seed=9)
-    seen = recognise_all(recogniser(small_map, 0.15), describer.describe(dim))
-    unseen = recognise_all(recogniser(small_map, 0.15), describer.describe(other))
-    assert all(answer.place == 10 + i - 2 for i, answer in enumerate(seen) if i >= 4)
-    assert all(answer.verdict is Verdict.NO_MATCH for answer in unseen[4:])
+    seen = recognize_all(recognizer(small_map, 0.15), extractor.extract(dim))
+    unseen = recognize_all(recognizer(small_map, 0.15), extractor.extract(other))
+    assert all(answer.place_index == 10 + i - 2 for i, answer in enumerate(seen) if i >= 4)
+    assert all(answer.status is Status.NO_MATCH for answer in unseen[4:])

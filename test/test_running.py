@@ -38,7 +38,7 @@ def run(bench, tmp_path):
     started = []
 
     def run(**parameters):
-        values = {'sequence_length': 5, 'neighbourhood': 5, 'keyframe_change': 0.0, 'diagnostics_period': 0.1}
+        values = {'sequence_length': 5, 'nms_radius': 5, 'keyframe_change': 0.0, 'diagnostics_period': 0.1}
         started.append(node_process(tmp_path / 'node.log', **values | TAKEN_RELIABLY | parameters))
         return started[0]
 
@@ -136,7 +136,7 @@ def test_a_signal_while_a_map_is_read(bench, run, map_file, tmp_path, how):
         with bench.request(futures, LoadMap, 'load_map', loading, path=str(pipe)):
             assert not any(future.done() for future in futures)
         answer = bench.ask(image_message(np.zeros((96, 128, 3), np.uint8), 1))  # goes on meanwhile
-        assert answer.verdict == PlaceMatch.WARMING_UP
+        assert answer.status == PlaceMatch.WARMING_UP
     else:
         bench.until_diagnosed('processing', DiagnosticStatus.OK, 'configuring')
         bench.until_diagnosed('map', DiagnosticStatus.OK, f'loading {pipe}')
@@ -185,7 +185,7 @@ def test_parameters_change_under_load(bench, run, small_map, map_file, route, tm
     assert last is bench.answers[-1]
     stamps = [answer.header.stamp.sec * 10**9 + answer.header.stamp.nanosec for answer in bench.answers]
     assert sorted(stamps[before:-1]) == [10**9 + i * 10**9 // 30 for i in range(images)]
-    assert {PlaceMatch.WARMING_UP, PlaceMatch.SKIPPED} <= {a.verdict for a in bench.answers[before:]}
+    assert {PlaceMatch.WARMING_UP, PlaceMatch.SKIPPED} <= {a.status for a in bench.answers[before:]}
 
 
 @pytest.mark.parametrize('verbosity', ['default', 'info'])

@@ -5,11 +5,11 @@ from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
-from engines import settings_of, show
+from pipelines import settings_of, show
 
 from stavpr_ros.errors import StavprError
 from stavpr_ros.mapping import load_map, save_map
-from stavpr_ros.operation import Engine, read_map
+from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.ros.runtime import Runtime
 from stavpr_ros.ros.saving import write_at_the_end, write_map
 from stavpr_ros.ros.worker import Worker
@@ -27,14 +27,14 @@ class Log:
 
 @pytest.fixture
 def mapping(route):
-    engine = Engine(settings_of(), 'mapping')
-    show(engine, route[:7])
-    return engine
+    pipeline = Pipeline(settings_of(), 'mapping')
+    show(pipeline, route[:7])
+    return pipeline
 
 
-def at_the_end(engine, path):
+def at_the_end(pipeline, path):
     log = Log()
-    write_at_the_end(engine, lambda function: function(), str(path), log)
+    write_at_the_end(pipeline, lambda function: function(), str(path), log)
     return log.said
 
 
@@ -61,11 +61,11 @@ def test_a_file_of_another_map_stays(mapping, route, tmp_path):
 def test_a_copy_elsewhere_does_not_make_the_file_another_maps(small_map, route, tmp_path):
     path = str(tmp_path / 'route.stavpr')
     save_map(small_map, path)
-    engine = Engine(settings_of(), 'mapping')
-    engine.use(read_map(path, engine.settings))
-    engine.save(str(tmp_path / 'backup.stavpr'), overwrite=False)
-    show(engine, route[:2])
-    assert at_the_end(engine, path)[-1] == ('info', f'62 places written to {path}')
+    pipeline = Pipeline(settings_of(), 'mapping')
+    pipeline.use(read_map(path, pipeline.settings))
+    pipeline.save(str(tmp_path / 'backup.stavpr'), overwrite=False)
+    show(pipeline, route[:2])
+    assert at_the_end(pipeline, path)[-1] == ('info', f'62 places written to {path}')
 
 
 def test_what_is_lost_is_said(mapping, route, tmp_path):
@@ -81,24 +81,24 @@ def test_what_is_lost_is_said(mapping, route, tmp_path):
 
 
 def test_a_route_that_closes_loops_is_written_where_a_file_is_named(route, tmp_path):
-    engine = Engine(settings_of(), 'loop_closure')
-    show(engine, route[:9])
-    assert at_the_end(engine, '') == []
-    at_the_end(engine, tmp_path / 'loop.stavpr')
+    pipeline = Pipeline(settings_of(), 'loop_closure')
+    show(pipeline, route[:9])
+    assert at_the_end(pipeline, '') == []
+    at_the_end(pipeline, tmp_path / 'loop.stavpr')
     assert len(load_map(tmp_path / 'loop.stavpr')) == 9
-    show(engine, route[9:11], first=9)
-    engine.set_operation('localization')  # now it is the map, and goes to its file all the same
-    at_the_end(engine, tmp_path / 'loop.stavpr')
+    show(pipeline, route[9:11], first=9)
+    pipeline.set_operation('localization')  # now it is the map, and goes to its file all the same
+    at_the_end(pipeline, tmp_path / 'loop.stavpr')
     assert len(load_map(tmp_path / 'loop.stavpr')) == 11
 
 
 def test_a_route_does_not_replace_the_map_that_it_was_begun_with(small_map, route, tmp_path):
     path = tmp_path / 'route.stavpr'
     save_map(small_map, path)
-    engine = Engine(settings_of(), 'loop_closure')
-    engine.use(read_map(str(path), engine.settings))
-    show(engine, route[:9])
-    assert at_the_end(engine, path)[-1][1].endswith('route-2.stavpr')
+    pipeline = Pipeline(settings_of(), 'loop_closure')
+    pipeline.use(read_map(str(path), pipeline.settings))
+    show(pipeline, route[:9])
+    assert at_the_end(pipeline, path)[-1][1].endswith('route-2.stavpr')
     assert (len(load_map(path)), len(load_map(tmp_path / 'route-2.stavpr'))) == (60, 9)
 
 
@@ -130,7 +130,7 @@ def test_another_map_is_not_taken_for_the_one_that_was_written(another, mapping,
 
     write_map(mapping, on_worker, path, overwrite=False)
     assert (mapping.unsaved, mapping.path) == (0, other if another else path)
-    assert mapping.filing.owns(other) == another
+    assert mapping.save_state.owns(other) == another
 
 
 def test_two_that_write_at_once_write_what_they_say(mapping, route, tmp_path):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.evaluation.datasets import open_dataset
 from stavpr_ros.evaluation.metrics import best_f1
+from stavpr_ros.evaluation.paper.datasets import open_dataset
 from stavpr_ros.evaluation.seqslam import (
     SeqSlamSettings,
     describe,
@@ -28,19 +28,19 @@ def test_patches_by_hand():
     np.testing.assert_allclose(described.reshape(2, 4), [[-root, 0, 0, 0], [0, root, 0, 0]], atol=1e-6)
 
 
-def test_images_are_shrunk_by_areas_and_made_grey():
-    grey = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8)
-    large = np.kron(grey, np.ones((3, 3), np.uint8))
-    colour = np.stack([large] * 3, axis=2)
-    expected = describe([grey], SMALL)
+def test_images_are_shrunk_by_areas_and_made_gray():
+    gray = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8)
+    large = np.kron(gray, np.ones((3, 3), np.uint8))
+    color = np.stack([large] * 3, axis=2)
+    expected = describe([gray], SMALL)
     np.testing.assert_array_equal(describe([large], SMALL), expected)
-    np.testing.assert_array_equal(describe([Frame(colour, 0, '')], SMALL), expected)
+    np.testing.assert_array_equal(describe([Frame(color, 0, '')], SMALL), expected)
 
 
 def test_red_counts_more_than_blue():
-    grey = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8) * 40
-    colour = np.stack([grey, grey * 0, 200 - grey], axis=2)  # red as the grey image, blue against it
-    np.testing.assert_allclose(describe([colour], SMALL), describe([grey], SMALL), atol=0.05)
+    gray = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8) * 40
+    color = np.stack([gray, gray * 0, 200 - gray], axis=2)  # red as the gray image, blue against it
+    np.testing.assert_allclose(describe([color], SMALL), describe([gray], SMALL), atol=0.05)
 
 
 def test_differences_by_hand():

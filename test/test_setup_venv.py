@@ -1,15 +1,17 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Tests of the set-up behind the Makefile; none of them needs a network."""
 
 import ast
 import json
 import os
+from pathlib import Path
 import platform
 import re
 import shutil
 import subprocess
 import sys
 import zipfile
-from pathlib import Path
 
 import pytest
 import setup_venv
@@ -21,7 +23,7 @@ BUILT_ON = '/opt/python/cp312-cp312'
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A checkout in which every requirement is the package ``fake`` and nothing is installed."""
+    """Make a checkout in which nothing is installed and every requirement is ``fake``."""
     for name in ('requirements', 'stavpr_msgs', 'stavpr_ros'):
         (tmp_path / name).mkdir()
     for name in GROUPS:
@@ -342,6 +344,11 @@ def test_requirements_are_pinned_exactly():
         pins = re.sub('#.*', '', text).split()
         assert pins
         assert [pin for pin in pins if not re.fullmatch(r'[\w.\[\]-]+==[\w.]+', pin)] == []
+
+
+def test_sources_of_a_build_exist():
+    sources = [name for names in setup_venv.SOURCES.values() for name in names]
+    assert [name for name in sources if not (ROOT / name).exists()] == []
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from stavpr_ros.errors import ImageError
 from stavpr_ros.sources import files, open_source
 from stavpr_ros.sources.encodings import decode_compressed, decode_compressed_message, decode_message
 
-# the colour at each pixel of the top-left 2x2, in reading order
+# the color at each pixel of the top-left 2x2, in reading order
 PATTERNS = {'rggb': (0, 1, 1, 2), 'bggr': (2, 1, 1, 0), 'gbrg': (1, 2, 0, 1), 'grbg': (1, 0, 2, 1)}
 GARBAGE = ['', ';', 'jpeg', 'png', 'rgb8; jpeg compressed bgr8', 'bayer_rggb8; png compressed ', 'compressed']
 
@@ -41,8 +41,8 @@ def test_jpeg_is_near():
 
 @pytest.mark.parametrize('suffix', ['.png', '.pgm', '.tiff'])
 def test_sixteen_bits_lose_the_lower_byte(suffix):
-    grey = (np.arange(12, dtype=np.uint16) * 5000).reshape(3, 4)
-    np.testing.assert_array_equal(decode_compressed(encoded(suffix, grey)), np.dstack([grey >> 8] * 3))
+    gray = (np.arange(12, dtype=np.uint16) * 5000).reshape(3, 4)
+    np.testing.assert_array_equal(decode_compressed(encoded(suffix, gray)), np.dstack([gray >> 8] * 3))
 
 
 def test_transparency_is_dropped():
@@ -128,7 +128,7 @@ def test_a_jpeg_with_a_video_behind_it(options):
 
 
 def test_of_several_pictures_in_a_jpeg_the_first_is_read():
-    first, second = (Image.new('RGB', (64, 64), colour) for colour in ((200, 100, 30), (0, 0, 0)))
+    first, second = (Image.new('RGB', (64, 64), color) for color in ((200, 100, 30), (0, 0, 0)))
     file = BytesIO()
     first.save(file, 'MPO', save_all=True, append_images=[second])
     data = file.getvalue()
@@ -191,8 +191,8 @@ def test_depth_is_refused_by_name(transport):
 def scene_and_mosaic(pattern, deep):
     scene = np.full((6, 8, 3), (220, 130, 30), np.uint8)
     order = np.array(PATTERNS[pattern]).reshape(2, 2)
-    colours = np.tile(order, (3, 4))
-    seen = np.take_along_axis(scene, colours[..., None], 2)[..., 0]
+    colors = np.tile(order, (3, 4))
+    seen = np.take_along_axis(scene, colors[..., None], 2)[..., 0]
     return scene, seen.astype(np.uint16) * 256 + 77 if deep else seen
 
 
@@ -229,12 +229,12 @@ def test_a_mosaic_in_a_jpeg():
     ],
 )
 def test_what_is_no_mosaic_any_more_is_left_alone(transport):
-    _, grey = scene_and_mosaic('rggb', False)
-    image = decode_compressed_message(compressed(transport, encoded('.png', grey)))
-    np.testing.assert_array_equal(image, np.dstack([grey] * 3))
+    _, gray = scene_and_mosaic('rggb', False)
+    image = decode_compressed_message(compressed(transport, encoded('.png', gray)))
+    np.testing.assert_array_equal(image, np.dstack([gray] * 3))
 
 
-def test_colour_is_no_mosaic_whatever_the_format_says():
+def test_color_is_no_mosaic_whatever_the_format_says():
     rgb = np.random.default_rng(0).integers(0, 256, (5, 6, 3), np.uint8)
     message = compressed('bayer_rggb8; png compressed ', encoded('.png', rgb[..., ::-1].copy()))
     np.testing.assert_array_equal(decode_compressed_message(message), rgb)

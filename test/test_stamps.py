@@ -5,7 +5,7 @@ import math
 import pytest
 
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.ros.stamps import StampEvent, StampWatch
+from stavpr_ros.pipeline.stamps import StampEvent, StampWatch
 
 MS = 1_000_000
 START = 1_700_000_000_000 * MS  # a camera's clock today: differences are exact only in whole numbers

@@ -7,7 +7,7 @@ import tracemalloc
 
 import pytest
 
-from stavpr_ros.ros.statistics import MOST_WORDS, OTHER, SHORTEST_SPAN, StageTime, Statistics
+from stavpr_ros.pipeline.statistics import MOST_WORDS, OTHER, SHORTEST_SPAN, StageTime, Statistics
 
 
 class Clock:
@@ -37,8 +37,8 @@ def stream(clock, seconds, hertz, event):
         event()
 
 
-def answer(statistics, verdict='match', reason='', place=0, distance=0.5, **stages):
-    statistics.answered(verdict, reason, place, distance, stages)
+def answer(statistics, status='match', reason='', place=0, distance=0.5, **stages):
+    statistics.answered(status, reason, place, distance, stages)
 
 
 def test_nothing_yet(clock, statistics):
@@ -47,8 +47,8 @@ def test_nothing_yet(clock, statistics):
     assert snapshot.uptime == pytest.approx(3)
     assert snapshot.rate_in == snapshot.rate_out == snapshot.received == snapshot.answered == 0
     assert snapshot.received_age is snapshot.answered_age is snapshot.total is snapshot.work is None
-    assert snapshot.drops == snapshot.recent_drops == snapshot.verdicts == snapshot.stages == {}
-    assert (snapshot.verdict, snapshot.place) == ('', -1)
+    assert snapshot.drops == snapshot.recent_drops == snapshot.statuses == snapshot.stages == {}
+    assert (snapshot.status, snapshot.place) == ('', -1)
     assert math.isnan(snapshot.distance)
 
 
@@ -141,9 +141,9 @@ def test_verdicts_and_the_last_answer(clock, statistics):
     answer(statistics, 'no match', 'failed the check', -1, 0.5)
     clock.now += 4
     snapshot = statistics.snapshot()
-    assert snapshot.verdicts == {'no match': 2, 'match': 1}
-    assert snapshot.recent_verdicts == {'match': 1, 'no match': 1}
-    last = (snapshot.verdict, snapshot.reason, snapshot.place, snapshot.distance)
+    assert snapshot.statuses == {'no match': 2, 'match': 1}
+    assert snapshot.recent_statuses == {'match': 1, 'no match': 1}
+    last = (snapshot.status, snapshot.reason, snapshot.place, snapshot.distance)
     assert last == ('no match', 'failed the check', -1, 0.5)
     assert snapshot.answered_age == pytest.approx(4)
 
@@ -236,12 +236,12 @@ def test_many_threads_lose_no_count():
     begin.wait(10)
     while any(worker.is_alive() for worker in workers):
         snapshot = statistics.snapshot()
-        assert sum(snapshot.verdicts.values()) == snapshot.answered
+        assert sum(snapshot.statuses.values()) == snapshot.answered
     snapshot = statistics.snapshot()
     assert not errors
     count = threads * each
     assert snapshot.received == snapshot.answered == snapshot.gaps == snapshot.jumps_back == count
-    assert snapshot.verdicts == {'match': count}
+    assert snapshot.statuses == {'match': count}
     assert snapshot.drops == {'cause 0': count // 2, 'cause 1': count // 2}
 
 
@@ -275,7 +275,7 @@ def test_memory_does_not_grow(clock, statistics):
         for number in range(first, first + events):
             clock.now += 1 / hertz
             statistics.received()
-            answer(statistics, f'verdict {number}', **{'matching': 0.001, f'stage {number}': 0.001})
+            answer(statistics, f'status {number}', **{'matching': 0.001, f'stage {number}': 0.001})
             statistics.dropped(f'cause {number}')
             statistics.dropped(f'invalid: kind {number}')
             statistics.gap(1)
@@ -292,7 +292,7 @@ def test_memory_does_not_grow(clock, statistics):
         tracemalloc.stop()
     snapshot = statistics.snapshot()
     assert sum(snapshot.drops.values()) == 2 * snapshot.received
-    assert len(snapshot.drops) == len(snapshot.verdicts) == MOST_WORDS + 1
+    assert len(snapshot.drops) == len(snapshot.statuses) == MOST_WORDS + 1
     assert snapshot.drops[OTHER] > 1000
 
 

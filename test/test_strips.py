@@ -11,7 +11,7 @@ from stavpr_ros.errors import InputError
 
 torch = pytest.importorskip('torch')
 strips_module = pytest.importorskip('stavpr_ros.features.strips')
-cut_strips, normalise = strips_module.cut_strips, strips_module.normalise
+cut_strips, normalize = strips_module.cut_strips, strips_module.normalize
 
 TOLERANCE = 1e-5
 
@@ -26,7 +26,7 @@ def random_strips(seed, W, n, d, zeros):
 
 def unit(strips):
     """Unit strips (W, n, d) and weights (W, n) as numpy."""
-    directions, weights = normalise(torch.from_numpy(strips))
+    directions, weights = normalize(torch.from_numpy(strips))
     return directions.numpy(), weights.numpy()
 
 

@@ -6,8 +6,8 @@ import torch
 from torch import nn
 
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
-from stavpr_ros.features import Describer
-from stavpr_ros.features.backbone import backbone_class, settings_class
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.features.registry import backbone_class, settings_class
 
 pytestmark = pytest.mark.filterwarnings('ignore:.torch.jit:DeprecationWarning')
 
@@ -139,16 +139,16 @@ def test_the_files_own_output(net, tmp_path):
 
 def test_errors_say_what_to_do(file, tmp_path):
     with pytest.raises(UnavailableError, match='cannot be read'):
-        Describer('torchscript', settings(tmp_path / 'missing.pt'))
+        FeatureExtractor('torchscript', settings(tmp_path / 'missing.pt'))
     (tmp_path / 'broken.pt').write_bytes(file.read_bytes()[:-200])
     with pytest.raises(UnavailableError, match='no usable TorchScript file'):
-        Describer('torchscript', settings(tmp_path / 'broken.pt'))
+        FeatureExtractor('torchscript', settings(tmp_path / 'broken.pt'))
     with pytest.raises(SettingsError, match=r"no layer 'body\.fire'.*body, body\.block, body\.block\.first"):
-        Describer('torchscript', settings(file, layer='body.fire'))
+        FeatureExtractor('torchscript', settings(file, layer='body.fire'))
     with pytest.raises(SettingsError, match=r"the layer 'body\.block\.unused', but calls it .* not at all"):
-        Describer('torchscript', settings(file, layer='body.block.unused'))
+        FeatureExtractor('torchscript', settings(file, layer='body.block.unused'))
     with pytest.raises(SettingsError, match=r'gives \(1, 10\) for 1 images: expected a map'):
-        Describer('torchscript', settings(file)).describe(images(1))
+        FeatureExtractor('torchscript', settings(file)).extract(images(1))
     with pytest.raises(SettingsError, match='must be'):
         settings(file, channels='hsv')
     with pytest.raises(SettingsError, match='sha256'):
@@ -158,7 +158,7 @@ def test_errors_say_what_to_do(file, tmp_path):
 def test_a_layer_in_a_branch(tmp_path):
     torch.jit.save(torch.jit.script(Branch()), tmp_path / 'branch.pt')
     with pytest.raises(SettingsError, match='in a branch or loop'):
-        Describer('torchscript', settings(tmp_path / 'branch.pt', layer='layer'))
+        FeatureExtractor('torchscript', settings(tmp_path / 'branch.pt', layer='layer'))
     maps = backbone_class('torchscript')(settings(tmp_path / 'branch.pt')).feature_maps(images(2))
     assert maps.shape == (2, 4, 16, 16)
 
@@ -167,19 +167,19 @@ def test_a_program_without_modules(tmp_path, net):
     frozen = torch.jit.freeze(torch.jit.script(net))
     torch.jit.save(frozen, tmp_path / 'frozen.pt')
     with pytest.raises(SettingsError, match='its layers are none'):
-        Describer('torchscript', settings(tmp_path / 'frozen.pt', layer='head'))
+        FeatureExtractor('torchscript', settings(tmp_path / 'frozen.pt', layer='head'))
 
 
 def test_a_map_remembers_the_file_not_its_place(file, tmp_path):
-    made = Describer('torchscript', settings(file, layer='body.last')).settings
+    made = FeatureExtractor('torchscript', settings(file, layer='body.last')).settings
     moved = tmp_path / 'moved.pt'
     moved.write_bytes(file.read_bytes())
-    assert Describer.from_settings(made, None, model=str(moved)).settings == made
+    assert FeatureExtractor.from_settings(made, None, model=str(moved)).settings == made
     torch.jit.save(torch.jit.script(Net()), moved)
     with pytest.raises(FeatureMismatchError, match='give the file that the map was built with'):
-        Describer.from_settings(made, None, model=str(moved))
+        FeatureExtractor.from_settings(made, None, model=str(moved))
     with pytest.raises(FeatureMismatchError, match='sha256'):
-        Describer('torchscript', settings(file, sha256='0' * 64))
+        FeatureExtractor('torchscript', settings(file, sha256='0' * 64))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='no CUDA device')

@@ -141,7 +141,7 @@ def test_no_stamp_and_no_settings():
             Trajectory(**wrong)
 
 
-def test_quaternions_are_normalised():
+def test_quaternions_are_normalized():
     trajectory = Trajectory()
     trajectory.add(1, np.array([0, 0, 0, 0, 0, 3.0, 4.0]))
     np.testing.assert_allclose(trajectory.at(1)[3:], [0, 0, 0.6, 0.8])

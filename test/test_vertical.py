@@ -7,10 +7,10 @@ import torch
 
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.features import Describer, FeatureSettings, LocalFeatures
+from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.mapping import build_map, load_map, save_map
-from stavpr_ros.recognition import Recogniser, RecognitionSettings
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher, cut_cells
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.sources import open_source
@@ -63,7 +63,7 @@ def test_against_the_oracle(n, strategy, xi):
 
 def test_a_map_remembers_its_cells(route, tmp_path):
     place_map = build_map(
-        [Frame(image, i, '') for i, image in enumerate(route[:8])], Describer(), progress=False
+        [Frame(image, i, '') for i, image in enumerate(route[:8])], FeatureExtractor(), progress=False
     )
     assert place_map.features.cells == (14, 2)
     save_map(place_map, tmp_path / 'map')
@@ -71,14 +71,14 @@ def test_a_map_remembers_its_cells(route, tmp_path):
     assert loaded.features.cells == (14, 2)
     assert loaded.features[2:5].cells == (14, 2)
     spatial = SpatialSettings(vertical=True)
-    distances = Recogniser(loaded, RecognitionSettings(1.0, spatial)).distances(loaded.features)
+    distances = PlaceRecognizer(loaded, RecognizerSettings(1.0, spatial)).distances(loaded.features)
     np.testing.assert_allclose(np.diag(distances), 0, atol=1e-5)
 
 
 def test_what_is_refused(small_map):
     spatial = SpatialSettings(vertical=True)
     with pytest.raises(InputError, match='without projection'):
-        Recogniser(small_map, RecognitionSettings(1.0, spatial))
+        PlaceRecognizer(small_map, RecognizerSettings(1.0, spatial))
     with pytest.raises(SettingsError, match='vertical'):
         SpatialSettings('none', vertical=True)
     with pytest.raises(SettingsError, match='cuda'):
@@ -88,14 +88,14 @@ def test_what_is_refused(small_map):
 def test_a_drone_that_flies_higher(data_folder):
     """Nearest images of one drive, seen from higher up: a third of every query image cut off."""
     frames = list(open_source(data_folder / 'gardens_point' / 'day_left'))[::2]
-    describer = Describer()
-    place_map = build_map(frames, describer, progress=False)
-    higher = describer.describe([np.ascontiguousarray(f.image[: -f.image.shape[0] // 3]) for f in frames])
-    lower = describer.describe([np.ascontiguousarray(f.image[f.image.shape[0] // 3 :]) for f in frames])
+    extractor = FeatureExtractor()
+    place_map = build_map(frames, extractor, progress=False)
+    higher = extractor.extract([np.ascontiguousarray(f.image[: -f.image.shape[0] // 3]) for f in frames])
+    lower = extractor.extract([np.ascontiguousarray(f.image[f.image.shape[0] // 3 :]) for f in frames])
     right = {}
     for vertical in (False, True):
-        recogniser = Recogniser(place_map, RecognitionSettings(1.0, SpatialSettings(vertical=vertical)))
-        found = [recogniser.distances(query).argmin(axis=1) for query in (higher, lower)]
+        recognizer = PlaceRecognizer(place_map, RecognizerSettings(1.0, SpatialSettings(vertical=vertical)))
+        found = [recognizer.distances(query).argmin(axis=1) for query in (higher, lower)]
         right[vertical] = np.mean([np.abs(places - np.arange(len(frames))) <= 1 for places in found])
     print(f'shifted up and down: right {right[False]:.3f} without, {right[True]:.3f} with vertical alignment')
     assert right[True] > right[False] + 0.05

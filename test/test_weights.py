@@ -15,7 +15,7 @@ from torch import nn
 
 from stavpr_ros.errors import FeatureMismatchError, UnavailableError
 from stavpr_ros.features.checkpoint import read_checkpoint
-from stavpr_ros.features.published import PublishedNetwork, PublishedSettings
+from stavpr_ros.features.paper_networks import PublishedNetwork, PublishedSettings
 from stavpr_ros.features.weights import PublishedFile, cache_folder, download, promised_hash
 
 
@@ -86,7 +86,7 @@ def server(content, monkeypatch):
     server.http.server_close()
 
 
-def describe(**settings) -> Tiny:
+def tiny(**settings) -> Tiny:
     backbone = Tiny(PublishedSettings(**settings))
     maps = backbone.feature_maps([np.full((40, 50, 3), 99, np.uint8)])
     assert maps.shape == (1, 2, 28, 28)
@@ -117,7 +117,7 @@ def test_nothing_is_downloaded_unasked(server, cache):
 
 
 def test_download_once_then_from_the_cache(server, cache, content, capsys):
-    first = describe(model='download')
+    first = tiny(model='download')
     digest = hashlib.sha256(content).hexdigest()
     assert first.settings.sha256 == digest
     assert first.settings.model == 'cached'  # what a map remembers must not download elsewhere
@@ -127,7 +127,7 @@ def test_download_once_then_from_the_cache(server, cache, content, capsys):
     assert 'trusted now' in said
     server.http.shutdown()
     for model in ('download', 'cached', str(cache / 'tiny.pth')):
-        assert describe(model=model).settings == first.settings
+        assert tiny(model=model).settings == first.settings
     assert server.asked == 1
 
 
@@ -182,31 +182,31 @@ def test_a_published_hash_is_held_against_the_download(server, cache, content, m
     assert list(cache.iterdir()) == []
     digest = hashlib.sha256(content).hexdigest()
     monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address, sha256=digest[:8]))
-    describe(model='download')
+    tiny(model='download')
     assert 'as published' in capsys.readouterr().err
 
 
 def test_the_first_download_is_held_against_later_ones(server, cache, content):
     """A file that was deleted and got again must be that of the first time, while the note is there."""
-    describe(model='download')
+    tiny(model='download')
     (cache / 'tiny.pth').unlink()
     server.body = content + b'\x00'
     with pytest.raises(UnavailableError, match='changed or damaged'):
         Tiny(PublishedSettings(model='download'))
     assert not (cache / 'tiny.pth').exists()
     server.body = content
-    describe(model='download')
+    tiny(model='download')
 
 
 def test_the_users_hash_is_held_against_the_download(server, cache, content):
     with pytest.raises(UnavailableError, match='expected 0000'):
         Tiny(PublishedSettings(model='download', sha256='0' * 64))
     assert list(cache.iterdir()) == []
-    describe(model='download', sha256=hashlib.sha256(content).hexdigest())
+    tiny(model='download', sha256=hashlib.sha256(content).hexdigest())
 
 
 def test_a_file_that_changed_since_its_download_is_noticed(server, cache, content):
-    describe(model='download')
+    tiny(model='download')
     (cache / 'tiny.pth').write_bytes(content[:-1] + b'\x01')
     with pytest.raises(UnavailableError, match='is damaged or another file; delete it'):
         Tiny(PublishedSettings())
@@ -218,7 +218,7 @@ def test_parameters_of_a_file_that_was_saved_in_training(server, tmp_path):
         Tiny(PublishedSettings(model=str(tmp_path / 'a.pth')))
     network = Tiny.whole_network().half()
     torch.save(network.state_dict() | dict(network.named_parameters()), tmp_path / 'b.pth')
-    maps = describe(model=str(tmp_path / 'b.pth')).feature_maps([np.zeros((9, 9, 3), np.uint8)])
+    maps = tiny(model=str(tmp_path / 'b.pth')).feature_maps([np.zeros((9, 9, 3), np.uint8)])
     assert (maps.dtype, maps.requires_grad) == (torch.float32, False)
 
 

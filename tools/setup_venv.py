@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Set up stavpr_ros without a ROS installation; the Makefile calls this program.
 
@@ -11,6 +13,7 @@ import hashlib
 import importlib.util
 import json
 import os
+from pathlib import Path
 import platform
 import re
 import shlex
@@ -19,7 +22,6 @@ import subprocess
 import sys
 import sysconfig
 import time
-from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 SUPPORTED = ('3.11', '3.12', '3.13')

@@ -76,7 +76,7 @@ class SequenceSettings:
 
 
 @dataclass(frozen=True)
-class SpeedSettings:
+class VelocitySettings:
     """
     How a window of query images is matched with the map at several speeds.
 

@@ -44,11 +44,11 @@ def strip_distances(query: np.ndarray | torch.Tensor, reference: np.ndarray | to
     if reference.is_cuda:
         similarity = torch.nn.functional.linear(query, reference.reshape(W * n, d))
         return similarity.neg_().add_(1).view(W, W, n)
-    from stavpr_ros.alignment.kernels.cpu import products
+    from stavpr_ros.alignment.cpu import dot
 
     rows = tiled(query[:, None])[0]
     distances = np.empty((len(rows), W, n), np.float32)
-    products.strip_distances(reference.contiguous().numpy(), rows, distances)
+    dot.strip_distances(reference.contiguous().numpy(), rows, distances)
     return torch.from_numpy(distances[:W])
 
 
@@ -59,7 +59,7 @@ def tiled(queries: torch.Tensor) -> np.ndarray:
     :param queries: shape (W, Q, d), float32.
     :returns: shape (Q, R, d), R is W rounded up to whole tiles; zeros from row W on.
     """
-    from stavpr_ros.alignment.kernels.cpu.products import TILE
+    from stavpr_ros.alignment.cpu.dot import TILE
 
     W, Q, d = queries.shape
     # of torch's memory, which starts with a cache line: products are a third faster than on NumPy's

@@ -37,8 +37,8 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
     :raises InputError: wrong shape or type, NaN, fewer strips than the sliding window has.
     :raises SettingsError: xi > W, or the strategy ``none``.
     """
-    from stavpr_ros.alignment.kernels.cpu import spatial
-    from stavpr_ros.alignment.kernels.cpu.vectors import LANES
+    from stavpr_ros.alignment.cpu import dtw
+    from stavpr_ros.alignment.cpu.simd import LANES
 
     d = _checked(d, 3)
     W, _, n = d.shape
@@ -49,14 +49,14 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
         if W < WINDOW:
             raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')
         out = np.empty(n, d.dtype)
-        spatial.sliding_window(d, WINDOW, band, out)
+        dtw.sliding_window(d, WINDOW, band, out)
         return out
     if n < LANES:
         padded = np.zeros((W, W, LANES), d.dtype)
         padded[:, :, :n] = d
         d = padded
     out = np.empty(d.shape[2], d.dtype)
-    spatial.spatial_dtw(d, adaptive_weights(W, settings, d.dtype), band, out)
+    dtw.spatial_dtw(d, adaptive_weights(W, settings, d.dtype), band, out)
     return out[:n]
 
 

@@ -24,7 +24,7 @@ EPILOG = """
 examples:
   build_map --input drive/ --output route.stavpr
   build_map --input drive.bag --topic /camera/image_raw --output route.stavpr
-  build_map --input drive.bag --output route.stavpr --odometry /odom --keyframe-metres 1 --keyframe-degrees 15
+  build_map --input drive.bag --output route.stavpr --odometry /odom --keyframe-distance 1 --keyframe-angle 15
   build_map --input drive/ --output route.stavpr --projection 512 --features onnx \\
       --onnx-model squeezenet.onnx --onnx-layer fire6/concat_1
 
@@ -51,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
         '--every', type=int, default=1, metavar='N', help='take every N-th image (%(default)s)'
     )
     parser.add_argument(
-        '--poses', metavar='CSV', help='one line an image: x,y,z or x,y,z,qx,qy,qz,qw (metres, quaternion)'
+        '--poses', metavar='CSV', help='one line an image: x,y,z or x,y,z,qx,qy,qz,qw (meters, quaternion)'
     )
     parser.add_argument(
         '--odometry', metavar='TOPIC', help='nav_msgs/Odometry of the same bag: where each place was seen'
@@ -75,11 +75,11 @@ def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         'keyframes',
         'Only images that differ enough from the last place become places. All rules given must agree, but '
-        'metres and degrees are one rule: moved so far or turned so much.',
+        'meters and degrees are one rule: moved so far or turned so much.',
     )
     for name, metavar, what in (
         ('seconds', 'S', 'time since the last place; for bags'),
-        ('metres', 'M', 'way since the last place; needs --odometry or --poses'),
+        ('meters', 'M', 'way since the last place; needs --odometry or --poses'),
         ('degrees', 'DEG', 'angle turned since the last place; likewise'),
         ('change', 'C', 'change of the picture, 0 to 2; a standing camera stays below 0.004'),
     ):
@@ -108,7 +108,7 @@ def _check(arguments: argparse.Namespace) -> None:
     """Refuse options that contradict each other, before anything is read."""
     from stavpr_ros.sources.bag_file import is_bag
 
-    moving = arguments.keyframe_metres or arguments.keyframe_degrees
+    moving = arguments.keyframe_distance or arguments.keyframe_angle
     bag = is_bag(Path(arguments.input))
     if arguments.every < 1:
         raise SettingsError(f'--every {arguments.every} must be at least 1')
@@ -117,11 +117,11 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.poses and arguments.odometry:
         raise SettingsError('--poses and --odometry: both say where the places are; give one')
     if moving and not (arguments.poses or arguments.odometry):
-        raise SettingsError('--keyframe-metres and --keyframe-degrees need --odometry or --poses')
+        raise SettingsError('--keyframe-distance and --keyframe-angle need --odometry or --poses')
     if arguments.odometry and not bag:
         raise SettingsError(f'--odometry: {arguments.input} is no bag; give --poses with a folder of images')
-    if arguments.keyframe_seconds and not bag:
-        raise SettingsError(f'--keyframe-seconds: {arguments.input} is no bag, its images have no times')
+    if arguments.keyframe_interval and not bag:
+        raise SettingsError(f'--keyframe-interval: {arguments.input} is no bag, its images have no times')
     if arguments.thumbnail_width is not None and arguments.no_thumbnails:
         raise SettingsError('--thumbnail-width and --no-thumbnails: give one')
     require_room(arguments.output)
@@ -131,16 +131,16 @@ def _keyframes(arguments: argparse.Namespace) -> 'KeyframeSettings':
     from stavpr_ros.mapping import KeyframeSettings
 
     return KeyframeSettings(
-        arguments.keyframe_seconds,
-        arguments.keyframe_metres,
-        arguments.keyframe_degrees,
+        arguments.keyframe_interval,
+        arguments.keyframe_distance,
+        arguments.keyframe_angle,
         arguments.keyframe_change,
     )
 
 
 def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajectory | None':
     """Read the poses of all images of the source, or the odometry."""
-    from stavpr_ros.evaluation.truth_files import read_poses
+    from stavpr_ros.evaluation.ground_truth_files import read_poses
     from stavpr_ros.mapping import Trajectory
     from stavpr_ros.sources.bag_odometry import read_odometry
 
@@ -153,13 +153,13 @@ def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajecto
         raise SourceError(
             f'poses {arguments.poses} has {len(poses)} lines for {images} images: give one each'
         )
-    if arguments.keyframe_degrees and not oriented:
-        raise SettingsError(f'--keyframe-degrees: {arguments.poses} has no orientations, leave it out')
+    if arguments.keyframe_angle and not oriented:
+        raise SettingsError(f'--keyframe-angle: {arguments.poses} has no orientations, leave it out')
     return poses[:: arguments.every]
 
 
 def _build(arguments: argparse.Namespace) -> 'PlaceMap':
-    from stavpr_ros.commands.feature_options import make_describer
+    from stavpr_ros.commands.feature_options import make_extractor
     from stavpr_ros.mapping import build_map
     from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
     from stavpr_ros.sources import open_source
@@ -171,13 +171,13 @@ def _build(arguments: argparse.Namespace) -> 'PlaceMap':
         print(f'skipped: {error}', file=sys.stderr)
 
     _check(arguments)
-    keyframes, describer = _keyframes(arguments), make_describer(arguments)
+    keyframes, extractor = _keyframes(arguments), make_extractor(arguments)
     source = open_source(arguments.input, arguments.topic, skip if arguments.skip_bad_images else None)
     images = _Images(source, arguments.every)
     width = THUMBNAIL_WIDTH if arguments.thumbnail_width is None else arguments.thumbnail_width
     place_map = build_map(
         images,
-        describer,
+        extractor,
         _poses(arguments, len(source)),
         thumbnails=not arguments.no_thumbnails,
         keyframes=keyframes,
@@ -202,7 +202,7 @@ def _known_poses(place_map: 'PlaceMap') -> str:
 
 def _report(place_map: 'PlaceMap', output: str) -> None:
     from stavpr_ros.errors import InputError
-    from stavpr_ros.evaluation.threshold import suggest_threshold
+    from stavpr_ros.recognition.threshold import suggest_threshold
 
     megabytes = Path(output).stat().st_size / 1e6
     strips = place_map.features.strips

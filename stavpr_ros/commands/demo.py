@@ -16,9 +16,9 @@ from stavpr_ros.threads import wait_passively
 if TYPE_CHECKING:
     import numpy as np
 
+    from stavpr_ros.demonstration.street import Drive
     from stavpr_ros.evaluation.drive import DriveResult
-    from stavpr_ros.evaluation.world import Drive
-    from stavpr_ros.features import Describer
+    from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import PlaceMap
 
 TOPIC = '/camera/image_raw'
@@ -159,7 +159,7 @@ def make_room(bag: Path) -> None:
 
 def _make_world(folder: Path, seed: int) -> Drives:
     """Drive twice through a made-up street and write a bag of each drive."""
-    from stavpr_ros.evaluation.world import World, first_drive, ground_truth, second_drive
+    from stavpr_ros.demonstration.street import World, first_drive, ground_truth, second_drive
     from stavpr_ros.sources.bag_writer import write_bag
 
     say('1. Two drives through a made-up street')
@@ -194,21 +194,21 @@ def _users_drives(arguments: argparse.Namespace) -> Drives:
         if images > places:
             raise SettingsError(f'--truth identity: {images} query images on a map of {places} places')
         truth = np.arange(images)
-    title = f'{Path(arguments.query).name} recognised on the map of {Path(arguments.map).name}'
+    title = f'{Path(arguments.query).name} recognized on the map of {Path(arguments.map).name}'
     return Drives(*paths, (first, second), truth, title)
 
 
-def describe(path: str, topic: str | None, describer: 'Describer') -> 'PlaceMap':
+def extract_map(path: str, topic: str | None, extractor: 'FeatureExtractor') -> 'PlaceMap':
     """Describe a drive; images that cannot be read are said and skipped, as the replay does."""
     from stavpr_ros.mapping import build_map
     from stavpr_ros.sources import open_source
 
-    return build_map(open_source(path, topic, lambda error: say(f'   skipped: {error}')), describer)
+    return build_map(open_source(path, topic, lambda error: say(f'   skipped: {error}')), extractor)
 
 
 def _choose_threshold(place_map: 'PlaceMap', mode: str, given: float | None) -> float:
-    from stavpr_ros.evaluation.threshold import suggest_threshold
-    from stavpr_ros.recognition.cures import THRESHOLD
+    from stavpr_ros.recognition.robust.options import THRESHOLD
+    from stavpr_ros.recognition.threshold import suggest_threshold
 
     if given is not None:
         return given
@@ -247,8 +247,8 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _two_drives(arguments: argparse.Namespace, folder: Path) -> None:
-    from stavpr_ros.commands.demo_pictures import draw_result
-    from stavpr_ros.commands.feature_options import make_describer
+    from stavpr_ros.commands.feature_options import make_extractor
+    from stavpr_ros.demonstration.plots import draw_result
     from stavpr_ros.evaluation.drive import judge
     from stavpr_ros.mapping import save_map
     from stavpr_ros.ros.live import run_live
@@ -257,12 +257,12 @@ def _two_drives(arguments: argparse.Namespace, folder: Path) -> None:
 
     map_path = folder / 'map.stavpr'
     say(f'2. The map of the first drive: {map_path}')
-    place_map = describe(drives.reference, drives.topics[0], make_describer(arguments))
+    place_map = extract_map(drives.reference, drives.topics[0], make_extractor(arguments))
     save_map(place_map, map_path)
     threshold = _choose_threshold(place_map, arguments.mode, arguments.threshold)
 
     say('3. The second drive through the node, over ROS, with replay and listener as processes of their own')
-    query = describe(drives.query, drives.topics[1], place_map.describer())
+    query = extract_map(drives.query, drives.topics[1], place_map.extractor())
     if drives.truth is not None and len(query) != len(drives.truth):
         raise SourceError('images were skipped: the truth of the others is not known; repair or remove them')
     parameters = {

@@ -1,4 +1,4 @@
-"""``ros2 run stavpr_ros evaluate``: how well a second drive is recognised on the map of a first one."""
+"""``ros2 run stavpr_ros evaluate``: how well a second drive is recognized on the map of a first one."""
 
 import argparse
 import sys
@@ -12,16 +12,16 @@ from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
-    from stavpr_ros.commands.evaluate_drives import Drives
+    from stavpr_ros.commands.evaluate_sequences import Drives
+    from stavpr_ros.evaluation.evaluate import Evaluation
     from stavpr_ros.evaluation.report import Report
-    from stavpr_ros.evaluation.run import Evaluation
-    from stavpr_ros.recognition import RecognitionSettings
+    from stavpr_ros.recognition import RecognizerSettings
 
 OUTPUT = 'evaluation_output'
 WARPS = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')
 
 DESCRIPTION = """
-Recognises a second drive on the map of a first one, image by image as the node does it, and compares the
+Recognizes a second drive on the map of a first one, image by image as the node does it, and compares the
 answers with the truth: precision over recall, F1, average precision, recall@k, recall at 100 % precision,
 false alarms; for sequences and for single images. Writes JSON, CSV, pictures and a page of HTML.
 """
@@ -29,7 +29,7 @@ false alarms; for sequences and for single images. Writes JSON, CSV, pictures an
 EPILOG = """
 the truth:
   identity     image i of the query was taken at image i of the map (the default); --tolerance is 3 then
-  poses        places within --metres and --degrees of the query's pose
+  poses        places within --meters and --degrees of the query's pose
   FILE         .csv: accepted pairs, query,place, from 0; .npy, .npz: a square array of loop closures, pairs,
                or a place a query; an image: white at row i, column j accepts place j for query i;
                --tolerance is 0 then
@@ -88,7 +88,7 @@ def _add_truth_options(parser: argparse.ArgumentParser) -> None:
     truth.add_argument('--tolerance', type=int, metavar='T', help='places that a right match may be off')
     truth.add_argument('--query-poses', metavar='CSV', help='x,y,z[,qx,qy,qz,qw] of every query image')
     truth.add_argument('--map-poses', metavar='CSV', help="the same of every place (those of the map's file)")
-    truth.add_argument('--metres', type=float, default=5.0, help='with poses (%(default)g)')
+    truth.add_argument('--meters', type=float, default=5.0, help='with poses (%(default)g)')
     truth.add_argument('--degrees', type=float, help='with poses that have orientations (any)')
 
 
@@ -147,16 +147,16 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         parser.error('--query-poses and --map-poses go with --truth poses')
 
 
-def recognition_settings(arguments: argparse.Namespace) -> 'RecognitionSettings':
+def recognition_settings(arguments: argparse.Namespace) -> 'RecognizerSettings':
     """
     Return the settings that the parsed options ask for; the threshold decides nothing here.
 
     :raises SettingsError: one is out of its range.
     """
     from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-    from stavpr_ros.recognition import RecognitionSettings
+    from stavpr_ros.recognition import RecognizerSettings
 
-    return RecognitionSettings(
+    return RecognizerSettings(
         threshold=1.0,
         spatial=SpatialSettings(arguments.spatial, arguments.sigma, arguments.xi, arguments.vertical),
         sequence=SequenceSettings(arguments.length, arguments.beta),
@@ -166,15 +166,15 @@ def recognition_settings(arguments: argparse.Namespace) -> 'RecognitionSettings'
 
 def _default_threshold(mode: str) -> float | None:
     """Return the threshold that a mode has of its own; the paper publishes none."""
-    from stavpr_ros.recognition.cures import THRESHOLD
+    from stavpr_ros.recognition.robust.options import THRESHOLD
 
     return THRESHOLD if mode == 'robust' else None
 
 
 def _evaluate(
-    arguments: argparse.Namespace, drives: 'Drives', settings: 'RecognitionSettings'
+    arguments: argparse.Namespace, drives: 'Drives', settings: 'RecognizerSettings'
 ) -> 'Evaluation':
-    from stavpr_ros.evaluation.run import evaluate_loop_closures, evaluate_on_map
+    from stavpr_ros.evaluation.evaluate import evaluate_loop_closures, evaluate_on_map
 
     shown = () if arguments.window is None else (arguments.window,)
     if drives.reference is None:
@@ -200,7 +200,7 @@ def _settings_told(arguments: argparse.Namespace, drives: 'Drives') -> dict[str,
 
     names = [
         *('map', 'query', 'dataset', 'topic', 'unknown', 'loop_closure', 'warp', 'crop_map', 'crop_query'),
-        *(('truth', 'query_poses', 'map_poses', 'metres', 'degrees') if drives.posed else ('truth',)),
+        *(('truth', 'query_poses', 'map_poses', 'meters', 'degrees') if drives.posed else ('truth',)),
         *('mode', 'length', 'beta', 'spatial', 'sigma', 'xi', 'vertical', 'backend', 'precision'),
     ]
     told: dict[str, Any] = {name: getattr(arguments, name) for name in names}
@@ -209,7 +209,7 @@ def _settings_told(arguments: argparse.Namespace, drives: 'Drives') -> dict[str,
 
 
 def _report(arguments: argparse.Namespace) -> 'Report':
-    from stavpr_ros.commands.evaluate_drives import load_drives
+    from stavpr_ros.commands.evaluate_sequences import load_drives
     from stavpr_ros.evaluation.curves import import_sklearn
     from stavpr_ros.evaluation.report import Report
 

@@ -13,9 +13,9 @@ from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
-    from stavpr_ros.evaluation.curves import Judgement
-    from stavpr_ros.evaluation.datasets import Dataset
-    from stavpr_ros.evaluation.experiments import Configuration
+    from stavpr_ros.evaluation.curves import Metrics
+    from stavpr_ros.evaluation.paper.datasets import Dataset
+    from stavpr_ros.evaluation.paper.experiments import Configuration
 
 METRICS = ('f1', 'average_precision', 'recall_at_1', 'recall_at_5', 'recall_at_100_precision')
 EMPTY = '-'
@@ -31,7 +31,7 @@ experiments:
   ablation     no alignment, only spatial, only temporal, both
   strategies   sliding window, vanilla DTW, adaptive DTW
   fast         random projection (GRP) and restricted alignment (RA), off and on
-  cures        the paper, mode robust, and robust without each of its cures
+  robust_options        the paper, mode robust, and robust without each of its robust_options
   sweep        one of l, beta, xi, sigma, W (--parameter), all others at their defaults
 
 data sets: nordland gardens_point gardens_point_night ua berlin_a100; synth_ before a name crops the images as
@@ -50,7 +50,7 @@ exit codes: 0 done, 1 something failed (the reason is printed), 2 usage, 130 int
 
 def _parser() -> argparse.ArgumentParser:
     from stavpr_ros.commands.feature_options import add_feature_options
-    from stavpr_ros.evaluation.experiments import PRESETS, SWEEPS
+    from stavpr_ros.evaluation.paper.experiments import PRESETS, SWEEPS
 
     parser = argparse.ArgumentParser(
         prog='experiments',
@@ -77,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _columns(arguments: argparse.Namespace) -> 'tuple[Configuration, ...]':
-    from stavpr_ros.evaluation.experiments import PRESETS, sweep_configurations
+    from stavpr_ros.evaluation.paper.experiments import PRESETS, sweep_configurations
 
     if arguments.experiment == 'sweep':
         return sweep_configurations(arguments.parameter or 'l', arguments.values)
@@ -88,8 +88,8 @@ def _columns(arguments: argparse.Namespace) -> 'tuple[Configuration, ...]':
 
 def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset]':
     """Open the data sets that are named, or all that are there."""
-    from stavpr_ros.evaluation.datasets import open_dataset
-    from stavpr_ros.evaluation.published import F1
+    from stavpr_ros.evaluation.paper.datasets import open_dataset
+    from stavpr_ros.evaluation.paper.published import F1
 
     found: dict[str, Dataset] = {}
     if arguments.datasets:
@@ -138,7 +138,7 @@ def _backbones(arguments: argparse.Namespace) -> dict[str, argparse.Namespace]:
 
 def _checked(options: argparse.Namespace) -> argparse.Namespace:
     """Refuse features options that the experiment decides."""
-    from stavpr_ros.evaluation.experiments import W
+    from stavpr_ros.evaluation.paper.experiments import W
 
     if options.strips != W or options.projection is not None or options.seed:
         raise SettingsError('--strips, --projection, --seed: the experiment decides them; leave them out')
@@ -151,17 +151,17 @@ def _run_row(
     columns: 'tuple[Configuration, ...]',
     mode: str,
     name: str,
-) -> 'dict[str, Judgement | None]':
+) -> 'dict[str, Metrics | None]':
     """Run all columns of a row; None where the data set is too short for one."""
     from tqdm import tqdm
 
-    from stavpr_ros.commands.feature_options import make_describer
+    from stavpr_ros.commands.feature_options import make_extractor
     from stavpr_ros.devices import choose_device
-    from stavpr_ros.evaluation.experiments import Bench
+    from stavpr_ros.evaluation.paper.experiments import Bench
 
-    features = make_describer(options).settings
+    features = make_extractor(options).settings
     bench = Bench(dataset, features.kind, features.backbone, mode, choose_device(options.device))
-    found: dict[str, Judgement | None] = {}
+    found: dict[str, Metrics | None] = {}
     for column in tqdm(columns, desc=name, unit='column', disable=None):
         too_short = len(dataset.query) < column.sequence.length
         found[column.name] = None if too_short else bench.judge(column)
@@ -170,7 +170,7 @@ def _run_row(
 
 def _published(dataset: str, columns: 'tuple[Configuration, ...]') -> dict[str, list[float | None]]:
     """Return the published F1 for the columns, by backbone; none where the paper has nothing."""
-    from stavpr_ros.evaluation.published import DENSENET, VGG, published_f1
+    from stavpr_ros.evaluation.paper.published import DENSENET, VGG, published_f1
 
     rows = {
         backbone: [published_f1(dataset, backbone, column.name) for column in columns]

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 from stavpr_ros.devices import DEVICES, choose_device
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features.backbone import KINDS, settings_class
+from stavpr_ros.features.registry import KINDS, settings_class
 
 if TYPE_CHECKING:
-    from stavpr_ros.features import Describer
+    from stavpr_ros.features import FeatureExtractor
 
 
 def _boolean(text: str) -> bool:
@@ -56,15 +56,15 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
             )
 
 
-def make_describer(arguments: argparse.Namespace) -> 'Describer':
+def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':
     """
-    Make the describer that the parsed options ask for.
+    Make the extractor that the parsed options ask for.
 
     :raises SettingsError: options that are missing, out of range or of another kind.
     """
-    from stavpr_ros.features import Describer
+    from stavpr_ros.features import FeatureExtractor
 
-    return Describer(
+    return FeatureExtractor(
         arguments.features,
         _backbone_settings(arguments),
         arguments.strips,

@@ -1,4 +1,4 @@
-"""The demonstration of loop closure: one drive, replayed into the node, recognised on its own past."""
+"""The demonstration of loop closure: one drive, replayed into the node, recognized on its own past."""
 
 import argparse
 from dataclasses import dataclass, replace
@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stavpr_ros.commands.demo import CHECK, EXCLUDE, TOPIC, describe, image_records, make_room, say
+from stavpr_ros.commands.demo import CHECK, EXCLUDE, TOPIC, extract_map, image_records, make_room, say
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.evaluation.drive import IN_WINDOW
-from stavpr_ros.evaluation.truth import GroundTruth
+from stavpr_ros.evaluation.ground_truth import GroundTruth
 
 if TYPE_CHECKING:
-    from stavpr_ros.features import Describer
+    from stavpr_ros.features import FeatureExtractor
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def read_result(
     :param matches: one an image, of the command ``record``; they tell which images became places.
     :param closures: of ``record --loop-closures``.
     """
-    images = np.array([i for i, match in enumerate(matches) if match['verdict'] in IN_WINDOW], np.int64)
+    images = np.array([i for i, match in enumerate(matches) if match['status'] in IN_WINDOW], np.int64)
     ends = [[closure['query_index'], closure['place_index']] for closure in closures]
     pairs = [[pair[0], pair[2]] for closure in closures for pair in closure['pairs']]
     return LoopResult(
@@ -101,13 +101,13 @@ def read_result(
         images[np.unique(np.array(pairs, np.int64).reshape(-1, 2), axis=0)],
         truth,
         exclude,
-        sum(match['verdict'] == 'SKIPPED' for match in matches),
+        sum(match['status'] == 'SKIPPED' for match in matches),
     )
 
 
 def _make_world(folder: Path, seed: int) -> LoopDrive:
     """Drive twice through a made-up street, in the afternoon on the other lane, and write one bag."""
-    from stavpr_ros.evaluation.world import GOOD_LIGHT, World, first_drive, ground_truth, second_drive
+    from stavpr_ros.demonstration.street import GOOD_LIGHT, World, first_drive, ground_truth, second_drive
     from stavpr_ros.sources.bag_writer import write_bag
 
     say('1. One drive twice along a made-up street, the second time on the other lane and with a detour')
@@ -148,13 +148,13 @@ def _truth(drive: LoopDrive, N: int, exclude: int, tolerance: int) -> GroundTrut
     return truth.loop_closures(exclude - 1)  # places are so many images back, and more
 
 
-def _save_features(drive: LoopDrive, describer: 'Describer', path: Path) -> None:
+def _save_features(drive: LoopDrive, extractor: 'FeatureExtractor', path: Path) -> None:
     """Write a map of one image: in operation loop_closure, a map tells what features to make, and no more."""
     from stavpr_ros.mapping import build_map, save_map
     from stavpr_ros.sources import open_source
 
     readable = iter(open_source(drive.path, drive.topic, lambda error: None))
-    save_map(build_map(islice(readable, 1), describer, thumbnails=False, progress=False), path)
+    save_map(build_map(islice(readable, 1), extractor, thumbnails=False, progress=False), path)
 
 
 def close_loops(arguments: argparse.Namespace, folder: Path) -> None:
@@ -164,9 +164,9 @@ def close_loops(arguments: argparse.Namespace, folder: Path) -> None:
     :param folder: where all is written.
     :raises StavprError: something failed.
     """
-    from stavpr_ros.commands.feature_options import make_describer
-    from stavpr_ros.commands.loop_demo_pictures import draw_loops
-    from stavpr_ros.recognition.cures import LOOP_THRESHOLD
+    from stavpr_ros.commands.feature_options import make_extractor
+    from stavpr_ros.demonstration.loop_plots import draw_loops
+    from stavpr_ros.recognition.robust.options import LOOP_THRESHOLD
     from stavpr_ros.ros.live import run_loop_closure
     from stavpr_ros.sources import open_source
 
@@ -175,13 +175,13 @@ def close_loops(arguments: argparse.Namespace, folder: Path) -> None:
     N = len(open_source(drive.path, drive.topic))
     if exclude + length >= N:
         raise SettingsError(f'{drive.path} has {N} images: --exclude {exclude} leaves no window of {length}')
-    describer = make_describer(arguments)
-    described = describe(drive.path, drive.topic, describer)
-    if drive.truth is not None and len(described) != N:
+    extractor = make_extractor(arguments)
+    extracted = extract_map(drive.path, drive.topic, extractor)
+    if drive.truth is not None and len(extracted) != N:
         raise SourceError('images were skipped: the truth of the others is not known; repair or remove them')
-    truth = _truth(drive, len(described), exclude, arguments.tolerance)
+    truth = _truth(drive, len(extracted), exclude, arguments.tolerance)
     features = folder / 'features.stavpr'
-    _save_features(drive, describer, features)
+    _save_features(drive, extractor, features)
 
     say('2. The drive through the node, over ROS, with replay and listeners as processes of their own')
     threshold = arguments.threshold or LOOP_THRESHOLD
@@ -193,9 +193,9 @@ def close_loops(arguments: argparse.Namespace, folder: Path) -> None:
         'exclude_places': exclude,
         'geometric_check': arguments.check or CHECK,
     }
-    matches, closures = run_loop_closure(parameters, drive.path, len(described), folder, drive.topic)
+    matches, closures = run_loop_closure(parameters, drive.path, len(extracted), folder, drive.topic)
     result = read_result(matches, closures, truth, exclude)
-    picture = draw_loops(result, described, drive.title, folder)
+    picture = draw_loops(result, extracted, drive.title, folder)
     say('\n3. What came out')
     for line in result.lines():
         say(f'   {line}')

@@ -9,11 +9,11 @@ from stavpr_ros.threads import wait_passively
 HELP = """usage: node [--ros-args -p map_path:=FILE -p threshold:=VALUE [-p NAME:=VALUE ...]
             [-r image:=TOPIC]]
 
-A managed (lifecycle) node, which configures and activates itself. It recognises where the images of the
+A managed (lifecycle) node, which configures and activates itself. It recognizes where the images of the
 topic `image` (sensor_msgs/Image) were taken on the route of a map (operation localization), makes a map
 of them (mapping), or finds places that they have passed before (loop_closure), with poses from `odom`.
 
-It publishes one ~/match (stavpr_msgs/PlaceMatch) for every image received, with a verdict; for accepted
+It publishes one ~/match (stavpr_msgs/PlaceMatch) for every image received, with a status; for accepted
 matches also ~/place_index, ~/distance, ~/pose and ~/loop_closure; ~/candidates, ~/match_image, ~/map_info
 and /diagnostics. Services: ~/load_map, ~/save_map, ~/reset, ~/relocalize, ~/set_operation.
 

@@ -13,7 +13,7 @@ from stavpr_ros.signals import obey_signals
 if TYPE_CHECKING:
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
 
-_VERDICTS = (
+_STATUSES = (
     'WARMING_UP',
     'NO_MATCH',
     'MATCH',
@@ -28,7 +28,7 @@ TOPICS = {'matches': '/stavpr/match', 'loop closures': '/stavpr/loop_closure'}
 LISTENING = 'recording {topic}'  # said when no message can be missed any more
 
 EPILOG = """
-The keys are the fields of stavpr_msgs/PlaceMatch, the verdict by its name, or with --loop-closures those
+The keys are the fields of stavpr_msgs/PlaceMatch, the status by its name, or with --loop-closures those
 of stavpr_msgs/LoopClosure. Stamps are nanoseconds, numbers that are not there are null; the path is a list
 of [query_index, map_index], pairs are [query_index, query_stamp, place_index, place_stamp], a pose is
 [x, y, z, qx, qy, qz, qw], null without odometry. received is the time of arrival (ns, system clock).
@@ -68,7 +68,7 @@ def _plain(message: 'PlaceMatch | LoopClosure', replaced: dict[str, Any]) -> dic
 def match_record(message: 'PlaceMatch') -> dict[str, Any]:
     """Return a match as plain values for JSON."""
     path = [[pair.query_index, pair.map_index] for pair in message.path]
-    return _plain(message, {'verdict': _VERDICTS[message.verdict], 'path': path})
+    return _plain(message, {'status': _STATUSES[message.status], 'path': path})
 
 
 def loop_closure_record(message: 'LoopClosure') -> dict[str, Any]:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from stavpr_ros.errors import InputError, UnavailableError
+from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.metrics import Score, score_at, sweep
-from stavpr_ros.evaluation.truth import GroundTruth
 
 RANKS = (1, 5, 10, 20)
 
@@ -62,7 +62,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Metrics:
     """
     What answers to some queries are worth.
 
@@ -122,7 +122,7 @@ def import_sklearn() -> ModuleType:
         ) from error
 
 
-def judge_ranking(ranking: Ranking, truth: GroundTruth, frames: slice = slice(None)) -> Judgement:
+def evaluate_ranking(ranking: Ranking, truth: GroundTruth, frames: slice = slice(None)) -> Metrics:
     """
     Judge answers.
 
@@ -137,7 +137,7 @@ def judge_ranking(ranking: Ranking, truth: GroundTruth, frames: slice = slice(No
         raise InputError(f'no queries are left to judge: {len(ranking)} came, {frames} of them count')
     counts = sweep(scores, correct[:, 0], has_match)
     average_precision, sklearn_f1, sklearn_recall = _sklearn_numbers(scores, correct[:, 0])
-    return Judgement(
+    return Metrics(
         queries=len(scores),
         with_match=int(np.count_nonzero(has_match)),
         best=max(counts, key=lambda score: score.f1),

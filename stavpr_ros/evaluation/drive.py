@@ -7,7 +7,7 @@ import numpy as np
 
 from stavpr_ros.evaluation.metrics import FrameAnswers, Score, WindowAnswer, frame_answers, score_at
 
-IN_WINDOW = ('WARMING_UP', 'NO_MATCH', 'MATCH')  # verdicts of images that the window holds
+IN_WINDOW = ('WARMING_UP', 'NO_MATCH', 'MATCH')  # statuses of images that the window holds
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ def window_answer(record: dict[str, Any]) -> WindowAnswer | None:
 
 def _answers(records: list[dict[str, Any]], length: int) -> FrameAnswers:
     """Assign windows to images; an image that was in no window (invalid, dropped) has no answer."""
-    taken = np.array([record['verdict'] in IN_WINDOW for record in records], bool)
-    windows = [window_answer(record) for record in records if record['verdict'] in IN_WINDOW]
+    taken = np.array([record['status'] in IN_WINDOW for record in records], bool)
+    windows = [window_answer(record) for record in records if record['status'] in IN_WINDOW]
     among_taken = frame_answers(windows, length)
     places, distances = np.full(len(records), -1, np.int64), np.full(len(records), np.inf)
     places[taken], distances[taken] = among_taken.places, among_taken.distances

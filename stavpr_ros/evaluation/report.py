@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 
 from stavpr_ros.errors import SettingsError, SourceError
-from stavpr_ros.evaluation import pictures
-from stavpr_ros.evaluation.pictures import MatchPair
+from stavpr_ros.evaluation import plots
+from stavpr_ros.evaluation.evaluate import Evaluation, WindowView
+from stavpr_ros.evaluation.ground_truth import GroundTruth
+from stavpr_ros.evaluation.plots import MatchPair
 from stavpr_ros.evaluation.report_html import html_page, jsonable
 from stavpr_ros.evaluation.report_matrix import draw_matrix
-from stavpr_ros.evaluation.run import Evaluation, WindowView
-from stavpr_ros.evaluation.truth import GroundTruth
 from stavpr_ros.mapping import PlaceMap
 
 JUDGED = ('sequence', 'sequence_without_ends', 'single', 'single_without_ends')
@@ -170,7 +170,7 @@ def _draw(report: Report, folder: Path) -> list[Path]:
     }
     best = evaluation.sequence.best
     drawn = [
-        pictures.precision_recall(
+        plots.precision_recall(
             folder / 'precision_recall.png',
             {name: (curve.recall, curve.precision) for name, curve in curves.items()},
             (best.recall, best.precision),
@@ -179,12 +179,12 @@ def _draw(report: Report, folder: Path) -> list[Path]:
     ]
     pairs = [pair for image in worst_mistakes(evaluation, 6) if (pair := _mistake(report, image))]
     if pairs:
-        drawn.append(pictures.match_overview(folder / 'mistakes.png', pairs, columns=2))
+        drawn.append(plots.match_overview(folder / 'mistakes.png', pairs, columns=2))
     view = chosen_view(evaluation, report.window)
     if view is not None:
         local = view.path - [0, view.first]
         drawn.append(
-            pictures.warping_path(folder / f'window_{view.image}.png', view.distances, local, view.first)
+            plots.warping_path(folder / f'window_{view.image}.png', view.distances, local, view.first)
         )
     return drawn
 
@@ -193,7 +193,7 @@ def chosen_view(evaluation: Evaluation, image: int | None) -> WindowView | None:
     """
     Return the window around an image, or the worst mistake's (else the middle one) if none is named.
 
-    :raises SettingsError: no window is centred on that image.
+    :raises SettingsError: no window is centered on that image.
     """
     views = evaluation.answers.views
     if image is not None:
@@ -201,8 +201,8 @@ def chosen_view(evaluation: Evaluation, image: int | None) -> WindowView | None:
             if view.image == image:
                 return view
         raise SettingsError(
-            f'no window is centred on image {image}: choose one of {evaluation.centred.start} .. '
-            f'{evaluation.centred.stop - 1}'
+            f'no window is centered on image {image}: choose one of {evaluation.centered.start} .. '
+            f'{evaluation.centered.stop - 1}'
         )
     if not views:
         return None

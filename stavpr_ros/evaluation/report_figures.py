@@ -66,20 +66,20 @@ def precision_recall_svg(curves: Sequence[tuple[str, str, Curve, tuple[float, fl
     """
     Draw precision over recall.
 
-    :param curves: name, colour, curve, and the point (recall, precision) of the best F1.
+    :param curves: name, color, curve, and the point (recall, precision) of the best F1.
     """
     parts = [_axes(('recall', 'precision'), [(t, f'{t:.1f}') for t in np.linspace(0, 1, 6)], True)]
-    for name, colour, curve, (recall, precision) in curves:
+    for name, color, curve, (recall, precision) in curves:
         points = thinned(curve)
         line = ' '.join(
             f'{LEFT + r * WIDE:.1f},{TOP + (1 - p) * HIGH:.1f}'
             for r, p in zip(points.recall, points.precision, strict=True)
         )
         parts.append(
-            f'<polyline class="curve" stroke="{colour}" points="{line}"><title>{name}</title></polyline>'
+            f'<polyline class="curve" stroke="{color}" points="{line}"><title>{name}</title></polyline>'
         )
         x, y = LEFT + recall * WIDE, TOP + (1 - precision) * HIGH
-        parts.append(f'<circle class="best" stroke="{colour}" cx="{x:.1f}" cy="{y:.1f}" r="5"/>')
+        parts.append(f'<circle class="best" stroke="{color}" cx="{x:.1f}" cy="{y:.1f}" r="5"/>')
     parts.append('<circle id="pr-dot" r="4.5" visibility="hidden"/>')
     what = 'role="img" aria-label="precision over recall"'
     return f'<svg id="pr" viewBox="0 0 440 360" {what}>{"".join(parts)}</svg>'
@@ -89,10 +89,10 @@ def scores_svg(groups: Sequence[tuple[str, str, np.ndarray]], threshold: float) 
     """
     Draw how the distances of right, wrong and unknown answers are spread.
 
-    :param groups: name, colour and distances of each group; those that are not finite are left out.
+    :param groups: name, color and distances of each group; those that are not finite are left out.
     :param threshold: drawn as a line.
     """
-    shown = [(name, colour, values[np.isfinite(values)]) for name, colour, values in groups]
+    shown = [(name, color, values[np.isfinite(values)]) for name, color, values in groups]
     everything = np.concatenate([values for _, _, values in shown] or [np.zeros(0)])
     if not everything.size:
         return '<p class="quiet">no answers</p>'
@@ -104,12 +104,12 @@ def scores_svg(groups: Sequence[tuple[str, str, np.ndarray]], threshold: float) 
     ticks = [(t, f'{low + t * (high - low):.3g}') for t in np.linspace(0, 1, 5)]
     parts = [_axes(('distance of the answer', 'answers'), ticks, False)]
     below = np.zeros(40)
-    for (name, colour, _), heights in zip(shown, counts, strict=True):
+    for (name, color, _), heights in zip(shown, counts, strict=True):
         for i in np.flatnonzero(heights):
             x, height = float(LEFT + i * WIDE / 40), heights[i] * HIGH / tallest
             y = TOP + HIGH - below[i] * HIGH / tallest - height
             parts.append(
-                f'<rect fill="{colour}" x="{x + 0.5:.1f}" y="{y:.1f}" width="{WIDE / 40 - 1:.1f}" '
+                f'<rect fill="{color}" x="{x + 0.5:.1f}" y="{y:.1f}" width="{WIDE / 40 - 1:.1f}" '
                 f'height="{height:.1f}"><title>{heights[i]} {name}</title></rect>'
             )
         below += heights
@@ -136,7 +136,7 @@ def matrix_svg(
     :param picture: the reduced distances, as for :func:`matrix_png`.
     :param shape: images, places.
     :param accepted: the true places of each image, sorted, for some of the images an empty array.
-    :param dots: image and place of answers, shape (count, 2), by colour.
+    :param dots: image and place of answers, shape (count, 2), by color.
     """
     images, places = shape
     high = 1000 * min(0.7, max(0.35, images / places))
@@ -149,13 +149,13 @@ def matrix_svg(
     )
     radius = float(np.clip(0.5 * max(x_scale, y_scale), 2.2, 7))
     circles = ''.join(
-        f'<g fill="{colour}" stroke="#fff" stroke-width="{0.16 * radius if radius > 3 else 0:.2f}">'
+        f'<g fill="{color}" stroke="#fff" stroke-width="{0.16 * radius if radius > 3 else 0:.2f}">'
         + ''.join(
             f'<circle cx="{(place + 0.5) * x_scale:.1f}" cy="{(i + 0.5) * y_scale:.1f}" r="{radius:.1f}"/>'
             for i, place in pairs.tolist()
         )
         + '</g>'
-        for colour, pairs in dots.items()
+        for color, pairs in dots.items()
     )
     return (
         f'<svg id="matrix" viewBox="0 0 1000 {high:.0f}" data-images="{images}" data-places="{places}">'

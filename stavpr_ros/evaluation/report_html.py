@@ -13,10 +13,10 @@ import numpy as np
 
 from stavpr_ros.evaluation import report_figures as figures
 from stavpr_ros.evaluation import report_page
-from stavpr_ros.evaluation.curves import Judgement
+from stavpr_ros.evaluation.curves import Metrics
+from stavpr_ros.evaluation.evaluate import WindowView
+from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.report_matrix import accepted_answers
-from stavpr_ros.evaluation.run import WindowView
-from stavpr_ros.evaluation.truth import GroundTruth
 from stavpr_ros.mapping import PlaceMap
 
 if TYPE_CHECKING:
@@ -53,8 +53,8 @@ def html_page(report: 'Report', mistakes: list[int]) -> str:
         'CARDS': _cards(report),
         'CURVES': figures.precision_recall_svg(
             [
-                (name, colour, judged.curve, (judged.best.recall, judged.best.precision))
-                for name, colour, judged in (
+                (name, color, judged.curve, (judged.best.recall, judged.best.precision))
+                for name, color, judged in (
                     ('single images', figures.SINGLE, evaluation.single),
                     ('sequences', figures.SEQUENCE, evaluation.sequence),
                 )
@@ -85,14 +85,14 @@ def _lead(report: 'Report') -> str:
     accepted = best.true_positives + best.false_positives
     count = len(report.evaluation.answers.single)
     text = (
-        f'Of {count} images, {accepted} are recognised at the best threshold, {best.threshold:.4g}: '
+        f'Of {count} images, {accepted} are recognized at the best threshold, {best.threshold:.4g}: '
         f'{best.true_positives} rightly, {best.false_positives} wrongly. Rejected although in the map: '
         f'{best.false_negatives}. Looking at single images only, {single.true_positives} would be right and '
         f'{single.false_positives} wrong.'
     )
     rate = report.evaluation.false_alarms('sequence')
     if rate is not None:
-        text += f' Of the images of unknown places, {rate:.1%} are recognised all the same.'
+        text += f' Of the images of unknown places, {rate:.1%} are recognized all the same.'
     return ' '.join([text, *map(html.escape, report.notes)])
 
 
@@ -121,8 +121,8 @@ def _cards(report: 'Report') -> str:
         cards.append(('false alarms', alarms, f'single images: {alone:.3f}', figures.WRONG))
     return ''.join(
         f'<div class="card"><span>{name}</span><b>{value:.3f}</b><span>{note}</span>'
-        f'<i style="--v:{100 * value:.1f}%;--c:{colour}"></i></div>'
-        for name, value, note, colour in cards
+        f'<i style="--v:{100 * value:.1f}%;--c:{color}"></i></div>'
+        for name, value, note, color in cards
     )
 
 
@@ -137,9 +137,9 @@ def _scores(report: 'Report') -> dict[str, str]:
     if evaluation.unknown is not None:
         groups.append(('unknown places', figures.UNKNOWN, evaluation.unknown.sequence.scores))
     keys = ''
-    for name, colour, scores in groups:
+    for name, color, scores in groups:
         none = np.count_nonzero(~np.isfinite(scores))
-        keys += f'<span class="key" style="--c:{colour}">{name}</span> '
+        keys += f'<span class="key" style="--c:{color}">{name}</span> '
         keys += f'({none} of them without a distance: no nearer than chance) ' if none else ''
     return {
         'SCORES': figures.scores_svg(groups, evaluation.sequence.best.threshold),
@@ -155,8 +155,8 @@ def accepted_lists(truth: GroundTruth) -> list[np.ndarray]:
 
 def _matrix(report: 'Report') -> str:
     truth = report.truth
-    colours = {'right': figures.RIGHT, 'wrong': figures.WRONG}
-    dots = {colours[name]: pairs for name, pairs in accepted_answers(report.evaluation, truth).items()}
+    colors = {'right': figures.RIGHT, 'wrong': figures.WRONG}
+    dots = {colors[name]: pairs for name, pairs in accepted_answers(report.evaluation, truth).items()}
     return figures.matrix_svg(
         report.evaluation.answers.picture.values, (truth.N, truth.n), accepted_lists(truth), dots
     )
@@ -184,9 +184,9 @@ def _mistake(report: 'Report', image: int) -> str:
         for name, url in images
     )
     accepted = answers.scores[image] < report.evaluation.sequence.best.threshold
-    verdict = 'accepted' if accepted else 'rejected, rightly'
+    status = 'accepted' if accepted else 'rejected, rightly'
     off = f', {abs(place - true)} places off' if true >= 0 else ''
-    caption = f'distance {answers.scores[image]:.4f}, {verdict}{off}'
+    caption = f'distance {answers.scores[image]:.4f}, {status}{off}'
     return f'<figure><div>{shown}</div><figcaption>{caption}</figcaption></figure>'
 
 
@@ -205,7 +205,7 @@ def _picture(place_map: PlaceMap, place: int) -> str:
 
 def _table(report: 'Report') -> str:
     evaluation = report.evaluation
-    judged: list[Judgement] = [
+    judged: list[Metrics] = [
         evaluation.sequence,
         evaluation.sequence_without_ends,
         evaluation.single,

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from stavpr_ros.evaluation import pictures
-from stavpr_ros.evaluation.run import DistancePicture, Evaluation
-from stavpr_ros.evaluation.truth import GroundTruth
+from stavpr_ros.evaluation import plots
+from stavpr_ros.evaluation.evaluate import DistancePicture, Evaluation
+from stavpr_ros.evaluation.ground_truth import GroundTruth
 
 
 def accepted_answers(evaluation: Evaluation, truth: GroundTruth) -> dict[str, np.ndarray]:
@@ -24,10 +24,10 @@ def accepted_answers(evaluation: Evaluation, truth: GroundTruth) -> dict[str, np
 
 
 def _true_cells(picture: DistancePicture, truth: GroundTruth) -> np.ndarray:
-    """Colour the cells with a true place, the others clear: RGBA, shape (rows, columns, 4), uint8."""
+    """Color the cells with a true place, the others clear: RGBA, shape (rows, columns, 4), uint8."""
     cells = np.zeros((*picture.values.shape, 4), np.uint8)
     rows, columns = (truth.pairs // picture.block).T
-    cells[rows, columns] = [int(pictures.TRUTH[i : i + 2], 16) for i in (1, 3, 5)] + [110]
+    cells[rows, columns] = [int(plots.TRUTH[i : i + 2], 16) for i in (1, 3, 5)] + [110]
     return cells
 
 
@@ -39,25 +39,25 @@ def draw_matrix(path: Path, evaluation: Evaluation, truth: GroundTruth) -> Path:
     """
     picture = evaluation.answers.picture
     side = 7.5
-    with pictures.page(path, side, float(np.clip(side * truth.N / truth.n, 4, 9))) as figure:
+    with plots.page(path, side, float(np.clip(side * truth.N / truth.n, 4, 9))) as figure:
         axes = figure.add_subplot()
         extent = (-0.5, truth.n - 0.5, truth.N - 0.5, -0.5)
         finite = picture.values[np.isfinite(picture.values)]
         low, high = np.quantile(finite, [0.002, 0.995]) if finite.size else (0.0, 1.0)
-        scale: dict[str, Any] = {'cmap': pictures.SCALE, 'vmin': low, 'vmax': max(high, low + 1e-6)}
+        scale: dict[str, Any] = {'cmap': plots.SCALE, 'vmin': low, 'vmax': max(high, low + 1e-6)}
         image = axes.imshow(picture.values, aspect='auto', extent=extent, **scale)
         axes.imshow(_true_cells(picture, truth), aspect='auto', extent=extent, interpolation='nearest')
-        axes.plot([], [], 's', color=pictures.TRUTH, ms=4, label='true place')
+        axes.plot([], [], 's', color=plots.TRUTH, ms=4, label='true place')
         for outcome, pairs in accepted_answers(evaluation, truth).items():
             if len(pairs):
                 style: dict[str, Any] = {
-                    'color': pictures.BRIGHT[outcome],
-                    'label': pictures.MEANING[outcome],
+                    'color': plots.BRIGHT[outcome],
+                    'label': plots.MEANING[outcome],
                 }
                 axes.plot(pairs[:, 1], pairs[:, 0], '.', ms=4, mew=0, **style)
         axes.set(xlabel='place in the map', ylabel='query image')
         axes.set(xlim=extent[:2], ylim=extent[2:])
-        pictures.colour_bar(figure, image, axes)
-        for handle in pictures.legend_above(axes, 3).get_lines():
+        plots.color_bar(figure, image, axes)
+        for handle in plots.legend_above(axes, 3).get_lines():
             handle.set_markersize(9)
     return path

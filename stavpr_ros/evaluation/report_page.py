@@ -42,10 +42,10 @@ GLOSSARY = """<dl>
 and wrong, FN rejected although the place is in the map.</dd>
 <dt>average precision</dt><dd>Area under scikit-learn's precision-recall curve of all answers.</dd>
 <dt>recall@k</dt><dd>Share of the queries with a place in the map that have a right one among the k nearest.
-The first and last images of a drive, which have no window centred on them, have one answer only.</dd>
+The first and last images of a drive, which have no window centered on them, have one answer only.</dd>
 <dt>recall at 100 % precision</dt><dd>The largest recall (TP / (TP + FN)) before the first wrong answer is
 accepted.</dd>
-<dt>without the ends</dt><dd>Only images that have a window centred on them.</dd>
+<dt>without the ends</dt><dd>Only images that have a window centered on them.</dd>
 <dt>false alarms</dt><dd>Share of images of places that are not in the map that are accepted all the same, at
 the threshold of the best F1.</dd>
 <dt>scikit-learn's F1</dt><dd>Counts only right answers that are rejected as misses; given for comparison with

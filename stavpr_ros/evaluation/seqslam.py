@@ -2,7 +2,7 @@
 SeqSLAM, the baseline that users compare with, written from its paper.
 
 M. Milford, G. Wyeth, "SeqSLAM: Visual Route-Based Navigation for Sunny Summer Days and Stormy Winter
-Nights", ICRA 2012. Small patch-normalised images, the sum of absolute differences, local contrast
+Nights", ICRA 2012. Small patch-normalized images, the sum of absolute differences, local contrast
 enhancement along the map, straight lines at several speeds through the enhanced differences.
 """
 
@@ -29,7 +29,7 @@ class SeqSlamSettings:
 
     :param width: of the small images, pixels (Rx).
     :param height: of the small images, pixels (Ry).
-    :param patch: side of the squares that are normalised, pixels; divides width and height.
+    :param patch: side of the squares that are normalized, pixels; divides width and height.
     :param contrast_window: places around each one, half before and half after, whose differences its own
         is held against (R_window); >= 2.
     :param length: images in a window (ds), >= 2.
@@ -93,14 +93,14 @@ def seqslam(
     """
     Find each query image in the map.
 
-    :param map_images: n frames, or images: uint8, RGB (h, w, 3) or grey (h, w).
+    :param map_images: n frames, or images: uint8, RGB (h, w, 3) or gray (h, w).
     :param query_images: N of the same kind.
     :returns: see :func:`match_differences`.
     :raises InputError: no images.
     """
     settings = settings or SeqSlamSettings()
-    places = describe(map_images, settings)
-    return match_differences(differences(describe(query_images, settings), places), settings)
+    places = preprocess(map_images, settings)
+    return match_differences(differences(preprocess(query_images, settings), places), settings)
 
 
 def match_differences(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndarray, np.ndarray]:
@@ -140,28 +140,28 @@ def match_differences(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndar
     return places, scores
 
 
-def describe(images: Iterable[Frame | np.ndarray], settings: SeqSlamSettings) -> np.ndarray:
+def preprocess(images: Iterable[Frame | np.ndarray], settings: SeqSlamSettings) -> np.ndarray:
     """
-    Make small patch-normalised images: in every patch the mean is 0 and the deviation 1.
+    Make small patch-normalized images: in every patch the mean is 0 and the deviation 1.
 
-    :returns: shape (images, height * width), float32; a patch of one grey level is 0.
+    :returns: shape (images, height * width), float32; a patch of one gray level is 0.
     :raises InputError: no images, or one that is no uint8 image.
     """
-    described = [_describe(item.image if isinstance(item, Frame) else item, settings) for item in images]
+    described = [_extract(item.image if isinstance(item, Frame) else item, settings) for item in images]
     if not described:
         raise InputError('SeqSLAM was given no images: expected at least one of the map and of the query')
     return np.stack(described)
 
 
-def _describe(image: np.ndarray, settings: SeqSlamSettings) -> np.ndarray:
+def _extract(image: np.ndarray, settings: SeqSlamSettings) -> np.ndarray:
     if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
         raise InputError(
             f'image is {image.dtype} of shape {image.shape}: expected uint8, (h, w) or (h, w, 3)'
         )
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
-    shrinks = grey.shape[0] >= settings.height and grey.shape[1] >= settings.width
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
+    shrinks = gray.shape[0] >= settings.height and gray.shape[1] >= settings.width
     method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    small = cv2.resize(grey, (settings.width, settings.height), interpolation=method).astype(np.float32)
+    small = cv2.resize(gray, (settings.width, settings.height), interpolation=method).astype(np.float32)
     side = settings.patch
     patches = small.reshape(settings.height // side, side, settings.width // side, side)
     patches = patches - patches.mean(axis=(1, 3), keepdims=True)
@@ -198,15 +198,15 @@ def enhance_contrast(D: np.ndarray, window: int) -> np.ndarray:
     ends = np.minimum(np.arange(n) + window // 2 + 1, n)
     enhanced = np.empty_like(D)
     for i, row in enumerate(D):  # a row at a time: the running sums need float64, the matrix is large
-        centred = row.astype(np.float64) - row.mean(dtype=np.float64)
-        sums = np.concatenate([[0.0], np.cumsum(centred)])
-        squares = np.concatenate([[0.0], np.cumsum(centred**2)])
+        centered = row.astype(np.float64) - row.mean(dtype=np.float64)
+        sums = np.concatenate([[0.0], np.cumsum(centered)])
+        squares = np.concatenate([[0.0], np.cumsum(centered**2)])
         count = ends - firsts
         mean = (sums[ends] - sums[firsts]) / count
         variance = (squares[ends] - squares[firsts]) / count - mean**2
         # running sums leave a rest of rounding where all are equal
         flat = variance <= 1e-12 * (squares[-1] / n)
-        enhanced[i] = np.where(flat, 0, (centred - mean) / np.sqrt(np.where(flat, 1, variance)))
+        enhanced[i] = np.where(flat, 0, (centered - mean) / np.sqrt(np.where(flat, 1, variance)))
     return enhanced
 
 

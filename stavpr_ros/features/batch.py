@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from stavpr_ros.features.resize import resize_square
+from stavpr_ros.features.preprocessing import resize_square
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of R, G, B in 0..1, which torchvision's networks are trained with
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -13,7 +13,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 class BatchMaker:
     """
-    Resizes images and standardises their channels: ``(scale * value - mean) / std``.
+    Resizes images and standardizes their channels: ``(scale * value - mean) / std``.
 
     :param size: side of the square, pixels.
     :param resize: method, see :func:`resize_square`.

@@ -13,13 +13,13 @@ import torch
 from torch import nn
 from torch.nn.functional import avg_pool2d, max_pool2d, relu
 
-from stavpr_ros.features.published import PublishedNetwork
+from stavpr_ros.features.paper_networks import PublishedNetwork
 from stavpr_ros.features.weights import PublishedFile
 
 GROWTH = 48  # channels that a layer adds
 FIRST = 96  # channels before the first block
 BLOCKS = (6, 12, 36, 24)  # layers of each block
-LAST_LAYER = 10  # of the last block: the feature maps are what its first normalisation and ReLU make
+LAST_LAYER = 10  # of the last block: the feature maps are what its first normalization and ReLU make
 OLD_NAMES = re.compile(r'(\.denselayer\d+\.(?:norm|conv))\.([12]\.)')  # of files from before torch 0.4
 
 
@@ -108,7 +108,7 @@ class UpToDenseLayer10(nn.Module):
         self.blocks = nn.Sequential(*(part for stage in stages for part in stage), last)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        """Turn standardised images, (n, 3, H, W), into maps, (n, 1488, H / 32, W / 32)."""
+        """Turn standardized images, (n, 3, H, W), into maps, (n, 1488, H / 32, W / 32)."""
         first = max_pool2d(relu(self.norm0(self.conv0(images)), inplace=True), 3, stride=2, padding=1)
         return relu(self.norm1(self.blocks(first)), inplace=True)
 

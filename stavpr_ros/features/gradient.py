@@ -1,9 +1,9 @@
 """
 Oriented-gradient features: no weights, no training, the default.
 
-Histograms of gradient orientation on a regular grid of overlapping cells, each normalised by the four
+Histograms of gradient orientation on a regular grid of overlapping cells, each normalized by the four
 2 x 2 blocks it lies in (after Dalal and Triggs, "Histograms of Oriented Gradients for Human Detection",
-CVPR 2005; one channel an orientation, the mean over the four normalisations). On a CPU they are computed
+CVPR 2005; one channel an orientation, the mean over the four normalizations). On a CPU they are computed
 picture by picture by a compiled kernel, elsewhere by torch for the whole batch.
 """
 
@@ -18,9 +18,9 @@ import torch
 from torch.nn.functional import avg_pool2d, pad
 
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features.backbone import setting
 from stavpr_ros.features.gradient_kernel import describe_picture
-from stavpr_ros.features.resize import check_method, resize_square
+from stavpr_ros.features.preprocessing import check_method, resize_square
+from stavpr_ros.features.registry import setting
 
 FLOOR = 1e-4  # squared gradient (intensities 0..1) below which a block counts as flat
 PER_THREAD = 8  # images at least: starting a thread takes as long as describing one or two
@@ -73,20 +73,20 @@ class Gradient:
         s = self.settings
         maps = np.empty((len(images), s.orientations, s.cells, s.cells), np.float32)
 
-        def describe(i: int) -> None:
+        def extract(i: int) -> None:
             describe_picture(self._prepare(images[i]), s.cell, s.signed, FLOOR, maps[i])
 
-        _on_threads(describe, len(images))
+        _on_threads(extract, len(images))
         return torch.from_numpy(maps)
 
     def _by_torch(self, images: Sequence[np.ndarray]) -> torch.Tensor:
-        grey = np.empty((len(images), self.settings.size, self.settings.size), np.uint8)
+        gray = np.empty((len(images), self.settings.size, self.settings.size), np.uint8)
 
         def prepare(i: int) -> None:
-            grey[i] = self._prepare(images[i])
+            gray[i] = self._prepare(images[i])
 
         _on_threads(prepare, len(images))
-        return feature_maps_by_torch(torch.from_numpy(grey).to(self._device), self.settings)
+        return feature_maps_by_torch(torch.from_numpy(gray).to(self._device), self.settings)
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         return resize_square(
@@ -110,32 +110,32 @@ def _on_threads(work: Callable[[int], None], count: int) -> None:
         list(pool.map(part, range(threads)))  # the list raises what a thread raised
 
 
-def feature_maps_by_torch(grey: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
+def feature_maps_by_torch(gray: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
     """
     Compute the feature maps of square pictures with torch's operators, on whatever device they are on.
 
-    :param grey: shape (n, size, size), uint8.
+    :param gray: shape (n, size, size), uint8.
     :returns: shape (n, orientations, cells, cells), float32.
     """
-    return _normalise(_histograms(grey, settings))
+    return _normalize(_histograms(gray, settings))
 
 
-def _histograms(grey: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
+def _histograms(gray: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
     """Pool the gradients by orientation over cells that overlap by half, (n, bins, cells, cells)."""
-    padded = pad(grey[:, None].float() / 255, (1, 1, 1, 1), mode='replicate')
+    padded = pad(gray[:, None].float() / 255, (1, 1, 1, 1), mode='replicate')
     dx = padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]
     dy = padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]
     period = 2 * math.pi if settings.signed else math.pi
     bins = settings.orientations
     position = (torch.atan2(dy, dx) * (bins / period)).remainder_(bins)
-    centres = torch.arange(bins, dtype=torch.float32, device=grey.device)
-    offset = (position - centres[None, :, None, None]).abs_()
+    centers = torch.arange(bins, dtype=torch.float32, device=gray.device)
+    offset = (position - centers[None, :, None, None]).abs_()
     share = torch.clamp_(1 - torch.minimum(offset, bins - offset), min=0)  # linear between two bins
     cell = settings.cell
     return avg_pool2d(share.mul_(torch.hypot(dx, dy)), 2 * cell, stride=cell, padding=cell // 2)
 
 
-def _normalise(histograms: torch.Tensor) -> torch.Tensor:
+def _normalize(histograms: torch.Tensor) -> torch.Tensor:
     """Multiply each cell by the mean of 1 / norm over the four 2 x 2 blocks that it is part of."""
     energy = pad((histograms**2).sum(dim=1, keepdim=True), (1, 1, 1, 1), mode='replicate')
     scale = torch.rsqrt(4 * avg_pool2d(energy, 2, stride=1) + FLOOR)

@@ -27,17 +27,17 @@ P0, P1, P2, P3, P4, P5, P6 = (
 FULL_SCALE = F(255)
 
 
-def describe_picture(grey: np.ndarray, cell: int, signed: bool, floor: float, maps: np.ndarray) -> None:
+def describe_picture(gray: np.ndarray, cell: int, signed: bool, floor: float, maps: np.ndarray) -> None:
     """
     Compute the feature maps of one picture.
 
-    :param grey: shape (size, size), uint8.
+    :param gray: shape (size, size), uint8.
     :param cell: side of a cell in pixels.
     :param signed: orientations cover the whole turn, else half of it.
     :param floor: squared gradient (intensities 0..1) below which a block counts as flat.
     :param maps: the answer is written here, shape (orientations, cells, cells), float32.
     """
-    padded = cv2.copyMakeBorder(grey, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    padded = cv2.copyMakeBorder(gray, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
     _feature_maps(padded, cell, F(1.0 if signed else 0.5), F(floor), maps)
 
 
@@ -46,9 +46,9 @@ def _feature_maps(padded: np.ndarray, cell: int, period: F, floor: F, maps: np.n
     orientations, cells = maps.shape[:2]
     chunks = np.empty((cells + 1, orientations, cells + 1), F)
     _sum_over_chunks(padded, cell, period, chunks)
-    energy = np.empty((cells + 2, cells + 2), F)  # with a border of one cell, equal to its neighbour
+    energy = np.empty((cells + 2, cells + 2), F)  # with a border of one cell, equal to its neighbor
     _chunks_to_cells(chunks, F(1) / (FULL_SCALE * F(4 * cell * cell)), maps, energy)
-    _normalise(maps, energy, floor)
+    _normalize(maps, energy, floor)
 
 
 @kernel
@@ -93,7 +93,7 @@ def _to_polar(
     """
     Turn a row of pixels (size + 2,) into the gradients' orientations and lengths (size,).
 
-    Orientations are counted in bins, 0..orientations; lengths in grey levels, central differences.
+    Orientations are counted in bins, 0..orientations; lengths in gray levels, central differences.
     """
     for x in range(position.shape[0]):
         dx = F(here[x + 2]) - F(here[x])
@@ -120,9 +120,9 @@ def _share_out(position: np.ndarray, magnitude: np.ndarray, columns: np.ndarray)
         share = position[x] - last
         column[x] += magnitude[x] * (share if share > F(0) else F(0))
     for b in range(columns.shape[0]):
-        column, centre = columns[b], F(b)
+        column, center = columns[b], F(b)
         for x in range(position.shape[0]):
-            share = F(1) - abs(position[x] - centre)
+            share = F(1) - abs(position[x] - center)
             column[x] += magnitude[x] * (share if share > F(0) else F(0))
 
 
@@ -145,7 +145,7 @@ def _chunks_to_cells(chunks: np.ndarray, factor: F, maps: np.ndarray, energy: np
 
 
 @kernel
-def _normalise(maps: np.ndarray, energy: np.ndarray, floor: F) -> None:
+def _normalize(maps: np.ndarray, energy: np.ndarray, floor: F) -> None:
     """Multiply each cell by the mean of 1 / norm over the four 2 x 2 blocks that it is part of."""
     cells = maps.shape[1]
     scale = energy  # in place: a block is read from its first cell on

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
-from stavpr_ros.features.backbone import setting
-from stavpr_ros.features.resize import check_method, resize_square
+from stavpr_ros.features.preprocessing import check_method, resize_square
+from stavpr_ros.features.registry import setting
 
 
 @dataclass(frozen=True)

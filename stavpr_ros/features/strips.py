@@ -13,7 +13,7 @@ def cut_strips(feature_maps: torch.Tensor, W: int) -> torch.Tensor:
     right; every strip is floor(Wf / W) columns wide.
 
     :param feature_maps: shape (n, C, H, Wf).
-    :returns: strip-major local features, shape (W, n, C * H * floor(Wf / W)), float32, not normalised.
+    :returns: strip-major local features, shape (W, n, C * H * floor(Wf / W)), float32, not normalized.
     :raises InputError: fewer columns than strips, or not four axes.
     """
     if feature_maps.ndim != 4:
@@ -28,7 +28,7 @@ def cut_strips(feature_maps: torch.Tensor, W: int) -> torch.Tensor:
     return strips.reshape(W, n, channels * height * width)
 
 
-def normalise(strips: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def normalize(strips: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """
     Split strips into directions and shares of the whole image's norm.
 

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from stavpr_ros.errors import SettingsError, UnavailableError
-from stavpr_ros.features.backbone import setting
 from stavpr_ros.features.batch import BatchMaker
 from stavpr_ros.features.onnx import OnnxSettings
-from stavpr_ros.features.published import check_hash
+from stavpr_ros.features.paper_networks import check_hash
+from stavpr_ros.features.registry import setting
 from stavpr_ros.features.weights import open_weights, promised_hash
 
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from torch import nn
 
-from stavpr_ros.features.published import PublishedNetwork
+from stavpr_ros.features.paper_networks import PublishedNetwork
 from stavpr_ros.features.weights import PublishedFile
 
 STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))  # convolutions' channels

@@ -14,7 +14,7 @@ SECOND = 1_000_000_000
 OVERTAKEN = SECOND // 10  # images less than this out of order overtook each other; the clock did not jump
 SIZE = (32, 24)  # width and height of the pictures compared: noise is averaged out, motion is not
 BLUR = 0.5  # pixels of the small picture
-FLAT = 1.0  # grey levels of deviation below which a picture shows nothing but noise
+FLAT = 1.0  # gray levels of deviation below which a picture shows nothing but noise
 
 
 @dataclass(frozen=True)
@@ -22,17 +22,17 @@ class KeyframeSettings:
     """
     Least differences between an image and the last keyframe; 0 = that rule is off.
 
-    All rules that are on must agree, but metres and degrees are one rule: moved so far *or* turned so much.
+    All rules that are on must agree, but meters and degrees are one rule: moved so far *or* turned so much.
 
     :param seconds: time between the two.
-    :param metres: way between where the two were taken.
+    :param meters: way between where the two were taken.
     :param degrees: angle by which the camera was turned, up to 180.
     :param change: :func:`image_change` of the two, up to 2.
     :raises SettingsError: a number that is negative, not finite or out of reach.
     """
 
     seconds: float = 0.0
-    metres: float = 0.0
+    meters: float = 0.0
     degrees: float = 0.0
     change: float = 0.0
 
@@ -54,26 +54,26 @@ class KeyframeSettings:
     @property
     def needs_poses(self) -> bool:
         """The rule of motion is on."""
-        return bool(self.metres or self.degrees)
+        return bool(self.meters or self.degrees)
 
 
-def small_grey(image: np.ndarray) -> np.ndarray:
+def small_gray(image: np.ndarray) -> np.ndarray:
     """
-    Return the small, blurred, grey picture by which images are compared.
+    Return the small, blurred, gray picture by which images are compared.
 
     :param image: RGB, uint8, shape (h, w, 3).
     :returns: float32, shape (24, 32).
     """
     small = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
-    grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(grey, (0, 0), BLUR))
+    gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(gray, (0, 0), BLUR))
 
 
 def image_change(a: np.ndarray, b: np.ndarray) -> float:
     """
-    Tell how much two pictures differ: 1 - their normalised cross-correlation, blind to brightness and gain.
+    Tell how much two pictures differ: 1 - their normalized cross-correlation, blind to brightness and gain.
 
-    :param a: of :func:`small_grey`, shape (24, 32), float32; so is b.
+    :param a: of :func:`small_gray`, shape (24, 32), float32; so is b.
     :returns: 0 (alike) to 2 (one is the other's negative); two flat pictures 0, one flat picture 1.
     """
     a, b = a - a.mean(), b - b.mean()
@@ -103,8 +103,8 @@ class KeyframeSelector:
         """Forget the last keyframe: the next image is one."""
         self._stamp = 0
         self._pose: np.ndarray | None = None
-        self._grey: np.ndarray | None = None
-        self._asked: tuple[np.ndarray, np.ndarray] | None = None  # the image asked about last, and its grey
+        self._gray: np.ndarray | None = None
+        self._asked: tuple[np.ndarray, np.ndarray] | None = None  # the image asked about last, and its gray
 
     def too_soon(self, stamp: int, pose: np.ndarray | None) -> str:
         """
@@ -120,7 +120,7 @@ class KeyframeSelector:
         """
         settings = self.settings
         if settings.needs_poses and pose is None:
-            return 'no odometry for this image, and the rule of motion (metres, degrees) is on'
+            return 'no odometry for this image, and the rule of motion (meters, degrees) is on'
         if settings.seconds and stamp and self._stamp:
             passed = stamp - self._stamp
             if -OVERTAKEN < passed < round(settings.seconds * SECOND):
@@ -137,10 +137,10 @@ class KeyframeSelector:
         :returns: the reason in words; empty if there is none.
         """
         least = self.settings.change
-        if not least or self._grey is None:
+        if not least or self._gray is None:
             return ''
-        self._asked = image, small_grey(image)
-        change = image_change(self._asked[1], self._grey)
+        self._asked = image, small_gray(image)
+        change = image_change(self._asked[1], self._gray)
         if change < least:
             return f'differs by {change:.4f} from the last keyframe: less than {least:g}'
         return ''
@@ -157,17 +157,17 @@ class KeyframeSelector:
         pose = None if pose is None else checked_pose(pose)
         # made even if the rule is off: it may be on when the next image comes
         asked, self._asked = self._asked, None
-        grey = asked[1] if asked is not None and asked[0] is image else small_grey(image)
-        self._stamp, self._pose, self._grey = stamp, pose, grey
+        gray = asked[1] if asked is not None and asked[0] is image else small_gray(image)
+        self._stamp, self._pose, self._gray = stamp, pose, gray
 
     def _not_moved(self, pose: np.ndarray, last: np.ndarray) -> str:
         rules = self.settings
         moved, turned = distance(pose, last), rotation(pose, last)
-        if (rules.metres and moved >= rules.metres) or (rules.degrees and turned >= rules.degrees):
+        if (rules.meters and moved >= rules.meters) or (rules.degrees and turned >= rules.degrees):
             return ''
         words = []
-        if rules.metres:
-            words.append(f'moved {moved:.3f} m of {rules.metres:g} m')
+        if rules.meters:
+            words.append(f'moved {moved:.3f} m of {rules.meters:g} m')
         if rules.degrees:
             words.append(f'turned {turned:.2f} of {rules.degrees:g} degrees')
         return ' and '.join(words) + ' since the last keyframe'

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from stavpr_ros.errors import InputError
-from stavpr_ros.features import Describer, FeatureSettings, LocalFeatures, Projection
+from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
 
 THUMBNAIL_WIDTH = 192  # pixels: enough to look at
 
@@ -21,7 +21,7 @@ class PlaceMap:
     :param projection: the random projection of the features, if they have one.
     :param stamps: when each place was seen, ns, shape (n,), int64; 0 = unknown.
     :param ids: external identifiers, n strings; '' = none.
-    :param poses: x y z (metres) and quaternion x y z w of each place, shape (n, 7), float64; a row of NaN =
+    :param poses: x y z (meters) and quaternion x y z w of each place, shape (n, 7), float64; a row of NaN =
         unknown for that place; None = unknown for all.
     :param thumbnails: a small JPEG of each place, n byte strings, an empty one = none of that place; empty =
         none kept.
@@ -77,14 +77,14 @@ class PlaceMap:
             return None
         return self.poses[place]
 
-    def describer(self, device: str = 'cpu', model: str = '') -> Describer:
+    def extractor(self, device: str = 'cpu', model: str = '') -> FeatureExtractor:
         """
-        Make the describer for queries: the one that this map's features were made with.
+        Make the extractor for queries: the one that this map's features were made with.
 
         :param model: where the network's file lies now, if it is not where it was.
         :raises FeatureMismatchError: the file is not the map's.
         """
-        return Describer.from_settings(self.settings, self.projection, device, model=model)
+        return FeatureExtractor.from_settings(self.settings, self.projection, device, model=model)
 
     def thumbnail(self, place: int) -> np.ndarray | None:
         """Return the small picture of a place, RGB (h, w, 3) uint8, or None."""

@@ -17,7 +17,7 @@ def checked_pose(pose: np.ndarray) -> np.ndarray:
     """
     Return a pose of our own memory whose quaternion has the norm 1.
 
-    :param pose: x y z (metres) and quaternion x y z w, shape (7,).
+    :param pose: x y z (meters) and quaternion x y z w, shape (7,).
     :returns: the same, float64.
     :raises InputError: another shape, values that are not finite, or a quaternion of zeros.
     """
@@ -26,7 +26,7 @@ def checked_pose(pose: np.ndarray) -> np.ndarray:
         raise InputError(f'pose has shape {own.shape}: expected 7 numbers, x y z and quaternion x y z w')
     norm = float(np.linalg.norm(own[3:]))
     if not np.isfinite(own).all() or not isfinite(norm):
-        raise InputError(f'pose {own.tolist()} is not finite: expected metres and a quaternion')
+        raise InputError(f'pose {own.tolist()} is not finite: expected meters and a quaternion')
     if norm == 0:
         raise InputError(f'pose {own.tolist()} has a quaternion of zeros: expected 0 0 0 1 for no rotation')
     own[3:] /= norm
@@ -34,7 +34,7 @@ def checked_pose(pose: np.ndarray) -> np.ndarray:
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the metres between two poses, each of shape (7,)."""
+    """Return the meters between two poses, each of shape (7,)."""
     return float(np.linalg.norm(a[:3] - b[:3]))
 
 
@@ -115,7 +115,7 @@ class Trajectory:
         Take in a pose; one of the same stamp is replaced.
 
         :param stamp: nanoseconds, above 0.
-        :param pose: x y z (metres) and quaternion x y z w, shape (7,).
+        :param pose: x y z (meters) and quaternion x y z w, shape (7,).
         :raises InputError: no such pose, or no stamp; nothing is changed then.
         """
         if stamp <= 0:

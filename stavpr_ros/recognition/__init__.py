@@ -1,6 +1,6 @@
-"""Recognition, frame by frame: query window, matcher, verdict."""
+"""Recognition, image by image: query window, matcher, match."""
 
-from stavpr_ros.recognition.candidates import Candidate
-from stavpr_ros.recognition.recogniser import Recogniser, Recognition, RecognitionSettings, Verdict
+from stavpr_ros.recognition.match import Candidate, Match, Status
+from stavpr_ros.recognition.recognizer import PlaceRecognizer, RecognizerSettings
 
-__all__ = ['Candidate', 'Recogniser', 'Recognition', 'RecognitionSettings', 'Verdict']
+__all__ = ['Candidate', 'Match', 'PlaceRecognizer', 'RecognizerSettings', 'Status']

@@ -1,45 +1,32 @@
-"""The nearest places of a window, one a neighbourhood: what a geometric check may choose from."""
+"""The nearest places of a window, one a nms_radius: what a geometric check may choose from."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from stavpr_ros.alignment.temporal import SequenceMatch
+from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.errors import InputError
-from stavpr_ros.recognition.cures import evidence, relative_distance
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """
-    A place that the window may show.
-
-    :param place: its index; the middle of the sequence that the window was matched with.
-    :param distance: on the scale of the answer's distance.
-    """
-
-    place: int
-    distance: float
+from stavpr_ros.recognition.match import Candidate
+from stavpr_ros.recognition.robust.options import evidence, relative_distance
 
 
 def ranked_candidates(
     nearest: SequenceMatch | None,
     sequences: tuple[np.ndarray, np.ndarray],
     count: int,
-    neighbourhood: int,
+    nms_radius: int,
     relative: bool,
 ) -> list[Candidate]:
     """
     Rank places by non-maximum suppression: around a place that is taken no other one is.
 
-    The first is the nearest sequence as it was answered, the second its runner-up. O(count x n).
+    The first is the nearest sequence as it was answered, the second its second best. O(count x n).
 
     :param nearest: the nearest sequence as it was answered; None if there is none.
     :param sequences: costs of all sequences, shape (n,), +inf where there is none, and their places, shape
         (n,), whole numbers, in any order; of equal costs the first is taken.
     :param count: most candidates, at least 0.
-    :param neighbourhood: candidates are more than so many places from each other.
+    :param nms_radius: candidates are more than so many places from each other.
     :param relative: the answer's distance is relative to chance; the others' are so by their evidence
         against the nearest.
     :raises InputError: count below 0.
@@ -52,7 +39,7 @@ def ranked_candidates(
     best = float(costs.min())
     found = [Candidate(nearest.middle, nearest.distance)]
     while len(found) < count:
-        costs[np.abs(places - found[-1].place) <= neighbourhood] = np.inf
+        costs[np.abs(places - found[-1].place) <= nms_radius] = np.inf
         at = int(np.argmin(costs))
         cost = float(costs[at])
         if math.isinf(cost):

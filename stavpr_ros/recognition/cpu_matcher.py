@@ -3,23 +3,23 @@
 import numpy as np
 import torch
 
-from stavpr_ros.alignment.kernels.cpu import products
-from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
-from stavpr_ros.alignment.similarity import tiled
-from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
-from stavpr_ros.alignment.temporal import (
+from stavpr_ros.alignment.cpu import dot
+from stavpr_ros.alignment.lm_dtw import (
     SequenceDistances,
     SequenceMatch,
     best_match,
     match_padded,
     trace_sequence,
 )
+from stavpr_ros.alignment.path import NO_PATH
+from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
+from stavpr_ros.alignment.similarity import tiled
+from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.recognition.window import DistanceWindow
+from stavpr_ros.recognition.sequence_buffer import DistanceWindow
 
 CACHE_LINE = 64  # bytes; vectors across two of them are read at half the speed
-NO_PATH = np.empty((0, 2), np.int32)
 
 
 def cut_cells(strips: torch.Tensor, cells: tuple[int, int]) -> torch.Tensor:
@@ -97,9 +97,9 @@ class CpuMatcher:
         queries = tiled(strips if self._cells is None else cut_cells(strips.cpu(), self._cells))
         out = np.empty((len(queries), self.places), np.float32)
         if self._cells is not None:
-            products.vertical_image_distances(self._map, queries, self._cell_a, self._a, self._band, out)
+            dot.vertical_image_distances(self._map, queries, self._cell_a, self._a, self._band, out)
         elif self._spatial.strategy in ('adaptive', 'vanilla'):
-            products.image_distances(self._map, queries, self._a, self._band, out)
+            dot.image_distances(self._map, queries, self._a, self._band, out)
         else:
             for x, query in enumerate(queries):
                 out[x] = self._compared(query, weights[:, x])
@@ -109,17 +109,17 @@ class CpuMatcher:
         """Distances of one image without DTW, (n,)."""
         W, n, _ = self._map.shape
         d = np.empty((len(query), W, n), np.float32)
-        products.strip_distances(self._map, query, d)
+        dot.strip_distances(self._map, query, d)
         if self._spatial.strategy == 'sliding_window':
             return image_distances(d[:W], self._spatial)
         similarity = 1 - torch.from_numpy(d).diagonal()[:, :W]  # (n, W)
         return (1 - (similarity * self._weights.T) @ weights).numpy()
 
-    def match(self, neighbourhood: int) -> tuple[SequenceMatch | None, np.ndarray]:
+    def match(self, nms_radius: int) -> tuple[SequenceMatch | None, np.ndarray]:
         """Return the nearest sequence and its warping path."""
         window = self._window.rows()
         self._matches = matches = match_padded(window, self.places, self._sequence.k)
-        nearest = best_match(matches, neighbourhood)
+        nearest = best_match(matches, nms_radius)
         if nearest is None:
             return None, NO_PATH
         return nearest, trace_sequence(window[:, : self.places], nearest.first, self._sequence.k).path

@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from stavpr_ros.alignment.kernels.cuda.compilation import Runtime, runtime
+from stavpr_ros.alignment.cuda.compilation import Runtime, runtime
+from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch, trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.similarity import holistic_distances
 from stavpr_ros.alignment.spatial import WINDOW
-from stavpr_ros.alignment.temporal import SequenceDistances, SequenceMatch, trace_sequence
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 
@@ -97,15 +97,15 @@ class CudaMatcher:
         """
         self._window.push(row)
 
-    def match(self, neighbourhood: int) -> tuple[SequenceMatch | None, np.ndarray]:
+    def match(self, nms_radius: int) -> tuple[SequenceMatch | None, np.ndarray]:
         """
         Find the window's sequence in the map.
 
-        :param neighbourhood: the runner-up's midpoint is more than so many places from the nearest one's.
+        :param nms_radius: the second best's midpoint is more than so many places from the nearest one's.
         :returns: the nearest sequence, None if there is none, and its warping path (window row, place), shape
             (m, 2), int32.
         """
-        return self._window.match(neighbourhood)
+        return self._window.match(nms_radius)
 
     def sequences(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the distances of the sequences matched last and their middle places."""
@@ -118,19 +118,19 @@ class _ImageDistances:
     def __init__(
         self, runtime: Runtime, strips: torch.Tensor, weights: torch.Tensor, settings: SpatialSettings
     ) -> None:
-        from stavpr_ros.alignment.kernels.cuda import spatial
+        from stavpr_ros.alignment.cuda import dtw
 
         self._runtime, self._strips, self._weights = runtime, strips, weights
         W = strips.shape[0]
         band = settings.band(W)
-        self._block, self._kernel = spatial.BLOCK, None
+        self._block, self._kernel = dtw.BLOCK, None
         self._sigma = np.float32(settings.sigma if settings.strategy == 'adaptive' else 0)
         if settings.strategy == 'sliding_window':
             if W < WINDOW:
                 raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')
-            self._kernel = spatial.sliding_window(W, WINDOW, band)
+            self._kernel = dtw.sliding_window(W, WINDOW, band)
         elif settings.strategy != 'none':
-            self._kernel = spatial.spatial_dtw(W, band)
+            self._kernel = dtw.spatial_dtw(W, band)
         self._half = strips.dtype != torch.float32
         self._in_pieces = self._half and not runtime.half_products
         self._workspace: tuple[torch.Tensor, Any] | None = None
@@ -219,19 +219,19 @@ class _Window:
     """
 
     def __init__(self, runtime: Runtime, places: int, settings: SequenceSettings) -> None:
-        from stavpr_ros.alignment.kernels.cuda import selection, temporal
+        from stavpr_ros.alignment.cuda import lm_dtw, selection
 
         l, k = int(settings.length), settings.k
-        block = temporal.BLOCK
+        block = lm_dtw.BLOCK
         blocks = -(-places // block)
         self._runtime, self._places, self._length, self._k = runtime, places, l, k
-        self._kernel, self._grid, self._block = temporal.lm_dtw(l, k, block), (blocks, 1), block
+        self._kernel, self._grid, self._block = lm_dtw.lm_dtw(l, k, block), (blocks, 1), block
         device = runtime.torch_device
 
         def array(count: int, dtype: torch.dtype) -> Any:
             return runtime.array(torch.zeros(max(1, count), dtype=dtype, device=device))
 
-        pitch = temporal.row_pitch(places, k, block)
+        pitch = lm_dtw.row_pitch(places, k, block)
         self._rows = torch.full((2 * l, pitch), torch.inf, device=device)
         slots = self._rows.view(2, l, pitch)
         self._slots = [slots[:, slot, :places] for slot in range(l)]
@@ -261,12 +261,12 @@ class _Window:
         self._slots[self._count % self._length].copy_(row)
         self._count += 1
 
-    def match(self, neighbourhood: int) -> tuple[SequenceMatch | None, np.ndarray]:
-        """Find the nearest start and its runner-up, and trace the path on the host."""
+    def match(self, nms_radius: int) -> tuple[SequenceMatch | None, np.ndarray]:
+        """Find the nearest start and its second best, and trace the path on the host."""
         no_path = np.empty((0, 2), np.int32)
         if self._places == 0:
             return None, no_path
-        apart = min(neighbourhood, self._places)  # no two midpoints are farther apart
+        apart = min(nms_radius, self._places)  # no two midpoints are farther apart
         first = self._count % self._length
         self._runtime.launch(
             self._kernel,
@@ -283,15 +283,15 @@ class _Window:
             return None, no_path
         path = trace_sequence(found.cells, 0, self._k).path
         path[:, 1] += found.start
-        runner_up = found.runner_up_start >= 0
-        middle = (2 * found.runner_up_start + found.runner_up_length - 1) // 2
+        second_best = found.second_best_start >= 0
+        middle = (2 * found.second_best_start + found.second_best_length - 1) // 2
         return SequenceMatch(
             first=found.start,
             last=found.start + found.length - 1,
             middle=(2 * found.start + found.length - 1) // 2,
             distance=found.distance,
-            runner_up_index=middle if runner_up else -1,
-            runner_up_distance=found.runner_up_distance if runner_up else float('nan'),
+            second_best_index=middle if second_best else -1,
+            second_best_distance=found.second_best_distance if second_best else float('nan'),
         ), path
 
     def sequences(self) -> tuple[np.ndarray, np.ndarray]:

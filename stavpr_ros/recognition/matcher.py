@@ -5,8 +5,8 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
-from stavpr_ros.alignment.temporal import SequenceMatch
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures
 
@@ -17,7 +17,7 @@ class Matcher(Protocol):
     """
     From a frame's local features to the nearest sequence of the map.
 
-    Nothing is checked here: see :class:`stavpr_ros.recognition.Recogniser`.
+    Nothing is checked here: see :class:`stavpr_ros.recognition.PlaceRecognizer`.
     """
 
     @property
@@ -51,11 +51,11 @@ class Matcher(Protocol):
     def reset(self) -> None:
         """Empty the window."""
 
-    def match(self, neighbourhood: int) -> tuple[SequenceMatch | None, np.ndarray]:
+    def match(self, nms_radius: int) -> tuple[SequenceMatch | None, np.ndarray]:
         """
-        Return the nearest sequence for a full window, with the runner-up, and its warping path.
+        Return the nearest sequence for a full window, with the second best, and its warping path.
 
-        :param neighbourhood: the runner-up's midpoint is more than so many places from the nearest one's.
+        :param nms_radius: the second best's midpoint is more than so many places from the nearest one's.
         :returns: None and an empty path where no sequence is possible; else path (m, 2), int32: position
             in the window, place.
         """

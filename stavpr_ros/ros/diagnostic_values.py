@@ -5,8 +5,8 @@ import re
 
 from diagnostic_msgs.msg import KeyValue
 
-from stavpr_ros.ros.health import Health
-from stavpr_ros.ros.statistics import RATE_WINDOW, Snapshot
+from stavpr_ros.pipeline.health import Health
+from stavpr_ros.pipeline.statistics import RATE_WINDOW, Snapshot
 
 INPUT_CAUSES = ('invalid', 'lost in transport', 'no odometry')
 """What the causes begin with that are shown with the input; the others are shown with the processing."""
@@ -51,12 +51,12 @@ def recognition_values(health: Health) -> dict[str, Value]:
         'threshold': health.threshold,
         'window': health.window,
         'length': health.length,
-        'last_verdict': snapshot.verdict or None,
+        'last_status': snapshot.status or None,
         'last_reason': snapshot.reason or None,
         'last_place': snapshot.place if snapshot.place >= 0 else None,
         'last_distance': snapshot.distance,
         'last_answer_age_s': snapshot.answered_age,
-        **{_key('verdicts', verdict): count for verdict, count in snapshot.verdicts.items()},
+        **{_key('statuses', status): count for status, count in snapshot.statuses.items()},
     }
 
 

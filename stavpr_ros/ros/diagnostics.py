@@ -6,6 +6,8 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from std_msgs.msg import Header
 
+from stavpr_ros.pipeline.health import Health
+from stavpr_ros.pipeline.statistics import RATE_WINDOW, Snapshot
 from stavpr_ros.ros.diagnostic_values import (
     input_values,
     key_values,
@@ -13,8 +15,6 @@ from stavpr_ros.ros.diagnostic_values import (
     processing_values,
     recognition_values,
 )
-from stavpr_ros.ros.health import Health
-from stavpr_ros.ros.statistics import RATE_WINDOW, Snapshot
 
 SILENCE = 2.0
 """Seconds without an image after which something is wrong with an active node's input."""
@@ -24,7 +24,7 @@ BUSY = 0.8
 
 JUDGED = ('match', 'no match')
 UNDECODED = ('invalid image', 'dropped', 'not ready', 'skipped')
-"""Verdicts on images, the latter on those that need not have been decoded."""
+"""Statuses on images, the latter on those that need not have been decoded."""
 
 NEXT_TRANSITION = {'unconfigured': 'configure', 'inactive': 'activate'}
 
@@ -133,7 +133,7 @@ def _invalid(snapshot: Snapshot) -> list[Finding]:
     kinds = ', '.join(f'{cause.removeprefix("invalid").lstrip(": ")} {n}' for cause, n in invalid.items())
     where = f'in the last {RATE_WINDOW} s were invalid ({kinds}): see the log'
     # A keyframe was decoded once: images that are compared with one do not come from a broken camera.
-    valid = sum(n for verdict, n in snapshot.recent_verdicts.items() if verdict not in UNDECODED)
+    valid = sum(n for status, n in snapshot.recent_statuses.items() if status not in UNDECODED)
     if valid or 'not a keyframe' in snapshot.recent_drops:
         return [(DiagnosticStatus.WARN, f'{_of(sum(invalid.values()), "image")} {where}')]
     return [
@@ -168,7 +168,7 @@ def _map(health: Health) -> list[Finding]:
 def _recognition(health: Health) -> list[Finding]:
     """What is to be said of the answers of an active node."""
     if health.operation == 'mapping':
-        return [(DiagnosticStatus.OK, 'mapping: images become places, none is recognised')]
+        return [(DiagnosticStatus.OK, 'mapping: images become places, none is recognized')]
     if health.map_state == 'loading' and not health.places:
         return [(DiagnosticStatus.OK, 'waiting for the map')]
     if health.missing:
@@ -176,20 +176,20 @@ def _recognition(health: Health) -> list[Finding]:
     if health.window < health.length:
         return [(DiagnosticStatus.OK, f'warming up: {health.window} of {health.length} images')]
     snapshot = health.snapshot
-    judged = sum(snapshot.recent_verdicts.get(verdict, 0) for verdict in JUDGED)
-    matched = snapshot.recent_verdicts.get('match', 0)
+    judged = sum(snapshot.recent_statuses.get(status, 0) for status in JUDGED)
+    matched = snapshot.recent_statuses.get('match', 0)
     share = f'{matched} of {_of(judged, "image")} matched in the last {RATE_WINDOW} s'
     return [(DiagnosticStatus.OK, '; '.join(filter(None, (share, _last_answer(snapshot)))))]
 
 
 def _last_answer(snapshot: Snapshot) -> str:
     """Return the last answer in words; empty if there was none."""
-    if not snapshot.verdict:
+    if not snapshot.status:
         return ''
     place = f', place {snapshot.place}' if snapshot.place >= 0 else ''
     distance = '' if math.isnan(snapshot.distance) else f', distance {snapshot.distance:.3f}'
     reason = f' ({snapshot.reason})' if snapshot.reason else ''
-    return f'last answer: {snapshot.verdict}{place}{distance}{reason}'
+    return f'last answer: {snapshot.status}{place}{distance}{reason}'
 
 
 def _processing(health: Health) -> list[Finding]:

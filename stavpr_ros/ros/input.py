@@ -24,9 +24,9 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.mapping.trajectory import Trajectory
+from stavpr_ros.pipeline.stamps import StampWatch
+from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros.messages import nanoseconds, odometry_pose
-from stavpr_ros.ros.stamps import StampWatch
-from stavpr_ros.ros.statistics import Statistics
 
 _REMEDIES = {
     'RELIABILITY': 'set qos_overrides.{topic}.subscription.reliability to best_effort, or make the publisher '
@@ -102,12 +102,12 @@ class ImageInput:
         hand_over: Callable[[Any, float], None],
         skip: Callable[[Any, str], None],
         restart: Callable[[str], None],
-        max_gap: float,
+        max_stamp_gap: float,
         max_rate: float,
     ) -> None:
         self._node, self._statistics = node, statistics
         self._hand_over, self._skip, self._restart = hand_over, skip, restart
-        self.stamps = StampWatch(max_gap)
+        self.stamps = StampWatch(max_stamp_gap)
         self.max_rate = max_rate
         self.remedy = ''
         self._last: float | None = None  # seconds, of the last image handed over
@@ -130,12 +130,12 @@ class ImageInput:
     def incompatible(self) -> int:
         """Publishers of the topic that are not heard because of their QoS."""
         asked, infos = self._subscription.qos_profile, self._node.get_publishers_info_by_topic(self.topic)
-        verdicts = (
+        statuses = (
             qos_check_compatible(info.qos_profile, asked)[0]
             for info in infos
             if info.topic_type == self._type
         )
-        return sum(verdict == QoSCompatibility.ERROR for verdict in verdicts)
+        return sum(status == QoSCompatibility.ERROR for status in statuses)
 
     @property
     def mistyped(self) -> str:

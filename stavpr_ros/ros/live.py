@@ -175,7 +175,7 @@ def _all_heard(folder: Path, images: int, loops: bool) -> bool:
         return False
     if not loops:
         return True
-    matches = sum(record['verdict'] == 'MATCH' for record in _records(folder / MATCHES))
+    matches = sum(record['status'] == 'MATCH' for record in _records(folder / MATCHES))
     return len(_lines(folder / CLOSURES)) >= matches
 
 

@@ -19,11 +19,11 @@ from stavpr_msgs.msg import (
     MapInfo,
     PlaceMatch,
 )
-from stavpr_ros.features import Describer
-from stavpr_ros.mapping import GrowingMap, PlaceMap
-from stavpr_ros.mapping.storage import VERSION
-from stavpr_ros.operation import Answer, Outcome, place_facts
-from stavpr_ros.recognition.candidates import Candidate as RankedPlace
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import GrowingMap, PlaceMap, place_at
+from stavpr_ros.mapping.map_file import VERSION
+from stavpr_ros.recognition import Candidate as RankedPlace
+from stavpr_ros.recognition import Match, Status
 
 SECOND = 1_000_000_000
 
@@ -53,56 +53,46 @@ def odometry_pose(message: Odometry) -> np.ndarray:
     return np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w])
 
 
-def blank_match(header: Header, answer: Answer, reason: str, threshold: float | None) -> PlaceMatch:
-    """Return an answer that names no place."""
-    return PlaceMatch(
+def match_message(
+    header: Header, match: Match, places: PlaceMap | GrowingMap | None = None
+) -> PlaceMatch:
+    """
+    Return the match as a message.
+
+    :param header: of the image.
+    :param places: the map that the indices of the match refer to.
+    """
+    message = PlaceMatch(
         header=header,
-        verdict=answer.value,
-        reason=reason,
-        place_index=-1,
-        newest_index=-1,
-        distance=math.nan,
-        threshold=math.nan if threshold is None else threshold,
+        status=match.status,
+        reason=match.reason,
+        place_index=match.place_index,
+        newest_index=match.image_index if match.status is Status.MAPPED else match.newest_index,
+        distance=match.distance,
+        threshold=match.threshold,
         sequence_first=-1,
         sequence_last=-1,
         sequence_middle=-1,
         window_first=header.stamp,
         window_middle=header.stamp,
         window_last=header.stamp,
-        runner_up_index=-1,
-        runner_up_distance=math.nan,
-        inliers=-1,
+        second_best_index=-1,
+        second_best_distance=math.nan,
+        inliers=match.inliers,
     )
-
-
-def match_message(header: Header, outcome: Outcome) -> PlaceMatch:
-    """
-    Return the answer to an image.
-
-    :param header: that of the image.
-    """
-    message = blank_match(header, outcome.answer, outcome.reason, outcome.threshold)
-    message.inliers = outcome.inliers
-    if outcome.answer is Answer.MAPPED:
-        message.newest_index = outcome.newest
-    recognition = outcome.recognition
-    if recognition is None:
-        return message
-    window = outcome.window
-    message.window_first = time_message(window[0])
-    message.window_middle = time_message(window[(len(window) - 1) // 2])
-    nearest = recognition.nearest
-    if nearest is None:
-        return message
-    message.distance = nearest.distance
-    message.sequence_first, message.sequence_last = nearest.first, nearest.last
-    message.sequence_middle = nearest.middle
-    message.path = [AlignedPair(query_index=q, map_index=m) for q, m in recognition.path.tolist()]
-    message.runner_up_index, message.runner_up_distance = nearest.runner_up_index, nearest.runner_up_distance
-    if outcome.answer is Answer.MATCH and outcome.places is not None:
-        message.place_index, message.newest_index = recognition.place, recognition.newest
-        place = place_facts(outcome.places, recognition.place)
-        newest = place_facts(outcome.places, recognition.newest)
+    if match.window_stamps:
+        stamps = match.window_stamps
+        message.window_first = time_message(stamps[0])
+        message.window_middle = time_message(stamps[(len(stamps) - 1) // 2])
+    if match.sequence is not None:
+        sequence = match.sequence
+        message.sequence_first, message.sequence_last = sequence.first, sequence.last
+        message.sequence_middle = sequence.middle
+        message.path = [AlignedPair(query_index=q, map_index=m) for q, m in match.path.tolist()]
+        message.second_best_index = sequence.second_best_index
+        message.second_best_distance = sequence.second_best_distance
+    if match.accepted and places is not None:
+        place, newest = place_at(places, match.place_index), place_at(places, match.newest_index)
         message.place_stamp, message.place_id = time_message(place.stamp), place.identifier
         message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
     return message
@@ -112,7 +102,7 @@ def candidate_messages(places: PlaceMap | GrowingMap, ranked: list[RankedPlace])
     """Return nearest places as messages."""
     messages = []
     for candidate in ranked:
-        facts = place_facts(places, candidate.place)
+        facts = place_at(places, candidate.place)
         messages.append(
             Candidate(
                 place_index=candidate.place,
@@ -124,45 +114,45 @@ def candidate_messages(places: PlaceMap | GrowingMap, ranked: list[RankedPlace])
     return messages
 
 
-def candidates_message(header: Header, outcome: Outcome) -> Candidates | None:
+def candidates_message(
+    header: Header, match: Match, places: PlaceMap | GrowingMap | None
+) -> Candidates | None:
     """Return the nearest places of a window, None where it has none."""
-    if not outcome.candidates or outcome.places is None:
+    if not match.candidates or places is None:
         return None
-    threshold = math.nan if outcome.threshold is None else outcome.threshold
-    listed = candidate_messages(outcome.places, list(outcome.candidates))
-    return Candidates(header=header, threshold=threshold, candidates=listed)
+    listed = candidate_messages(places, list(match.candidates))
+    return Candidates(header=header, threshold=match.threshold, candidates=listed)
 
 
-def loop_closure_message(header: Header, outcome: Outcome) -> LoopClosure | None:
+def loop_closure_message(
+    header: Header, match: Match, route: PlaceMap | GrowingMap | None
+) -> LoopClosure | None:
     """Return the loop that a match on the growing route closes; None if it is no such match."""
-    recognition, route = outcome.recognition, outcome.places
-    if outcome.answer is not Answer.MATCH or outcome.first_image < 0:
+    first = match.first_image_index
+    if not match.accepted or first < 0 or route is None or match.sequence is None:
         return None
-    assert recognition is not None
-    assert recognition.nearest is not None
-    assert route is not None
     pairs = []
-    for q, m in recognition.path.tolist():
-        later, earlier = outcome.first_image + q, int(m)
+    for q, m in match.path.tolist():
+        later, earlier = first + q, int(m)
         pairs.append(
             AlignedImages(
                 query_index=later,
-                query_stamp=time_message(place_facts(route, later).stamp),
+                query_stamp=time_message(place_at(route, later).stamp),
                 place_index=earlier,
-                place_stamp=time_message(place_facts(route, earlier).stamp),
+                place_stamp=time_message(place_at(route, earlier).stamp),
             )
         )
-    middle = outcome.first_image + (len(outcome.window) - 1) // 2
-    query, place = place_facts(route, middle), place_facts(route, recognition.place)
+    middle = first + (len(match.window_stamps) - 1) // 2
+    query, place = place_at(route, middle), place_at(route, match.place_index)
     message = LoopClosure(
         header=header,
         query_index=middle,
         query_stamp=time_message(query.stamp),
-        place_index=recognition.place,
+        place_index=match.place_index,
         place_stamp=time_message(place.stamp),
-        distance=recognition.nearest.distance,
-        threshold=recognition.threshold,
-        inliers=outcome.inliers,
+        distance=match.distance,
+        threshold=match.threshold,
+        inliers=match.inliers,
         pairs=pairs,
     )
     if query.pose is not None and place.pose is not None:
@@ -171,31 +161,32 @@ def loop_closure_message(header: Header, outcome: Outcome) -> LoopClosure | None
     return message
 
 
-def matched_pose_message(header: Header, outcome: Outcome, frame: str) -> PoseWithCovarianceStamped | None:
+def matched_pose_message(
+    header: Header, match: Match, places: PlaceMap | GrowingMap | None, frame: str
+) -> PoseWithCovarianceStamped | None:
     """
-    Return the pose of the place that the newest image was taken at; None without a match or a known pose.
+    Return the pose of the place where the newest image was taken; None without a match or a known pose.
 
     The covariance is diagonal: the variance of each coordinate over the poses of the two places before and
-    after it, since a match may be a place off, and at least (0.1 m)^2 and (0.1 rad)^2; the camera may besides
-    stand beside the way that the map was made on, which no place recognition tells.
+    after it, since a match may be a place off, and at least (0.1 m)^2 and (0.1 rad)^2. A lateral offset of
+    the camera from the mapped route is not observable by place recognition and not part of it.
 
     :param frame: of the map's poses.
     """
-    places, recognition = outcome.places, outcome.recognition
-    if outcome.answer is not Answer.MATCH or places is None or recognition is None:
+    if not match.accepted or places is None:
         return None
-    newest = recognition.newest
-    facts = place_facts(places, newest)
-    if facts.pose is None:
+    newest = match.newest_index
+    pose = place_at(places, newest).pose
+    if pose is None:
         return None
     first = places.first if isinstance(places, GrowingMap) else 0
     around = range(max(first, newest - 2), min(first + len(places), newest + 3))
-    near = [pose for pose in (place_facts(places, i).pose for i in around) if pose is not None]
+    near = [other for other in (place_at(places, i).pose for i in around) if other is not None]
     message = PoseWithCovarianceStamped()
     message.header.stamp, message.header.frame_id = header.stamp, frame
-    message.pose.pose = pose_message(facts.pose)
-    spread = np.var([pose[:3] for pose in near], axis=0)
-    turns = np.var([_rotation_between(facts.pose, pose) for pose in near], axis=0)
+    message.pose.pose = pose_message(pose)
+    spread = np.var([other[:3] for other in near], axis=0)
+    turns = np.var([_rotation_between(pose, other) for other in near], axis=0)
     message.pose.covariance[::7] = np.maximum(np.append(spread, turns), 0.01)
     return message
 
@@ -230,7 +221,7 @@ def map_info_message(
     state: str,
     path: str,
     places: PlaceMap | GrowingMap | None,
-    describer: Describer | None,
+    extractor: FeatureExtractor | None,
     stamp: Time,
 ) -> MapInfo:
     """
@@ -241,8 +232,8 @@ def map_info_message(
     message = MapInfo(
         header=Header(stamp=stamp), operation=operation, state=state, path=path, format_version=VERSION
     )
-    if describer is not None:
-        settings = describer.settings
+    if extractor is not None:
+        settings = extractor.settings
         message.features, message.settings = settings.kind, settings.to_json()
         message.strips = settings.strips
         message.projected = settings.projection is not None

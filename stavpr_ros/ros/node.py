@@ -19,6 +19,7 @@ from stavpr_msgs.msg import MapInfo
 from stavpr_ros.devices import why_no_cuda
 from stavpr_ros.errors import SettingsError, SourceError, StavprError
 from stavpr_ros.output_file import require_room
+from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros.executor import SlowCallbackGroup
 from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.parameter_table import declare_parameters
@@ -27,7 +28,6 @@ from stavpr_ros.ros.reporter import Reporter
 from stavpr_ros.ros.runtime import Runtime
 from stavpr_ros.ros.services import Services
 from stavpr_ros.ros.settings import NodeSettings, node_settings, unknown_parameters
-from stavpr_ros.ros.statistics import Statistics
 from stavpr_ros.ros.worker import PATIENCE
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -35,7 +35,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 class PlaceRecognitionNode(ManagedNode):
     """
-    Recognises where images were taken; publishes one ``~/match`` for each image on ``image``.
+    Recognizes where images were taken; publishes one ``~/match`` for each image on ``image``.
 
     A managed node: configuring loads the map and the model and compiles the kernels, activating subscribes,
     deactivating stops, cleaning up frees. With parameter ``autostart`` it configures and activates itself
@@ -170,7 +170,7 @@ class PlaceRecognitionNode(ManagedNode):
 
     def _configure(self) -> None:
         settings = self._settings
-        backend, wish = settings.engine.backend, settings.backend
+        backend, wish = settings.pipeline.backend, settings.backend
         reason = (why_no_cuda() or 'there is a device') if wish == 'auto' else 'as asked for'
         self.get_logger().info(f'backend {backend} ({reason})')
         _require_room(settings.save_path)
@@ -178,7 +178,7 @@ class PlaceRecognitionNode(ManagedNode):
             self._tell(MapInfo(operation=settings.operation, state='loading', path=settings.map_path))
         self._runtime = Runtime(self, settings, self.statistics)
         self._runtime.on_loading = self.publish_map_info
-        if missing := self._runtime.engine.missing:
+        if missing := self._runtime.pipeline.missing:
             self.get_logger().warning(f'waiting, no image can be matched: {missing}')
         self.publish_map_info()
         # what is there now stays: Python's collector would look through all of it again and again, half a
@@ -204,7 +204,7 @@ class PlaceRecognitionNode(ManagedNode):
                 self._tell(MapInfo(operation=self._settings.operation, state='none'))
         gc.unfreeze()
         gc.collect()  # runtime and worker refer to each other: the map would stay until Python tidies up
-        if self._settings.engine.backend == 'cuda':
+        if self._settings.pipeline.backend == 'cuda':
             import torch
 
             torch.cuda.empty_cache()

@@ -11,9 +11,9 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float32, Header, Int32
 
 from stavpr_msgs.msg import Candidates, LoopClosure, PlaceMatch
-from stavpr_ros.evaluation.overlay import match_image
-from stavpr_ros.operation import Answer, Outcome
-from stavpr_ros.operation.outcome import place_picture
+from stavpr_ros.mapping import GrowingMap, PlaceMap, place_thumbnail
+from stavpr_ros.pipeline.overlay import match_image
+from stavpr_ros.recognition import Match
 from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.messages import (
     candidates_message,
@@ -61,19 +61,26 @@ class Output:
             event_callbacks=PublisherEventCallbacks(incompatible_qos=refused),
         )
 
-    def publish(self, header: Header, outcome: Outcome, frame: str = '') -> PlaceMatch:
+    def publish(
+        self,
+        header: Header,
+        match: Match,
+        places: PlaceMap | GrowingMap | None = None,
+        frame: str = '',
+    ) -> PlaceMatch:
         """
-        Publish everything that is to be said of an image, its ``~/match`` last; return that.
+        Publish everything about one image, its ``~/match`` last; return that.
 
+        :param places: the map that the indices of the match refer to.
         :param frame: of the poses.
         """
-        answer = match_message(header, outcome)
+        message = match_message(header, match, places)
         try:
-            self._publish(answer, header, outcome, frame)
+            self._publish(message, match, places, frame)
         except rclpy_implementation.RCLError:
-            if self._node.context.ok():  # else ROS was shut down before the node: nobody hears anything
+            if self._node.context.ok():  # else ROS was shut down before the node
                 raise
-        return answer
+        return message
 
     @property
     def wants_candidates(self) -> bool:
@@ -85,20 +92,23 @@ class Output:
                 raise
             return False
 
-    def _publish(self, answer: PlaceMatch, header: Header, outcome: Outcome, frame: str) -> None:
-        if outcome.answer is Answer.MATCH:
-            self.place_index.publish(Int32(data=answer.place_index))
-            self.distance.publish(Float32(data=answer.distance))
-        for publisher, message in (
-            (self.loop_closure, loop_closure_message(header, outcome)),
-            (self.pose, matched_pose_message(header, outcome, frame)),
-            (self.candidates, candidates_message(header, outcome)),
+    def _publish(
+        self, message: PlaceMatch, match: Match, places: PlaceMap | GrowingMap | None, frame: str
+    ) -> None:
+        header = message.header
+        if match.accepted:
+            self.place_index.publish(Int32(data=message.place_index))
+            self.distance.publish(Float32(data=message.distance))
+        for publisher, more in (
+            (self.loop_closure, loop_closure_message(header, match, places)),
+            (self.pose, matched_pose_message(header, match, places, frame)),
+            (self.candidates, candidates_message(header, match, places)),
         ):
-            if message is not None:
-                publisher.publish(message)
-        if outcome.image is not None and self.match_image.get_subscription_count():
-            self.match_image.publish(image_message(header, drawn(outcome)))
-        self.match.publish(answer)
+            if more is not None:
+                publisher.publish(more)
+        if match.image is not None and self.match_image.get_subscription_count():
+            self.match_image.publish(image_message(header, drawn(match, places)))
+        self.match.publish(message)
 
     def close(self) -> None:
         """Destroy the publishers."""
@@ -107,23 +117,19 @@ class Output:
                 self._node.destroy_lifecycle_publisher(publisher)
 
 
-def drawn(outcome: Outcome) -> Any:
+def drawn(match: Match, places: PlaceMap | GrowingMap | None) -> Any:
     """
-    Draw an image beside the place that it is nearest to, with the verdict and the distance.
+    Draw an image beside its nearest place, with status and distance.
 
     :returns: RGB, uint8.
     """
-    recognition, places, image = outcome.recognition, outcome.places, outcome.image
-    assert image is not None
-    nearest = recognition.nearest if recognition is not None else None
-    matched = outcome.answer is Answer.MATCH
-    word = outcome.answer.name.lower().replace('_', ' ')
-    if recognition is None or nearest is None or places is None:
-        return match_image(image, None, f'{word} {outcome.reason}'.strip(), False)
-    place = recognition.newest if matched else nearest.middle
-    text = f'{word}: place {place}, distance {nearest.distance:.3f}'
-    if outcome.threshold is not None and not math.isnan(outcome.threshold):
-        text += f' (threshold {outcome.threshold:.3f})'
-    if outcome.inliers >= 0:
-        text += f', {outcome.inliers} inliers'
-    return match_image(image, place_picture(places, place), text, matched)
+    assert match.image is not None
+    if match.sequence is None or places is None:
+        return match_image(match.image, None, f'{match.status.label} {match.reason}'.strip(), False)
+    place = match.newest_index if match.accepted else match.sequence.middle
+    text = f'{match.status.label}: place {place}, distance {match.distance:.3f}'
+    if not math.isnan(match.threshold):
+        text += f' (threshold {match.threshold:.3f})'
+    if match.inliers >= 0:
+        text += f', {match.inliers} inliers'
+    return match_image(match.image, place_thumbnail(places, place), text, match.accepted)

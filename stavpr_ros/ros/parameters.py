@@ -8,10 +8,10 @@ from pathlib import Path
 
 from stavpr_ros.alignment.settings import STRATEGIES
 from stavpr_ros.devices import BACKENDS
-from stavpr_ros.features.backbone import KINDS
-from stavpr_ros.operation.settings import OPERATIONS
-from stavpr_ros.recognition.cures import MODES
+from stavpr_ros.features.registry import KINDS
+from stavpr_ros.pipeline.settings import OPERATIONS
 from stavpr_ros.recognition.matcher import PRECISIONS
+from stavpr_ros.recognition.robust.options import MODES
 from stavpr_ros.ros.parameter_table import (
     TABLE_HEAD,
     NodeParameter,
@@ -54,7 +54,7 @@ _WHAT = (
         'mode',
         'robust',
         '',
-        'How places are recognised: paper is STA-VPR as published; robust goes beyond it.',
+        'How places are recognized: paper is STA-VPR as published; robust goes beyond it.',
         choices=MODES,
     ),
     NodeParameter(
@@ -87,7 +87,7 @@ _INPUT = (
         (0.0, 1e4),
     ),
     NodeParameter(
-        'keyframe_seconds',
+        'keyframe_interval',
         0.0,
         's',
         'An image counts only so long after the last that counted; 0 = at once.',
@@ -95,19 +95,19 @@ _INPUT = (
         bounds=(0.0, 1e4),
     ),
     NodeParameter(
-        'keyframe_metres',
+        'keyframe_distance',
         0.0,
         'm',
-        'An image counts only when the camera has moved this far (or turned by keyframe_degrees) since the '
+        'An image counts only when the camera has moved this far (or turned by keyframe_angle) since the '
         'last that counted, by nav_msgs/Odometry on the topic odom; 0 = not asked.',
         'live',
         bounds=(0.0, 1e4),
     ),
     NodeParameter(
-        'keyframe_degrees',
+        'keyframe_angle',
         0.0,
         'degrees',
-        'See keyframe_metres; 0 = turning does not count.',
+        'See keyframe_distance; 0 = turning does not count.',
         'live',
         bounds=(0.0, 180.0),
     ),
@@ -116,12 +116,12 @@ _INPUT = (
         0.004,
         '',
         'An image counts only when it differs by this from the last that counted (1 - correlation of small '
-        'grey pictures), so that a robot that stands still does not fill the window; 0 = not asked.',
+        'gray pictures), so that a robot that stands still does not fill the window; 0 = not asked.',
         'live',
         bounds=(0.0, 2.0),
     ),
     NodeParameter(
-        'max_gap',
+        'max_stamp_gap',
         2.0,
         's',
         'A longer time between the stamps of two images is counted as a gap in the diagnostics.',
@@ -129,7 +129,7 @@ _INPUT = (
         bounds=(0.01, 1e6),
     ),
     NodeParameter(
-        'odometry_patience',
+        'odometry_timeout',
         0.5,
         's',
         'The newest odometry is taken for an image that is this much newer.',
@@ -146,7 +146,7 @@ _METHOD = (
         choices=STRATEGIES,
     ),
     NodeParameter(
-        'sigma', 1.0, '', 'How strongly a viewpoint change penalises diagonal steps.', bounds=(0.0, 100.0)
+        'sigma', 1.0, '', 'How strongly a viewpoint change penalizes diagonal steps.', bounds=(0.0, 100.0)
     ),
     NodeParameter(
         'xi',
@@ -170,10 +170,10 @@ _METHOD = (
         bounds=(1.01, 20.0),
     ),
     NodeParameter(
-        'neighbourhood',
+        'nms_radius',
         20,
         'places',
-        'The runner-up, and every candidate, is more than so many places from those that are nearer.',
+        'The second best, and every candidate, is more than so many places from those that are nearer.',
         bounds=(0, 1000000),
     ),
     NodeParameter('candidates', 10, 'places', 'Nearest places in ~/candidates.', 'live', (0, 1000)),

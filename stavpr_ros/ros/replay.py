@@ -223,6 +223,6 @@ class Replayer:
         if match.header != self._outstanding:
             return
         self._outstanding = None
-        if match.verdict == PlaceMatch.DROPPED:
+        if match.status == PlaceMatch.DROPPED:
             self.dropped += 1
             self.notify(f'image {self.published + 1} was dropped by the node: is another camera publishing?')

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 
+from stavpr_ros.pipeline.health import Health
 from stavpr_ros.ros.diagnostics import diagnostic_array
-from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.runtime import Runtime
 
 if TYPE_CHECKING:
@@ -62,10 +62,10 @@ def health(node: 'PlaceRecognitionNode') -> Health:
         operation=settings.operation,
         mode=settings.mode,
         max_places=settings.max_places,
-        backend=settings.engine.backend,
-        device=_device(settings.engine.backend),
+        backend=settings.pipeline.backend,
+        device=_device(settings.pipeline.backend),
         precision=settings.precision,
-        threshold=settings.engine.applied_threshold(settings.operation),
+        threshold=settings.pipeline.applied_threshold(settings.operation),
         **(_of_runtime(runtime) if runtime is not None else _unconfigured(node)),
     )
 
@@ -91,17 +91,17 @@ def _unconfigured(node: 'PlaceRecognitionNode') -> dict[str, Any]:
 
 def _of_runtime(runtime: Runtime) -> dict[str, Any]:
     """Return what there is to tell of a configured node only."""
-    engine, images, odometry = runtime.engine, runtime.images, runtime.odometry
-    places, describer = engine.places, engine.describer
-    needs_poses = engine.settings.keyframes.needs_poses  # else they are welcome, not needed
+    pipeline, images, odometry = runtime.pipeline, runtime.images, runtime.odometry
+    places, extractor = pipeline.places, pipeline.extractor
+    needs_poses = pipeline.settings.keyframes.needs_poses  # else they are welcome, not needed
     told = _UNCONFIGURED | {
         'queue': runtime.waiting,
-        'window': engine.window_fill,
-        'map_path': runtime.loading or engine.path,
-        'map_state': 'loading' if runtime.loading else engine.map_state,
+        'window': pipeline.window_fill,
+        'map_path': runtime.loading or pipeline.path,
+        'map_state': 'loading' if runtime.loading else pipeline.map_state,
         'places': 0 if places is None else len(places),
-        'features': '' if describer is None else describer.settings.kind,
-        'missing': engine.missing,
+        'features': '' if extractor is None else extractor.settings.kind,
+        'missing': pipeline.missing,
         'odometry': odometry.freshness() if odometry is not None and needs_poses else '',
     }
     if images is not None:

@@ -1,5 +1,6 @@
-"""What the node has while it is configured: the engine on its worker, the publishers, the inputs."""
+"""What the node has while it is configured: the pipeline on its worker, the publishers, the inputs."""
 
+import math
 import threading
 import time
 import traceback
@@ -11,15 +12,16 @@ from typing import Any, TypeVar
 
 from stavpr_msgs.msg import Candidate, MapInfo, PlaceMatch
 from stavpr_ros.errors import StavprError
-from stavpr_ros.operation import Answer, Engine, Outcome
-from stavpr_ros.operation.begin import LoadedMap, read_map
+from stavpr_ros.pipeline import Pipeline
+from stavpr_ros.pipeline.start import LoadedMap, read_map
+from stavpr_ros.pipeline.statistics import WAITING, Statistics
+from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.input import ImageInput, OdometryInput
 from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.messages import candidate_messages, map_info_message, match_message, nanoseconds
 from stavpr_ros.ros.output import Output
 from stavpr_ros.ros.saving import write_at_the_end, write_map
 from stavpr_ros.ros.settings import NodeSettings
-from stavpr_ros.ros.statistics import WAITING, Statistics
 from stavpr_ros.ros.worker import PATIENCE, Worker
 from stavpr_ros.threads import limit_threads
 
@@ -52,7 +54,7 @@ class Runtime:
         self._node, self._settings, self._statistics = node, settings, statistics
         self._images: ImageInput | None = None
         self._odometry: OdometryInput | None = None
-        self._epoch = self._engine_epoch = 0
+        self._epoch = self._pipeline_epoch = 0
         self._explained: set[str] = set()
         self._last_match: PlaceMatch | None = None
         self.loading = ''  # the map that is being loaded
@@ -61,18 +63,18 @@ class Runtime:
         self.on_loading: Callable[[], None] = lambda: None  # called when that has changed
         self._worker = Worker(self._answer, settings.queue_size)
         self._output = Output(node, settings.queue_size)
-        self._made: Engine | None = None
+        self._made: Pipeline | None = None
         try:
-            self._made = self._on_worker(lambda: self._make_engine(settings))
+            self._made = self._on_worker(lambda: self._make_pipeline(settings))
             if settings.map_path:
                 self.load(settings.map_path)
         except BaseException:
             self.close()
             raise
 
-    def _make_engine(self, settings: NodeSettings) -> Engine:
+    def _make_pipeline(self, settings: NodeSettings) -> Pipeline:
         limit_threads(settings.threads)
-        return Engine(settings.engine, settings.operation)
+        return Pipeline(settings.pipeline, settings.operation)
 
     def _on_worker(self, function: Callable[[], Result]) -> Result:
         """Have the worker call a function; give up when the node ends meanwhile."""
@@ -87,8 +89,8 @@ class Runtime:
             raise StavprError('the node is no longer configured') from None
 
     @property
-    def engine(self) -> Engine:
-        """The engine; only the worker may change it."""
+    def pipeline(self) -> Pipeline:
+        """The pipeline; only the worker may change it."""
         assert self._made is not None
         return self._made
 
@@ -106,14 +108,14 @@ class Runtime:
             self._hand_over,
             self._skip,
             self.restart,
-            s.max_gap,
+            s.max_stamp_gap,
             s.max_rate,
         )
 
     def deactivate(self) -> None:
         """Hear nothing more; images that wait are answered as dropped, what has grown is written."""
         self._hear_nothing()
-        write_at_the_end(self.engine, self._on_worker, self._settings.save_path, self._node.get_logger())
+        write_at_the_end(self.pipeline, self._on_worker, self._settings.save_path, self._node.get_logger())
 
     def close(self) -> None:
         """Hear, say and do nothing more."""
@@ -142,14 +144,14 @@ class Runtime:
         self._images = self._odometry = None
         for item in self._worker.clear():
             self._drop(
-                item.message, Answer.DROPPED, 'the node was deactivated before its turn', 'deactivated'
+                item.message, Status.DROPPED, 'the node was deactivated before its turn', 'deactivated'
             )
 
     def _update_odometry(self, settings: NodeSettings) -> None:
         """Subscribe to odometry where it is asked for, and only there."""
         wanted = settings.wants_odometry
         if wanted and self._odometry is None:
-            self._odometry = OdometryInput(self._node, settings.odometry_patience)
+            self._odometry = OdometryInput(self._node, settings.odometry_timeout)
         elif not wanted and self._odometry is not None:
             self._odometry.close()
             self._odometry = None
@@ -164,11 +166,11 @@ class Runtime:
         """
         path = settings.map_path if settings.map_path != self._settings.map_path else ''
         with self._loading(path) if path else nullcontext():
-            loaded = read_map(path, settings.engine) if path else None
+            loaded = read_map(path, settings.pipeline) if path else None
             if self._images is not None:
                 self._update_odometry(settings)  # may fail, and is easily undone
             try:
-                self._on_worker(lambda: self.engine.change(settings.engine, settings.operation, loaded))
+                self._on_worker(lambda: self.pipeline.change(settings.pipeline, settings.operation, loaded))
             except BaseException:
                 if self._images is not None:
                     self._update_odometry(self._settings)
@@ -177,7 +179,7 @@ class Runtime:
         if loaded is not None:
             self._tell(loaded)
         if self._images is not None:
-            self._images.max_rate, self._images.stamps.gap = settings.max_rate, settings.max_gap
+            self._images.max_rate, self._images.stamps.gap = settings.max_rate, settings.max_stamp_gap
 
     def load(self, path: str) -> None:
         """
@@ -186,8 +188,8 @@ class Runtime:
         :raises StavprError: the file, the model or the settings do not do; the old map stays.
         """
         with self._loading(path):
-            loaded = read_map(path, self._settings.engine)
-            self._on_worker(lambda: self.engine.use(loaded))
+            loaded = read_map(path, self._settings.pipeline)
+            self._on_worker(lambda: self.pipeline.use(loaded))
         self._tell(loaded)
 
     @contextmanager
@@ -213,18 +215,19 @@ class Runtime:
         )
 
     def save(self, path: str, overwrite: bool) -> int:
-        """Write the map; see :meth:`Engine.to_save`."""
-        return write_map(self.engine, self._on_worker, path, overwrite)
+        """Write the map; see :meth:`Pipeline.to_save`."""
+        return write_map(self.pipeline, self._on_worker, path, overwrite)
 
     def relocalize(self, count: int) -> tuple[PlaceMatch, list[Candidate]]:
-        """Return the answer for the window as it is, and candidates; see :meth:`Engine.relocalize`."""
+        """Return the answer for the window as it is, and candidates; see :meth:`Pipeline.relocalize`."""
 
         def ask() -> tuple[PlaceMatch, list[Candidate]]:
             # messages are made here, on the worker: a route may grow and forget before the next call
-            outcome, ranked = self.engine.relocalize(count)
+            match, ranked = self.pipeline.relocalize(count)
+            places = self.pipeline.places
             header = self._last_match.header if self._last_match is not None else PlaceMatch().header
-            listed = [] if outcome.places is None else candidate_messages(outcome.places, ranked)
-            return match_message(header, outcome), listed
+            listed = [] if places is None else candidate_messages(places, ranked)
+            return match_message(header, match, places), listed
 
         return self._on_worker(ask)
 
@@ -242,8 +245,8 @@ class Runtime:
         epoch = self._epoch
 
         def empty() -> None:
-            self._engine_epoch = epoch
-            self.engine.reset()
+            self._pipeline_epoch = epoch
+            self.pipeline.reset()
 
         self._on_worker(empty)
 
@@ -252,69 +255,72 @@ class Runtime:
     def _hand_over(self, message: Any, arrival: float) -> None:
         dropped = self._worker.put(_Item(message, arrival, self._epoch))
         if dropped is not None:
-            self._drop(dropped.message, Answer.DROPPED, 'newer images came before its turn', 'queue full')
+            self._drop(dropped.message, Status.DROPPED, 'newer images came before its turn', 'queue full')
             self._node.get_logger().warning(
                 'images come faster than they can be matched, some are dropped: see /diagnostics',
                 throttle_duration_sec=REPORT_PERIOD,
             )
 
     def _skip(self, message: Any, reason: str) -> None:
-        self._drop(message, Answer.SKIPPED, reason, 'max_rate')
+        self._drop(message, Status.SKIPPED, reason, 'max_rate')
 
-    def _drop(self, message: Any, answer: Answer, reason: str, cause: str) -> None:
+    def _drop(self, message: Any, status: Status, reason: str, cause: str) -> None:
         """Answer an image that is not looked at."""
         self._statistics.dropped(cause)
-        self._output.publish(message.header, Outcome(answer, reason, self.engine.threshold))
+        threshold = self.pipeline.threshold
+        threshold = math.nan if threshold is None else threshold
+        self._output.publish(message.header, Match(status, reason, threshold))
 
     def _answer(self, item: _Item) -> None:
         """Answer one image, on the worker's thread."""
-        if item.epoch < self._engine_epoch:
-            self._drop(item.message, Answer.DROPPED, 'the window was emptied before its turn', 'window reset')
+        if item.epoch < self._pipeline_epoch:
+            self._drop(item.message, Status.DROPPED, 'the window was emptied before its turn', 'window reset')
             return
-        if item.epoch > self._engine_epoch:
-            self._engine_epoch = item.epoch
-            self.engine.reset()
+        if item.epoch > self._pipeline_epoch:
+            self._pipeline_epoch = item.epoch
+            self.pipeline.reset()
         waited = time.monotonic() - item.arrival
         header = item.message.header
         stamp = nanoseconds(header.stamp)
         odometry = self._odometry  # another thread may take it away
         pose = odometry.trajectory.at(stamp) if odometry is not None else None
         # poses of a map are in the map's frame, those of a route that grows in the odometry's
-        grows = odometry is not None and self.engine.operation != 'localization'
+        grows = odometry is not None and self.pipeline.operation != 'localization'
         frame = odometry.frame if grows and odometry is not None else self._settings.map_frame
-        self.engine.ranking = self._output.wants_candidates
+        self.pipeline.ranking = self._output.wants_candidates
         try:
-            outcome = self.engine.process(item.message, stamp, pose)
+            match = self.pipeline.process(item.message, stamp, pose)
         except Exception as error:
             self._node.get_logger().error(f'an image could not be matched: {traceback.format_exc()}')
             reason = f'internal error: {type(error).__name__}: {error}'
-            outcome = Outcome(Answer.INVALID_IMAGE, reason, cause='internal error')
-        if outcome.answer is Answer.NOT_READY and self.loading:
-            outcome = replace(outcome, reason=f'map {self.loading} is being loaded')
-        self._publish(header, outcome, frame, waited)
+            match = Match(Status.INVALID_IMAGE, reason, cause='internal error')
+        if match.status is Status.NOT_READY and self.loading:
+            match = replace(match, reason=f'map {self.loading} is being loaded')
+        self._publish(header, match, frame, waited)
 
-    def _publish(self, header: Any, outcome: Outcome, frame: str, waited: float) -> None:
+    def _publish(self, header: Any, match: Match, frame: str, waited: float) -> None:
         began = time.monotonic()
-        match = self._output.publish(header, outcome, frame)
-        stages = {WAITING: waited, **outcome.stages, 'publishing': time.monotonic() - began}
-        if outcome.cause:
-            self._statistics.dropped(outcome.cause)
-        self._explain(outcome)
-        if outcome.recognition is not None or outcome.answer is Answer.MAPPED:
-            self._last_match = match
-            place = match.place_index if outcome.recognition is not None else match.newest_index
-            self._statistics.answered(outcome.answer.name, outcome.reason, place, match.distance, stages)
+        message = self._output.publish(header, match, self.pipeline.places, frame)
+        stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
+        if match.cause:
+            self._statistics.dropped(match.cause)
+        self._explain(match)
+        mapped = match.status is Status.MAPPED
+        if match.status in (Status.WARMING_UP, Status.NO_MATCH, Status.MATCH) or mapped:
+            self._last_match = message
+            place = message.newest_index if mapped else message.place_index
+            self._statistics.answered(match.status.name, match.reason, place, message.distance, stages)
 
-    def _explain(self, outcome: Outcome) -> None:
+    def _explain(self, match: Match) -> None:
         """Say what is wrong with an image, once for each kind of trouble."""
-        if outcome.answer is Answer.INVALID_IMAGE and outcome.cause not in self._explained:
-            self._explained.add(outcome.cause)
+        if match.status is Status.INVALID_IMAGE and match.cause not in self._explained:
+            self._explained.add(match.cause)
             self._node.get_logger().warning(
-                f'image skipped: {outcome.reason} (said once; /diagnostics counts "{outcome.cause}")'
+                f'image skipped: {match.reason} (said once; /diagnostics counts "{match.cause}")'
             )
-        elif outcome.answer is Answer.NOT_READY:
+        elif match.status is Status.NOT_READY:
             self._node.get_logger().warning(
-                f'images arrive, but cannot be matched: {outcome.reason}',
+                f'images arrive, but cannot be matched: {match.reason}',
                 throttle_duration_sec=REPORT_PERIOD,
             )
 
@@ -337,12 +343,12 @@ class Runtime:
 
     def map_info(self) -> MapInfo:
         """Describe the map that is in use."""
-        engine = self.engine
+        pipeline = self.pipeline
         return map_info_message(
-            engine.operation,
-            'loading' if self.loading else engine.map_state,
-            engine.path,
-            engine.places,
-            engine.describer,
+            pipeline.operation,
+            'loading' if self.loading else pipeline.map_state,
+            pipeline.path,
+            pipeline.places,
+            pipeline.extractor,
             self._node.get_clock().now().to_msg(),
         )

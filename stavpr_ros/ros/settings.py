@@ -9,9 +9,9 @@ from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.keyframes import KeyframeSettings
-from stavpr_ros.operation import EngineSettings
-from stavpr_ros.recognition.geometry import GeometricSettings
-from stavpr_ros.recognition.loop_closure import least_limit
+from stavpr_ros.pipeline import PipelineSettings
+from stavpr_ros.recognition.loop_closer import least_limit
+from stavpr_ros.recognition.verification import GeometricSettings
 from stavpr_ros.ros.parameters import BY_NAME
 
 _OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
@@ -23,16 +23,16 @@ class NodeSettings:
     The parameters as the node uses them.
 
     :param values: of all parameters, name to value.
-    :param engine: those that decide the answers; its backend is chosen.
+    :param pipeline: those that decide the answers; its backend is chosen.
     """
 
     values: Mapping[str, Any]
-    engine: EngineSettings
+    pipeline: PipelineSettings
 
     @property
     def wants_odometry(self) -> bool:
         """Poses are asked for: by the keyframes, or for the places of a growing map."""
-        return self.engine.keyframes.needs_poses or self.operation != 'localization'
+        return self.pipeline.keyframes.needs_poses or self.operation != 'localization'
 
     def __getattr__(self, name: str) -> Any:
         """Return the value of a parameter."""
@@ -70,14 +70,14 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
         raise SettingsError(
             f'geometric_check = {method} with thumbnail_width = 0: it compares images with those pictures'
         )
-    engine = EngineSettings(
+    pipeline = PipelineSettings(
         threshold=None if values['threshold'] < 0 else values['threshold'],
         spatial=spatial,
         sequence=SequenceSettings(values['sequence_length'], values['beta']),
         keyframes=KeyframeSettings(
-            values['keyframe_seconds'],
-            values['keyframe_metres'],
-            values['keyframe_degrees'],
+            values['keyframe_interval'],
+            values['keyframe_distance'],
+            values['keyframe_angle'],
             values['keyframe_change'],
         ),
         geometric=None if method == 'none' else GeometricSettings(method, values['min_inliers']),
@@ -85,7 +85,7 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
         **{
             name: values[name]
             for name in (
-                'neighbourhood',
+                'nms_radius',
                 'mode',
                 'precision',
                 'model_path',
@@ -99,7 +99,7 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
             )
         },
     )
-    return NodeSettings(dict(values), engine)
+    return NodeSettings(dict(values), pipeline)
 
 
 def _spatial(values: Mapping[str, Any]) -> SpatialSettings:

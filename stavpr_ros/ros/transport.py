@@ -17,7 +17,7 @@ def prepare_transport() -> None:
     """
     Give this process shared memory that holds images; call it before ``rclpy.init``.
 
-    The default segment of 512 KiB is smaller than one 640x480 colour image, and the publisher's segment is
+    The default segment of 512 KiB is smaller than one 640x480 color image, and the publisher's segment is
     what counts. A profile that the user has set stays; other middlewares do not read it.
 
     :raises UnavailableError: the package's share folder is not found.

@@ -20,7 +20,7 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
     :param path: a ROS 1 .bag file; a ROS 2 bag: its folder, or its .db3 or .mcap file.
     :param topic: with or without the leading slash.
     :returns: stamps of the headers (times of recording where they are 0), ns, shape (m,), int64, in order;
-        x y z (metres) and quaternion x y z w, shape (m, 7), float64, as they were recorded.
+        x y z (meters) and quaternion x y z w, shape (m, 7), float64, as they were recorded.
     :raises SourceError: the bag cannot be read, there is no such topic, or time goes back in it.
     """
     path = Path(path)

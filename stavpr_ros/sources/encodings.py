@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from stavpr_ros.errors import ImageError
-from stavpr_ros.sources.colour import convert, copy, demosaic, keep, nv24_to_rgb
+from stavpr_ros.sources.color import convert, copy, demosaic, keep, nv24_to_rgb
 from stavpr_ros.sources.files import check_pixels, decode_compressed, decode_file, flat_bytes
 
 __all__ = [
@@ -35,8 +35,8 @@ class Encoding:
     :param value_bytes: bytes per value, 1 or 2; of two only the more significant one is used.
     :param to_rgb: takes uint8 (rows, width, channels), a view of the message unless the values had two
         bytes; gives a new RGB array (height, width, 3), C-contiguous.
-    :param block: (rows, columns) of the pixels that share a colour: the size is a multiple of it.
-    :param chroma_rows: rows of ``step`` bytes with colour below the picture, per row of the picture.
+    :param block: (rows, columns) of the pixels that share a color: the size is a multiple of it.
+    :param chroma_rows: rows of ``step`` bytes with color below the picture, per row of the picture.
     """
 
     channels: int
@@ -68,11 +68,11 @@ ENCODINGS: dict[str, Encoding] = {
     'bgr16': Encoding(3, 2, _FROM_BGR),
     'rgba16': Encoding(4, 2, _FROM_RGBA),
     'bgra16': Encoding(4, 2, _FROM_BGRA),
-    # OpenCV's names; colour is BGR there, as cv_bridge has it
+    # OpenCV's names; color is BGR there, as cv_bridge has it
     '8UC1': Encoding(1, 1, _FROM_GREY),
     '8UC3': Encoding(3, 1, _FROM_BGR),
     '8UC4': Encoding(4, 1, _FROM_BGRA),
-    '16UC1': Encoding(1, 2, _FROM_GREY),  # industrial cameras mean grey by it; depth cameras do not
+    '16UC1': Encoding(1, 2, _FROM_GREY),  # industrial cameras mean gray by it; depth cameras do not
     '16UC3': Encoding(3, 2, _FROM_BGR),
     '16UC4': Encoding(4, 2, _FROM_BGRA),
     'bayer_rggb8': Encoding(1, 1, _FROM_RGGB),
@@ -109,7 +109,7 @@ def decode_image(
     valid when the message goes. Sixteen bits become eight by dropping the lower byte. YUV is taken as BT.601
     in the range of video, as cv_bridge does.
 
-    :param height: rows of the picture; NV12, NV21 and NV24 have rows of colour below them.
+    :param height: rows of the picture; NV12, NV21 and NV24 have rows of color below them.
     :param width: pixels per row.
     :param encoding: a key of :data:`ENCODINGS`.
     :param is_bigendian: byte order of 16 bit values.
@@ -167,7 +167,7 @@ def decode_compressed_message(message: Any) -> np.ndarray:
     Decode a ``sensor_msgs/CompressedImage``.
 
     The bytes decide which kind of file it is. What ``format`` says is needed twice: to refuse depth images,
-    and to find Bayer mosaics, which image_transport packs as they are into grey files.
+    and to find Bayer mosaics, which image_transport packs as they are into gray files.
 
     :param message: anything with ``format`` and ``data``.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
@@ -177,7 +177,7 @@ def decode_compressed_message(message: Any) -> np.ndarray:
     if 'compresseddepth' in message.format.lower() or _MEASUREMENTS.fullmatch(original):
         raise ImageError(
             f'compressed format {message.format!r} holds depth or measurements, not a picture: '
-            "choose the camera's colour or grey topic",
+            "choose the camera's color or gray topic",
             kind='depth',
         )
     try:
@@ -209,7 +209,7 @@ def _layout(encoding: str) -> Encoding:
     if _MEASUREMENTS.fullmatch(encoding):
         raise ImageError(
             f'encoding {encoding!r} holds depth or measurements, not a picture: expected one of {known}; '
-            "choose the camera's colour or grey topic",
+            "choose the camera's color or gray topic",
             kind='depth',
         )
     raise ImageError(
@@ -227,7 +227,7 @@ def _check_header(height: int, width: int, encoding: str, step: int, row: int) -
     if height % rows or width % columns:
         raise ImageError(
             f'{encoding} image of {width}x{height} pixels: expected a width that is a multiple of {columns} '
-            f'and a height that is a multiple of {rows}, since so many pixels share a colour; check the '
+            f'and a height that is a multiple of {rows}, since so many pixels share a color; check the '
             'camera driver',
             kind='size',
         )

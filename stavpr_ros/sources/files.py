@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from stavpr_ros.errors import ImageError
-from stavpr_ros.sources.colour import convert
+from stavpr_ros.sources.color import convert
 
 MAX_PIXELS = 64_000_000
 """Largest image that is decoded: a small file may claim a picture that fills the memory."""
@@ -27,7 +27,7 @@ def decode_compressed(data: Any) -> np.ndarray:
     """
     Decode the bytes of an image file: JPEG, PNG, BMP, TIFF, PNM, WebP.
 
-    Grey, 16 bit and transparent images come out as RGB uint8 too; a rotation that the camera noted (EXIF) is
+    Gray, 16 bit and transparent images come out as RGB uint8 too; a rotation that the camera noted (EXIF) is
     applied.
 
     :param data: the file's bytes: anything with the buffer protocol.
@@ -42,8 +42,8 @@ def decode_file(flat: np.ndarray, demosaic: Callable[[np.ndarray], np.ndarray] |
     Decode a file.
 
     :param flat: the file's bytes, shape (size,), uint8.
-    :param demosaic: makes RGB of a grey image (height, width), which is a Bayer mosaic; not called if the
-        file has colour.
+    :param demosaic: makes RGB of a gray image (height, width), which is a Bayer mosaic; not called if the
+        file has color.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
     :raises ImageError: see :func:`decode_compressed`.
     """
@@ -100,7 +100,7 @@ def _check_file(flat: np.ndarray) -> str:
 
 
 def _check_end_of_jpeg(data: bytes) -> None:
-    """Refuse half a picture, whose rest OpenCV before version 5 makes up in grey."""
+    """Refuse half a picture, whose rest OpenCV before version 5 makes up in gray."""
     # segment by segment: a thumbnail in one, and a video behind the picture, have the same two bytes
     at = 2
     while found := JPEG_MARKER.search(data, at):

@@ -1,0 +1,151 @@
+"""
+Local features times local features: the cosine distances of one image's strips to all strips of the map.
+
+A map's features are read once, a block of images at a time, and stay in the cache until the block's
+images are aligned: one frame costs little more than reading the map. In half width (float16) that is half
+as much; products and sums are float32 all the same.
+"""
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic, overload
+
+from stavpr_ros.alignment.cpu.dtw import align_lanes
+from stavpr_ros.alignment.cpu.dtw_steps import SLOT
+from stavpr_ros.alignment.cpu.simd import LANES, store
+from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
+
+TILE = 7  # query strips whose sums stay in registers: all of them, with the paper's W
+IMAGES = 256  # map images a thread takes at a time; a multiple of LANES
+FEW_IMAGES = 64  # likewise, where the distances of all cells are kept
+
+
+@intrinsic
+def _from_half(typing, bits):
+    """float32 of a float16 number, whose bits came as int16: one instruction for a whole vector."""
+
+    def generate(context, builder, signature, arguments):
+        return builder.fpext(builder.bitcast(arguments[0], ir.HalfType()), ir.FloatType())
+
+    return types.float32(bits), generate
+
+
+def widened(x):
+    """Return a float32 number as it is, the bits of a float16 number as float32."""
+
+
+@overload(widened)
+def _overload_widened(x):
+    if x is types.int16:
+        return lambda x: _from_half(x)  # noqa: PLW0108 numba asks for a function
+    return lambda x: x
+
+
+@reassociating_kernel
+def _dots(y, q, sums):
+    """Products of one map strip (d,) with TILE query strips (TILE, d)."""
+    q0, q1, q2, q3, q4, q5, q6 = q[0], q[1], q[2], q[3], q[4], q[5], q[6]
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = np.float32(0)
+    for t in range(y.shape[0]):
+        value = widened(y[t])
+        s0 += q0[t] * value
+        s1 += q1[t] * value
+        s2 += q2[t] * value
+        s3 += q3[t] * value
+        s4 += q4[t] * value
+        s5 += q5[t] * value
+        s6 += q6[t] * value
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6] = s0, s1, s2, s3, s4, s5, s6
+
+
+@kernel
+def _block_distances(features, query, first, count, d, sums):
+    """Distances of all query strips to those of ``count`` map images from ``first``, into d (rows, W, .)."""
+    for j in range(features.shape[0]):
+        for y in range(count):
+            for i in range(0, query.shape[0], TILE):
+                _dots(features[j, first + y], query[i : i + TILE], sums)
+                for t in range(TILE):
+                    d[i + t, j, y] = np.float32(1) - sums[t]
+
+
+@parallel_kernel
+def strip_distances(features, query, d):
+    """
+    Distances d[i, j, y] = 1 - <x_i, y_j>.
+
+    :param features: the map's unit-norm local features, shape (W, n, d), float32, or int16 that hold the
+        bits of float16 numbers.
+    :param query: those of one image, shape (R, d), float32; R is W rounded up to whole TILEs, zeros there.
+    :param d: shape (R, W, n), written.
+    """
+    n = features.shape[1]
+    for block in nb.prange((n + IMAGES - 1) // IMAGES):
+        first = block * IMAGES
+        count = min(IMAGES, n - first)
+        _block_distances(features, query, first, count, d[:, :, first:], np.empty(TILE, np.float32))
+
+
+@parallel_kernel
+def image_distances(features, queries, weights, xi, out):
+    """
+    Image distances S[W,W] / C[W,W] of Q images to all map images, from the features in one go.
+
+    :param features: as in :func:`strip_distances`.
+    :param queries: those of Q images, shape (Q, R, d), likewise.
+    :param weights, xi: as in :func:`stavpr_ros.alignment.cpu.dtw.align_lanes`.
+    :param out: shape (Q, m), written; m <= n: only so many map images are looked at.
+    """
+    W, n = features.shape[0], out.shape[1]
+    for block in nb.prange((n + IMAGES - 1) // IMAGES):
+        first = block * IMAGES
+        count = min(IMAGES, n - first)
+        d = np.empty((queries.shape[1], W, IMAGES), np.float32)
+        sums = np.empty(TILE, np.float32)
+        edge = np.empty((W + 1) * SLOT, np.float32)
+        lanes = np.empty(IMAGES, np.float32)
+        for x in range(queries.shape[0]):
+            _block_distances(features, queries[x], first, count, d, sums)
+            for at in range(0, count, LANES):
+                store(lanes, at, align_lanes(d.reshape(-1), at, W * IMAGES, IMAGES, weights, xi, edge))
+            out[x, first : first + count] = lanes[:count]
+
+
+@parallel_kernel
+def vertical_image_distances(features, queries, cell_weights, weights, xi, out):
+    """
+    Image distances where the distance of two strips is that of their cells, aligned from top to bottom.
+
+    :param features: unit-norm cells of the map, shape (W H, n, c), strip by strip, each from the top;
+        float32 or the bits of float16.
+    :param queries: those of Q images, shape (Q, R, c), float32; R is W H rounded up to whole TILEs.
+    :param cell_weights: a for each |I_c - c| of the H cells, shape (H,).
+    :param weights, xi: of the W strips, as in :func:`image_distances`.
+    :param out: shape (Q, n), written.
+    """
+    rows, n, _ = features.shape
+    H, W = cell_weights.shape[0], weights.shape[0]
+    for block in nb.prange((n + FEW_IMAGES - 1) // FEW_IMAGES):
+        first = block * FEW_IMAGES
+        count = min(FEW_IMAGES, n - first)
+        d = np.empty((queries.shape[1], rows, FEW_IMAGES), np.float32)
+        strips = np.empty((W, W, FEW_IMAGES), np.float32)
+        sums = np.empty(TILE, np.float32)
+        edge = np.empty((max(W, H) + 1) * SLOT, np.float32)
+        lanes = np.empty(FEW_IMAGES, np.float32)
+        cells, flat = d.reshape(-1), strips.reshape(-1)
+        for x in range(queries.shape[0]):
+            _block_distances(features, queries[x], first, count, d, sums)
+            for at in range(0, count, LANES):
+                for i in range(W):
+                    for j in range(max(0, i - xi + 1), min(W, i + xi)):
+                        corner = (i * H * rows + j * H) * FEW_IMAGES + at
+                        distance = align_lanes(
+                            cells, corner, rows * FEW_IMAGES, FEW_IMAGES, cell_weights, H, edge
+                        )
+                        store(flat, (i * W + j) * FEW_IMAGES + at, distance)
+                aligned = align_lanes(flat, at, W * FEW_IMAGES, FEW_IMAGES, weights, xi, edge)
+                store(lanes, at, aligned)
+            out[x, first : first + count] = lanes[:count]

@@ -1,0 +1,61 @@
+"""What the kernel chose, in one small buffer: written on the device, copied to the host once."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from stavpr_ros.alignment.cuda.compilation import Runtime
+
+WORDS = 6  # four places and two distances, in front of the window's cells
+
+
+@dataclass(frozen=True)
+class Selection:
+    """
+    The nearest start and its second best.
+
+    :param start, length: the nearest start s and its m; -1 and undefined where no path is finite.
+    :param distance: its q_m.
+    :param second_best_start, second_best_length, second_best_distance: the same of the second best; -1 for none.
+    :param cells: what the nearest start sees of the window, shape (l, k), float32, +inf past the map's end;
+        valid until the next fetch.
+    """
+
+    start: int
+    length: int
+    distance: float
+    second_best_start: int
+    second_best_length: int
+    second_best_distance: float
+    cells: np.ndarray
+
+
+class SelectionBuffer:
+    """
+    The buffer on the device, its twin on the host, and views of both.
+
+    :param runtime: what kernels run on.
+    :param l, k: rows of the window, columns that one start sees.
+    """
+
+    def __init__(self, runtime: Runtime, l: int, k: int) -> None:
+        size = 4 * (WORDS + l * k)
+        self._runtime, self._shape = runtime, (l, k)
+        self._device = torch.zeros(size, dtype=torch.uint8, device=runtime.torch_device)
+        self._host = runtime.host_buffer(size)
+        places, answer = self._device[:16].view(torch.int32), self._device[16:].view(torch.float32)
+        self.arguments: tuple[Any, Any] = (runtime.array(places), runtime.array(answer))
+        self._places = self._host[:16].view(torch.int32).numpy()
+        self._answer = self._host[16:].view(torch.float32).numpy()
+
+    def fetch(self) -> Selection:
+        """Copy the answer to the host and wait for it."""
+        self._runtime.fetch(self._device, self._host)
+        start, length, second_best_start, second_best_length = self._places.tolist()
+        distance, second_best_distance = self._answer[:2].tolist()
+        cells = self._answer[2:].reshape(self._shape)
+        return Selection(
+            start, length, distance, second_best_start, second_best_length, second_best_distance, cells
+        )

@@ -1,1 +1,0 @@
-"""The kernels, one folder a backend; twins have one name and give the same answers."""

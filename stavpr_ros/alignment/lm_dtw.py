@@ -1,0 +1,153 @@
+"""Temporal alignment: a window of query images against every place of the map, LM-DTW (section 4)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stavpr_ros.alignment.path import Alignment, trace
+from stavpr_ros.alignment.settings import SequenceSettings
+from stavpr_ros.checks import float_array, no_nan
+from stavpr_ros.errors import InputError
+
+
+@dataclass(frozen=True)
+class SequenceDistances:
+    """
+    The best sequence from every start.
+
+    :param distances: q_m of each start, shape (n,); +inf where no sequence is possible.
+    :param lengths: its number of map images m, shape (n,), int32; it spans s .. s + m - 1. 0 where none.
+    """
+
+    distances: np.ndarray
+    lengths: np.ndarray
+
+    @property
+    def middles(self) -> np.ndarray:
+        """Midpoint floor((first + last) / 2) of each start's sequence, shape (n,), int64."""
+        starts = np.arange(len(self.lengths))
+        return (2 * starts + self.lengths - 1) // 2
+
+
+@dataclass(frozen=True)
+class SequenceMatch:
+    """
+    The nearest sequence of the map, indices 0-based.
+
+    :param first, last: its first and last map image.
+    :param middle: the matched place: floor((first + last) / 2), or where a path says so itself, the place of
+        the window's middle image.
+    :param distance: its q_m.
+    :param second_best_index: midpoint of the nearest sequence outside the nms_radius; -1 if none.
+    :param second_best_distance: its distance; NaN if none.
+    """
+
+    first: int
+    last: int
+    middle: int
+    distance: float
+    second_best_index: int
+    second_best_distance: float
+
+    @property
+    def start(self) -> int:
+        """The start s, 0-based: the same as ``first``."""
+        return self.first
+
+    @property
+    def length(self) -> int:
+        """The number of map images m."""
+        return self.last - self.first + 1
+
+
+def padded_width(n: int, k: int) -> int:
+    """Columns that the kernel wants for n starts: whole blocks of lanes, and the last start's k images."""
+    from stavpr_ros.alignment.cpu.simd import LANES
+
+    return -(-n // LANES) * LANES + k - 1
+
+
+def match_padded(window: np.ndarray, n: int, k: int) -> SequenceDistances:
+    """
+    Match a window that lies ready for the kernel; nothing is checked (see :func:`match_sequence`).
+
+    :param window: shape (l, padded_width(n, k)), C-contiguous, +inf in the columns from n on.
+    """
+    from stavpr_ros.alignment.cpu.lm_dtw import lm_dtw
+
+    starts = window.shape[1] - k + 1
+    distances, lengths = np.empty(starts, window.dtype), np.empty(starts, np.int32)
+    lm_dtw(window, k, distances, lengths)
+    return SequenceDistances(distances[:n], lengths[:n])
+
+
+def _checked(distances: np.ndarray, settings: SequenceSettings) -> np.ndarray:
+    D = float_array(distances, 'image distances', 2)
+    if D.shape[0] != settings.length:
+        raise InputError(f'image distances have shape {D.shape}: expected l = {settings.length} rows')
+    return no_nan(D, 'image distances')
+
+
+def match_sequence(distances: np.ndarray, settings: SequenceSettings) -> SequenceDistances:
+    """
+    Find the best map sequence from every start.
+
+    :param distances: image distances D, shape (l, n), float32 or float64; row = query image, oldest
+        first. +inf bans a pair.
+    :returns: distance and length for each of the n starts.
+    :raises InputError: wrong shape or type, NaN.
+    """
+    D = _checked(distances, settings)
+    l, n = D.shape
+    window = np.full((l, padded_width(n, settings.k)), np.inf, D.dtype)
+    window[:, :n] = D
+    return match_padded(window, n, settings.k)
+
+
+def align_sequence(distances: np.ndarray, start: int, settings: SequenceSettings) -> Alignment:
+    """
+    Return the warping path of one start.
+
+    :param distances: image distances D, shape (l, n).
+    :param start: 0-based start s.
+    :returns: path of (query index, map index), both 0-based, map index counted from the map's start.
+    :raises InputError: wrong shape or type, NaN, a start outside the map.
+    """
+    D = _checked(distances, settings)
+    if not 0 <= start < D.shape[1]:
+        raise InputError(f'start {start} is outside the map of {D.shape[1]} places')
+    return trace_sequence(D, start, settings.k)
+
+
+def trace_sequence(window: np.ndarray, start: int, k: int) -> Alignment:
+    """Trace the path of one start in a window that is known to be good (see :func:`align_sequence`)."""
+    costs = np.ascontiguousarray(window[:, start : start + k])
+    alignment = trace(costs, 1.0, sum(costs.shape), free_end=True)
+    alignment.path[:, 1] += start
+    return alignment
+
+
+def best_match(matches: SequenceDistances, nms_radius: int) -> SequenceMatch | None:
+    """
+    Return the nearest sequence (the lowest start on a tie) and the second best; None if there is none.
+
+    :param nms_radius: the second best's midpoint is more than so many places from the nearest one's.
+    """
+    from stavpr_ros.alignment.cpu.lm_dtw import nearest_elsewhere
+
+    distances = matches.distances
+    if distances.size == 0:
+        return None
+    start = int(np.argmin(distances))
+    if not np.isfinite(distances[start]):
+        return None
+    middles = matches.middles
+    second = nearest_elsewhere(distances, matches.lengths, middles[start], nms_radius)
+    return SequenceMatch(
+        first=start,
+        last=start + int(matches.lengths[start]) - 1,
+        middle=int(middles[start]),
+        distance=float(distances[start]),
+        second_best_index=int(middles[second]) if second >= 0 else -1,
+        second_best_distance=float(distances[second]) if second >= 0 else float('nan'),
+    )

@@ -1,0 +1,1 @@
+"""The demonstration: a synthetic street, traversed twice, and its plots."""

@@ -1,0 +1,184 @@
+"""
+The layout of a made-up street: which building, hedge, tree and lamp stands where.
+
+A street is cut into cells of half a meter along its center line. For each of its four rows (the near and the
+far row on the left and on the right) a cell names the lot that stands there, so that the renderer finds what
+a ray meets without searching. Positions are (along the route, to the right of its center line), in meters.
+"""
+
+from dataclasses import dataclass
+from random import Random
+
+import numpy as np
+
+from stavpr_ros.errors import SettingsError
+
+CELL = 0.5  # meters of the route that share one entry of the tables
+VIEW = 260.0  # how far the renderer looks along the route, meters
+ROAD_HALF_WIDTH = 5.6  # two lanes and a row of parked cars on each side
+LEFT_NEAR, RIGHT_NEAR, LEFT_FAR, RIGHT_FAR = range(4)
+
+# Columns of the table of lots; kernels read them by number.
+(
+    LOT_START,
+    LOT_LENGTH,
+    LOT_SETBACK,
+    LOT_HEIGHT,
+    LOT_KIND,
+    LOT_RED,
+    LOT_GREEN,
+    LOT_BLUE,
+    LOT_GROUND_FLOOR,
+    LOT_FLOOR,
+    LOT_PITCH,
+    LOT_WINDOW,
+    LOT_STYLE,
+    LOT_GABLE,
+    LOT_SEED,
+    LOT_TRIM,
+) = range(16)
+BUILDING, SIDE_STREET, PARK = range(3)
+PLASTER, BRICK, OFFICE, HALL = range(4)
+
+# Columns of the table of things that stand in the street.
+THING_KIND, THING_ALONG, THING_ACROSS, THING_SIZE, THING_SEED = range(5)
+TREE, LAMP, SIGN, CAR, VAN = range(5)
+
+PALETTE = (
+    (0.74, 0.70, 0.62), (0.80, 0.76, 0.68), (0.62, 0.36, 0.28), (0.55, 0.29, 0.23), (0.82, 0.68, 0.44),
+    (0.70, 0.55, 0.36), (0.58, 0.62, 0.64), (0.44, 0.47, 0.50), (0.60, 0.67, 0.58), (0.78, 0.58, 0.48),
+    (0.86, 0.83, 0.78), (0.52, 0.58, 0.66), (0.47, 0.40, 0.36), (0.71, 0.46, 0.36), (0.88, 0.79, 0.58),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Street:
+    """
+    One street as the tables that the renderer reads.
+
+    :param length: meters that can be driven; the tables reach :data:`VIEW` further.
+    :param lots: one row per lot, columns LOT_*, shape (lots, 16), float64.
+    :param lot_of: lot in each cell of the four rows, shape (4, cells), int32.
+    :param curvature: curvature of the center line, positive to the right, shape (cells,), 1/meter.
+    :param things: trees, lamps, signs, shape (things, 5), columns THING_*, float64.
+    :param seed: what it grew from; also the seed of its ground.
+    """
+
+    length: float
+    lots: np.ndarray
+    lot_of: np.ndarray
+    curvature: np.ndarray
+    things: np.ndarray
+    seed: int
+
+
+def grow_street(seed: int, length: float, bends: float = 1.0) -> Street:
+    """
+    Make a street from a seed.
+
+    :param seed: any integer; equal seeds give equal streets on every machine.
+    :param length: meters that can be driven.
+    :param bends: factor on the curvature; 0 is a straight street.
+    :raises SettingsError: the length is not a positive number of meters.
+    """
+    if not 0 < length < 1e5:
+        raise SettingsError(f'length of the street is {length} m; expected more than 0 and less than 100000')
+    cells = int(np.ceil((length + VIEW) / CELL)) + 1
+    lots: list[tuple[float, ...]] = []
+    lot_of = np.zeros((4, cells), np.int32)
+    for row in range(4):
+        # `random()` alone is the same in every version of Python: nothing else of Random is used.
+        dice = Random(seed * 4 + row)
+        at = -int(dice.random() * 16)
+        while at < cells:
+            lot = _draw_lot(dice, row, at * CELL)
+            stop = at + int(lot[LOT_LENGTH] / CELL)
+            lot_of[row, max(at, 0) : stop] = len(lots)
+            lots.append(lot)
+            at = stop
+    table = np.array(lots, np.float64)
+    return Street(
+        length=length,
+        lots=table,
+        lot_of=lot_of,
+        curvature=_draw_curvature(Random(seed + 7919), cells) * bends,
+        things=_plant(Random(seed + 104729), table, lot_of),
+        seed=seed,
+    )
+
+
+def _between(dice: Random, low: float, high: float) -> float:
+    return low + (high - low) * dice.random()
+
+
+def _draw_lot(dice: Random, row: int, start: float) -> tuple[float, ...]:
+    """Draw one building, side street or park; its length is a whole number of cells."""
+    near = row in (LEFT_NEAR, RIGHT_NEAR)
+    kind = BUILDING
+    if near:
+        roll = dice.random()
+        kind = SIDE_STREET if roll < 0.1 else PARK if roll < 0.24 else BUILDING
+    style = (PLASTER, PLASTER, BRICK, BRICK, BRICK, OFFICE, HALL)[int(dice.random() * 7)]
+    length = _between(dice, 7, 19) if style != HALL else _between(dice, 14, 26)
+    height = {PLASTER: _between(dice, 6, 19), BRICK: _between(dice, 6, 21), OFFICE: _between(dice, 15, 32),
+              HALL: _between(dice, 5, 8)}[style]  # fmt: skip
+    setback = _between(dice, 15.0, 18.0)
+    gable = float(dice.random() < 0.3 and style in (PLASTER, BRICK))
+    if not near:
+        setback, height = _between(dice, 36, 46), height + _between(dice, 2, 9)
+    if kind == SIDE_STREET:
+        length, setback = _between(dice, 7, 11), 1e6
+    elif kind == PARK:
+        length, setback, height, gable = (
+            _between(dice, 9, 24),
+            _between(dice, 14.4, 15.8),
+            _between(dice, 0.8, 1.6),
+            0,
+        )
+    color = PALETTE[int(dice.random() * len(PALETTE))]
+    light = _between(dice, 0.82, 1.12)
+    return (start, round(length / CELL) * CELL, setback, height, kind, *(part * light for part in color),
+            _between(dice, 3.6, 4.6), _between(dice, 2.7, 3.6), _between(dice, 1.9, 3.9),
+            _between(dice, 0.38, 0.68), style, gable, int(dice.random() * 2**30), dice.random())  # fmt: skip
+
+
+def _draw_curvature(dice: Random, cells: int) -> np.ndarray:
+    """Draw a curvature (1/m) that changes gently: knots every 45 m, joined smoothly."""
+    step = round(45 / CELL)
+    knots = [_between(dice, -1, 1) * 0.009 for _ in range(cells // step + 3)]
+    at = np.arange(cells) / step
+    low = at.astype(int)
+    weight = (1 - np.cos((at - low) * np.pi)) / 2
+    values = np.array(knots)
+    return values[low] * (1 - weight) + values[low + 1] * weight
+
+
+def _plant(dice: Random, lots: np.ndarray, lot_of: np.ndarray) -> np.ndarray:
+    """Draw what stands on the pavements and in the parks."""
+    things = []
+    end = lot_of.shape[1] * CELL
+    for row, side in ((LEFT_NEAR, -1), (RIGHT_NEAR, 1)):
+        at, avenue = _between(dice, 0, 20), 0.0
+        while at < end:
+            kind = lots[lot_of[row, int(at / CELL)], LOT_KIND]
+            if kind == PARK:
+                things.append(
+                    (
+                        TREE,
+                        at,
+                        side * _between(dice, 16.5, 24),
+                        _between(dice, 0.9, 1.6),
+                        dice.random() * 2**30,
+                    )
+                )
+                at += _between(dice, 2.5, 6)
+                continue
+            avenue = avenue * 0.75 + dice.random() * 0.25  # trees come in groups
+            roll = dice.random()
+            if kind == BUILDING:
+                pick = TREE if roll < avenue * 0.9 else LAMP if roll < 0.65 else SIGN if roll < 0.78 else -1
+                if pick >= 0:
+                    size = _between(dice, 0.6, 1.1)
+                    things.append((pick, at, side * _between(dice, 6.1, 6.5), size, dice.random() * 2**30))
+            at += _between(dice, 7, 15)
+    return np.array(sorted(things, key=lambda thing: thing[1]), np.float64).reshape(-1, 5)

@@ -1,0 +1,276 @@
+"""Ground truth: which places of the map are right for each query image."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from stavpr_ros.errors import InputError
+from stavpr_ros.evaluation.ground_truth_files import read_pairs, read_poses
+
+CHUNK = 1_000_000  # pairs of poses compared at a time
+LISTED = 10  # images that an error names, of however many
+
+
+@dataclass(frozen=True, eq=False)
+class GroundTruth:
+    """
+    The accepted places of each query; make it with one of the constructors.
+
+    Tolerances are part of it: every place that counts as right is an accepted one.
+
+    :param N: number of query images.
+    :param n: number of places of the map.
+    :param keys: query * n + place of each accepted pair, sorted, each once, shape (M,), int64.
+    """
+
+    N: int
+    n: int
+    keys: np.ndarray
+
+    @classmethod
+    def from_pairs(cls, queries: np.ndarray, places: np.ndarray, N: int, n: int, tolerance: int = 0) -> Self:
+        """
+        Accept the given pairs.
+
+        :param queries: shape (M,), integers 0 .. N - 1, in any order.
+        :param places: shape (M,), integers 0 .. n - 1.
+        :param tolerance: so many places before and after an accepted one are accepted too.
+        :raises InputError: a pair outside N queries and n places.
+        """
+        queries, places = np.asarray(queries, np.int64), np.asarray(places, np.int64)
+        if N < 1 or n < 1:
+            raise InputError(f'ground truth of {N} queries in {n} places: expected at least one of each')
+        if queries.shape != places.shape or queries.ndim != 1:
+            raise InputError(
+                f'{queries.shape} queries and {places.shape} places: expected one of each a pair'
+            )
+        outside = (queries < 0) | (queries >= N) | (places < 0) | (places >= n)
+        if outside.any():
+            first = int(np.argmax(outside))
+            raise InputError(
+                f'ground truth pairs query {queries[first]} with place {places[first]}: expected queries '
+                f'0 .. {N - 1} and places 0 .. {n - 1}; is it that of other images, or counted from 1?'
+            )
+        return cls(N, n, np.unique(queries * n + places)).widened(tolerance)
+
+    @classmethod
+    def identity(cls, N: int, n: int, tolerance: int = 0) -> Self:
+        """
+        Accept the same index: both drives have equally many images, image for image of the same places.
+
+        :raises InputError: N and n differ.
+        """
+        if n != N:
+            raise InputError(
+                f'{N} query images and {n} places: the same index is the truth only where both are equally '
+                'many; give a file of accepted pairs'
+            )
+        return cls.from_pairs(np.arange(N), np.arange(n), N, n, tolerance)
+
+    @classmethod
+    def from_file(cls, path: str | Path, N: int, n: int, tolerance: int = 0) -> Self:
+        """
+        Read accepted pairs; queries and places are counted from 0.
+
+        * Text (.csv, .tsv, .txt): a line a pair, query and place, after a header or without one. A column
+          alone holds the place of query 0, 1, 2 and so on. A place of -1 = none in the map.
+        * Array (.npy, .npz with one array or one called ``truth``): shape (N, n), 0 or 1; else shape (M, 2),
+          pairs; or shape (N,), the place of each query, -1 = none.
+        * Black and white image, N high and n wide: white at row i, column j accepts place j for query i.
+          For loop closures, where both are one drive, see :meth:`loop_closures`.
+
+        :raises SourceError: the file cannot be read, or holds objects (pickles).
+        :raises InputError: it is that of other images: wrong size, or indices outside.
+        """
+        queries, places = read_pairs(Path(path), N, n)
+        try:
+            return cls.from_pairs(queries, places, N, n, tolerance)
+        except InputError as error:
+            raise InputError(f'{path}: {error}') from error
+
+    @classmethod
+    def from_poses(
+        cls, queries: np.ndarray, places: np.ndarray, meters: float, degrees: float | None = None
+    ) -> Self:
+        """
+        Accept places that are near and look the same way.
+
+        :param queries: x y z (meters), quaternion x y z w of each query, shape (N, 7).
+        :param places: the same of each place, shape (n, 7); a row of NaN = unknown, which accepts nothing.
+        :param meters: largest distance, >= 0.
+        :param degrees: largest angle between the two orientations, >= 0; None = any.
+        :raises InputError: a query whose pose is not known, or no place whose pose is; poses that are none.
+        """
+        query, place = _checked_poses(queries, 'query'), _checked_poses(places, 'map')
+        unknown = np.flatnonzero(np.isnan(query[:, 0]))
+        if len(unknown):
+            listed = ', '.join(map(str, unknown[:LISTED])) + (' ...' if len(unknown) > LISTED else '')
+            raise InputError(
+                f'{len(unknown)} of {len(query)} query images have no pose ({listed}): give poses of all, or '
+                'leave these images out'
+            )
+        if not meters >= 0 or (degrees is not None and not degrees >= 0):
+            raise InputError(f'{meters} meters and {degrees} degrees: expected numbers >= 0')
+        pairs = []
+        step = max(1, CHUNK // len(place))
+        for first in range(0, len(query), step):
+            part = query[first : first + step]
+            near = np.linalg.norm(part[:, None, :3] - place[None, :, :3], axis=2) <= meters
+            found = np.argwhere(near)
+            if degrees is not None:
+                # a quaternion and its negative are the same rotation: the angle is 2 acos |<p, q>|
+                cosines = np.abs(np.sum(part[found[:, 0], 3:] * place[found[:, 1], 3:], axis=1))
+                angles = 2 * np.degrees(np.arccos(np.minimum(cosines, 1)))
+                found = found[angles <= degrees + 1e-5]  # acos is coarse near 1
+            pairs.append(found + np.array([first, 0]))
+        accepted = np.concatenate(pairs)
+        return cls.from_pairs(accepted[:, 0], accepted[:, 1], len(query), len(place))
+
+    @classmethod
+    def from_pose_files(
+        cls,
+        queries: str | Path,
+        places: str | Path,
+        N: int,
+        n: int,
+        meters: float,
+        degrees: float | None = None,
+    ) -> Self:
+        """
+        Read poses, a line an image, as ``build_map --poses`` does, and compare them: :meth:`from_poses`.
+
+        :raises InputError: not one pose an image; degrees asked of poses that have no orientation.
+        """
+        poses = []
+        for path, count in ((queries, N), (places, n)):
+            found, oriented = read_poses(Path(path))
+            if len(found) != count:
+                raise InputError(f'{path} has {len(found)} poses for {count} images: give one each')
+            if degrees is not None and not oriented:
+                raise InputError(f'{path} has no orientations: leave degrees = {degrees} out')
+            poses.append(found)
+        return cls.from_poses(poses[0], poses[1], meters, degrees)
+
+    @property
+    def pairs(self) -> np.ndarray:
+        """Accepted pairs (query, place), sorted, shape (M, 2), int64."""
+        return np.stack([self.keys // self.n, self.keys % self.n], axis=1)
+
+    @cached_property
+    def has_match(self) -> np.ndarray:
+        """Tell which queries are in the map at all, shape (N,), bool."""
+        return self._counts > 0
+
+    @cached_property
+    def middles(self) -> np.ndarray:
+        """Return the middle one of each query's accepted places, shape (N,), int64; -1 = none."""
+        found = np.full(self.N, -1, np.int64)
+        ends = np.cumsum(self._counts)
+        at = (2 * ends - self._counts - 1) // 2
+        found[self.has_match] = self.keys[at[self.has_match]] % self.n
+        return found
+
+    @cached_property
+    def _counts(self) -> np.ndarray:
+        return np.bincount(self.keys // self.n, minlength=self.N)
+
+    def matrix(self) -> np.ndarray:
+        """Return all of it as an array for drawing, shape (N, n), bool: a byte a pair."""
+        matrix = np.zeros(self.N * self.n, bool)
+        matrix[self.keys] = True
+        return matrix.reshape(self.N, self.n)
+
+    def accepts(self, places: np.ndarray) -> np.ndarray:
+        """
+        Tell which answers are right.
+
+        :param places: the answer to each query, shape (N,), or several, shape (N, k); integers, -1 = none,
+            which is never right.
+        :returns: bool, of the same shape.
+        :raises InputError: another shape or type, or a place that the map does not have.
+        """
+        places = np.asarray(places)
+        if places.ndim not in (1, 2) or len(places) != self.N or not np.issubdtype(places.dtype, np.integer):
+            raise InputError(
+                f'answers are {places.dtype} of shape {places.shape}: expected integers, a row a query, '
+                f'({self.N},) or ({self.N}, k)'
+            )
+        if places.size and not (places.min() >= -1 and places.max() < self.n):
+            raise InputError(
+                f'answers {places.min()} .. {places.max()}: expected places 0 .. {self.n - 1}, or -1'
+            )
+        if not self.keys.size:
+            return np.zeros(places.shape, bool)
+        queries = np.arange(self.N).reshape(-1, *[1] * (places.ndim - 1))
+        wanted = queries * self.n + places
+        at = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
+        return (self.keys[at] == wanted) & (places >= 0)
+
+    def widened(self, tolerance: int) -> Self:
+        """Accept so many places before and after each accepted one as well."""
+        if not tolerance >= 0 or not float(tolerance).is_integer():
+            raise InputError(f'tolerance {tolerance}: expected a whole number of places >= 0')
+        if tolerance == 0:
+            return self
+        queries, places = self.pairs.T
+        around = places[:, None] + np.arange(-int(tolerance), int(tolerance) + 1)
+        inside = (around >= 0) & (around < self.n)
+        keys = (queries[:, None] * self.n + around)[inside]
+        return type(self)(self.N, self.n, np.unique(keys))
+
+    def select(self, indices: np.ndarray) -> Self:
+        """
+        Return the truth of a changed drive.
+
+        :param indices: which query is each image of it, shape (K,); may repeat and leave out.
+        """
+        indices = np.asarray(indices)
+        if indices.ndim != 1 or not indices.size or not np.issubdtype(indices.dtype, np.integer):
+            raise InputError(f'indices are {indices.dtype} of shape {indices.shape}: expected integers (K,)')
+        if indices.min() < 0 or indices.max() >= self.N:
+            raise InputError(f'indices {indices.min()} .. {indices.max()}: expected 0 .. {self.N - 1}')
+        counts = self._counts[indices]
+        firsts = np.searchsorted(self.keys, indices.astype(np.int64) * self.n)
+        # position of each pair in keys: its run's first, plus how far it is into the run
+        at = np.repeat(firsts - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+        rows = np.repeat(np.arange(len(indices)), counts)
+        return type(self)(len(indices), self.n, rows * self.n + self.keys[at] % self.n)
+
+    def loop_closures(self, exclude: int = 0) -> Self:
+        """
+        Return the truth for one drive that is its own map: of each pair, the later image is the query.
+
+        It does not matter which triangle of a square image is white, the lower one (row = query, as
+        RTAB-Map writes it), the upper one or both.
+
+        :param exclude: the newest so many images before the query are no places yet.
+        :raises InputError: N and n differ.
+        """
+        if self.n != self.N:
+            raise InputError(
+                f'{self.N} queries, {self.n} places: loop closures need one drive, as many of both'
+            )
+        if exclude < 0:
+            raise InputError(f'{exclude} excluded images: expected 0 or more')
+        pairs = self.pairs
+        later, earlier = pairs.max(axis=1), pairs.min(axis=1)
+        past = later - earlier > exclude
+        return type(self)(self.N, self.n, np.unique(later[past] * self.n + earlier[past]))
+
+
+def _checked_poses(poses: np.ndarray, name: str) -> np.ndarray:
+    """Return poses with quaternions of norm 1; rows of NaN, which are unknown, stay so."""
+    poses = np.array(poses, np.float64)
+    if poses.ndim != 2 or poses.shape[1] != 7 or not len(poses):
+        raise InputError(f'{name} poses have shape {poses.shape}: expected (images, 7)')
+    known = ~np.isnan(poses).all(axis=1)
+    lengths = np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+    if not np.isfinite(poses[known]).all() or not lengths.all():
+        raise InputError(f'{name} poses: expected finite numbers and quaternions other than 0')
+    if not known.any():
+        raise InputError(f'{name} poses: not one of {len(poses)} is known; give others')
+    poses[:, 3:] /= lengths
+    return poses

@@ -1,0 +1,174 @@
+"""The paper's experiments as configurations: one is a column of a table, a drive with features is a row."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from stavpr_ros.alignment import SequenceSettings, SpatialSettings
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.evaluation.curves import Metrics, Ranking, evaluate_ranking
+from stavpr_ros.evaluation.evaluate import evaluate_on_map
+from stavpr_ros.evaluation.paper.datasets import Dataset
+from stavpr_ros.evaluation.seqslam import SeqSlamSettings, seqslam
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import PlaceMap, build_map
+from stavpr_ros.recognition import RecognizerSettings
+from stavpr_ros.recognition.robust.options import PAPER, ROBUST, RobustOptions
+
+W = 7
+GRP, XI = 512, 3  # the paper's random projection and restricted alignment
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """
+    One way to recognize places.
+
+    :param name: how the published numbers call it, see :mod:`stavpr_ros.evaluation.paper.published`.
+    :param title: head of its column.
+    :param temporal: sequences; False = single images.
+    :param strips: W.
+    :param projection: dimensions of a random projection, None without.
+    :param robust_options: those of the recognizer, None for those of the mode.
+    :param baseline: ``seqslam``: that instead, with the length of the sequence settings.
+    """
+
+    name: str
+    title: str
+    spatial: SpatialSettings = field(default_factory=SpatialSettings)
+    sequence: SequenceSettings = field(default_factory=SequenceSettings)
+    temporal: bool = True
+    strips: int = W
+    projection: int | None = None
+    robust_options: RobustOptions | None = None
+    baseline: str = ''
+
+
+NO_ALIGNMENT = SpatialSettings('none')
+STA_VPR = Configuration('sta_vpr', 'STA-VPR')
+FAST = Configuration('sta_vpr_fast', 'GRP + RA', SpatialSettings(xi=XI), projection=GRP)
+
+PRESETS: dict[str, tuple[Configuration, ...]] = {
+    'paper': (
+        Configuration('seqslam', 'SeqSLAM', baseline='seqslam'),
+        Configuration('no_alignment', 'no alignment', NO_ALIGNMENT, temporal=False),
+        STA_VPR,
+        FAST,
+    ),
+    'ablation': (
+        Configuration('no_alignment', 'none', NO_ALIGNMENT, temporal=False),
+        Configuration('spatial', 'only spatial', temporal=False),
+        Configuration('temporal', 'only temporal', NO_ALIGNMENT),
+        replace(STA_VPR, title='both'),
+    ),
+    'strategies': (
+        Configuration('sliding_window', 'sliding window', SpatialSettings('sliding_window')),
+        Configuration('vanilla', 'vanilla DTW', SpatialSettings('vanilla')),
+        Configuration('adaptive', 'adaptive DTW'),
+    ),
+    'fast': (
+        replace(STA_VPR, title='plain'),
+        Configuration('grp', 'GRP', projection=GRP),
+        Configuration('ra', 'RA', SpatialSettings(xi=XI)),
+        FAST,
+    ),
+    'robust_options': (
+        replace(STA_VPR, robust_options=PAPER),
+        Configuration('robust', 'robust', robust_options=ROBUST),
+        *(
+            Configuration(f'without_{option.name}', f'without {option.name}', robust_options=ROBUST.without(option.name))
+            for option in fields(RobustOptions)
+        ),
+    ),
+}
+SWEEPS: dict[str, tuple[float, ...]] = {
+    'l': (5, 10, 15, 20, 30, 40),
+    'beta': (1.25, 1.5, 2, 2.5, 3),
+    'xi': (1, 2, 3, 4, 5, 6, 7),
+    'sigma': (0, 0.25, 0.5, 1, 2, 4),
+    'W': (4, 5, 7, 10, 14),
+}
+
+
+def sweep_configurations(parameter: str, values: Sequence[float] = ()) -> tuple[Configuration, ...]:
+    """
+    Vary one of the paper's parameters, all others at their defaults.
+
+    :param parameter: l, beta, xi, sigma or W.
+    :param values: those that are tried; the table ``SWEEPS`` without.
+    :raises SettingsError: no such parameter, or a value out of its range.
+    """
+    if parameter not in SWEEPS:
+        raise SettingsError(f'parameter {parameter!r} is unknown: take one of {", ".join(SWEEPS)}')
+    found = []
+    for value in values or SWEEPS[parameter]:
+        whole = parameter in ('l', 'xi', 'W')
+        if whole and not float(value).is_integer():
+            raise SettingsError(f'{parameter} = {value} must be a whole number')
+        title = f'{parameter} = {value:g}'
+        found.append(_changed(Configuration(f'{parameter}_{value:g}', title), parameter, value))
+    return tuple(found)
+
+
+def _changed(plain: Configuration, parameter: str, value: float) -> Configuration:
+    if parameter == 'W':
+        return replace(plain, strips=int(value))
+    if parameter == 'l':
+        return replace(plain, sequence=SequenceSettings(length=int(value)))
+    if parameter == 'beta':
+        return replace(plain, sequence=SequenceSettings(beta=value))
+    spatial = SpatialSettings(xi=int(value)) if parameter == 'xi' else SpatialSettings(sigma=value)
+    return replace(plain, spatial=spatial)
+
+
+class Bench:
+    """
+    One data set with one kind of features; descriptions are kept, since several columns want the same.
+
+    :param dataset: where the images are.
+    :param kind, backbone: of the features, see :class:`stavpr_ros.features.FeatureExtractor`.
+    :param mode: of the recognizer, ``paper`` or ``robust``.
+    """
+
+    def __init__(
+        self, dataset: Dataset, kind: str, backbone: Any, mode: str = 'paper', device: str = 'cpu'
+    ) -> None:
+        self._dataset, self._kind, self._backbone = dataset, kind, backbone
+        self._mode, self._device = mode, device
+        self._described: dict[tuple[int, int | None], tuple[PlaceMap, PlaceMap]] = {}
+
+    def judge(self, configuration: Configuration, progress: bool = False) -> Metrics:
+        """Run one configuration."""
+        if configuration.baseline:
+            return self._judge_baseline(configuration)
+        reference, query = self._drives(configuration, progress)
+        settings = RecognizerSettings(
+            threshold=1.0,
+            spatial=configuration.spatial,
+            sequence=configuration.sequence,
+            mode=self._mode,
+            robust_options=configuration.robust_options,
+        )
+        evaluation = evaluate_on_map(reference, query.features, self._dataset.truth, settings)
+        return evaluation.sequence if configuration.temporal else evaluation.single
+
+    def _judge_baseline(self, configuration: Configuration) -> Metrics:
+        settings = SeqSlamSettings(length=configuration.sequence.length)
+        places, scores = seqslam(self._dataset.map, self._dataset.query, settings)
+        return evaluate_ranking(Ranking(places[:, None], scores), self._dataset.truth)
+
+    def _drives(self, configuration: Configuration, progress: bool) -> tuple[PlaceMap, PlaceMap]:
+        key = (configuration.strips, configuration.projection)
+        if key not in self._described:
+            extractor = FeatureExtractor(
+                self._kind,
+                self._backbone,
+                configuration.strips,
+                configuration.projection,
+                device=self._device,
+            )
+            self._described[key] = tuple(  # type: ignore[assignment]
+                build_map(source, extractor, thumbnails=False, progress=progress)
+                for source in (self._dataset.map, self._dataset.query)
+            )
+        return self._described[key]

@@ -1,0 +1,164 @@
+"""Building a map from a sequence of images."""
+
+from collections.abc import Generator, Iterable, Iterator, Sized
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.mapping.keyframes import KeyframeSelector, KeyframeSettings
+from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH, PlaceMap, encode_thumbnail
+from stavpr_ros.mapping.trajectory import Trajectory, checked_pose
+from stavpr_ros.sources.frame import Frame
+
+BATCH = 16  # images described at a time
+
+
+class _Place(NamedTuple):
+    """An image that becomes a place, its number in the source, and its pose if that is known."""
+
+    number: int
+    frame: Frame
+    pose: np.ndarray | None
+
+
+def extract_features(frames: Iterable[Frame], extractor: FeatureExtractor, progress: bool = True) -> LocalFeatures:
+    """
+    Describe every image of a sequence, in batches.
+
+    :param frames: a sequence of frames; its length, if it has one, scales the progress bar.
+    :returns: local features of all images.
+    :raises InputError: no images.
+    """
+    return build_map(frames, extractor, thumbnails=False, progress=progress).features
+
+
+def build_map(
+    frames: Iterable[Frame],
+    extractor: FeatureExtractor,
+    poses: np.ndarray | Trajectory | None = None,
+    thumbnails: bool = True,
+    progress: bool = True,
+    keyframes: KeyframeSettings | None = None,
+    thumbnail_width: int = THUMBNAIL_WIDTH,
+) -> PlaceMap:
+    """
+    Make a map with one place for each image, or for each keyframe.
+
+    The next images are decoded by another thread while the last ones are described.
+
+    :param frames: images in the order in which the route was driven.
+    :param extractor: makes their features; the map remembers its settings.
+    :param poses: of each image, shape (images, 7), see :class:`PlaceMap`; or by the images' stamps.
+    :param thumbnails: keep a small picture of each place.
+    :param progress: show a progress bar.
+    :param keyframes: which images become places; None = all.
+    :param thumbnail_width: of the small pictures, pixels.
+    :raises InputError: no images, none that became a place, or poses that do not fit.
+    :raises SettingsError: a rule of motion without poses.
+    """
+    keyframes = keyframes or KeyframeSettings()
+    if keyframes.needs_poses and poses is None:
+        raise SettingsError('keyframe meters or degrees without poses: give poses, or leave these rules out')
+    if thumbnail_width < 1:
+        raise SettingsError(f'thumbnail width {thumbnail_width} must be at least 1 pixel')
+    places = _places(frames, poses, keyframes)
+    features: list[LocalFeatures] = []
+    found: list[tuple[int, str, np.ndarray | None, bytes]] = []
+    total = len(frames) if isinstance(frames, Sized) else None
+    with (
+        closing(_batches_ahead(places)) as batches,
+        tqdm(total=total, unit='image', desc='describing', disable=None if progress else True) as bar,
+    ):
+        for batch in batches:
+            features.append(extractor.extract([place.frame.image for place in batch]))
+            for _, frame, pose in batch:
+                picture = encode_thumbnail(frame.image, thumbnail_width) if thumbnails else b''
+                found.append((frame.stamp, frame.identifier, pose, picture))
+            bar.update(batch[-1].number + 1 - bar.n)
+    stamps, ids, known, pictures = zip(*found, strict=True)
+    return PlaceMap(
+        features=LocalFeatures.concatenate(features).to('cpu'),
+        projection=extractor.projection,
+        stamps=np.array(stamps, np.int64),
+        ids=ids,
+        poses=_rows(known),
+        thumbnails=pictures if thumbnails else (),
+    )
+
+
+def _batches_ahead(places: Generator[_Place, None, None]) -> Generator[list[_Place], None, None]:
+    """Give batches; while one is used, the next is made by a thread of its own, always the same one."""
+
+    def take() -> list[_Place]:
+        return list(islice(places, BATCH))
+
+    with ThreadPoolExecutor(1, 'decoding') as pool:
+        try:
+            following = pool.submit(take)
+            while batch := following.result():
+                following = pool.submit(take)
+                yield batch
+        finally:
+            # a bag's database must be closed by the thread that opened it
+            pool.submit(places.close).result()
+
+
+def _places(
+    frames: Iterable[Frame], poses: np.ndarray | Trajectory | None, keyframes: KeyframeSettings
+) -> Generator[_Place, None, None]:
+    """Choose the images that become places."""
+    selector = KeyframeSelector(keyframes)
+    images, places, reason = 0, 0, ''
+    for number, (frame, pose) in enumerate(_with_poses(frames, poses)):
+        images += 1
+        reason = selector.too_soon(frame.stamp, pose) or selector.too_alike(frame.image)
+        if reason:
+            continue
+        if keyframes.any:
+            selector.accept(frame.stamp, pose, frame.image)
+        places += 1
+        yield _Place(number, frame, pose)
+    if not images:
+        raise InputError('no images to build a map from: the source is empty')
+    if not places:
+        raise InputError(f'none of {images} images became a place; the last one: {reason}')
+
+
+def _with_poses(
+    frames: Iterable[Frame], poses: np.ndarray | Trajectory | None
+) -> Iterator[tuple[Frame, np.ndarray | None]]:
+    if poses is None:
+        yield from ((frame, None) for frame in frames)
+    elif isinstance(poses, Trajectory):
+        yield from ((frame, poses.at(frame.stamp)) for frame in frames)
+    else:
+        if poses.ndim != 2 or poses.shape[1] != 7:
+            raise InputError(f'poses have shape {poses.shape}: expected (images, 7)')
+        count = 0
+        for count, frame in enumerate(frames, 1):
+            if count <= len(poses):
+                yield frame, _pose(poses[count - 1], f'image {count - 1} {frame.identifier!r}')
+        if count != len(poses):
+            raise InputError(f'{len(poses)} poses for {count} images: expected one each')
+
+
+def _pose(row: np.ndarray, name: str) -> np.ndarray | None:
+    if np.isnan(row).all():
+        return None
+    try:
+        return checked_pose(row)
+    except InputError as error:
+        raise InputError(f'{name}: {error}') from error
+
+
+def _rows(poses: Iterable[np.ndarray | None]) -> np.ndarray | None:
+    """Return poses as rows, NaN where one is unknown; None if all are."""
+    rows = [np.full(7, np.nan) if pose is None else pose for pose in poses]
+    table = np.array(rows, np.float64)
+    return None if np.isnan(table).all() else table

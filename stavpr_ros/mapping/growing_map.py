@@ -1,0 +1,223 @@
+"""A map that grows by one place at a time, while the robot drives."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.features import FeatureSettings, LocalFeatures, Projection
+from stavpr_ros.mapping.place_map import PlaceMap, require_projection
+from stavpr_ros.mapping.trajectory import checked_pose
+
+ROOM = 256  # places that there is room for at first; doubled when they are full
+
+
+class GrowingMap:
+    """
+    Places in the order in which they were added.
+
+    A place costs no rebuild: memory doubles when it is full, up to ``limit`` places. The oldest places may be
+    forgotten; a place that is number i here was number ``first`` + i of all that were added. Not for several
+    threads at once.
+
+    :param settings: how the features are made.
+    :param projection: the random projection of the features, if they have one.
+    :param limit: most places held at a time, at least 1.
+    :param cells: see :class:`LocalFeatures`; taken from the first place if not given.
+    :raises SettingsError: no room for a place.
+    :raises InputError: the projection is not that of the settings.
+    """
+
+    def __init__(
+        self,
+        settings: FeatureSettings,
+        projection: Projection | None,
+        limit: int,
+        cells: tuple[int, int] | None = None,
+    ) -> None:
+        if limit < 1:
+            raise SettingsError(f'limit = {limit} must be at least 1 place')
+        require_projection(projection, settings)
+        self.settings, self.projection, self.limit = settings, projection, limit
+        self._cells = cells
+        self._first = self._count = 0
+        self._strips = np.empty((settings.strips, 0, 0), np.float32)
+        self._weights = np.empty((settings.strips, 0), np.float32)
+        self._stamps = np.empty(0, np.int64)
+        self._poses = np.empty((0, 7))
+        self._ids: list[str] = []
+        self._thumbnails: list[bytes] = []
+
+    @classmethod
+    def from_map(cls, place_map: PlaceMap, limit: int) -> 'GrowingMap':
+        """
+        Continue a map; its content is copied.
+
+        :raises InputError: it has more places than the limit allows.
+        """
+        n = len(place_map)
+        if n > limit:
+            raise InputError(f'a map of {n} places does not fit into a limit of {limit}: raise the limit')
+        features = place_map.features.to('cpu')
+        growing = cls(place_map.settings, place_map.projection, limit, features.cells)
+        growing._make_room(max(n, min(ROOM, limit)), features.strips.shape[2])
+        growing._strips[:, :n], growing._weights[:, :n] = features.strips.numpy(), features.weights.numpy()
+        growing._stamps[:n] = place_map.stamps
+        growing._poses[:n] = np.nan if place_map.poses is None else place_map.poses
+        growing._ids = list(place_map.ids)
+        growing._thumbnails = list(place_map.thumbnails) or [b''] * n
+        growing._count = n
+        return growing
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def first(self) -> int:
+        """Number of places forgotten so far: the number of the oldest one that is held."""
+        return self._first
+
+    @property
+    def full(self) -> bool:
+        """There is no room for another place."""
+        return self._count >= self.limit
+
+    @property
+    def features(self) -> LocalFeatures:
+        """The features of all places: a view, valid until the map changes; strips (W, n, d)."""
+        n = self._count
+        strips, weights = torch.from_numpy(self._strips[:, :n]), torch.from_numpy(self._weights[:, :n])
+        return LocalFeatures(strips, weights, self.settings, self._cells)
+
+    @property
+    def stamps(self) -> np.ndarray:
+        """When each place was seen, ns, 0 = unknown: a view, shape (n,), int64."""
+        return self._stamps[: self._count]
+
+    @property
+    def poses(self) -> np.ndarray:
+        """Pose of each place, a row of NaN = unknown: a view, shape (n, 7), float64."""
+        return self._poses[: self._count]
+
+    @property
+    def ids(self) -> Sequence[str]:
+        """External identifiers, '' = none: not a copy."""
+        return self._ids
+
+    @property
+    def thumbnails(self) -> Sequence[bytes]:
+        """A small JPEG of each place, an empty one = none: not a copy."""
+        return self._thumbnails
+
+    @property
+    def has_stamps(self) -> bool:
+        """Some place has a stamp."""
+        return bool(np.any(self.stamps))
+
+    @property
+    def has_ids(self) -> bool:
+        """Some place has an external identifier."""
+        return any(self._ids)
+
+    @property
+    def has_poses(self) -> bool:
+        """Some place has a pose."""
+        return bool(np.isfinite(self.poses).any())
+
+    @property
+    def memory(self) -> int:
+        """Bytes held, the room for places to come included."""
+        arrays = (self._strips, self._weights, self._stamps, self._poses)
+        texts = sum(map(len, self._thumbnails)) + sum(map(len, self._ids))
+        return sum(array.nbytes for array in arrays) + texts
+
+    def add(
+        self,
+        features: LocalFeatures,
+        stamp: int = 0,
+        identifier: str = '',
+        pose: np.ndarray | None = None,
+        thumbnail: bytes = b'',
+    ) -> int:
+        """
+        Add a place; an error leaves everything as it was.
+
+        :param features: those of one image, strips (W, 1, d).
+        :param stamp: when it was seen, ns; 0 = unknown.
+        :param identifier: what others call it.
+        :param pose: x y z (meters) and quaternion x y z w, shape (7,); None = unknown.
+        :param thumbnail: a small JPEG, see :func:`encode_thumbnail`.
+        :returns: number of the place, counting all that were ever added.
+        :raises FeatureMismatchError: features made with other settings.
+        :raises InputError: the map is full; not one image; values that are not finite.
+        """
+        strips, weights = self._checked(features)
+        row = np.full(7, np.nan) if pose is None else checked_pose(pose)
+        n = self._count
+        if n == self._strips.shape[1]:
+            self._make_room(min(max(2 * n, ROOM), self.limit), strips.shape[1])
+        self._strips[:, n], self._weights[:, n] = strips, weights
+        self._stamps[n], self._poses[n] = stamp, row
+        if not n and not self._first and self._cells is None:
+            self._cells = features.cells
+        self._ids.append(identifier)
+        self._thumbnails.append(thumbnail)
+        self._count += 1
+        return self._first + n
+
+    def forget(self, count: int) -> None:
+        """
+        Drop the oldest places; those that stay are moved, so drop many at a time.
+
+        :raises InputError: there are not so many.
+        """
+        n = self._count
+        if not 0 <= count <= n:
+            raise InputError(f'{count} places cannot be forgotten: expected 0 to {n}')
+        for array in (*self._strips, *self._weights, self._stamps, self._poses):
+            array[: n - count] = array[count:n]
+        del self._ids[:count], self._thumbnails[:count]
+        self._first, self._count = self._first + count, n - count
+
+    def snapshot(self) -> PlaceMap:
+        """Return the map as it is now, in memory of its own."""
+        features = self.features
+        strips, weights = features.strips.clone(), features.weights.clone()
+        return PlaceMap(
+            features=dataclasses.replace(features, strips=strips, weights=weights),
+            projection=self.projection,
+            stamps=self.stamps.copy(),
+            ids=tuple(self._ids),
+            poses=None if np.isnan(self.poses).all() else self.poses.copy(),
+            thumbnails=tuple(self._thumbnails) if any(self._thumbnails) else (),
+        )
+
+    def _checked(self, features: LocalFeatures) -> tuple[np.ndarray, np.ndarray]:
+        """Return the strips (W, d) and weights (W,) of an image that fits."""
+        features.require_same_settings(self.settings, 'the map')
+        if len(features) != 1:
+            raise InputError(f'features of {len(features)} images came: expected those of one')
+        if self.full:
+            raise InputError(
+                f'the map is full, it has {self.limit} places: raise its limit, forget the oldest places or '
+                'save it and begin another'
+            )
+        strips, weights = features.strips[:, 0].cpu().numpy(), features.weights[:, 0].cpu().numpy()
+        d = self._strips.shape[2]
+        if d and strips.shape[1] != d:
+            raise InputError(f'strips of {strips.shape[1]} dimensions came: the map has {d}')
+        if not np.isfinite(strips).all() or not np.isfinite(weights).all():
+            raise InputError('the features are not finite: check the network and its input')
+        return strips, weights
+
+    def _make_room(self, room: int, d: int) -> None:
+        """Give every array room for so many places; all or none."""
+        n, W = self._count, self.settings.strips
+        strips, weights = np.empty((W, room, d), np.float32), np.empty((W, room), np.float32)
+        stamps, poses = np.empty(room, np.int64), np.empty((room, 7))
+        if n:
+            strips[:, :n], weights[:, :n] = self._strips[:, :n], self._weights[:, :n]
+            stamps[:n], poses[:n] = self._stamps[:n], self._poses[:n]
+        self._strips, self._weights, self._stamps, self._poses = strips, weights, stamps, poses

@@ -1,0 +1,112 @@
+"""The result for one image: its status, the nearest sequence of the map, the matched place."""
+
+import enum
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stavpr_ros.alignment.lm_dtw import SequenceMatch
+from stavpr_ros.alignment.path import NO_PATH, aligned_index
+
+
+class Status(enum.IntEnum):
+    """Status of one image; names and values are the constants of ``stavpr_msgs/PlaceMatch``."""
+
+    WARMING_UP = 0
+    NO_MATCH = 1
+    MATCH = 2
+    INVALID_IMAGE = 3
+    NOT_READY = 4
+    DROPPED = 5
+    SKIPPED = 6
+    MAPPED = 7
+
+    @property
+    def label(self) -> str:
+        """The name for people: ``no match``."""
+        return self.name.lower().replace('_', ' ')
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """
+    A place that the window may show.
+
+    :param place: its index, the middle of the sequence that the window was matched with.
+    :param distance: on the scale of :attr:`Match.distance`.
+    """
+
+    place: int
+    distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """
+    The result for one image; indices are 0-based places of the map.
+
+    The recognizer fills the first six fields, the pipeline the others.
+
+    :param status: only ``MATCH`` names a place.
+    :param reason: why there is no match, one sentence; empty for ``MATCH`` and ``MAPPED``.
+    :param threshold: a window is matched below it; NaN = not set.
+    :param sequence: the nearest sequence of the map, accepted or not; None where there is none.
+    :param path: its warping path, shape (m, 2), int32: position in the window, place.
+    :param relative: distances are relative to the chance level, 1
+        (:mod:`stavpr_ros.recognition.robust.options`).
+    :param window_stamps: stamps (ns) of the images in the window, oldest first, this one the last.
+    :param image_index: place of a growing map that this image has become, -1 = none.
+    :param inliers: of the geometric verification, -1 = not verified.
+    :param candidates: nearest places, nearest first.
+    :param cause: why the image is in no window, two or three words to be counted; '' = it is in one.
+    :param stages: seconds that each stage took.
+    :param image: the image, RGB, where it was decoded.
+    """
+
+    status: Status
+    reason: str = ''
+    threshold: float = math.nan
+    sequence: SequenceMatch | None = None
+    path: np.ndarray = field(default_factory=lambda: NO_PATH, repr=False)
+    relative: bool = False
+    window_stamps: tuple[int, ...] = field(default=(), repr=False)
+    image_index: int = -1
+    inliers: int = -1
+    candidates: tuple[Candidate, ...] = ()
+    cause: str = ''
+    stages: Mapping[str, float] = field(default_factory=dict, repr=False)
+    image: np.ndarray | None = field(default=None, repr=False)
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the image was matched."""
+        return self.status is Status.MATCH
+
+    @property
+    def place_index(self) -> int:
+        """The matched place, the middle of the matched sequence; -1 unless matched."""
+        return self.sequence.middle if self.sequence and self.accepted else -1
+
+    @property
+    def newest_index(self) -> int:
+        """The place aligned with the newest image; -1 unless matched."""
+        return aligned_index(self.path, int(self.path[-1, 0])) if self.accepted else -1
+
+    @property
+    def distance(self) -> float:
+        """Distance of the nearest sequence, accepted or not; NaN without one."""
+        return self.sequence.distance if self.sequence else math.nan
+
+    @property
+    def score(self) -> float:
+        """The distance, +inf without a sequence or where it is not below the chance level."""
+        if self.sequence is None or (self.relative and self.sequence.distance >= 1):
+            return math.inf
+        return self.sequence.distance
+
+    @property
+    def first_image_index(self) -> int:
+        """Place of the window's first image on a route that grows with every image, -1 = none."""
+        return self.image_index - len(self.window_stamps) + 1 if self.image_index >= 0 else -1

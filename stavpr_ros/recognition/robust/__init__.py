@@ -1,0 +1,1 @@
+"""Mode robust: options, centering, z-normalization, hysteresis."""

@@ -1,0 +1,51 @@
+"""Features without what all images of a drive share."""
+
+from dataclasses import replace
+
+import torch
+
+from stavpr_ros.features import LocalFeatures
+
+PRIOR = 20  # images that the map's mean counts for in the mean of the query so far
+
+
+class MeanCentering:
+    """
+    Takes the mean off features; unit norm again afterwards, and zero features stay zero.
+
+    :param features: those of the map, strips (W, n, d).
+    """
+
+    def __init__(self, features: LocalFeatures) -> None:
+        self._mean = features.strips.sum(dim=1) / max(len(features), 1)  # (W, d)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the query."""
+        # float64: in float32, a long drive's images would be rounded away
+        self._sum, self._count = self._mean.double() * PRIOR, PRIOR
+
+    def places(self, features: LocalFeatures) -> LocalFeatures:
+        """Features of the map, or of a query of which nothing else is known, less the map's mean."""
+        return replace(features, strips=without_mean(features.strips, self._mean))
+
+    def next_query(self, strips: torch.Tensor) -> torch.Tensor:
+        """
+        Features of the next image of the query less the query's mean so far, this image included.
+
+        :param strips: shape (W, d); the same is returned.
+        """
+        strips = strips.to(self._mean.device)
+        self._sum = self._sum + strips
+        self._count += 1
+        return without_mean(strips[:, None], (self._sum / self._count).float())[:, 0]
+
+
+def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
+    """Unit-norm (W, n, d) less (W, d), one strip after the other so that little memory is taken."""
+    out = torch.empty_like(strips, memory_format=torch.contiguous_format)
+    for j in range(len(strips)):
+        torch.sub(strips[j], mean[j], out=out[j])
+        out[j] *= strips[j].any(dim=1, keepdim=True)
+        out[j] /= out[j].norm(dim=1, keepdim=True).clamp_(min=1e-12)
+    return out

@@ -1,0 +1,89 @@
+"""A threshold to start with, from the map alone."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+
+
+@dataclass(frozen=True)
+class ThresholdSuggestion:
+    """
+    A threshold and what it rests on.
+
+    :param threshold: the suggested value.
+    :param elsewhere: for each altered window of the map, the distance of the nearest sequence in
+        another part of the map, shape (windows,).
+    """
+
+    threshold: float
+    elsewhere: np.ndarray
+
+
+def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np.ndarray:
+    """
+    Alter an image as another day and another lane might: shifted, lit and exposed otherwise, duller, noisy.
+
+    :param image: RGB (h, w, 3) uint8.
+    :param variant: 0..3: shifted to one side or the other, darker or brighter.
+    """
+    height, width = image.shape[:2]
+    shift = round(0.15 * width)
+    kept = image[:, shift:] if variant % 2 else image[:, : width - shift]
+    value: np.ndarray = (
+        cv2.resize(kept, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32) / 255
+    )
+    value **= 1.6 if variant // 2 % 2 else 0.6
+    shade = cv2.resize(rng.normal(0, 0.4, (4, 5)), (width, height), interpolation=cv2.INTER_CUBIC)
+    value *= np.exp(shade)[:, :, None].astype(np.float32)
+    value = cv2.GaussianBlur(value, (0, 0), width / 320) * 0.6 + 0.25
+    value += rng.normal(0, 0.02, value.shape).astype(np.float32)
+    return (np.clip(value, 0, 1) * 255).astype(np.uint8)
+
+
+def suggest_threshold(
+    place_map: PlaceMap,
+    settings: RecognizerSettings | None = None,
+    windows: int = 24,
+    progress: bool = False,
+) -> ThresholdSuggestion:
+    """
+    Ask how near the map's places come to *other* places of it when they look different.
+
+    Windows spread over the map are altered (:func:`harder_look`, on the thumbnails) and matched with the
+    map without their own nms_radius. All those answers are wrong; the suggestion is the median of
+    their distances. It is a start: where precision matters, evaluate with a second real drive.
+
+    :param settings: of the recognizer; its threshold is not used.
+    :param windows: how many windows are tried.
+    :raises InputError: the map has no thumbnails, or is too short to have an elsewhere.
+    """
+    settings = settings or RecognizerSettings(threshold=1.0)
+    sequence = settings.sequence
+    n, l = len(place_map), sequence.length
+    if n < 4 * l:
+        raise InputError(f'a map of {n} places is too short for a threshold: at least {4 * l} are needed')
+    if not place_map.thumbnails:
+        raise InputError('the map was built without thumbnails: a threshold cannot be tried on it')
+    recognizer, extractor = PlaceRecognizer(place_map, settings), place_map.extractor()
+    rng = np.random.default_rng(0)
+    elsewhere = []
+    starts = np.unique(np.linspace(0, n - l, min(windows, n - l + 1)).astype(int))
+    for variant, start in enumerate(
+        tqdm(starts, desc='threshold', unit='window', disable=None if progress else True)
+    ):
+        pictures = [place_map.thumbnail(place) for place in range(start, start + l)]
+        altered = [harder_look(picture, variant, rng) for picture in pictures if picture is not None]
+        features = extractor.extract(altered)
+        window = recognizer.distances(features)
+        window[:, max(0, start - l) : start + 2 * l] = np.inf
+        nearest = best_match(match_sequence(window, sequence), settings.nms_radius)
+        if nearest is not None:
+            elsewhere.append(nearest.distance)
+    return ThresholdSuggestion(float(np.median(elsewhere)), np.array(elsewhere))

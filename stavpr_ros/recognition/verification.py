@@ -1,0 +1,155 @@
+"""
+Geometric verification: whether two pictures show the same scene from two viewpoints.
+
+Keypoints of both are matched, and the matches counted that one epipolar geometry explains. A wrong place that
+looks alike has matches as well, but few that one geometry explains.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from stavpr_ros.errors import InputError, SettingsError
+
+METHODS = ('orb', 'sift')
+LEAST_MATCHES = 8  # a fundamental matrix fits any seven
+ITERATIONS = 2000
+CONFIDENCE = 0.999
+LOWEST = 32  # rows of a picture below which keypoints have no room, and some detectors fail
+TALLEST = 4  # a picture is brought to at most so many times its width
+
+
+@dataclass(frozen=True)
+class GeometricSettings:
+    """
+    How two pictures are checked against each other.
+
+    The defaults belong together: more features, a ratio nearer to 1 and more pixels let more matches of wrong
+    places through, and ``min_inliers`` has to rise with them. For ``sift``, 20 do.
+
+    :param method: keypoints: ``orb`` (fast) or ``sift`` (slower, fewer matches).
+    :param min_inliers: matches that one geometry must explain; at least 8.
+    :param features: most keypoints a picture; at least 8.
+    :param ratio: a match is this much nearer than the second nearest, in (0, 1].
+    :param pixels: how far a match may lie off the geometry, in pixels at ``width``.
+    :param width: pictures are brought to this width before, in pixels; at least 32.
+    """
+
+    method: str = 'orb'
+    min_inliers: int = 30
+    features: int = 1000
+    ratio: float = 0.9
+    pixels: float = 2.0
+    width: int = 320
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise SettingsError(f'method {self.method!r} is unknown: take one of {", ".join(METHODS)}')
+        for name, value in (('min_inliers', self.min_inliers), ('features', self.features)):
+            if value < LEAST_MATCHES:
+                raise SettingsError(
+                    f'{name} = {value} must be at least {LEAST_MATCHES}: a fundamental matrix fits any seven'
+                )
+        if not 0 < self.ratio <= 1:
+            raise SettingsError(f'ratio = {self.ratio} must lie above 0 and be at most 1')
+        if not (math.isfinite(self.pixels) and self.pixels > 0):
+            raise SettingsError(f'pixels = {self.pixels} must be a finite number above 0')
+        if self.width < 32:
+            raise SettingsError(f'width = {self.width} must be at least 32 pixels')
+
+
+@dataclass(frozen=True)
+class _Keypoints:
+    """Those of a picture: where they are, (m, 2), pixels at the common width, and descriptors (m, ...)."""
+
+    points: np.ndarray
+    descriptors: np.ndarray
+
+
+class GeometricVerifier:
+    """
+    Counts the matches of two pictures that one geometry explains. Belongs to one thread.
+
+    The same pictures give the same count. The keypoints of the last query are kept, so that one image is
+    checked against several places at little more than the places' cost.
+
+    :param settings: see :class:`GeometricSettings`.
+    """
+
+    def __init__(self, settings: GeometricSettings | None = None) -> None:
+        self.settings = settings or GeometricSettings()
+        self._detector = _detector(self.settings)
+        self._query: tuple[np.ndarray, _Keypoints] | None = None  # small and gray; its keypoints
+
+    def verifies(self, query: np.ndarray, place: np.ndarray) -> bool:
+        """Return whether as many matches are explained as the settings ask for."""
+        return self.inliers(query, place) >= self.settings.min_inliers
+
+    def inliers(self, query: np.ndarray, place: np.ndarray) -> int:
+        """
+        Count the matches that one geometry explains; 0 for pictures that have too few.
+
+        :param query, place: RGB, each (h, w, 3) uint8, of any size.
+        :raises InputError: no such pictures.
+        """
+        gray = self._small_gray(query, 'query')
+        other = self._detected(self._small_gray(place, 'place'))
+        # compared by what it shows: a caller may use the memory of an image again for the next
+        if self._query is None or not np.array_equal(self._query[0], gray):
+            self._query = gray, self._detected(gray)
+        keypoints = self._query[1]
+        if min(len(keypoints.points), len(other.points)) < LEAST_MATCHES:
+            return 0
+        mine, theirs = self._matches(keypoints.descriptors, other.descriptors)
+        if len(mine) < LEAST_MATCHES:
+            return 0
+        return _explained(keypoints.points[mine], other.points[theirs], self.settings.pixels)
+
+    def _small_gray(self, image: np.ndarray, name: str) -> np.ndarray:
+        """Return a picture at the common width, (h, w) uint8."""
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
+            raise InputError(f'{name} is {image.dtype} {image.shape}: expected RGB (h, w, 3) uint8')
+        (height, width), to = image.shape[:2], self.settings.width
+        size = to, min(max(1, round(height * to / width)), TALLEST * to)
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        return cv2.resize(gray, size, interpolation=cv2.INTER_AREA if width > to else cv2.INTER_LINEAR)
+
+    def _detected(self, gray: np.ndarray) -> _Keypoints:
+        nothing = _Keypoints(np.empty((0, 2), np.float32), np.empty((0, 0), np.uint8))
+        if len(gray) < LOWEST:
+            return nothing
+        keypoints, descriptors = self._detector.detectAndCompute(gray, None)
+        if descriptors is None:
+            return nothing
+        return _Keypoints(np.array([point.pt for point in keypoints], np.float32), descriptors)
+
+    def _matches(self, mine: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of keypoints, each other's nearest and clearly so: two arrays (m,) of their numbers."""
+        how = (cv2.CV_32S, cv2.NORM_HAMMING) if self.settings.method == 'orb' else (cv2.CV_32F, cv2.NORM_L2)
+        distances, nearest = cv2.batchDistance(mine, theirs, how[0], normType=how[1], K=2)
+        clear = np.flatnonzero(distances[:, 0] < self.settings.ratio * distances[:, 1])
+        matched = nearest[clear, 0]
+        if not len(clear):
+            return clear, matched
+        _, back = cv2.batchDistance(theirs[matched], mine, how[0], normType=how[1], K=1)
+        mutual = back[:, 0] == clear
+        return clear[mutual], matched[mutual]
+
+
+def _detector(settings: GeometricSettings) -> Any:
+    library: Any = cv2  # its types leave these out
+    if settings.method == 'sift':
+        return library.SIFT_create(settings.features)
+    return library.ORB_create(settings.features, fastThreshold=7)
+
+
+def _explained(points: np.ndarray, others: np.ndarray, pixels: float) -> int:
+    """Matches (m, 2) with (m, 2) that the best fundamental matrix explains; also those of a flat scene."""
+    try:
+        _, mask = cv2.findFundamentalMat(points, others, cv2.USAC_MAGSAC, pixels, CONFIDENCE, ITERATIONS)
+    except cv2.error:  # how it says of some matches, many in one point, that no matrix fits
+        return 0
+    return 0 if mask is None else int(np.count_nonzero(mask))

@@ -1,0 +1,60 @@
+"""The house keeps its order: who may import whom, and how light the package is to import."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / 'stavpr_ros'
+ROS = {'rclpy', 'ament_index_python', 'stavpr_msgs', 'rcl_interfaces', 'builtin_interfaces'}
+ROS |= {f'{name}_msgs' for name in ('std', 'sensor', 'geometry', 'nav', 'diagnostic', 'lifecycle')}
+CORE = ('alignment', 'sources', 'features', 'mapping', 'recognition', 'pipeline')
+"""Each of these may import the ones before it, and features and sources not each other."""
+MAY_IMPORT = {
+    'alignment': set(),
+    'sources': set(),
+    'features': set(),
+    'mapping': {'alignment', 'sources', 'features'},
+    'recognition': {'alignment', 'features', 'mapping'},
+    'pipeline': set(CORE[:5]),
+    'evaluation': set(CORE[:5]),
+    'demonstration': {'evaluation', *CORE},
+    'ros': set(CORE),
+    'commands': {'ros', 'demonstration', 'evaluation', *CORE},
+}
+
+
+def imported_modules(path: Path) -> set[str]:
+    modules = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            modules |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            modules.add(node.module or '')
+    return modules
+
+
+@pytest.mark.parametrize('folder', list(MAY_IMPORT))
+def test_arrows_run_one_way(folder):
+    files = sorted((PACKAGE / folder).rglob('*.py'))
+    assert files
+    for path in files:
+        for module in imported_modules(path):
+            parts = module.split('.')
+            if parts[0] == 'stavpr_ros' and len(parts) > 1 and parts[1] in MAY_IMPORT:
+                assert parts[1] in MAY_IMPORT[folder] | {folder}, f'{path} imports {module}'
+            if folder not in ('ros', 'commands'):
+                assert parts[0] not in ROS, f'{path} imports {module}'
+
+
+def test_every_folder_is_in_the_plan():
+    folders = {path.name for path in PACKAGE.iterdir() if (path / '__init__.py').exists()}
+    assert folders == set(MAY_IMPORT)
+
+
+def test_importing_the_package_is_light():
+    code = 'import sys, stavpr_ros; print(*sys.modules)'
+    loaded = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
+    assert not {'torch', 'numba', 'numpy', 'cv2', 'rclpy', 'rosbags'} & set(loaded.split())

@@ -1,0 +1,353 @@
+"""Ground truth: what is accepted, by hand, and every kind of file it comes in."""
+
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+
+from stavpr_ros.errors import InputError, SourceError
+from stavpr_ros.evaluation.ground_truth import GroundTruth
+
+# three queries in five places: 0 -> 1, 2; 1 -> nothing; 2 -> 4
+PAIRS = [(0, 1), (0, 2), (2, 4)]
+MATRIX = np.array([[0, 1, 1, 0, 0], [0, 0, 0, 0, 0], [0, 0, 0, 0, 1]])
+
+
+def by_hand(pairs=PAIRS, N=3, n=5, tolerance=0):
+    queries, places = np.array(pairs).reshape(-1, 2).T
+    return GroundTruth.from_pairs(queries, places, N, n, tolerance)
+
+
+def pose(x=0.0, y=0.0, z=0.0, yaw=0.0):
+    return [x, y, z, 0, 0, np.sin(np.radians(yaw) / 2), np.cos(np.radians(yaw) / 2)]
+
+
+def test_accepts_by_hand():
+    truth = by_hand()
+    assert truth.accepts(np.array([1, 0, 4])).tolist() == [True, False, True]
+    assert truth.accepts(np.array([2, 4, 3])).tolist() == [True, False, False]
+    assert truth.accepts(np.array([-1, -1, -1])).tolist() == [False] * 3
+    assert truth.accepts(np.array([[1, 2, 3], [1, 2, 4], [-1, 3, 4]])).tolist() == [
+        [True, True, False],
+        [False, False, False],
+        [False, False, True],
+    ]
+    assert by_hand([(0, 1)]).accepts(np.array([1, 4, 4])).tolist() == [True, False, False]
+    assert truth.has_match.tolist() == [True, False, True]
+    assert truth.middles.tolist() == [1, -1, 4]
+    assert truth.pairs.tolist() == [[0, 1], [0, 2], [2, 4]]
+    np.testing.assert_array_equal(truth.matrix(), MATRIX.astype(bool))
+
+
+def test_no_answer_is_never_the_last_place_of_the_query_before():
+    """Query 1 with -1 has the key of query 0 with the last place, which is accepted here."""
+    truth = by_hand([(0, 4), (1, 0)], 2, 5)
+    assert truth.accepts(np.array([4, -1])).tolist() == [True, False]
+
+
+def test_nothing_accepted():
+    truth = by_hand([], 2, 3)
+    assert truth.accepts(np.array([0, -1])).tolist() == [False, False]
+    assert truth.has_match.tolist() == [False, False]
+    assert truth.middles.tolist() == [-1, -1]
+    assert not truth.matrix().any()
+
+
+@pytest.mark.parametrize(
+    'places',
+    [np.array([0, 1]), np.array([0.0, 1, 2]), np.array([0, 1, 5]), np.array([0, 1, -2]), np.array(1)],
+)
+def test_answers_that_do_not_fit(places):
+    with pytest.raises(InputError, match='answers'):
+        by_hand().accepts(places)
+
+
+def test_identity_with_tolerance():
+    truth = GroundTruth.identity(4, 4, 1)
+    expected = np.abs(np.subtract.outer(np.arange(4), np.arange(4))) <= 1
+    np.testing.assert_array_equal(truth.matrix(), expected)
+    assert truth.middles.tolist() == [0, 1, 2, 2]
+    assert truth.has_match.all()
+    with pytest.raises(InputError, match='5 query images and 4 places'):
+        GroundTruth.identity(5, 4)
+
+
+def test_widened_stays_within_the_query_and_the_map():
+    truth = by_hand().widened(1)
+    assert truth.pairs.tolist() == [[0, 0], [0, 1], [0, 2], [0, 3], [2, 3], [2, 4]]
+    assert by_hand(tolerance=1).pairs.tolist() == truth.pairs.tolist()
+    for wrong in (-1, 0.5):
+        with pytest.raises(InputError, match='tolerance'):
+            by_hand().widened(wrong)
+
+
+def test_select():
+    truth = by_hand().select(np.array([2, 0, 1, 0]))
+    assert (truth.N, truth.n) == (4, 5)
+    assert truth.pairs.tolist() == [[0, 4], [1, 1], [1, 2], [3, 1], [3, 2]]
+    for wrong in ([3], [-1], [], [0.5]):
+        with pytest.raises(InputError, match='indices'):
+            by_hand().select(np.array(wrong))
+
+
+def test_select_equals_rows_of_the_matrix():
+    rng = np.random.default_rng(0)
+    matrix = rng.random((40, 30)) < 0.1
+    truth = GroundTruth.from_pairs(*np.nonzero(matrix), 40, 30)
+    indices = rng.integers(0, 40, 100)
+    np.testing.assert_array_equal(truth.select(indices).matrix(), matrix[indices])
+    answers = rng.integers(-1, 30, 40)
+    expected = [bool(answer >= 0 and matrix[query, answer]) for query, answer in enumerate(answers)]
+    assert truth.accepts(answers).tolist() == expected
+
+
+def test_loop_closures_whichever_triangle():
+    lower = np.zeros((5, 5), bool)
+    lower[3, 0] = lower[4, 1] = lower[4, 3] = True
+    expected = [[3, 0], [4, 1], [4, 3]]
+    for matrix in (lower, lower.T, lower | lower.T | np.eye(5, dtype=bool)):
+        truth = GroundTruth.from_pairs(*np.nonzero(matrix), 5, 5)
+        assert truth.loop_closures().pairs.tolist() == expected
+        assert truth.loop_closures(exclude=1).pairs.tolist() == expected[:2]
+        assert truth.loop_closures(exclude=1).has_match.tolist() == [False, False, False, True, True]
+        assert truth.loop_closures(exclude=3).pairs.tolist() == []
+    with pytest.raises(InputError, match='one drive'):
+        by_hand().loop_closures()
+    with pytest.raises(InputError, match='excluded'):
+        GroundTruth.identity(3, 3).loop_closures(-1)
+
+
+def test_pairs_outside():
+    for pair in [(3, 0), (-1, 0), (0, 5), (0, -1)]:
+        with pytest.raises(InputError, match=rf'query {pair[0]} with place {pair[1]}'):
+            by_hand([*PAIRS, pair])
+    with pytest.raises(InputError, match='at least one'):
+        by_hand([], 0, 5)
+
+
+# ------------------------------------------------------------------------------------------ files
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        '0,1\n0,2\n2,4\n',
+        'query,place\n0,1\n0,2\n2,4\n1,-1\n',
+        'accepted_reference;query\n1;0\n2;0\n4;2\n',
+        '# by hand\n\n2 4\n0 1\n0 2\n0 2',
+        '\ufeff"Live"\t"Reference"\tmeters\n0\t1\t0.3\n0\t2.0\t1\n2\t4\t0\n',
+        'a,b\n0,1\n0,2\n2,4\n',
+        '\ufeff"0","1"\n"0","2"\n"2","4"\n',
+    ],
+)
+def test_text(tmp_path, text):
+    path = tmp_path / 'truth.csv'
+    path.write_text(text, encoding='utf-8')
+    assert GroundTruth.from_file(path, 3, 5).pairs.tolist() == [list(pair) for pair in PAIRS]
+    assert GroundTruth.from_file(path, 3, 5, 1).pairs.tolist() == by_hand(tolerance=1).pairs.tolist()
+
+
+def test_a_place_a_line(tmp_path):
+    path = tmp_path / 'truth.txt'
+    path.write_text('Reference\n1\n-1\n4\n')
+    assert GroundTruth.from_file(path, 3, 5).pairs.tolist() == [[0, 1], [2, 4]]
+    for N in (2, 4):
+        with pytest.raises(InputError, match=f'a place for 3 queries, but there are {N}'):
+            GroundTruth.from_file(path, N, 5)
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('query,place\n0,1\n0,one\n', "line 3: '0,one' has no whole number in column 2"),
+        ('0,1.5\n', 'line 1'),
+        ('0,1\n2\n', 'line 2'),
+        ('0,1,2\n', '3 columns'),
+        ('query,place\n', 'no line of numbers'),
+        ('', 'no line of numbers'),
+        ('0,-1\n', 'accepts no pair'),
+        ('0,5\n', r'truth\.csv: ground truth pairs query 0 with place 5.*counted from 1'),
+        ('query,place\n3,0\n', 'query 3 with place 0'),
+    ],
+)
+def test_text_that_is_wrong(tmp_path, text, message):
+    path = tmp_path / 'truth.csv'
+    path.write_text(text)
+    with pytest.raises((InputError, SourceError), match=message):
+        GroundTruth.from_file(path, 3, 5)
+
+
+@pytest.mark.parametrize(
+    'array',
+    [
+        MATRIX,
+        MATRIX.astype(bool),
+        MATRIX.astype(np.float32),
+        MATRIX * 255,
+        np.array(PAIRS),
+        np.array([*PAIRS, (1, -1)], float),
+    ],
+)
+def test_arrays(tmp_path, array):
+    np.save(tmp_path / 'truth.npy', array)
+    np.savez(tmp_path / 'one.npz', anything=array)
+    np.savez_compressed(tmp_path / 'several.npz', truth=array, other=np.zeros(2))
+    for name in ('truth.npy', 'one.npz', 'several.npz'):
+        assert GroundTruth.from_file(tmp_path / name, 3, 5).pairs.tolist() == [list(pair) for pair in PAIRS]
+
+
+def test_array_with_a_place_a_query(tmp_path):
+    np.save(tmp_path / 'truth.npy', np.array([1, -1, 4]))
+    assert GroundTruth.from_file(tmp_path / 'truth.npy', 3, 5).pairs.tolist() == [[0, 1], [2, 4]]
+
+
+@pytest.mark.parametrize(
+    ('array', 'message'),
+    [
+        (MATRIX.T, r'shape \(5, 3\): expected \(3, 5\).*transposed'),
+        (np.ones((4, 4)), r'shape \(4, 4\)'),
+        (np.zeros((3, 5), bool), 'accepts no pair'),
+        (np.random.default_rng(0).random((3, 5)), 'matrix of distances'),
+        (np.array(['a']), 'expected finite numbers'),
+        (np.array([[0, np.nan]]), 'expected finite numbers'),
+        (np.array([[0, 7]]), 'query 0 with place 7'),
+        (np.array([[0.5, 1]]), r'shape \(1, 2\)'),
+        (np.array([1, 2]), r'shape \(2,\)'),
+    ],
+)
+def test_arrays_that_are_wrong(tmp_path, array, message):
+    np.save(tmp_path / 'truth.npy', array)
+    with pytest.raises(InputError, match=message):
+        GroundTruth.from_file(tmp_path / 'truth.npy', 3, 5)
+
+
+def test_objects_are_refused_with_the_reason(tmp_path):
+    """As VPR-Bench keeps its truth: rows of a number and a list."""
+    rows = np.empty((1, 2), object)
+    rows[0] = [0, [1, 2]]
+    np.save(tmp_path / 'objects.npy', rows, allow_pickle=True)
+    np.savez(tmp_path / 'objects.npz', truth=rows)
+    (tmp_path / 'pickle.npy').write_bytes(pickle.dumps(MATRIX))
+    for name in ('objects.npy', 'objects.npz', 'pickle.npy'):
+        with pytest.raises(SourceError, match=rf'{name} holds Python objects.*runs whatever'):
+            GroundTruth.from_file(tmp_path / name, 3, 5)
+
+
+@pytest.mark.parametrize('white', [1, 255])
+def test_images(tmp_path, white):
+    for name in ('truth.png', 'truth.bmp'):
+        cv2.imwrite(str(tmp_path / name), (MATRIX * white).astype(np.uint8))
+        assert GroundTruth.from_file(tmp_path / name, 3, 5).pairs.tolist() == [list(pair) for pair in PAIRS]
+
+
+def test_images_that_are_wrong(tmp_path):
+    path = tmp_path / 'truth.png'
+    cv2.imwrite(str(path), (MATRIX * 255).astype(np.uint8))
+    with pytest.raises(InputError, match='3 high and 5 wide: expected 5 rows, one a query, and 3 columns'):
+        GroundTruth.from_file(path, 5, 3)
+    cv2.imwrite(str(path), (MATRIX * 128).astype(np.uint8))
+    with pytest.raises(InputError, match='3 gray pixels'):
+        GroundTruth.from_file(path, 3, 5)
+    path.write_bytes(b'')
+    with pytest.raises(SourceError, match='no image that can be decoded'):
+        GroundTruth.from_file(path, 3, 5)
+
+
+@pytest.mark.parametrize('name', ['truth.csv', 'truth.npy', 'truth.npz', 'truth.png', 'truth.pkl'])
+def test_files_that_cannot_be_read(tmp_path, name):
+    with pytest.raises(SourceError, match=name):
+        GroundTruth.from_file(tmp_path / name, 3, 5)
+    (tmp_path / name).write_bytes(b'PK\x03\x04\xff damaged')
+    with pytest.raises(SourceError, match=name):
+        GroundTruth.from_file(tmp_path / name, 3, 5)
+
+
+def test_an_archive_with_several_arrays(tmp_path):
+    np.savez(tmp_path / 'truth.npz', hard=MATRIX, soft=MATRIX)
+    with pytest.raises(SourceError, match='holds hard, soft: expected one array, or one called truth'):
+        GroundTruth.from_file(tmp_path / 'truth.npz', 3, 5)
+
+
+# ------------------------------------------------------------------------------------------ poses
+
+
+def test_poses_by_hand():
+    places = np.array([pose(0), pose(3, 4), pose(0, yaw=90), pose(0, yaw=-30)])
+    queries = np.array([pose(0), pose(0, yaw=180), pose(3, 4, 0.5)])
+    near = GroundTruth.from_poses(queries, places, 0.5)
+    assert near.pairs.tolist() == [[0, 0], [0, 2], [0, 3], [1, 0], [1, 2], [1, 3], [2, 1]]
+    assert GroundTruth.from_poses(queries, places, 5).matrix()[0].all()
+    same_way = GroundTruth.from_poses(queries, places, 0.4, 90)
+    assert same_way.pairs.tolist() == [[0, 0], [0, 2], [0, 3], [1, 2]]
+    assert GroundTruth.from_poses(queries, places, 0.5, 29).pairs.tolist() == [[0, 0], [2, 1]]
+    mirrored = queries * np.array([1, 1, 1, -2, -2, -2, -2])  # the same rotations
+    for degrees in (29, 90):
+        of_mirrored = GroundTruth.from_poses(mirrored, places, 0.4, degrees).pairs.tolist()
+        assert of_mirrored == GroundTruth.from_poses(queries, places, 0.4, degrees).pairs.tolist()
+
+
+def test_poses_in_parts(monkeypatch):
+    monkeypatch.setattr('stavpr_ros.evaluation.ground_truth.CHUNK', 7)
+    poses = np.array([pose(float(i)) for i in range(5)])
+    assert (
+        GroundTruth.from_poses(poses, poses, 1).pairs.tolist() == GroundTruth.identity(5, 5, 1).pairs.tolist()
+    )
+
+
+def test_pose_files(tmp_path):
+    (tmp_path / 'query.csv').write_text('# x,y,z\n0,0,0\n10,0,0\n')
+    (tmp_path / 'map.csv').write_text('0,1,0,0,0,0,1\n9,0,0,0,0,0,1\n30,0,0,0,0,0,1\n')
+    paths = tmp_path / 'query.csv', tmp_path / 'map.csv'
+    assert GroundTruth.from_pose_files(*paths, 2, 3, 1.0).pairs.tolist() == [[0, 0], [1, 1]]
+    with pytest.raises(InputError, match='no orientations'):
+        GroundTruth.from_pose_files(*paths, 2, 3, 1.0, 30)
+    with pytest.raises(InputError, match='3 poses for 4 images'):
+        GroundTruth.from_pose_files(*paths, 2, 4, 1.0)
+    (tmp_path / 'map.csv').write_text('0,1\n')
+    with pytest.raises(SourceError, match='3 or 7 numbers'):
+        GroundTruth.from_pose_files(*paths, 2, 1, 1.0)
+    with pytest.raises(SourceError, match='cannot be read'):
+        GroundTruth.from_pose_files(tmp_path / 'none.csv', paths[1], 2, 1, 1.0)
+
+
+def test_places_whose_pose_is_not_known_are_nobodys_truth():
+    unknown = [np.nan] * 7
+    places, queries = np.array([pose(0), unknown, pose(5)]), np.array([pose(0), pose(5), pose(9)])
+    for degrees in (None, 90):
+        truth = GroundTruth.from_poses(queries, places, 1, degrees)
+        assert truth.pairs.tolist() == [[0, 0], [1, 2]]
+        assert truth.n == 3
+    with pytest.raises(InputError, match=r'2 of 3 query images have no pose \(0, 2\)'):
+        GroundTruth.from_poses(np.array([unknown, pose(5), unknown]), places, 1)
+
+
+@pytest.mark.parametrize('wrong', [np.zeros((2, 3)), np.zeros((2, 7)), np.full((2, 7), np.nan)])
+def test_poses_that_are_wrong(wrong):
+    with pytest.raises(InputError, match='map poses'):
+        GroundTruth.from_poses(np.array([pose()]), wrong, 1)
+
+
+def test_thresholds_that_are_wrong():
+    for meters, degrees in [(-1, None), (1, -1), (float('nan'), None)]:
+        with pytest.raises(InputError, match='meters'):
+            GroundTruth.from_poses(np.array([pose()]), np.array([pose()]), meters, degrees)
+
+
+# ------------------------------------------------------------------------------------------ real files
+
+
+def test_loop_closures_of_the_hallway(data_folder):
+    """RTAB-Map's sample: white below the diagonal, row = query, column = the earlier image."""
+    truth = GroundTruth.from_file(data_folder / 'rtabmap_hallway_loop' / 'samples_GT.bmp', 84, 84)
+    queries, places = truth.pairs.T
+    assert len(queries) == 228
+    assert (queries > places).all()
+    assert truth.loop_closures().pairs.tolist() == truth.pairs.tolist()
+    assert truth.has_match.tolist() == [False] * 40 + [True] * 44
+    assert truth.loop_closures(exclude=60).has_match.nonzero()[0].min() > 60
+
+
+def test_pairs_of_the_corridor(data_folder):
+    truth = GroundTruth.from_file(data_folder / 'corridor' / 'ground_truth.csv', 111, 111)
+    np.testing.assert_array_equal(truth.matrix(), GroundTruth.identity(111, 111, 2).matrix())

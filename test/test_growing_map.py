@@ -1,0 +1,225 @@
+"""The growing map: what was added comes out, room doubles, places are forgotten, errors change nothing."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.mapping import GrowingMap, growing_map, load_map, save_map
+
+DESCRIBER = FeatureExtractor()
+W, D = 7, 5
+
+
+@pytest.fixture(autouse=True)
+def little_room(monkeypatch):
+    """Borders are crossed by a few places."""
+    monkeypatch.setattr(growing_map, 'ROOM', 4)
+
+
+def features(i, d=D, settings=DESCRIBER.settings, count=1):
+    strips = torch.arange(W * count * d, dtype=torch.float32).reshape(W, count, d) + 1000 * i
+    return LocalFeatures(strips, torch.full((W, count), float(i)), settings, (5, 1))
+
+
+def where(i):
+    return np.array([i, 2 * i, 3, 0, 0, 0.6, 0.8])
+
+
+def grown(count, limit=100):
+    """A map of places 0 to count - 1; every third has no pose, every second no picture."""
+    made = GrowingMap(DESCRIBER.settings, None, limit)
+    for i in range(count):
+        add(made, i)
+    return made
+
+
+def add(made, i):
+    pose = where(i) if i % 3 else None
+    return made.add(features(i), i * 10, f'place {i}', pose, b'' if i % 2 else bytes([i]))
+
+
+def assert_holds(made, numbers):
+    """The map, or a snapshot of one, holds these places."""
+    assert len(made) == len(numbers)
+    assert made.stamps.tolist() == [i * 10 for i in numbers]
+    assert tuple(made.ids) == tuple(f'place {i}' for i in numbers)
+    assert tuple(made.features.strips.shape) == (W, len(numbers), D)
+    for place, i in enumerate(numbers):
+        torch.testing.assert_close(made.features.strips[:, place], features(i).strips[:, 0], rtol=0, atol=0)
+        assert made.features.weights[:, place].tolist() == [i] * W
+        known = where(i) if i % 3 else np.full(7, np.nan)
+        np.testing.assert_allclose(made.poses[place], known)
+        assert made.thumbnails[place] == (b'' if i % 2 else bytes([i]))
+
+
+@pytest.mark.parametrize('count', [1, 4, 5, 9, 10])
+def test_what_was_added_comes_out(count):
+    made = grown(count, limit=10)
+    assert_holds(made, range(count))
+    assert made.full is (count == 10)
+    assert made.features.cells == (5, 1)
+    assert made.first == 0
+
+
+def test_room_doubles_up_to_the_limit():
+    made, rooms = GrowingMap(DESCRIBER.settings, None, 18), []
+    for i in range(18):
+        rooms.append(made.memory)
+        assert add(made, i) == i
+    place = W * (D + 1) * 4 + 8 + 7 * 8
+    texts = [sum(len(f'place {j}') + (j % 2 == 0) for j in range(i)) for i in range(18)]
+    places = [(room - text) / place for room, text in zip(rooms, texts, strict=True)]
+    assert places == [0, *[4] * 4, *[8] * 4, *[16] * 8, 18]
+    with pytest.raises(InputError, match=r'full, it has 18 places: raise its limit, forget'):
+        add(made, 18)
+    assert_holds(made, range(18))
+
+
+def test_the_view_is_no_copy():
+    made = grown(6)
+    first, second = made.features, made.features
+    assert first.strips.data_ptr() == second.strips.data_ptr()
+    assert made.poses.base is not None
+
+
+def test_a_snapshot_does_not_change():
+    made = grown(3)
+    snapshot = made.snapshot()
+    assert_holds(snapshot, range(3))
+    made.features.strips[:] = 0
+    made.poses[:] = 0
+    made.stamps[:] = 0
+    made.forget(2)
+    add(made, 3)
+    assert_holds(snapshot, range(3))
+
+
+def test_snapshot_of_nothing_and_without_extras():
+    made = GrowingMap(DESCRIBER.settings, None, 3)
+    assert len(made.snapshot()) == 0
+    assert len(made.features) == 0
+    made.add(features(1))
+    snapshot = made.snapshot()
+    assert snapshot.poses is None
+    assert snapshot.thumbnails == ()
+    assert snapshot.ids == ('',)
+    assert snapshot.thumbnail(0) is None
+
+
+def test_snapshot_to_file_and_back(tmp_path):
+    """Poses of some places, pictures of some places."""
+    save_map(grown(7).snapshot(), tmp_path / 'map')
+    loaded = load_map(tmp_path / 'map')
+    assert_holds(loaded, range(7))
+    assert loaded.pose(3) is None
+    assert loaded.thumbnail(1) is None
+    continued = GrowingMap.from_map(loaded, 8)
+    assert add(continued, 7) == 7
+    assert_holds(continued, range(8))
+    assert_holds(loaded, range(7))
+
+
+def test_continue_a_map(small_map, route):
+    made = GrowingMap.from_map(small_map, 61)
+    extractor = small_map.extractor()
+    assert made.add(extractor.extract([route[0]]), 5, 'again') == 60
+    assert made.full
+    snapshot = made.snapshot()
+    assert snapshot.projection is small_map.projection
+    assert snapshot.ids == (*small_map.ids, 'again')
+    torch.testing.assert_close(snapshot.features.strips[:, :60], small_map.features.strips)
+    assert snapshot.pose(60) is None
+    assert snapshot.pose(59)[0] == 59
+    assert snapshot.thumbnails == (*small_map.thumbnails, b'')
+    assert len(small_map) == 60
+    with pytest.raises(InputError, match='60 places does not fit into a limit of 59'):
+        GrowingMap.from_map(small_map, 59)
+
+
+def test_continue_a_map_without_extras(small_map):
+    plain = dataclasses.replace(small_map, poses=None, thumbnails=())
+    made = GrowingMap.from_map(plain, 100)
+    assert np.isnan(made.poses).all()
+    assert made.snapshot().thumbnails == ()
+    made.add(small_map.features[0:1], thumbnail=b'x')
+    assert made.thumbnails == [*[b''] * 60, b'x']
+
+
+def test_forgetting():
+    made = grown(10, limit=10)
+    made.forget(4)
+    assert made.first == 4
+    assert_holds(made, range(4, 10))
+    assert add(made, 10) == 10
+    made.forget(0)
+    made.forget(7)
+    assert made.first == 11
+    assert_holds(made, [])
+    assert add(made, 11) == 11
+    for wrong in (-1, 2):
+        with pytest.raises(InputError, match='expected 0 to 1'):
+            made.forget(wrong)
+    assert_holds(made, [11])
+
+
+@given(st.lists(st.one_of(st.none(), st.integers(0, 6)), max_size=60))
+def test_against_a_list(steps):
+    """None adds a place, a number forgets so many."""
+    made, plain, added = GrowingMap(DESCRIBER.settings, None, 9), [], 0
+    for step in steps:
+        if step is not None:
+            made.forget(min(step, len(plain)))
+            plain = plain[step:]
+        elif len(plain) < 9:
+            assert add(made, added) == added
+            plain.append(added)
+            added += 1
+        assert made.first == added - len(plain)
+        assert made.full is (len(plain) == 9)
+    assert len(made) == len(plain)
+    if plain:
+        assert_holds(made, plain)
+
+
+@pytest.mark.parametrize('count', [0, 3, 4])
+@pytest.mark.parametrize(
+    ('arguments', 'error', 'words'),
+    [
+        ((features(1, settings=FeatureExtractor(strips=6).settings),), FeatureMismatchError, 'strips'),
+        ((features(1, count=2),), InputError, 'features of 2 images'),
+        ((features(1, count=0),), InputError, 'features of 0 images'),
+        ((features(float('nan')),), InputError, 'not finite'),
+        ((features(1), 0, '', np.zeros(7)), InputError, 'zeros'),
+        ((features(1), 0, '', np.zeros(6)), InputError, 'shape'),
+        ((features(1), 2**64), OverflowError, 'int'),
+    ],
+)
+def test_an_error_leaves_all_as_it_was(count, arguments, error, words):
+    made = grown(count)
+    with pytest.raises(error, match=words):
+        made.add(*arguments)
+    if count:
+        assert_holds(made, range(count))
+    assert add(made, count) == count
+    assert_holds(made, range(count + 1))
+
+
+def test_other_dimensions():
+    made = grown(2)
+    with pytest.raises(InputError, match='6 dimensions came: the map has 5'):
+        made.add(features(2, d=6))
+    assert_holds(made, range(2))
+
+
+def test_wrong_beginnings(small_map):
+    with pytest.raises(SettingsError, match='limit = 0'):
+        GrowingMap(DESCRIBER.settings, None, 0)
+    for settings, projection in ((small_map.settings, None), (DESCRIBER.settings, small_map.projection)):
+        with pytest.raises(InputError, match='projection'):
+            GrowingMap(settings, projection, 5)

@@ -1,0 +1,181 @@
+"""The made-up world: reproducible, geometrically sane, and with the truth known."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from stavpr_ros.demonstration.street import (
+    GOOD_LIGHT,
+    RAINY_DUSK,
+    Conditions,
+    Drive,
+    Route,
+    World,
+    first_drive,
+    ground_truth,
+    second_drive,
+)
+from stavpr_ros.demonstration.street.street import CELL, grow_street
+from stavpr_ros.errors import InputError, SettingsError
+
+SIZE = (96, 72)
+STILL = replace(GOOD_LIGHT, noise=0.0, shake=0.0)
+
+
+@pytest.fixture(scope='module')
+def world():
+    return World(7)
+
+
+def view(world, along, conditions, size=SIZE):
+    """Render one image on the street."""
+    return Drive(world, Route(np.array([along]), np.array([False])), conditions, size=size)[0].image
+
+
+def difference(a, b):
+    return float(np.abs(a.astype(float) - b.astype(float)).mean())
+
+
+def test_images_have_the_promised_type_and_are_not_blank(world):
+    for drive in (first_drive(world, 5, SIZE), second_drive(world, 5, SIZE)):
+        for frame in drive:
+            assert frame.image.shape == (72, 96, 3)
+            assert frame.image.dtype == np.uint8
+            assert frame.image.flags.c_contiguous
+            assert frame.image.std() > 15
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_gives_others():
+    one, same, other = (second_drive(World(seed), 40, SIZE) for seed in (3, 3, 4))
+    assert all(np.array_equal(one[k].image, same[k].image) for k in (0, 17, 39))
+    assert not np.array_equal(one[17].image, other[17].image)
+
+
+def test_an_image_does_not_depend_on_what_was_rendered_before(world):
+    drive = second_drive(world, 30, SIZE)
+    alone = drive[12].image
+    assert np.array_equal(list(drive)[12].image, alone)
+    assert np.array_equal(drive[10:14][2].image, alone)
+    assert np.array_equal(drive[-18].image, alone)
+
+
+def test_the_same_place_in_the_same_conditions_looks_the_same(world):
+    drive = Drive(world, Route(np.full(2, 100.0), np.zeros(2, bool)), STILL, size=SIZE)
+    still, later = drive[0].image, drive[1].image  # only the cars ahead may have moved a little
+    assert difference(still, later) < 1.0
+    assert difference(view(world, 130.0, STILL), still) > 10.0
+
+
+def shift_of_patch(before, after, x, y, size=36, reach=14):
+    """Find how many pixels a patch has moved sideways."""
+    patch = before[y : y + size, x : x + size]
+    strip = after[y : y + size, x - reach : x + size + reach]
+    return int(cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED).argmax()) - reach
+
+
+def test_a_step_aside_moves_near_things_more_than_far_ones(world):
+    """Houses at the sides are some 20 m away, what is seen around the vanishing point some 60 m and more."""
+    near, far = [], []
+    for along in np.arange(20.0, 320.0, 20.0):
+        before = view(world, along, replace(STILL, lane=0.0), (320, 240))
+        after = view(world, along, replace(STILL, lane=0.6), (320, 240))
+        near += [shift_of_patch(before, after, x, 60) for x in (24, 260)]
+        far.append(shift_of_patch(before, after, 142, 116))
+    assert -9 <= np.median(near) <= -3  # the camera steps to the right, the image moves to the left
+    assert abs(np.median(far)) <= 2
+    assert abs(np.median(near)) >= 2 * abs(np.median(far))
+
+
+@pytest.mark.parametrize(
+    'change',
+    [{'fog': 0.03}, {'exposure': 0.5}, {'warmth': 0.2}, {'rain': 1.0}, {'noise': 0.05},
+     {'sun_azimuth': 250.0}, {'lane': -1.0}, {'traffic': 5}, {'lamps': 0.5}, {'autumn': 1.0},
+     {'clouds': 1.0}, {'sun': 0.0}, {'ambient': 0.3}],
+)  # fmt: skip
+def test_every_condition_is_seen(world, change):
+    base = replace(STILL, lamps=0.01)  # with lamps at all, those of the street are lit
+    assert difference(view(world, 60.0, base), view(world, 60.0, replace(base, **change))) > 0.3
+
+
+def test_fog_hides_what_is_far_and_exposure_darkens(world):
+    clear, fog = view(world, 60.0, STILL), view(world, 60.0, replace(STILL, fog=1.0))
+    assert fog[:40].std() < 0.5 * clear[:40].std()
+    assert view(world, 60.0, replace(STILL, exposure=0.4)).mean() < 0.7 * clear.mean()
+
+
+def test_the_default_drives_are_what_the_demonstration_needs(world):
+    first, second = first_drive(world), second_drive(world)
+    assert len(first) == 300
+    np.testing.assert_allclose(np.diff(first.position), 2.0)
+    truth = ground_truth(first, second)
+    assert 300 <= len(second) <= 350
+    assert 40 <= np.count_nonzero(truth < 0) <= 60
+    assert np.all(np.diff(np.flatnonzero(truth < 0)) == 1)  # one stretch
+    assert second[0].stamp > first[len(first) - 1].stamp
+    assert np.all(np.diff(second.stamps) > 0)
+
+
+def test_the_second_drive_stops_once_and_drives_at_half_to_twice_the_speed(world):
+    second = second_drive(world)
+    step = np.diff(second.position)
+    step = step[np.isfinite(step) & (step < 20)]  # not across the detour
+    assert np.all(step >= 0)
+    assert 8 <= np.count_nonzero(step == 0) <= 20
+    driving = step[step > 0.9]
+    assert driving.min() < 1.3
+    assert driving.max() > 3.0
+    assert driving.max() < 4.5
+
+
+def test_the_ground_truth_is_the_nearest_place(world):
+    def drive(along, detour):
+        return Drive(world, Route(np.array(along), np.array(detour)), STILL, size=SIZE)
+
+    first = drive([0.0, 2.0, 4.0, 6.0], [False] * 4)
+    second = drive([0.9, 1.1, 50.0, 6.9, 3.0], [False, False, True, False, False])
+    assert ground_truth(first, second).tolist() == [0, 1, -1, 3, 1]  # the lower one on a tie
+    assert np.isnan(second[2].position)
+    with pytest.raises(InputError, match='1 of them without a position'):
+        ground_truth(second, first)
+
+
+def test_the_detour_is_another_street(world):
+    assert world.detour.seed != world.street.seed
+    here = Drive(world, Route(np.array([60.0, 60.0]), np.array([False, True])), STILL, size=SIZE)
+    assert difference(here[0].image, here[1].image) > 10.0
+
+
+def test_a_street_is_the_same_for_any_length_and_fits_its_tables():
+    short, long = grow_street(5, 100.0), grow_street(5, 400.0)
+    cells = int(100.0 / CELL)
+    assert np.array_equal(short.lots[short.lot_of[:, :cells]], long.lots[long.lot_of[:, :cells]])
+    assert long.lot_of.max() < len(long.lots)
+    assert np.isfinite(long.lots).all()
+
+
+def test_the_ends_of_the_street_can_be_rendered(world):
+    for along in (0.0, world.length):
+        assert view(world, along, RAINY_DUSK).std() > 10
+
+
+def test_settings_out_of_range_are_refused(world):
+    with pytest.raises(SettingsError, match='lane is 9'):
+        Conditions(lane=9.0)
+    with pytest.raises(SettingsError, match='fog is -1'):
+        Conditions(fog=-1.0)
+    with pytest.raises(SettingsError, match='sun_elevation is 90'):
+        Conditions(sun_elevation=90.0)
+    with pytest.raises(SettingsError, match='seed of the world is -1'):
+        World(-1)
+    with pytest.raises(SettingsError, match='detour from'):
+        World(detour_from=500.0, detour_to=400.0)
+    with pytest.raises(SettingsError, match='places is 1'):
+        first_drive(world, 1)
+    with pytest.raises(SettingsError, match='images is 0'):
+        second_drive(world, 0)
+    with pytest.raises(SettingsError, match='size of the images'):
+        first_drive(world, 5, (8, 8))
+    with pytest.raises(IndexError, match='image 5'):
+        first_drive(world, 5, SIZE)[5]

@@ -1,0 +1,144 @@
+"""Matching at several speeds: worked by hand, against plain loops, and on blocks' borders."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stavpr_ros.alignment import VelocitySettings, best_velocity_match, match_velocities, trace_velocity
+from stavpr_ros.alignment.cpu import velocity as kernel
+from stavpr_ros.errors import InputError, SettingsError
+
+INF = np.inf
+
+
+def plain_paths(costs, speeds, penalty):
+    """Every end's best (cost of all rows, first, middle, speed, path), by loops over all that may be."""
+    l, n = costs.shape
+    answers = [(INF, 0, 0, 0, None)] * n
+    for v, speed in enumerate(speeds):
+        line = [int(np.floor(speed * i + 0.5)) for i in range(l)]
+        best = {y: (costs[0][y], [y]) for y in range(n)}
+        for i in range(1, l):
+            step = line[i] - line[i - 1]
+            nearer = {}
+            for y in range(n):
+                for moved, extra in ((step, 0), (step - 1, penalty), (step + 1, penalty)):
+                    if moved < 0 or y - moved not in best:
+                        continue
+                    cost = best[y - moved][0] + extra
+                    if y not in nearer or cost < nearer[y][0]:
+                        nearer[y] = (cost, [*best[y - moved][1], y])
+            best = {y: (costs[i][y] + cost, path) for y, (cost, path) in nearer.items()}
+        for y, (cost, path) in best.items():
+            if cost / l < answers[y][0]:
+                answers[y] = (cost / l, path[0], path[(l - 1) // 2], v, path)
+    return answers
+
+
+def test_by_hand():
+    """
+    Three images, five places, speeds 1 and 2, a step more or less costs 1.
+
+    Speed 2 passes places 0, 2, 4 at 0 + 0 + 0; speed 1 would pay 1 a step for the same places. To end at
+    place 3, speed 1 passes 1, 2, 3 at 5 + 0 + 5, or 0, 2, 3 at 0 + (0 + 1) + 5 = 6; speed 2 goes 0, 2, 3 at
+    0 + 0 + (5 + 1) = 6 as well: the first speed wins the tie.
+    """
+    costs = np.array([[0, 5, 5, 5, 5], [5, 5, 0, 5, 5], [5, 5, 5, 5, 0]], float)
+    chosen = VelocitySettings((1.0, 2.0), 1.0)
+    matches = match_velocities(costs, chosen)
+    assert matches.distances[4] == 0
+    assert (matches.firsts[4], matches.middles[4], matches.speeds[4]) == (0, 2, 1)
+    assert matches.distances[3] == 2
+    assert (matches.firsts[3], matches.middles[3], matches.speeds[3]) == (0, 2, 0)
+    np.testing.assert_array_equal(trace_velocity(costs, 4, 1, chosen), [[0, 0], [1, 2], [2, 4]])
+    nearest = best_velocity_match(matches, 0)
+    assert (nearest.first, nearest.last, nearest.middle, nearest.distance) == (0, 4, 2, 0)
+    assert nearest.second_best_index != 2
+
+
+def test_steps_of_a_speed():
+    np.testing.assert_array_equal(
+        VelocitySettings((0.5, 1.33)).steps(6), [[0, 1, 0, 1, 0, 1], [0, 1, 2, 1, 1, 2]]
+    )
+
+
+@settings(max_examples=60)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    l=st.integers(2, 8),
+    n=st.integers(1, 45),
+    levels=st.sampled_from([0, 2, 5]),
+    speeds=st.lists(st.sampled_from([0.0, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0]), min_size=1, max_size=4),
+    penalty=st.sampled_from([0.0, 0.25, 2.0]),
+    banned=st.sampled_from([0.0, 0.2]),
+    dtype=st.sampled_from([np.float32, np.float64]),
+)
+def test_against_plain_loops(seed, l, n, levels, speeds, penalty, banned, dtype):
+    rng = np.random.default_rng(seed)
+    costs = rng.standard_normal((l, n)) if not levels else rng.integers(-levels, levels, (l, n)) / 4
+    costs[rng.random((l, n)) < banned] = INF
+    costs = costs.astype(dtype)
+    chosen = VelocitySettings(tuple(speeds), penalty)
+    matches = match_velocities(costs, chosen)
+    for end, (distance, first, middle, speed, path) in enumerate(plain_paths(costs, speeds, dtype(penalty))):
+        assert matches.distances[end] == pytest.approx(distance, abs=1e-5)
+        if not np.isfinite(distance) or levels != 0:
+            continue  # of equal paths any may be taken
+        found = (matches.firsts[end], matches.middles[end], matches.speeds[end])
+        assert found == (first, middle, speed)
+        traced = trace_velocity(costs, end, speed, chosen)
+        np.testing.assert_array_equal(traced[:, 1], path)
+
+
+@pytest.mark.parametrize('n', [kernel.ENDS - 1, kernel.ENDS, kernel.ENDS + 1, 2 * kernel.ENDS + 17])
+def test_borders_of_blocks_leave_no_trace(n):
+    """The ends round a border give what they give in a map that is cut out round them."""
+    rng = np.random.default_rng(n)
+    window = rng.standard_normal((20, n)).astype(np.float32)
+    shift, scale = (rng.uniform(0.5, 2, n).astype(np.float32) for _ in range(2))
+    whole = match_velocities(window, VelocitySettings(), shift, scale)
+    for border in range(kernel.ENDS, n, kernel.ENDS):
+        near = slice(border - 100, min(n, border + 20))
+        part = match_velocities(window[:, near], VelocitySettings(), shift[near], scale[near])
+        count = min(n, border + 20) - (border - 20)
+        np.testing.assert_array_equal(whole.distances[near][-count:], part.distances[-count:])
+        np.testing.assert_array_equal(whole.firsts[near][-count:], part.firsts[-count:] + border - 100)
+        np.testing.assert_array_equal(whole.middles[near][-count:], part.middles[-count:] + border - 100)
+
+
+def test_shift_and_scale():
+    rng = np.random.default_rng(0)
+    window, shift = rng.random((5, 30)), rng.random(30)
+    scale = rng.uniform(0.5, 2, 30)
+    given = match_velocities(window, VelocitySettings(), shift, scale)
+    done = match_velocities((window - shift) * scale, VelocitySettings())
+    np.testing.assert_array_equal(given.distances, done.distances)
+    np.testing.assert_array_equal(given.firsts, done.firsts)
+
+
+def test_the_runner_up_is_elsewhere_and_nothing_is_nothing():
+    costs = np.full((4, 30), 1.0)
+    costs[np.arange(4), np.arange(4) + 20] = 0
+    costs[np.arange(4), np.arange(4) + 2] = 0.25
+    matches = match_velocities(costs, VelocitySettings())
+    nearest = best_velocity_match(matches, 5)
+    assert (nearest.first, nearest.last, nearest.middle) == (20, 23, 21)
+    assert (nearest.second_best_index, nearest.second_best_distance) == (3, 0.25)
+    alone = best_velocity_match(matches, 30)
+    assert alone.second_best_index == -1
+    assert np.isnan(alone.second_best_distance)
+    assert best_velocity_match(match_velocities(np.full((4, 6), INF), VelocitySettings()), 0) is None
+    assert best_velocity_match(match_velocities(np.empty((4, 0)), VelocitySettings()), 0) is None
+
+
+def test_what_is_refused():
+    with pytest.raises(InputError, match='NaN'):
+        match_velocities(np.full((3, 4), np.nan), VelocitySettings())
+    with pytest.raises(InputError, match='shift'):
+        match_velocities(np.zeros((3, 4)), VelocitySettings(), shift=np.zeros(3))
+    for speeds in ((), (-1.0,), (np.nan,)):
+        with pytest.raises(SettingsError, match='velocity_search'):
+            VelocitySettings(speeds)
+    with pytest.raises(SettingsError, match='penalty'):
+        VelocitySettings(penalty=-1)
