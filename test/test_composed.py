@@ -8,7 +8,7 @@ import pytest
 import rclpy
 import torch
 from image_messages import image_message
-from processes import DOMAIN, PATIENCE
+from processes import DOMAIN, TIMEOUT
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -52,7 +52,7 @@ def test_ros_may_be_shut_down_before_the_node_is_destroyed(make, context, route,
     assert node.trigger_configure() == node.trigger_activate() == SUCCESS
     for i, image in enumerate(route[:20]):
         node.configured.images._on_image(image_message(image, i + 1))
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while not len(node.configured.pipeline.places) and time.monotonic() < end:
         time.sleep(0.001)
     rclpy.shutdown(context=context)

@@ -156,7 +156,7 @@ def _parser() -> argparse.ArgumentParser:
         '--rate',
         type=_positive,
         metavar='R',
-        help=f'factor on the recorded pace (1), or images per second of a folder ({FOLDER_RATE:g})',
+        help=f'factor on the recorded pace (1); for a folder images per second ({FOLDER_RATE:g})',
     )
     pace.add_argument(
         '--lossless', action='store_true', help='send each image after the result of the last one'

@@ -5,7 +5,7 @@ import numpy as np
 
 from stavpr_ros.errors import InputError
 
-RIGHT, WRONG, NO_MATCH = (46, 125, 80), (190, 58, 48), (200, 150, 40)  # RGB
+RIGHT, NO_MATCH = (46, 125, 80), (200, 150, 40)  # RGB
 _INK, _PAPER, _EMPTY = (32, 34, 38), (250, 250, 248), (226, 226, 222)
 
 
