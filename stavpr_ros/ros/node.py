@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
@@ -20,11 +21,11 @@ from stavpr_ros.devices import why_no_cuda
 from stavpr_ros.errors import SettingsError, SourceError, StavprError
 from stavpr_ros.output_file import require_room
 from stavpr_ros.pipeline.statistics import Statistics
-from stavpr_ros.ros.executor import SlowCallbackGroup
-from stavpr_ros.ros.lifecycle import ManagedNode
+from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
+from stavpr_ros.ros.health import Health, node_health
 from stavpr_ros.ros.parameter_table import declare_parameters
 from stavpr_ros.ros.parameters import BY_NAME, PARAMETERS
-from stavpr_ros.ros.reporter import Reporter
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.runtime import Runtime
 from stavpr_ros.ros.services import Services
 from stavpr_ros.ros.settings import NodeSettings, node_settings, unknown_parameters
@@ -44,7 +45,7 @@ class PlaceRecognitionNode(ManagedNode):
     :raises StavprError: parameters that cannot work together, or a backend that is not here.
     """
 
-    THREADS = 4  # for services, the life cycle and parameters: images wait for none of them
+    THREADS = 4  # a transition, a service and parameters may each take long; images take the fourth
 
     def __init__(self, **options: Any) -> None:
         self._lock = threading.RLock()  # one change at a time: transitions and parameters
@@ -67,13 +68,13 @@ class PlaceRecognitionNode(ManagedNode):
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
         )
         self._jumps = self.get_clock().create_jump_callback(backwards, post_callback=self._on_clock_jump)
-        self._reporter = Reporter(self, self._settings.diagnostics_period)
+        self._diagnostics = DiagnosticsPublisher(self, self._settings.diagnostics_period, self._health)
         self._start: Timer | None = None
         if self._settings.autostart:
             self._start = self.create_timer(
                 0.0,
                 self._on_start,
-                callback_group=SlowCallbackGroup(),
+                callback_group=MutuallyExclusiveCallbackGroup(),
                 clock=Clock(clock_type=ClockType.STEADY_TIME),
             )
 
@@ -287,6 +288,11 @@ class PlaceRecognitionNode(ManagedNode):
         if runtime is not None:
             runtime.restart(f'the clock jumped back by {-jump.delta.nanoseconds / 1e9:.3f} s')
 
+    def _health(self) -> Health:
+        self.publish_map_info()
+        counts = self.statistics.counts()
+        return node_health(self.state, self.problem, self._settings, counts, self._runtime)
+
     def publish_map_info(self) -> None:
         """Publish ``~/map_info`` if it has changed."""
         with self._telling:
@@ -305,7 +311,7 @@ class PlaceRecognitionNode(ManagedNode):
 
     def destroy_node(self) -> None:
         """End the worker, say what was done, and take the node down."""
-        self._reporter.stop()
+        self._diagnostics.stop()
         patience = 0.2 if self.ending.is_set() else PATIENCE + 1  # spin_until has waited before
         self.ending.set()
         # who holds the lock may be reading a large map, or compiling: nobody waits for that at the end
@@ -321,7 +327,7 @@ class PlaceRecognitionNode(ManagedNode):
                 runtime.write_at_the_end()
         if self.left_behind:
             self.get_logger().warning('something is still being loaded or compiled: it is left to itself')
-        seen = self.statistics.snapshot()
+        seen = self.statistics.counts()
         drops = ''.join(f', {count} {cause}' for cause, count in sorted(seen.drops.items()))
         self.get_logger().info(f'{seen.received} images received, {seen.answered} answered{drops}')
         super().destroy_node()

@@ -14,7 +14,6 @@ from stavpr_msgs.msg import Candidates, LoopClosure, PlaceMatch
 from stavpr_ros.mapping import GrowingMap, PlaceMap, place_thumbnail
 from stavpr_ros.pipeline.overlay import match_image
 from stavpr_ros.recognition import Match
-from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.messages import (
     candidates_message,
     image_message,
@@ -22,6 +21,7 @@ from stavpr_ros.ros.messages import (
     match_message,
     matched_pose_message,
 )
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 
 DEPTH = 50  # answers kept for subscribers that are slower
 PICTURES = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)

@@ -17,9 +17,9 @@ from stavpr_ros.pipeline.start import LoadedMap, read_map
 from stavpr_ros.pipeline.statistics import WAITING, Statistics
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.input import ImageInput, OdometryInput
-from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.messages import candidate_messages, map_info_message, match_message, nanoseconds
 from stavpr_ros.ros.output import Output
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.saving import write_at_the_end, write_map
 from stavpr_ros.ros.settings import NodeSettings
 from stavpr_ros.ros.worker import PATIENCE, Worker

@@ -9,7 +9,7 @@ from std_srvs.srv import Trigger
 
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
-from stavpr_ros.ros.answers import wait_for_clients
+from stavpr_ros.ros.rclpy_workarounds import repeat_responses
 
 if TYPE_CHECKING:
     from stavpr_ros.ros.node import PlaceRecognitionNode
@@ -34,7 +34,7 @@ class Services:
             (SetOperation, 'set_operation', self._set_operation),
         ):
             answer = self._with_reason(serve)
-            wait_for_clients(node.create_service(kind, f'~/{name}', answer, callback_group=group))
+            repeat_responses(node.create_service(kind, f'~/{name}', answer, callback_group=group))
 
     def _with_reason(self, serve: Callable[['Runtime', Any, Any], str]) -> Callable[[Any, Any], Any]:
         """Turn errors into answers: ``success`` and ``message``."""
