@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-from stavpr_ros.demonstration.street import World, first_drive
+from stavpr_ros.demonstration.street import World, first_traverse
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.metrics import best_f1, frame_answers, score_at
@@ -408,7 +408,7 @@ def test_a_route_that_has_just_begun_closes_no_loops_by_chance():
     """Three streets of the made-up world, driven once: nothing can be right, and chance had a lead before."""
     extractor = FeatureExtractor()
     for seed in (3, 7, 11):
-        images = [frame.image for frame, _ in zip(first_drive(World(seed)), range(130), strict=False)]
+        images = [frame.image for frame, _ in zip(first_traverse(World(seed)), range(130), strict=False)]
         features = extractor.extract(images)
         closer = LoopCloser(RecognizerSettings(LOOP_THRESHOLD, mode='robust'), 50, features.settings)
         found = [closer.update(features[i : i + 1]).place for i in range(len(images))]
