@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-from stavpr_ros.demonstration.street import World, first_drive
+from stavpr_ros.demonstration.street import World, first_traverse
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.evaluation.ground_truth import GroundTruth
@@ -411,7 +411,7 @@ def test_a_route_that_has_just_begun_closes_no_loops_by_chance():
     """Three streets of the made-up world, driven once: nothing can be right, and chance had a lead before."""
     extractor = FeatureExtractor()
     for seed in (3, 7, 11):
-        images = [frame.image for frame, _ in zip(first_drive(World(seed)), range(130), strict=False)]
+        images = [frame.image for frame, _ in zip(first_traverse(World(seed)), range(130), strict=False)]
         features = extractor.extract(images)
         closer = LoopCloser(RecognizerSettings(LOOP_THRESHOLD, mode='robust'), 50, features.settings)
         found = [closer.update(features[i : i + 1]).place_index for i in range(len(images))]
