@@ -30,7 +30,7 @@ LISTENING = 'recording {topic}'  # said when no message can be missed any more
 EPILOG = """
 The keys are the fields of stavpr_msgs/PlaceMatch, the status by its name, or with --loop-closures those
 of stavpr_msgs/LoopClosure. Stamps are nanoseconds, numbers that are not there are null; the path is a list
-of [query_index, map_index], pairs are [query_index, query_stamp, place_index, place_stamp], a pose is
+of [query_index, place_index], pairs are [query_index, query_stamp, place_index, place_stamp], a pose is
 [x, y, z, qx, qy, qz, qw], null without odometry. received is the time of arrival (ns, system clock).
 
 exit codes: 0 done (--count reached, or stopped by a signal), 1 the file cannot be written, 2 usage,
@@ -67,7 +67,7 @@ def _plain(message: 'PlaceMatch | LoopClosure', replaced: dict[str, Any]) -> dic
 
 def match_record(message: 'PlaceMatch') -> dict[str, Any]:
     """Return a match as plain values for JSON."""
-    path = [[pair.query_index, pair.map_index] for pair in message.path]
+    path = [[pair.query_index, pair.place_index] for pair in message.path]
     return _plain(message, {'status': _STATUSES[message.status], 'path': path})
 
 

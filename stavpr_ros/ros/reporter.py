@@ -52,19 +52,20 @@ class Reporter:
 def health(node: 'PlaceRecognitionNode') -> Health:
     """Collect what the diagnostics tell; from any thread, since it only looks."""
     settings, runtime = node.settings, node.configured
+    backend = settings.pipeline.matching_backend(settings.operation)
     return Health(
         snapshot=node.statistics.snapshot(),
         state=node.state,
         problem=node.problem or (runtime.problem if runtime is not None else ''),
         transport=settings.image_transport,
         queue_size=settings.queue_size,
-        length=settings.sequence_length,
+        length=settings.pipeline.sequence.length,
         operation=settings.operation,
-        mode=settings.mode,
-        max_places=settings.max_places,
-        backend=settings.pipeline.backend,
-        device=_device(settings.pipeline.backend),
-        precision=settings.precision,
+        mode=settings.pipeline.mode,
+        max_places=settings.pipeline.max_places,
+        backend=backend,
+        device=_device(backend),
+        precision=settings.pipeline.precision,
         threshold=settings.pipeline.applied_threshold(settings.operation),
         **(_of_runtime(runtime) if runtime is not None else _unconfigured(node)),
     )
@@ -95,7 +96,7 @@ def _of_runtime(runtime: Runtime) -> dict[str, Any]:
     places, extractor = pipeline.places, pipeline.extractor
     needs_poses = pipeline.settings.keyframes.needs_poses  # else they are welcome, not needed
     told = _UNCONFIGURED | {
-        'queue': runtime.waiting,
+        'queue': runtime.worker.waiting,
         'window': pipeline.window_fill,
         'map_path': runtime.loading or pipeline.path,
         'map_state': 'loading' if runtime.loading else pipeline.map_state,

@@ -1,4 +1,4 @@
-"""One thread does the heavy work; callbacks only hand over."""
+"""One thread does the heavy work; callbacks only enqueue."""
 
 import threading
 import traceback
@@ -9,18 +9,18 @@ from typing import Any
 
 from rclpy.logging import get_logger
 
-PATIENCE = 3.0  # seconds for what is in work when the thread is stopped: `ros2 launch` loses its own after 5
+STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end: `ros2 launch` kills after 5
 
 
 class Worker:
     """
-    A thread that works on items, newest kept: when the slot is full, the oldest item is dropped.
+    A thread that processes items; when the queue is full, the oldest item is dropped.
 
-    Calls, such as using a map, are run by the same thread, before the next item: whatever the thread
-    owns needs no lock.
+    Calls, such as a change of the map, run on the same thread before the next item: objects that
+    the thread owns need no lock.
 
     :param process: called with each item.
-    :param capacity: items that may wait.
+    :param capacity: maximum number of waiting items.
     """
 
     def __init__(self, process: Callable[[Any], None], capacity: int) -> None:
@@ -36,11 +36,11 @@ class Worker:
 
     @property
     def waiting(self) -> int:
-        """Items that wait."""
+        """Number of waiting items."""
         return len(self._items)
 
     def put(self, item: Any) -> Any | None:
-        """Hand over an item; return the item that was dropped for it, if any."""
+        """Enqueue an item; return the item that was dropped for it, if any."""
         with self._changed:
             dropped = self._items.popleft() if len(self._items) >= self._capacity else None
             self._items.append(item)
@@ -48,14 +48,14 @@ class Worker:
         return dropped
 
     def clear(self) -> list[Any]:
-        """Drop the items that wait, and return them."""
+        """Remove the waiting items and return them."""
         with self._changed:
             items = list(self._items)
             self._items.clear()
         return items
 
     def call(self, function: Callable[[], Any]) -> Future[Any]:
-        """Have the thread call a function; the future holds what came of it, cancelled after the end."""
+        """Call a function on the thread; after :meth:`stop`, the future is cancelled."""
         future: Future[Any] = Future()
         with self._changed:
             if self._stopping:
@@ -67,7 +67,7 @@ class Worker:
 
     def stop(self) -> bool:
         """
-        Finish what is in work, drop the rest, end the thread; what takes too long is left to itself.
+        Finish the work in progress, cancel the rest, and end the thread or abandon it.
 
         :returns: whether the thread has ended.
         """
@@ -75,11 +75,13 @@ class Worker:
             self._stopping = True
             self._changed.notify()
         if threading.current_thread() is not self._thread:
-            self._thread.join(PATIENCE)
+            self._thread.join(STOP_TIMEOUT)
         for future, _ in self._calls:
             future.cancel()
         if self._thread.is_alive() and self._running is not None and not self._running.done():
-            self._running.set_exception(TimeoutError(f'the node ended; not done within {PATIENCE:g} s'))
+            self._running.set_exception(
+                TimeoutError(f'the node ended; not done within {STOP_TIMEOUT:g} s')
+            )
         return not self._thread.is_alive()
 
     def _run(self) -> None:
@@ -99,10 +101,10 @@ class Worker:
         self._running = future
         try:
             result, error = function(), None
-        except Exception as raised:  # handed to whoever asked
+        except Exception as raised:  # handed to the caller
             result, error = None, raised
         self._running = None
-        if future.done():  # given up meanwhile
+        if future.done():  # abandoned by stop()
             return
         if error is None:
             future.set_result(result)
@@ -110,7 +112,7 @@ class Worker:
             future.set_exception(error)
 
     def _process_safely(self, item: Any) -> None:
-        """Nothing that one item does may end the thread, which would end all that come after."""
+        """Process an item; an error must not end the thread, and with it all later items."""
         try:
             self._process(item)
         except Exception:
