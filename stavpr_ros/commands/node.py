@@ -21,7 +21,7 @@ accepted matches also ~/place_index, ~/distance, ~/pose and ~/loop_closure; ~/ca
 ~/relocalize, ~/set_operation.
 
 Build a map with `build_map`. Without a map (in mode paper: or a threshold) the node publishes the
-status NOT_READY with the reason; the service ~/load_map and the parameter threshold set them later.
+status NOT_READY with the reason; set them later by ~/load_map and the parameter threshold.
 
 parameters:
 {parameters}

@@ -76,7 +76,7 @@ class PipelineSettings:
         return LOOP_THRESHOLD if operation == 'loop_closure' else THRESHOLD
 
     def recognition(self, operation: str) -> RecognizerSettings:
-        """Return settings of the recognizer; a missing threshold is a value that is not applied."""
+        """Return settings of the recognizer; without a threshold, with one that is not applied."""
         threshold = self.applied_threshold(operation) or THRESHOLD
         return RecognizerSettings(
             threshold, self.spatial, self.sequence, self.nms_radius, self.mode
@@ -136,9 +136,8 @@ class PipelineSettings:
         if operation == 'mapping':
             return stages
         matching = self.matching_backend(operation)
-        sequences = (
-            'cpu' if options_of(self.mode).any else matching
-        )  # mode robust: on the CPU only
+        # mode robust matches sequences on the CPU only
+        sequences = 'cpu' if options_of(self.mode).any else matching
         return (
             f'{stages}, image distances on {matching} ({self.precision}), sequences on {sequences}'
         )
@@ -202,30 +201,26 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
         choices = BY_NAME[name].choices
         if choices and value not in choices:
             raise SettingsError(f'{name} = {value!r} is unknown: take one of {", ".join(choices)}')
-    taken = dict(values)
-    threshold, method = taken.pop('threshold'), taken.pop('geometric_check')
-    min_inliers = taken.pop('min_inliers')
+    values = {**values, 'threshold': None if values['threshold'] < 0 else values['threshold']}
+    method = values['geometric_check']
     pipeline = PipelineSettings(
-        threshold=None if threshold < 0 else threshold,
         spatial=SpatialSettings(
-            taken.pop('strategy'),
-            taken.pop('sigma'),
-            taken.pop('xi') or None,
-            taken.pop('vertical'),
+            values['strategy'], values['sigma'], values['xi'] or None, values['vertical']
         ),
-        sequence=SequenceSettings(taken.pop('sequence_length'), taken.pop('beta')),
+        sequence=SequenceSettings(values['sequence_length'], values['beta']),
         keyframes=KeyframeSettings(
-            taken.pop('keyframe_interval'),
-            taken.pop('keyframe_distance'),
-            taken.pop('keyframe_angle'),
-            taken.pop('keyframe_change'),
+            values['keyframe_interval'],
+            values['keyframe_distance'],
+            values['keyframe_angle'],
+            values['keyframe_change'],
         ),
-        geometric=None if method == 'none' else GeometricSettings(method, min_inliers),
-        **{
-            name: taken.pop(name)
-            for name in list(taken)
-            if name in PipelineSettings.__dataclass_fields__
-        },
+        geometric=None if method == 'none' else GeometricSettings(method, values['min_inliers']),
+        **_of_same_name(PipelineSettings, values),
     )
     choose_backend(pipeline.backend)
-    return NodeSettings(**taken, pipeline=pipeline)
+    return NodeSettings(pipeline=pipeline, **_of_same_name(NodeSettings, values))
+
+
+def _of_same_name(settings: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of parameters that are fields of the same name."""
+    return {name: value for name, value in values.items() if name in settings.__annotations__}

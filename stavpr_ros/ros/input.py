@@ -30,8 +30,8 @@ from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros.messages import nanoseconds, odometry_pose
 
 _REMEDIES = {
-    'RELIABILITY': 'set qos_overrides.{topic}.subscription.reliability to best_effort, or make the '
-    'publisher reliable',
+    'RELIABILITY': 'set qos_overrides.{topic}.subscription.reliability to best_effort, or make '
+    'the publisher reliable',
     'DURABILITY': 'set qos_overrides.{topic}.subscription.durability to volatile, or make the '
     'publisher transient local',
 }
