@@ -5,10 +5,9 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 from std_msgs.msg import Header
 
@@ -26,9 +25,6 @@ from stavpr_ros.ros.worker import STOP_TIMEOUT, Worker
 from stavpr_ros.threads import limit_threads
 
 REPORT_PERIOD = 10.0  # seconds between repeated warnings
-END_POLL = 0.2  # seconds until a call to the worker detects the end of the node
-
-Result = TypeVar('Result')
 
 
 @dataclass(frozen=True)
@@ -71,11 +67,11 @@ class Runtime:
         self.last_header = Header()  # of the last image in the window
         self.loading = self.problem = ''
         self._load_lock = threading.Lock()
-        self.worker = Worker(self._process, settings.queue_size)
+        self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size)
         self._pipeline: Pipeline | None = None
         try:
-            self._pipeline = self.on_worker(self._make_pipeline)
+            self._pipeline = self.worker.run(self._make_pipeline)
             if settings.map_path:
                 self.load(settings.map_path)
         except BaseException:
@@ -92,24 +88,6 @@ class Runtime:
         limit_threads(self._settings.threads)
         return Pipeline(self._settings.pipeline, self._settings.operation)
 
-    def on_worker(self, function: Callable[[], Result]) -> Result:
-        """
-        Call a function on the worker and return its result.
-
-        :raises StavprError: the node ends, or is cleaned up, before the call is done.
-        """
-        future = self.worker.call(function)
-        while not future.done():
-            wait([future], END_POLL)
-            if self._node.ending.is_set() and not future.done():
-                raise StavprError('the node ends')
-        try:
-            return future.result()
-        except CancelledError:
-            raise StavprError('the node is no longer configured') from None
-        except TimeoutError as error:  # the worker was abandoned
-            raise StavprError(str(error)) from error
-
     # life cycle
 
     def activate(self) -> None:
@@ -123,7 +101,7 @@ class Runtime:
     def deactivate(self) -> None:
         """Unsubscribe; publish waiting images as dropped, and save a recorded map."""
         self._unsubscribe()
-        self._save(self.on_worker)
+        self._save(self.worker.run)
 
     def close(self) -> None:
         """Unsubscribe, save a recorded map, and end the worker and the publishers."""
@@ -173,7 +151,7 @@ class Runtime:
 
         :raises StavprError: the operation cannot be changed; nothing is changed then.
         """
-        self.on_worker(lambda: self.pipeline.change(settings.pipeline, settings.operation))
+        self.worker.run(lambda: self.pipeline.change(settings.pipeline, settings.operation))
         self._settings = settings
         if self.images is not None:
             self.images.max_rate, self.images.stamps.gap = (
@@ -194,7 +172,7 @@ class Runtime:
         """
         with self._loading(path):
             loaded = read_map(path, self._settings.pipeline)
-            self.on_worker(lambda: self.pipeline.change(loaded=loaded))
+            self.worker.run(lambda: self.pipeline.change(loaded=loaded))
         places, features = loaded.places, loaded.places.features
         self._node.get_logger().info(
             f'map {path}: {len(places)} places, features {places.settings.kind}, '
@@ -232,7 +210,7 @@ class Runtime:
             self._pipeline_epoch = epoch
             self.pipeline.reset()
 
-        self.on_worker(empty)
+        self.worker.run(empty)
 
     def map_info(self) -> MapInfo:
         """Return the description of the map in use."""

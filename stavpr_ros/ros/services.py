@@ -73,7 +73,7 @@ class Services:
             raise StavprError(
                 "path = '', save_path is not set, and the map has no file: set a path"
             )
-        response.places = write_map(runtime.pipeline, runtime.on_worker, path, request.overwrite)
+        response.places = write_map(runtime.pipeline, runtime.worker.run, path, request.overwrite)
         self._node.publish_map_info()
         return f'{response.places} places to {path}'
 
@@ -93,7 +93,7 @@ class Services:
             candidates = candidates_message(header, match, pipeline.places)
             response.candidates = candidates.candidates if candidates is not None else []
 
-        runtime.on_worker(relocalize)
+        runtime.worker.run(relocalize)
         return response.match.reason or f'place {response.match.place_index}'
 
     def _set_operation(self, runtime: 'Runtime', request: Any, response: Any) -> str:

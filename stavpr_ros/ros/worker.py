@@ -4,12 +4,18 @@ import threading
 import traceback
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future
-from typing import Any
+from concurrent.futures import CancelledError, Future, wait
+from typing import Any, TypeVar
 
 from rclpy.logging import get_logger
 
+from stavpr_ros.errors import StavprError
+
 STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end: `ros2 launch` kills after 5
+
+END_POLL = 0.2  # seconds until a waiting caller detects the end of the node
+
+Result = TypeVar('Result')
 
 
 class Worker:
@@ -21,11 +27,13 @@ class Worker:
 
     :param process: called with each item.
     :param capacity: maximum number of waiting items.
+    :param ending: set when callers must not wait any longer.
     """
 
-    def __init__(self, process: Callable[[Any], None], capacity: int) -> None:
-        self._process = process
-        self._capacity = capacity
+    def __init__(
+        self, process: Callable[[Any], None], capacity: int, ending: threading.Event
+    ) -> None:
+        self._process, self._capacity, self._ending = process, capacity, ending
         self._items: deque[Any] = deque()
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._running: Future[Any] | None = None
@@ -64,6 +72,24 @@ class Worker:
                 self._calls.append((future, function))
                 self._changed.notify()
         return future
+
+    def run(self, function: Callable[[], Result]) -> Result:
+        """
+        Call a function on the thread and return its result.
+
+        :raises StavprError: the thread was stopped, or the node ends, before the call is done.
+        """
+        future = self.call(function)
+        while not future.done():
+            wait([future], END_POLL)
+            if self._ending.is_set() and not future.done():
+                raise StavprError('the node ends')
+        try:
+            return future.result()
+        except CancelledError:
+            raise StavprError('the node is no longer configured') from None
+        except TimeoutError as error:  # abandoned by stop()
+            raise StavprError(str(error)) from error
 
     def stop(self) -> bool:
         """
