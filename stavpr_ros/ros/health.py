@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, replace
 
+from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.statistics import Counts
 from stavpr_ros.ros.runtime import Runtime
-from stavpr_ros.ros.settings import NodeSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +71,7 @@ def node_health(
     :param problem: cause of the last failed transition; empty = none failed.
     :param runtime: None while the node is not configured.
     """
+    backend = settings.pipeline.matching_backend(settings.operation)
     loads = state == 'configuring' and settings.map_path
     health = Health(
         counts=counts,
@@ -80,13 +81,13 @@ def node_health(
         map_path=settings.map_path if loads else '',
         transport=settings.image_transport,
         queue_size=settings.queue_size,
-        length=settings.sequence_length,
+        length=settings.pipeline.sequence.length,
         operation=settings.operation,
-        mode=settings.mode,
-        max_places=settings.max_places,
-        backend=settings.pipeline.backend,
-        device=_device(settings.pipeline.backend),
-        precision=settings.precision,
+        mode=settings.pipeline.mode,
+        max_places=settings.pipeline.max_places,
+        backend=backend,
+        device=_device(backend),
+        precision=settings.pipeline.precision,
         threshold=settings.pipeline.applied_threshold(settings.operation),
     )
     return health if runtime is None else _configured(health, runtime)
@@ -100,7 +101,7 @@ def _configured(health: Health, runtime: Runtime) -> Health:
     health = replace(
         health,
         problem=health.problem or runtime.problem,
-        queue=runtime.waiting,
+        queue=runtime.worker.waiting,
         window=pipeline.window_fill,
         map_path=runtime.loading or pipeline.path,
         map_state='loading' if runtime.loading else pipeline.map_state,
