@@ -65,7 +65,7 @@ def plain(images: Sequence[np.ndarray]) -> Any:
     import torch
 
     from stavpr_ros.features.gradient import GradientSettings, feature_maps_by_torch
-    from stavpr_ros.features.strips import cut_strips, normalize
+    from stavpr_ros.features.extractor import cut_strips, normalize
 
     s = GradientSettings()
     square = partial(cv2.resize, dsize=(s.size, s.size), interpolation=cv2.INTER_AREA)

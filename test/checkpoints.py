@@ -3,25 +3,34 @@
 import struct
 from collections import OrderedDict
 
+import numpy as np
 import torch
 
 MAGIC, PROTOCOL = 0x1950A86A20F9469CFC6C, 1001  # the first two numbers in every file of before torch 1.6
 
 
 def random_parameters(shapes: dict[str, tuple[int, ...]], seed: int = 0) -> dict[str, torch.Tensor]:
-    """Parameters that keep the maps at about one scale; those of linear layers take no memory."""
-    generator = torch.Generator().manual_seed(seed)
+    """
+    Return parameters that keep the maps at about one scale, equal to the bit on every machine.
+
+    Those of linear layers are zeros, one element in memory.
+    """
+    generator = np.random.RandomState(seed)  # whose bytes are the same in every version of numpy
     parameters = {}
     for name, shape in shapes.items():
-        noise = torch.zeros(1).expand(shape) if len(shape) == 2 else torch.randn(shape, generator=generator)
+        if len(shape) == 2:
+            parameters[name] = torch.zeros(1).expand(shape)
+            continue
+        numbers = np.frombuffer(generator.bytes(int(np.prod(shape))), np.int8)
+        noise = torch.from_numpy(numbers.reshape(shape).astype(np.float32) / 74)  # deviation 1
         if len(shape) == 4:
-            noise = noise * (2 / (shape[1] * shape[2] * shape[3])) ** 0.5
+            noise *= (2 / (shape[1] * shape[2] * shape[3])) ** 0.5
         elif name.endswith('running_var'):
             noise = noise.abs() + 0.5
         elif 'norm' in name and name.endswith('weight'):
             noise = 1 + 0.2 * noise
         else:
-            noise = 0.2 * noise
+            noise *= 0.2
         parameters[name] = noise
     return parameters
 
@@ -38,7 +47,7 @@ class OldPickle:
         parts = [self.pickle(part) for part in (MAGIC, PROTOCOL, system, content)]
         parts.append(self.pickle(sorted(self.storages)))
         for _, tensor in sorted(self.storages.items()):
-            parts += [struct.pack('<q', tensor.numel()), tensor.contiguous().numpy().tobytes()]
+            parts += [struct.pack('<q', tensor.numel()), tensor.numpy().tobytes()]
         return b''.join(parts)
 
     def pickle(self, value: object) -> bytes:
@@ -78,10 +87,12 @@ class OldPickle:
 
     def _tensor(self, tensor: torch.Tensor) -> bytes:
         key = str(94000000 + len(self.storages))
-        self.storages[key] = tensor
+        expanded = not any(tensor.stride())  # of one element
+        self.storages[key] = tensor.as_strided((1,), (1,)) if expanded else tensor.contiguous()
         kind = Global('torch.cuda', 'FloatStorage')
-        storage = self._emit(('storage', kind, key, 'cuda:0', tensor.numel(), None)) + b'Q'
-        strides = tensor.contiguous().stride()
+        size = self.storages[key].numel()
+        storage = self._emit(('storage', kind, key, 'cuda:0', size, None)) + b'Q'
+        strides = tensor.stride() if expanded else tensor.contiguous().stride()
         view = b'(' + storage + b''.join(map(self._emit, (0, tuple(tensor.shape), strides))) + b't'
         return self._emit(Global('torch._utils', '_rebuild_tensor')) + view + b'R'
 

@@ -1,11 +1,14 @@
 """Fixtures: the folder of real data, synthetic images and maps."""
 
 import os
+from collections import OrderedDict
 from functools import partial
 from pathlib import Path
 
+import networks
 import numpy as np
 import pytest
+from checkpoints import OldPickle, places365_file, random_parameters
 from hypothesis import settings
 
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
@@ -110,3 +113,31 @@ def squeezenet_settings(data_folder):
         mean=(104, 117, 123),
         std=(1, 1, 1),
     )
+
+
+@pytest.fixture(scope='session')
+def densenet_parameters():
+    """Random parameters of DenseNet161, equal to the bit on every machine."""
+    return random_parameters(networks.densenet161_shapes())
+
+
+@pytest.fixture(scope='session')
+def densenet_file(densenet_parameters, tmp_path_factory) -> Path:
+    """Their checkpoint as published: of Python 2, old names, a prefix, tensors of a GPU."""
+    path = tmp_path_factory.mktemp('weights') / 'densenet161_places365.pth.tar'
+    path.write_bytes(places365_file(densenet_parameters))
+    return path
+
+
+@pytest.fixture(scope='session')
+def vgg_parameters():
+    """Random parameters of VGG16, equal to the bit on every machine."""
+    return random_parameters(networks.vgg16_shapes())
+
+
+@pytest.fixture(scope='session')
+def vgg_file(vgg_parameters, tmp_path_factory) -> Path:
+    """Their checkpoint, of Python 2 as the published one."""
+    path = tmp_path_factory.mktemp('weights') / 'vgg16.pth'
+    path.write_bytes(OldPickle().file(OrderedDict(vgg_parameters)))
+    return path

@@ -18,9 +18,10 @@ from stavpr_ros.features.gradient import (
     _on_threads,
     feature_maps_by_torch,
 )
-from stavpr_ros.features.gradient_kernel import _to_polar, describe_picture
-from stavpr_ros.features.preprocessing import METHODS, resize_square
-from stavpr_ros.features.strips import cut_strips, normalize
+from stavpr_ros.features.gradient_kernel import _to_polar, gradient_maps
+from stavpr_ros.features.preprocessing import resize_square
+from stavpr_ros.features.registry import RESIZE_METHODS
+from stavpr_ros.features.extractor import cut_strips, normalize
 
 
 def reference_maps(gray: np.ndarray, settings: GradientSettings) -> np.ndarray:
@@ -44,7 +45,7 @@ def reference_maps(gray: np.ndarray, settings: GradientSettings) -> np.ndarray:
 def kernel_maps(gray: np.ndarray, settings: GradientSettings) -> np.ndarray:
     """What the compiled kernel makes of a square picture."""
     maps = np.full((settings.orientations, settings.cells, settings.cells), np.nan, np.float32)
-    describe_picture(gray, settings.cell, settings.signed, FLOOR, maps)
+    gradient_maps(gray, settings.cell, settings.signed, FLOOR, maps)
     return maps
 
 
@@ -64,7 +65,7 @@ def gradient_settings(draw):
     cell = draw(st.integers(2, 17))
     cells = draw(st.integers(2, 64 // cell + 2))
     bins, signed = draw(st.integers(2, 12)), draw(st.booleans())
-    return GradientSettings(cell * cells, draw(st.sampled_from(METHODS)), cell, bins, signed)
+    return GradientSettings(cell * cells, draw(st.sampled_from(RESIZE_METHODS)), cell, bins, signed)
 
 
 def picture(seed: int, contrast: int, shape: tuple[int, int]) -> np.ndarray:

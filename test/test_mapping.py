@@ -73,7 +73,7 @@ def test_projected_otherwise_is_refused(small_map, route):
     recognizer = PlaceRecognizer(small_map, RecognizerSettings(threshold=1.0))
     for other in (FeatureExtractor(projection=64, seed=1), FeatureExtractor(), FeatureExtractor(projection=64, strips=6)):
         with pytest.raises(FeatureMismatchError) as caught:
-            recognizer.add(other.extract(route[:1]))
+            recognizer.update(other.extract(route[:1]))
         assert small_map.settings.to_json() in str(caught.value)
         assert other.settings.to_json() in str(caught.value)
     assert recognizer.window_fill == 0
@@ -219,7 +219,7 @@ def test_images_are_decoded_by_one_thread_that_also_closes_the_source(route):
         build_map(damaged, FeatureExtractor(), progress=False)
     given_up = Watched(drive(route))
     broken = FeatureExtractor()
-    broken.describe = lambda images: 1 / 0
+    broken.extract = lambda images: 1 / 0
     with pytest.raises(ZeroDivisionError):
         build_map(given_up, broken, progress=False)
     for source in (whole, damaged, given_up):

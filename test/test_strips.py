@@ -3,15 +3,14 @@
 import numpy as np
 import oracle
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stavpr_ros.alignment import holistic_distances, strip_distances
 from stavpr_ros.errors import InputError
+from stavpr_ros.features.extractor import cut_strips, normalize
 
-torch = pytest.importorskip('torch')
-strips_module = pytest.importorskip('stavpr_ros.features.strips')
-cut_strips, normalize = strips_module.cut_strips, strips_module.normalize
 
 TOLERANCE = 1e-5
 

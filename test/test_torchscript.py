@@ -111,7 +111,7 @@ def test_nothing_after_the_layer_runs(file):
     """At 32 pixels the head does not fit: what comes before it does not mind."""
     backbone = backbone_class('torchscript')(settings(file, layer='body.last', size=32))
     assert backbone.feature_maps(images(2)).shape == (2, 6, 16, 16)
-    with pytest.raises(SettingsError, match='does not take 2 images of size 32'):
+    with pytest.raises(SettingsError, match='rejects 2 images of size 32'):
         backbone_class('torchscript')(settings(file, layer='head', size=32)).feature_maps(images(2))
 
 
@@ -147,7 +147,7 @@ def test_errors_say_what_to_do(file, tmp_path):
         FeatureExtractor('torchscript', settings(file, layer='body.fire'))
     with pytest.raises(SettingsError, match=r"the layer 'body\.block\.unused', but calls it .* not at all"):
         FeatureExtractor('torchscript', settings(file, layer='body.block.unused'))
-    with pytest.raises(SettingsError, match=r'gives \(1, 10\) for 1 images: expected a map'):
+    with pytest.raises(SettingsError, match=r'returns \(1, 10\) for 1 images: expected a map'):
         FeatureExtractor('torchscript', settings(file)).extract(images(1))
     with pytest.raises(SettingsError, match='must be'):
         settings(file, channels='hsv')

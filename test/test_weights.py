@@ -14,9 +14,15 @@ from checkpoints import Call, Global, OldPickle
 from torch import nn
 
 from stavpr_ros.errors import FeatureMismatchError, UnavailableError
-from stavpr_ros.features.checkpoint import read_checkpoint
-from stavpr_ros.features.paper_networks import PublishedNetwork, PublishedSettings
-from stavpr_ros.features.weights import PublishedFile, cache_folder, download, promised_hash
+from stavpr_ros.features.paper_networks import PublishedNetwork
+from stavpr_ros.features.registry import PublishedSettings
+from stavpr_ros.features.weights import (
+    PublishedFile,
+    cache_folder,
+    download,
+    expected_hash,
+    read_checkpoint,
+)
 
 
 class Tiny(PublishedNetwork):
@@ -102,8 +108,7 @@ def test_the_cache_is_where_the_desktop_wants_it(monkeypatch, tmp_path):
 
 
 def test_the_official_files():
-    from stavpr_ros.features.densenet import DenseNet161Places365
-    from stavpr_ros.features.vgg import VGG16Pool4
+    from stavpr_ros.features.paper_networks import DenseNet161Places365, VGG16Pool4
 
     assert DenseNet161Places365.published.name == 'densenet161_places365.pth.tar'
     assert VGG16Pool4.published.name == f'vgg16-{VGG16Pool4.published.sha256}.pth'
@@ -135,7 +140,7 @@ def test_download_once_then_from_the_cache(server, cache, content, capsys):
     ('changes', 'message'),
     [
         ({'status': 404}, 'HTTP Error 404'),
-        ({'announced': 10**6}, 'of 1000000 bytes came'),
+        ({'announced': 10**6}, 'of 1000000 bytes received'),
         ({'body': b''}, 'cannot be read as a file of weights'),
     ],
 )
@@ -208,7 +213,7 @@ def test_the_users_hash_is_held_against_the_download(server, cache, content):
 def test_a_file_that_changed_since_its_download_is_noticed(server, cache, content):
     tiny(model='download')
     (cache / 'tiny.pth').write_bytes(content[:-1] + b'\x01')
-    with pytest.raises(UnavailableError, match='is damaged or another file; delete it'):
+    with pytest.raises(UnavailableError, match='it is damaged or another file; delete it'):
         Tiny(PublishedSettings())
 
 
@@ -231,13 +236,13 @@ def test_another_file_than_the_maps(server, tmp_path, content):
 
 def test_hashes_that_are_known(tmp_path):
     published = PublishedFile('http://a/b/net-89abcdef.pth', sha256='89abcdef')
-    assert promised_hash(tmp_path / 'net-89abcdef.pth', published) == '89abcdef'
-    assert promised_hash(tmp_path / 'other.pth', published) == ''
+    assert expected_hash(tmp_path / 'net-89abcdef.pth', published) == '89abcdef'
+    assert expected_hash(tmp_path / 'other.pth', published) == ''
     (tmp_path / 'other.pth.sha256').write_text('ABCD  other.pth\n')
-    assert promised_hash(tmp_path / 'other.pth', published) == 'abcd'
+    assert expected_hash(tmp_path / 'other.pth', published) == 'abcd'
     (tmp_path / 'other.pth.sha256').write_bytes(b'\xff')
     with pytest.raises(UnavailableError, match='sha256 cannot be read'):
-        promised_hash(tmp_path / 'other.pth')
+        expected_hash(tmp_path / 'other.pth')
 
 
 def read(tmp_path, content: bytes) -> dict[str, torch.Tensor]:

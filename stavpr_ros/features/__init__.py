@@ -1,7 +1,22 @@
-"""Images to local features: one file a kind, vertical strips, random projection."""
+"""
+Images to local features: one kind a module, vertical strips, random projection.
 
-from stavpr_ros.features.extractor import FeatureExtractor, FeatureSettings, LocalFeatures
-from stavpr_ros.features.projection import Projection
-from stavpr_ros.features.registry import KINDS
+The names below are imported on first use: :mod:`stavpr_ros.features.registry` loads without torch.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from stavpr_ros.features.extractor import FeatureExtractor, FeatureSettings, LocalFeatures
+    from stavpr_ros.features.projection import Projection
+    from stavpr_ros.features.registry import KINDS
 
 __all__ = ['KINDS', 'FeatureExtractor', 'FeatureSettings', 'LocalFeatures', 'Projection']
+_MODULES = {'KINDS': 'registry', 'Projection': 'projection'}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    return getattr(import_module(f'{__name__}.{_MODULES.get(name, "extractor")}'), name)

@@ -1,4 +1,4 @@
-"""Images to local features: backbone, strips, projection; and the record of how they were made."""
+"""Images to local features: backbone, strips, projection; and the record of their settings."""
 
 import dataclasses
 import json
@@ -9,18 +9,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from stavpr_ros.errors import FeatureMismatchError, ImageError, SettingsError
+from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, SettingsError
 from stavpr_ros.features.projection import Projection
-from stavpr_ros.features.registry import backbone_class, settings_class
-from stavpr_ros.features.strips import cut_strips, normalize
+from stavpr_ros.features.registry import Backbone, backbone_class, settings_class
 
 
 @dataclass(frozen=True)
 class FeatureSettings:
     """
-    Everything that decides what the features of an image are; equal settings give comparable features.
+    All settings with an effect on the features; equal settings give comparable features.
 
-    :param kind: row of the table of kinds, such as ``gradient``.
+    :param kind: name in the table of kinds, such as ``gradient``.
     :param backbone: the settings of that kind, its frozen dataclass.
     :param strips: number of vertical strips W.
     :param projection: identity of the random projection, None without one.
@@ -36,22 +35,24 @@ class FeatureSettings:
             raise SettingsError(f'strips W = {self.strips} must be at least 1')
 
     def to_json(self) -> str:
-        """Return the settings as one line of JSON."""
+        """Return the settings as one line of JSON; map files keep it, so its keys are fixed."""
         return json.dumps(dataclasses.asdict(self), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> 'FeatureSettings':
         """
-        Read what :meth:`to_json` wrote.
+        Read the settings from the JSON of :meth:`to_json`.
 
-        :raises SettingsError: no such kind, or settings that it does not have.
+        :raises SettingsError: no such kind, or no such setting of that kind.
         """
         try:
             fields = json.loads(text)
             fields['backbone'] = settings_class(fields['kind'])(**fields['backbone'])
             return cls(**fields)
         except (ValueError, TypeError, KeyError) as error:
-            raise SettingsError(f'feature settings cannot be read ({error}): {text[:200]}') from error
+            raise SettingsError(
+                f'feature settings cannot be read ({error}): {text[:200]}'
+            ) from error
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,9 @@ class LocalFeatures:
 
     :param strips: unit-norm features, shape (W, n, d), float32, a zero feature all zeros.
     :param weights: norm of each strip over the norm of its image's strips, shape (W, n), float32.
-    :param settings: how they were made.
-    :param cells: rows H and columns of a strip's cells: strips are (channels, H, columns), flattened; None
-        where that is not known, or no more so (random projection).
+    :param settings: the settings of the extractor.
+    :param cells: rows H and columns of a strip's cells: strips are (channels, H, columns),
+        flattened; None if unknown, and after a random projection.
     """
 
     strips: torch.Tensor
@@ -75,22 +76,24 @@ class LocalFeatures:
         return self.strips.shape[1]
 
     def __getitem__(self, images: slice) -> 'LocalFeatures':
-        return dataclasses.replace(self, strips=self.strips[:, images], weights=self.weights[:, images])
+        strips, weights = self.strips[:, images], self.weights[:, images]
+        return dataclasses.replace(self, strips=strips, weights=weights)
 
     def to(self, device: str | torch.device) -> 'LocalFeatures':
         """Return the features on a device."""
-        return dataclasses.replace(self, strips=self.strips.to(device), weights=self.weights.to(device))
+        strips, weights = self.strips.to(device), self.weights.to(device)
+        return dataclasses.replace(self, strips=strips, weights=weights)
 
     def require_same_settings(self, other: FeatureSettings, where: str) -> None:
         """
-        Refuse features that were made otherwise.
+        Reject features with other settings.
 
         :raises FeatureMismatchError: names both settings.
         """
         if self.settings != other:
             raise FeatureMismatchError(
-                f'query features were made with {self.settings.to_json()}, those of {where} with '
-                f'{other.to_json()}: describe the query with the settings of the map'
+                f'query features have the settings {self.settings.to_json()}, those of {where} '
+                f'have {other.to_json()}: extract the query with the settings of the map'
             )
 
     @staticmethod
@@ -108,11 +111,11 @@ class FeatureExtractor:
     """
     Turns images into local features.
 
-    :param kind: ``gradient`` or ``onnx``.
+    :param kind: name in :data:`stavpr_ros.features.registry.KINDS`.
     :param backbone: settings of that kind; None for its defaults.
     :param strips: number of vertical strips W.
-    :param projection: the number of dimensions to project to (a new seeded Gaussian matrix), a
-        :class:`Projection`, or None.
+    :param projection: number of dimensions of a new Gaussian projection, a :class:`Projection`,
+        or None.
     :param seed: of a new projection.
     :param device: ``cpu`` or ``cuda``.
     """
@@ -128,7 +131,7 @@ class FeatureExtractor:
     ) -> None:
         if backbone is None:
             backbone = settings_class(kind)()
-        self._backbone = backbone_class(kind)(backbone, device)
+        self._backbone: Backbone = backbone_class(kind)(backbone, device)
         self._projection: Projection | None = None
         plain = FeatureSettings(kind, self._backbone.settings, strips)
         self.settings = plain
@@ -141,13 +144,17 @@ class FeatureExtractor:
 
     @classmethod
     def from_settings(
-        cls, settings: FeatureSettings, projection: Projection | None, device: str = 'cpu', **changes: Any
+        cls,
+        settings: FeatureSettings,
+        projection: Projection | None,
+        device: str = 'cpu',
+        **changes: Any,
     ) -> 'FeatureExtractor':
         """
-        Make the extractor that a map's features were made with.
+        Make the extractor with the settings of a map.
 
-        :param changes: settings of the backbone to replace, such as the place of a model file.
-        :raises FeatureMismatchError: the projection, or what was changed, gives other features.
+        :param changes: settings of the backbone to replace, such as the path of a model file.
+        :raises FeatureMismatchError: the projection or a change gives other features.
         """
         known = {field.name for field in dataclasses.fields(settings.backbone)}
         changes = {name: value for name, value in changes.items() if value and name in known}
@@ -155,18 +162,19 @@ class FeatureExtractor:
         extractor = cls(settings.kind, backbone, settings.strips, projection, device=device)
         if extractor.settings != settings:
             raise FeatureMismatchError(
-                f'this extractor makes {extractor.settings.to_json()}, the map asks for {settings.to_json()}'
+                f'this extractor has the settings {extractor.settings.to_json()}, the map requires '
+                f'{settings.to_json()}'
             )
         return extractor
 
     @property
     def projection(self) -> Projection | None:
-        """The random projection that is applied, if any."""
+        """The random projection of the features, if any."""
         return self._projection
 
     def extract(self, images: Sequence[np.ndarray]) -> LocalFeatures:
         """
-        Describe images.
+        Extract the local features of images.
 
         :param images: RGB, each (h, w, 3) uint8, of any size.
         :returns: local features of shape (W, len(images), d).
@@ -177,9 +185,51 @@ class FeatureExtractor:
         cells: tuple[int, int] | None = (maps.shape[2], maps.shape[3] // self.settings.strips)
         if not bool(torch.isfinite(strips).all()):
             raise ImageError(
-                'the features of an image are not finite: the network or its input is out of range',
+                'the features of an image are not finite: the network or its input is out of '
+                'range',
                 kind='features',
             )
         if self._projection is not None:
             strips, cells = self._projection.apply(strips), None
         return LocalFeatures(*normalize(strips), self.settings, cells)
+
+
+def cut_strips(feature_maps: torch.Tensor, W: int) -> torch.Tensor:
+    """
+    Cut feature maps into W vertical strips and flatten each (section 1 of the method).
+
+    Of the r = Wf mod W surplus columns, floor(r / 2) are dropped on the left, the others on the
+    right; every strip is floor(Wf / W) columns wide.
+
+    :param feature_maps: shape (n, C, H, Wf).
+    :returns: local features, shape (W, n, C * H * floor(Wf / W)), float32, not normalized.
+    :raises InputError: fewer columns than strips, or not four axes.
+    """
+    if feature_maps.ndim != 4:
+        raise InputError(
+            f'feature maps have shape {tuple(feature_maps.shape)}: expected (n, C, H, Wf)'
+        )
+    n, channels, height, Wf = feature_maps.shape
+    if not 1 <= W <= Wf:
+        raise InputError(
+            f'feature maps are Wf = {Wf} columns wide: they cannot be cut into W = {W} strips'
+        )
+    width = Wf // W
+    left = (Wf % W) // 2
+    kept = feature_maps[..., left : left + W * width].float()
+    strips = kept.reshape(n, channels, height, W, width).permute(3, 0, 1, 2, 4)
+    return strips.reshape(W, n, channels * height * width)
+
+
+def normalize(strips: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """
+    Split strips into directions and shares of the image's norm.
+
+    :param strips: shape (W, n, d), float32.
+    :returns: unit-norm strips (W, n, d), a zero strip stays zero (distance 1 to everything), and
+        weights (W, n): norm of the strip / norm of all strips of its image, 0 for a black image.
+    """
+    norms = torch.linalg.vector_norm(strips, dim=2)
+    whole = torch.linalg.vector_norm(norms, dim=0)
+    unit = strips / torch.where(norms > 0, norms, 1)[:, :, None]
+    return unit, norms / torch.where(whole > 0, whole, 1)

@@ -1,60 +1,31 @@
 """
 Oriented-gradient features: no weights, no training, the default.
 
-Histograms of gradient orientation on a regular grid of overlapping cells, each normalized by the four
-2 x 2 blocks it lies in (after Dalal and Triggs, "Histograms of Oriented Gradients for Human Detection",
-CVPR 2005; one channel an orientation, the mean over the four normalizations). On a CPU they are computed
-picture by picture by a compiled kernel, elsewhere by torch for the whole batch.
+Histograms of gradient orientation on a regular grid of overlapping cells, each normalized by the
+four 2 x 2 blocks around it (after Dalal and Triggs, "Histograms of Oriented Gradients for Human
+Detection", CVPR 2005; one channel an orientation, the mean over the four normalizations). On a CPU
+a compiled kernel computes them image by image, elsewhere torch for the whole batch.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, pad
 
-from stavpr_ros.errors import SettingsError
-from stavpr_ros.features.gradient_kernel import describe_picture
-from stavpr_ros.features.preprocessing import check_method, resize_square
-from stavpr_ros.features.registry import setting
+from stavpr_ros.features.gradient_kernel import gradient_maps
+from stavpr_ros.features.preprocessing import resize_square
+from stavpr_ros.features.registry import GradientSettings
 
 FLOOR = 1e-4  # squared gradient (intensities 0..1) below which a block counts as flat
-PER_THREAD = 8  # images at least: starting a thread takes as long as describing one or two
-
-
-@dataclass(frozen=True)
-class GradientSettings:
-    """Settings of the oriented-gradient features."""
-
-    size: int = setting(224, help='images are resized to size x size pixels first')
-    resize: str = setting('area', help='how images are resized: bilinear, or area (averages, no aliasing)')
-    cell: int = setting(16, help='side of a cell in pixels; size must be a multiple of it')
-    orientations: int = setting(8, help='number of orientation bins')
-    signed: bool = setting(True, help='tell dark-to-bright from bright-to-dark')
-
-    def __post_init__(self) -> None:
-        check_method(self.resize)
-        if self.cell < 2 or self.size < 2 * self.cell or self.size % self.cell:
-            raise SettingsError(
-                f'size {self.size} and cell {self.cell}: size must be a multiple of cell, at least twice it'
-            )
-        if self.orientations < 2:
-            raise SettingsError(f'orientations = {self.orientations} must be at least 2')
-
-    @property
-    def cells(self) -> int:
-        """Cells along one side of a feature map: size / cell, one less if cell is odd (none is half)."""
-        return self.size // self.cell - self.cell % 2
+PER_THREAD = 8  # images at least: starting a thread costs as much as one or two images
 
 
 class Gradient:
     """Feature maps of ``orientations`` channels, ``cells`` x ``cells``."""
-
-    Settings = GradientSettings
 
     def __init__(self, settings: GradientSettings, device: str = 'cpu') -> None:
         self.settings = settings
@@ -62,19 +33,18 @@ class Gradient:
 
     def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
         """
-        Describe a batch of images, on a CPU as many at a time as torch may use threads.
+        Compute the feature maps of a batch of images, on a CPU on as many threads as torch's.
 
         :param images: RGB, each (h, w, 3) uint8, of any size.
         :returns: shape (n, orientations, cells, cells), float32, values >= 0.
         """
-        return self._by_kernel(images) if self._device.type == 'cpu' else self._by_torch(images)
-
-    def _by_kernel(self, images: Sequence[np.ndarray]) -> torch.Tensor:
+        if self._device.type != 'cpu':
+            return self._by_torch(images)
         s = self.settings
         maps = np.empty((len(images), s.orientations, s.cells, s.cells), np.float32)
 
         def extract(i: int) -> None:
-            describe_picture(self._prepare(images[i]), s.cell, s.signed, FLOOR, maps[i])
+            gradient_maps(self._prepare(images[i]), s.cell, s.signed, FLOOR, maps[i])
 
         _on_threads(extract, len(images))
         return torch.from_numpy(maps)
@@ -89,13 +59,12 @@ class Gradient:
         return feature_maps_by_torch(torch.from_numpy(gray).to(self._device), self.settings)
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
-        return resize_square(
-            cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), self.settings.size, self.settings.resize
-        )
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        return resize_square(gray, self.settings.size, self.settings.resize)
 
 
 def _on_threads(work: Callable[[int], None], count: int) -> None:
-    """Call work(0) .. work(count - 1), which hardly needs the GIL, on at most as many threads as torch."""
+    """Call work(0) .. work(count - 1), which rarely holds the GIL, on as many threads as torch."""
     threads = min(torch.get_num_threads(), count // PER_THREAD)
     if threads < 2:
         for i in range(count):
@@ -107,12 +76,12 @@ def _on_threads(work: Callable[[int], None], count: int) -> None:
             work(i)
 
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(part, range(threads)))  # the list raises what a thread raised
+        list(pool.map(part, range(threads)))  # the list re-raises errors of the threads
 
 
 def feature_maps_by_torch(gray: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
     """
-    Compute the feature maps of square pictures with torch's operators, on whatever device they are on.
+    Compute the feature maps of square images with torch's operators, on their device.
 
     :param gray: shape (n, size, size), uint8.
     :returns: shape (n, orientations, cells, cells), float32.
@@ -136,7 +105,7 @@ def _histograms(gray: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
 
 
 def _normalize(histograms: torch.Tensor) -> torch.Tensor:
-    """Multiply each cell by the mean of 1 / norm over the four 2 x 2 blocks that it is part of."""
+    """Multiply each cell by the mean of 1 / norm over the four 2 x 2 blocks around it."""
     energy = pad((histograms**2).sum(dim=1, keepdim=True), (1, 1, 1, 1), mode='replicate')
     scale = torch.rsqrt(4 * avg_pool2d(energy, 2, stride=1) + FLOOR)
     return histograms * avg_pool2d(scale, 2, stride=1)

@@ -1,11 +1,11 @@
 """
-The oriented gradients of one picture on one core, compiled.
+The oriented gradients of one image on one core, compiled.
 
-All arithmetic on pixels runs over rows in SIMD lanes: nothing is looked up and nothing scattered. A
-pixel's share in every orientation is computed, also where it is zero: that is a subtraction and a
-maximum, and costs less than finding the two orientations that get one. Cells overlap by half and are two
-cells wide, so a picture is summed once over *chunks*, a cell wide and half a cell off the grid; a cell is
-two by two of them. No ``fastmath``: the features are the same on every machine.
+All arithmetic on pixels runs over rows in SIMD lanes: without look-up and scatter. A pixel's share
+in every orientation is computed, also where it is zero: that is a subtraction and a maximum, and
+costs less than finding the two orientations with a share. Cells overlap by half and are two cells
+wide, so an image is summed once over *chunks*, a cell wide and half a cell off the grid; a cell is
+two by two of them. No ``fastmath``: the features are equal on every machine.
 """
 
 import cv2
@@ -27,15 +27,17 @@ P0, P1, P2, P3, P4, P5, P6 = (
 FULL_SCALE = F(255)
 
 
-def describe_picture(gray: np.ndarray, cell: int, signed: bool, floor: float, maps: np.ndarray) -> None:
+def gradient_maps(
+    gray: np.ndarray, cell: int, signed: bool, floor: float, maps: np.ndarray
+) -> None:
     """
-    Compute the feature maps of one picture.
+    Compute the feature maps of one image.
 
     :param gray: shape (size, size), uint8.
     :param cell: side of a cell in pixels.
     :param signed: orientations cover the whole turn, else half of it.
     :param floor: squared gradient (intensities 0..1) below which a block counts as flat.
-    :param maps: the answer is written here, shape (orientations, cells, cells), float32.
+    :param maps: output, shape (orientations, cells, cells), float32.
     """
     padded = cv2.copyMakeBorder(gray, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
     _feature_maps(padded, cell, F(1.0 if signed else 0.5), F(floor), maps)
@@ -128,7 +130,7 @@ def _share_out(position: np.ndarray, magnitude: np.ndarray, columns: np.ndarray)
 
 @kernel
 def _chunks_to_cells(chunks: np.ndarray, factor: F, maps: np.ndarray, energy: np.ndarray) -> None:
-    """Average the chunks over cells, intensities 0..1, and give the squared norm of each cell."""
+    """Average the chunks over cells, intensities 0..1; energy: the squared norm of each cell."""
     cells = maps.shape[1]
     for i in range(cells):
         for j in range(cells):
@@ -146,7 +148,7 @@ def _chunks_to_cells(chunks: np.ndarray, factor: F, maps: np.ndarray, energy: np
 
 @kernel
 def _normalize(maps: np.ndarray, energy: np.ndarray, floor: F) -> None:
-    """Multiply each cell by the mean of 1 / norm over the four 2 x 2 blocks that it is part of."""
+    """Multiply each cell by the mean of 1 / norm over the four 2 x 2 blocks around it."""
     cells = maps.shape[1]
     scale = energy  # in place: a block is read from its first cell on
     for i in range(cells + 1):
@@ -155,6 +157,8 @@ def _normalize(maps: np.ndarray, energy: np.ndarray, floor: F) -> None:
             scale[i, j] = F(1) / np.sqrt(block + floor)
     for i in range(cells):
         for j in range(cells):
-            mean = F(0.25) * (scale[i, j] + scale[i, j + 1] + scale[i + 1, j] + scale[i + 1, j + 1])
+            mean = F(0.25) * (
+                scale[i, j] + scale[i, j + 1] + scale[i + 1, j] + scale[i + 1, j + 1]
+            )
             for b in range(maps.shape[0]):
                 maps[b, i, j] *= mean

@@ -1,115 +1,94 @@
-"""What the networks with published weights have in common: settings, loading, batches, half precision."""
+"""
+The paper's two networks with their published weights (section 1 of the method).
 
-from abc import ABC, abstractmethod
+DenseNet161: Huang, Liu, van der Maaten, Weinberger, "Densely connected convolutional networks",
+CVPR 2017, growth rate 48, with the Places365 weights of Zhou et al., "Places: a 10 million image
+database for scene recognition", PAMI 2017; its layer denseblock4.denselayer10.relu1.
+
+VGG16: configuration D of Simonyan, Zisserman, "Very deep convolutional networks for large-scale
+image recognition", ICLR 2015, with torchvision's ImageNet weights; its fourth pooling layer.
+"""
+
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import nn
+from torch.nn.functional import avg_pool2d, max_pool2d, relu
 
-from stavpr_ros.errors import SettingsError, UnavailableError
-from stavpr_ros.features.batch import BatchMaker
-from stavpr_ros.features.checkpoint import load_parameters, read_checkpoint
-from stavpr_ros.features.preprocessing import check_method
-from stavpr_ros.features.registry import setting
+from stavpr_ros.errors import UnavailableError
+from stavpr_ros.features.preprocessing import BatchMaker
+from stavpr_ros.features.registry import CACHED, DOWNLOAD, PublishedSettings
 from stavpr_ros.features.weights import (
-    CACHED,
-    DOWNLOAD,
     PublishedFile,
+    expected_hash,
     find_weights,
+    load_parameters,
     open_weights,
-    promised_hash,
+    read_checkpoint,
 )
 
-PER_PASS = 32  # images that go through a network together, which bounds its memory
+PER_PASS = 32  # images that go through a network together: bounds its memory
+
+GROWTH = 48  # channels of a layer of DenseNet161
+FIRST = 96  # channels before the first block
+BLOCKS = (6, 12, 36, 24)  # layers of each block
+LAST_LAYER = 10  # of the last block: its first normalization and ReLU give the feature maps
+OLD_NAMES = re.compile(r'(\.denselayer\d+\.(?:norm|conv))\.([12]\.)')  # from before torch 0.4
+
+# Channels of the convolutions of VGG16, and the index of the fourth pooling among its layers.
+STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+POOL4 = 23
 
 
-@dataclass(frozen=True)
-class PublishedSettings:
-    """Settings of a network with published weights; it takes RGB with ImageNet's mean and deviation."""
-
-    model: str = setting(
-        CACHED,
-        help="file of the weights; 'download' = the published one, downloaded unless it is in the cache; "
-        "'cached' = the published one from the cache",
-        identity=False,
-    )
-    size: int = setting(224, help='images are resized to size x size pixels')
-    resize: str = setting(
-        'bilinear', help='how images are resized: bilinear, or area (averages, no aliasing)'
-    )
-    half: bool = setting(
-        False, help='float16 on a GPU: faster, hardly other features; no change on a CPU', identity=False
-    )
-    sha256: str = setting('', help='expected hash of the file; empty = take the file as it is')
-
-    def __post_init__(self) -> None:
-        check_method(self.resize)
-        check_hash(self.sha256)
-        if self.size < 32:
-            raise SettingsError(f'size = {self.size} must be at least 32 pixels')
-
-
-def check_hash(sha256: str) -> None:
-    """
-    Refuse what cannot be a sha256.
-
-    :raises SettingsError: not empty and not 64 hexadecimal digits, lower case.
-    """
-    if sha256 and (len(sha256) != 64 or set(sha256) - set('0123456789abcdef')):
-        raise SettingsError(f'sha256 = {sha256!r} must be empty or 64 digits 0-9 a-f')
-
-
-class PublishedNetwork(ABC):
+class PublishedNetwork:
     """
     Feature maps of one layer of a network with published weights.
 
-    A network is one subclass: its file, and how it is built.
+    A subclass names the file and the network: the whole network, with all parameters of the file
+    under their names there, and its part up to the layer.
     """
 
-    Settings = PublishedSettings
     published: ClassVar[PublishedFile]
+    whole_network: ClassVar[type[nn.Module]]
 
     def __init__(self, settings: PublishedSettings, device: str = 'cpu') -> None:
         self._device = torch.device(device)
         path = find_weights(settings.model, self.published, settings.sha256)
-        file, digest = open_weights(path, promised_hash(path, self.published), settings.sha256)
+        file, digest = open_weights(path, expected_hash(path, self.published), settings.sha256)
         with file:
             parameters = read_checkpoint(file, str(path))
-        # A map that was made with a downloaded file finds it in any cache, but downloads nothing by itself.
+        # Recorded in maps: a query elsewhere finds the file in its cache, but downloads nothing.
         model = CACHED if settings.model == DOWNLOAD else settings.model
         self.settings = replace(settings, model=model, sha256=digest)
         with torch.device('meta'):
             network = self.whole_network()
         load_parameters(network, self.current_names(parameters), str(path))
-        dtype = torch.float16 if settings.half and self._device.type == 'cuda' else torch.float32
+        half = settings.half and self._device.type == 'cuda'
+        dtype = torch.float16 if half else torch.float32
         self._layer = self.up_to_layer(network).eval().to(self._device, dtype)
-        self._layer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stub lacks it
+        self._layer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._batch = BatchMaker(settings.size, settings.resize, self._device, dtype)
 
     @staticmethod
-    @abstractmethod
-    def whole_network() -> nn.Module:
-        """Build the network with all parameters that the file has, under the names that they have there."""
-
-    @staticmethod
-    @abstractmethod
     def up_to_layer(network: nn.Module) -> nn.Module:
-        """Return the part of the network that makes the feature maps, without what comes after them."""
+        """Return the part of the network up to the feature maps."""
+        raise NotImplementedError
 
     @staticmethod
     def current_names(parameters: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Rename the parameters of files from before a change of names."""
+        """Rename the parameters of a file with old names."""
         return parameters
 
     def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
         """
-        Describe a batch of images.
+        Compute the feature maps of a batch of images.
 
         :param images: RGB, each (h, w, 3) uint8, of any size; resized without keeping the aspect.
-        :returns: shape (n, C, H, Wf), values >= 0, float32, or float16 with ``half`` on a GPU.
+        :returns: shape (n, C, H, Wf), >= 0, float32, or float16 with ``half`` on a GPU.
         :raises UnavailableError: the device has too little memory.
         """
         try:
@@ -121,6 +100,159 @@ class PublishedNetwork(ABC):
                 return torch.cat(parts)
         except torch.cuda.OutOfMemoryError as error:
             raise UnavailableError(
-                f'device {self._device} has too little memory for {min(len(images), PER_PASS)} images of '
-                f'size {self.settings.size}: give fewer at a time, or take half or another device'
+                f'device {self._device} has too little memory for '
+                f'{min(len(images), PER_PASS)} images of size {self.settings.size}: give fewer at '
+                'a time, or take half or another device'
             ) from error
+
+
+class VGG16(nn.Module):
+    """
+    All parameters of the network, under their names in torchvision's file.
+
+    :param classes: outputs of the last layer.
+    """
+
+    def __init__(self, classes: int = 1000) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        channels = 3
+        for stage in STAGES:
+            for width in stage:
+                layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
+                channels = width
+            layers.append(nn.MaxPool2d(2))
+        self.features = nn.Sequential(*layers)
+        self.classifier = nn.Sequential(
+            nn.Linear(channels * 7 * 7, 4096),
+            nn.ReLU(),
+            nn.Dropout(),
+            nn.Linear(4096, 4096),
+            nn.ReLU(),
+            nn.Dropout(),
+            nn.Linear(4096, classes),
+        )
+
+
+class VGG16Pool4(PublishedNetwork):
+    """Feature maps of 512 channels, size / 16 on a side: 14 x 14 at 224."""
+
+    whole_network = VGG16
+    published = PublishedFile(
+        'https://download.pytorch.org/models/vgg16-397923af.pth', sha256='397923af'
+    )
+
+    @staticmethod
+    def up_to_layer(network: nn.Module) -> nn.Module:
+        """Keep the layers up to the fourth pooling: 29 of the 528 MB of weights."""
+        assert isinstance(network, VGG16)
+        return network.features[: POOL4 + 1]
+
+
+class DenseLayer(nn.Module):
+    """Bottleneck of 1 x 1 and 3 x 3, from all maps so far to ``GROWTH`` new ones."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm1 = nn.BatchNorm2d(channels)
+        self.conv1 = nn.Conv2d(channels, 4 * GROWTH, 1, bias=False)
+        self.norm2 = nn.BatchNorm2d(4 * GROWTH)
+        self.conv2 = nn.Conv2d(4 * GROWTH, GROWTH, 3, padding=1, bias=False)
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        """Compute new maps, (n, GROWTH, H, W), from those so far, (n, channels, H, W)."""
+        narrow = self.conv1(relu(self.norm1(maps), inplace=True))
+        return self.conv2(relu(self.norm2(narrow), inplace=True))
+
+
+class DenseBlock(nn.ModuleDict):
+    """Layers, each with the maps of all layers before it as input."""
+
+    def __init__(self, channels: int, layers: int) -> None:
+        widths = [channels + i * GROWTH for i in range(layers)]
+        super().__init__({f'denselayer{i}': DenseLayer(w) for i, w in enumerate(widths, start=1)})
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        """Append each layer's maps, (n, channels + layers * GROWTH, H, W)."""
+        for layer in self.values():
+            maps = torch.cat([maps, layer(maps)], dim=1)
+        return maps
+
+
+class Transition(nn.Module):
+    """Half as many channels, half as wide and high."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm2d(channels)
+        self.conv = nn.Conv2d(channels, channels // 2, 1, bias=False)
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        """Shrink the maps. The paper averages after the convolution: equal, with 4 x the work."""
+        return self.conv(avg_pool2d(relu(self.norm(maps), inplace=True), 2))
+
+
+class DenseNet161(nn.Module):
+    """
+    All parameters of the network, under their names in the published files.
+
+    :param classes: outputs of the last layer.
+    """
+
+    def __init__(self, classes: int = 365) -> None:
+        super().__init__()
+        features: dict[str, nn.Module] = {
+            'conv0': nn.Conv2d(3, FIRST, 7, stride=2, padding=3, bias=False),
+            'norm0': nn.BatchNorm2d(FIRST),
+        }
+        channels = FIRST
+        for i, layers in enumerate(BLOCKS, start=1):
+            features[f'denseblock{i}'] = DenseBlock(channels, layers)
+            channels += layers * GROWTH
+            if i < len(BLOCKS):
+                features[f'transition{i}'] = Transition(channels)
+                channels //= 2
+        features['norm5'] = nn.BatchNorm2d(channels)
+        self.features = nn.ModuleDict(features)
+        self.classifier = nn.Linear(channels, classes)
+
+
+class UpToDenseLayer10(nn.Module):
+    """The part of a DenseNet161 up to ``features.denseblock4.denselayer10.relu1``."""
+
+    def __init__(self, network: DenseNet161) -> None:
+        super().__init__()
+        conv0, norm0, *blocks, last, _ = network.features.values()
+        assert isinstance(last, DenseBlock)
+        end = last[f'denselayer{LAST_LAYER}']
+        assert isinstance(end, DenseLayer)
+        for i in range(LAST_LAYER, len(last) + 1):
+            del last[f'denselayer{i}']
+        self.conv0, self.norm0, self.norm1 = conv0, norm0, end.norm1
+        self.blocks = nn.Sequential(*blocks, last)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        """Turn standardized images, (n, 3, H, W), into maps, (n, 1488, H / 32, W / 32)."""
+        first = relu(self.norm0(self.conv0(images)), inplace=True)
+        first = max_pool2d(first, 3, stride=2, padding=1)
+        return relu(self.norm1(self.blocks(first)), inplace=True)
+
+
+class DenseNet161Places365(PublishedNetwork):
+    """Feature maps of 1488 channels, size / 32 on a side: 7 x 7 at 224."""
+
+    whole_network = DenseNet161
+    published = PublishedFile(
+        'http://places2.csail.mit.edu/models_places365/densenet161_places365.pth.tar'
+    )
+
+    @staticmethod
+    def up_to_layer(network: nn.Module) -> nn.Module:
+        """Keep the layers up to the first ReLU of layer 10 in the last block."""
+        assert isinstance(network, DenseNet161)
+        return UpToDenseLayer10(network)
+
+    @staticmethod
+    def current_names(parameters: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Rename ``norm.1`` to ``norm1``, ``conv.2`` to ``conv2`` and so on."""
+        return {OLD_NAMES.sub(r'\1\2', key): value for key, value in parameters.items()}

@@ -1,24 +1,150 @@
-"""What a kind of features must offer, and the table of the kinds there are."""
+"""
+The kinds of features: their settings, and the table of the kinds.
+
+Imports neither torch nor OpenCV, so that parameters and command-line options load quickly.
+"""
 
 import dataclasses
 import importlib
 import json
 from collections.abc import Sequence
-from typing import Any, Protocol
-
-import numpy as np
-import torch
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from stavpr_ros.errors import SettingsError
 
-# One row a kind: its name and the class that makes it. Its settings, a frozen dataclass, give the
-# command-line options and what a map remembers; see `setting` below.
-KINDS = {
-    'gradient': 'stavpr_ros.features.gradient:Gradient',
-    'onnx': 'stavpr_ros.features.onnx:Onnx',
-    'torchscript': 'stavpr_ros.features.torchscript:TorchScript',
-    'densenet161_places365': 'stavpr_ros.features.densenet:DenseNet161Places365',
-    'vgg16': 'stavpr_ros.features.vgg:VGG16Pool4',
+if TYPE_CHECKING:
+    import numpy as np
+    import torch
+
+RESIZE_METHODS = ('bilinear', 'area')
+IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of R, G, B in 0..1: torchvision's networks are trained so
+IMAGENET_STD = (0.229, 0.224, 0.225)
+CACHED, DOWNLOAD = 'cached', 'download'  # stand for a published file instead of a path
+_RESIZE_HELP = 'how images are resized: bilinear, or area (averages, no aliasing)'
+_HALF_HELP = 'float16 on a GPU: faster, nearly the same features; no effect on a CPU'
+
+
+def setting(default: Any = dataclasses.MISSING, *, help: str, identity: bool = True) -> Any:
+    """
+    Declare a field of a kind's settings.
+
+    :param help: one sentence for ``--help``.
+    :param identity: False for a field without effect on the features (the location of a file).
+    """
+    return dataclasses.field(default=default, metadata={'help': help}, compare=identity)
+
+
+def _check_resize(method: str) -> None:
+    if method not in RESIZE_METHODS:
+        raise SettingsError(f'resize = {method!r} must be one of {", ".join(RESIZE_METHODS)}')
+
+
+@dataclass(frozen=True)
+class GradientSettings:
+    """Settings of the oriented-gradient features."""
+
+    size: int = setting(224, help='images are resized to size x size pixels first')
+    resize: str = setting('area', help=_RESIZE_HELP)
+    cell: int = setting(16, help='side of a cell in pixels; size must be a multiple of it')
+    orientations: int = setting(8, help='number of orientation bins')
+    signed: bool = setting(True, help='distinguish dark-to-bright from bright-to-dark')
+
+    def __post_init__(self) -> None:
+        _check_resize(self.resize)
+        if self.cell < 2 or self.size < 2 * self.cell or self.size % self.cell:
+            raise SettingsError(
+                f'size {self.size} and cell {self.cell}: size must be a multiple of cell, at '
+                'least twice it'
+            )
+        if self.orientations < 2:
+            raise SettingsError(f'orientations = {self.orientations} must be at least 2')
+
+    @property
+    def cells(self) -> int:
+        """Cells along one side of a feature map: size / cell, one less if cell is odd."""
+        return self.size // self.cell - self.cell % 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkSettings:
+    """Settings that all networks share."""
+
+    LEAST_SIZE: ClassVar[int] = 8
+
+    model: str = setting(help='file of the network', identity=False)
+    size: int = setting(224, help='images are resized to size x size pixels')
+    resize: str = setting('bilinear', help=_RESIZE_HELP)
+    sha256: str = setting('', help='expected hash of the file; empty: not checked')
+
+    def __post_init__(self) -> None:
+        _check_resize(self.resize)
+        if self.sha256 and (len(self.sha256) != 64 or set(self.sha256) - set('0123456789abcdef')):
+            raise SettingsError(f'sha256 = {self.sha256!r} must be empty or 64 digits 0-9 a-f')
+        if self.size < self.LEAST_SIZE:
+            raise SettingsError(f'size = {self.size} must be at least {self.LEAST_SIZE} pixels')
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnnxSettings(NetworkSettings):
+    """Settings of the ONNX features; mean and std are in units of scale * (0..255)."""
+
+    model: str = setting(help='the ONNX file', identity=False)
+    layer: str = setting(help='inner output (tensor) to use, of shape (n, C, H, W)')
+    channels: str = setting('rgb', help='order of the input channels, rgb or bgr')
+    scale: float = setting(1 / 255, help='factor on the pixel values 0..255, before the mean')
+    mean: tuple[float, ...] = setting(
+        IMAGENET_MEAN, help='subtracted, in the order of the channels'
+    )
+    std: tuple[float, ...] = setting(IMAGENET_STD, help='divided by, in the order of the channels')
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, 'mean', tuple(float(v) for v in self.mean))
+        object.__setattr__(self, 'std', tuple(float(v) for v in self.std))
+        if self.channels not in ('rgb', 'bgr'):
+            raise SettingsError(f"channels = {self.channels!r} must be 'rgb' or 'bgr'")
+        if len(self.mean) != 3 or len(self.std) != 3 or not all(self.std):
+            raise SettingsError(
+                f'mean {self.mean} and std {self.std} must be three numbers each, std not 0'
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorchScriptSettings(OnnxSettings):
+    """Settings of the TorchScript features: those of ONNX, and the precision."""
+
+    model: str = setting(help='the TorchScript file', identity=False)
+    layer: str = setting(
+        '',
+        help='module to use the output of, such as features.23, of shape (n, C, H, W); empty: '
+        "the network's output",
+    )
+    half: bool = setting(False, help=_HALF_HELP, identity=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedSettings(NetworkSettings):
+    """Settings of a network with published weights; its input is normalized as for ImageNet."""
+
+    LEAST_SIZE: ClassVar[int] = 32
+
+    model: str = setting(
+        CACHED,
+        help="file of the weights; 'download': the published file, downloaded unless it is in the "
+        "cache; 'cached': the published file from the cache",
+        identity=False,
+    )
+    half: bool = setting(False, help=_HALF_HELP, identity=False)
+
+
+# Settings and class of each kind, the class as MODULE:NAME in this package, imported on use.
+KINDS: dict[str, tuple[type, str]] = {
+    'gradient': (GradientSettings, 'gradient:Gradient'),
+    'onnx': (OnnxSettings, 'onnx:Onnx'),
+    'torchscript': (TorchScriptSettings, 'torchscript:TorchScript'),
+    'densenet161_places365': (PublishedSettings, 'paper_networks:DenseNet161Places365'),
+    'vgg16': (PublishedSettings, 'paper_networks:VGG16Pool4'),
 }
 
 
@@ -26,61 +152,56 @@ class Backbone(Protocol):
     """
     Images to feature maps.
 
-    A class with this shape has an attribute ``Settings``, the frozen dataclass of its settings, and is
-    called with an instance of it and the device (``cpu``, ``cuda``).
+    The class of a kind is called with the kind's settings and the device (``cpu``, ``cuda``).
     """
 
     settings: Any
 
-    def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
-        """Turn RGB images, each (h, w, 3) uint8 of any size, into feature maps (n, C, H, Wf), float."""
+    def feature_maps(self, images: 'Sequence[np.ndarray]') -> 'torch.Tensor':
+        """Compute feature maps (n, C, H, Wf), float, of RGB images (h, w, 3), uint8."""
         ...
 
 
-def setting(default: Any = dataclasses.MISSING, *, help: str, identity: bool = True) -> Any:
+def settings_class(kind: str) -> Any:
     """
-    Declare a field of a backbone's settings.
-
-    :param help: one sentence for ``--help``.
-    :param identity: False for what does not change the features (where a file lies).
-    """
-    return dataclasses.field(default=default, metadata={'help': help}, compare=identity)
-
-
-def backbone_class(kind: str) -> Any:
-    """
-    Return the class of a kind of features, importing its module now.
+    Return the frozen dataclass of a kind's settings.
 
     :raises SettingsError: no such kind.
     """
     if kind not in KINDS:
         raise SettingsError(f'features {kind!r} are unknown: take one of {", ".join(KINDS)}')
-    module, name = KINDS[kind].split(':')
-    return getattr(importlib.import_module(module), name)
+    return KINDS[kind][0]
 
 
-def settings_class(kind: str) -> Any:
-    """Return the frozen dataclass of a kind's settings."""
-    return backbone_class(kind).Settings
+def backbone_class(kind: str) -> Any:
+    """
+    Return the class of a kind, a :class:`Backbone`; imports its module.
+
+    :raises SettingsError: no such kind.
+    """
+    settings_class(kind)
+    module, name = KINDS[kind][1].split(':')
+    return getattr(importlib.import_module(f'stavpr_ros.features.{module}'), name)
 
 
 def settings_from_json(kind: str, text: str, model: str = '') -> Any:
     """
-    Read a kind's settings from a JSON object; what it does not name is the default.
+    Read a kind's settings from a JSON object; missing names take their defaults.
 
-    :param model: the network's file, for kinds that have one; '' = what the object says.
-    :raises SettingsError: no such kind, no such setting, one that is missing, or no JSON object.
+    :param model: the network's file, for kinds that have one; '' = the file in the object.
+    :raises SettingsError: no such kind, no such setting, a missing one, or no JSON object.
     """
     cls = settings_class(kind)
+    names = [field.name for field in dataclasses.fields(cls)]
     try:
         values = json.loads(text)
         if not isinstance(values, dict):
             raise TypeError('expected an object, {"name": value}')
-        if model and 'model' in {field.name for field in dataclasses.fields(cls)}:
+        if model and 'model' in names:
             values['model'] = model
         return cls(**values)
     except (ValueError, TypeError) as error:
-        names = ', '.join(field.name for field in dataclasses.fields(cls))
         raise SettingsError(
-            f'settings {text!r} of features {kind} do not do ({error}): expected a JSON object with {names}'
+            f'settings {text!r} of features {kind} are invalid ({error}): expected a JSON object '
+            f'with {", ".join(names)}'
         ) from error

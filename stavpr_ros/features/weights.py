@@ -1,22 +1,28 @@
-"""Files of weights: where they lie, how published ones get here, and that they are what they should be."""
+"""Files of weights: paths, downloads, hashes; and checkpoints into networks."""
 
 import hashlib
 import http.client
 import os
+import re
 import sys
 import tempfile
 import urllib.request
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import IO, Any, BinaryIO
 
+import numpy as np
+import torch
+from torch import nn
 from tqdm import tqdm
 
 from stavpr_ros.errors import FeatureMismatchError, UnavailableError
+from stavpr_ros.features.registry import CACHED, DOWNLOAD
 
-CACHED, DOWNLOAD = 'cached', 'download'  # words that stand for a published file instead of a path
 TIMEOUT = 30  # seconds without a byte
 PIECE = 1 << 20  # bytes
+COUNTER = '.num_batches_tracked'  # for training only; missing in files from before torch 0.4
 
 
 @dataclass(frozen=True)
@@ -25,7 +31,7 @@ class PublishedFile:
     A file of weights on the server of its authors.
 
     :param address: its URL.
-    :param sha256: what its authors say of its hash: the first digits, or '' where they say nothing.
+    :param sha256: the first digits of its hash as published by the authors, '' if unpublished.
     """
 
     address: str
@@ -38,7 +44,7 @@ class PublishedFile:
 
 
 def cache_folder() -> Path:
-    """Return the folder of downloaded weights, ``$XDG_CACHE_HOME/stavpr_ros`` or ``~/.cache/stavpr_ros``."""
+    """Return the folder of downloads, ``$XDG_CACHE_HOME/stavpr_ros`` or below ``~/.cache``."""
     return Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'stavpr_ros'
 
 
@@ -46,10 +52,10 @@ def find_weights(model: str, published: PublishedFile, sha256: str = '') -> Path
     """
     Turn a setting into the path of a file.
 
-    :param model: a path; or ``cached``, the published file as an earlier download left it; or
-        ``download``, the same, downloaded now if it is not there.
-    :param sha256: the hash that a download must have, '' if it is not known.
-    :raises UnavailableError: the published file is not there, or cannot be downloaded.
+    :param model: a path; or ``cached``, the published file in the cache; or ``download``, the
+        same, downloaded now if it is missing.
+    :param sha256: the required hash of a download, '' if unknown.
+    :raises UnavailableError: the published file is missing, or cannot be downloaded.
     """
     if model not in (CACHED, DOWNLOAD):
         return Path(model)
@@ -58,43 +64,44 @@ def find_weights(model: str, published: PublishedFile, sha256: str = '') -> Path
         return path
     if model == CACHED:
         raise UnavailableError(
-            f"there is no {path}: give 'download' to get it from {published.address}, or the file's path"
+            f"there is no {path}: give 'download' to get it from {published.address}, or the "
+            "file's path"
         )
-    download(published.address, path, sha256 or promised_hash(path, published))
+    download(published.address, path, sha256 or expected_hash(path, published))
     return path
 
 
-def promised_hash(path: Path, published: PublishedFile | None = None) -> str:
+def expected_hash(path: Path, published: PublishedFile | None = None) -> str:
     """
-    Return what is known of the hash that a file ought to have, its first digits or all, '' if nothing.
+    Return the expected hash of a file, its first digits or all, '' if unknown.
 
-    That is what the authors of a published file say; else what stands in ``NAME.sha256`` beside the file,
-    in the format of sha256sum: a download leaves it there, so that later changes are noticed.
+    It is the hash published by the authors, else that in ``NAME.sha256`` beside the file, in the
+    format of sha256sum: a download writes it, so that later changes are detected.
     """
     if published is not None and published.sha256 and path.name == published.name:
         return published.sha256
     try:
-        words = _note(path).read_text().split()
+        words = _hash_file(path).read_text().split()
     except FileNotFoundError:
         return ''
     except (OSError, ValueError) as error:
-        raise UnavailableError(f'{_note(path)} cannot be read: {error}') from error
+        raise UnavailableError(f'{_hash_file(path)} cannot be read: {error}') from error
     return words[0].lower() if words else ''
 
 
-def _note(path: Path) -> Path:
+def _hash_file(path: Path) -> Path:
     return path.with_name(path.name + '.sha256')
 
 
-def open_weights(path: Path, promised: str = '', wanted: str = '') -> tuple[BinaryIO, str]:
+def open_weights(path: Path, expected: str = '', required: str = '') -> tuple[BinaryIO, str]:
     """
-    Open a file of weights once its content is known to be the right one.
+    Open a file of weights and check its hash.
 
-    :param promised: the first digits of the hash that the file ought to have, see :func:`promised_hash`.
-    :param wanted: the hash of the file that a map was made with, '' for any.
+    :param expected: the first digits of its hash, see :func:`expected_hash`.
+    :param required: the hash of the file of a map, '' for any.
     :returns: the open file, at its beginning, and its sha256.
     :raises UnavailableError: it cannot be read, or is damaged.
-    :raises FeatureMismatchError: it is another file than the one wanted.
+    :raises FeatureMismatchError: it is another file than the required one.
     """
     try:
         file = path.open('rb')
@@ -102,14 +109,14 @@ def open_weights(path: Path, promised: str = '', wanted: str = '') -> tuple[Bina
         raise UnavailableError(f'weights {str(path)!r} cannot be read: {error}') from error
     try:
         digest = hashlib.file_digest(file, 'sha256').hexdigest()
-        if not digest.startswith(promised):
+        if not digest.startswith(expected):
             raise UnavailableError(
-                f'{path} has sha256 {digest[:16]}, it ought to begin with {promised[:16]}: it is damaged or '
+                f'{path} has sha256 {digest[:16]}, expected {expected[:16]}: it is damaged or '
                 'another file; delete it and get it again'
             )
-        if wanted and digest != wanted:
+        if required and digest != required:
             raise FeatureMismatchError(
-                f'weights {path} have sha256 {digest[:16]}, the settings ask for {wanted[:16]}: '
+                f'weights {path} have sha256 {digest[:16]}, the settings require {required[:16]}: '
                 'give the file that the map was built with'
             )
         file.seek(0)
@@ -126,47 +133,136 @@ def download(address: str, path: Path, expected: str = '') -> None:
     """
     Download a file; it appears under its name complete and checked, or not at all.
 
-    Its hash is noted beside it: where nothing is known of the hash, the first download is trusted, and
-    whatever comes later is held against it.
+    Its hash is written beside it: where no hash is published, the first download is trusted, and
+    later ones are compared with it.
 
-    :param expected: the first digits of the hash that it must have, '' for any.
-    :raises UnavailableError: it cannot be had, is cut short or has another hash.
+    :param expected: the first digits of its required hash, '' for any.
+    :raises UnavailableError: the download fails, is incomplete or has another hash.
     """
     advice = f'download it by other means and give its path, or copy it to {path}'
     partial = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f'{path.name}.', delete=False) as file:
+        with tempfile.NamedTemporaryFile(
+            dir=path.parent, prefix=f'{path.name}.', delete=False
+        ) as file:
             partial = Path(file.name)
             digest = _fetch(address, file, path.name)
         if not digest.startswith(expected):
             raise UnavailableError(
-                f'what {address} sent has sha256 {digest[:16]}, expected {expected[:16]}: it was changed or '
-                f'damaged on its way; try again, or {advice}'
+                f'the file from {address} has sha256 {digest[:16]}, expected {expected[:16]}: it '
+                f'was changed or damaged on its way; try again, or {advice}'
             )
-        _note(path).write_text(f'{digest}  {path.name}\n')
+        _hash_file(path).write_text(f'{digest}  {path.name}\n')
         partial.replace(path)
     except (OSError, http.client.HTTPException) as error:
         raise UnavailableError(f'{address} cannot be downloaded ({error}): {advice}') from error
     finally:
         if partial is not None:
             partial.unlink(missing_ok=True)
-    known = 'as published' if expected else 'not published: trusted now, and noted to notice later changes'
+    known = 'as published' if expected else 'unpublished: trusted now, kept to detect changes'
     tqdm.write(f'{path}: sha256 {digest} ({known})', file=sys.stderr)
 
 
 def _fetch(address: str, file: IO[bytes], name: str) -> str:
-    """Copy what the address sends into a file and return its sha256."""
+    """Copy the content of an address into a file and return its sha256."""
     digest = hashlib.sha256()
-    with urllib.request.urlopen(address, timeout=TIMEOUT) as answer:
-        length = answer.headers.get('Content-Length')
+    with urllib.request.urlopen(address, timeout=TIMEOUT) as response:
+        length = response.headers.get('Content-Length')
         total = int(length) if length and length.isdigit() else None
         with tqdm(total=total, unit='B', unit_scale=True, desc=name, disable=None) as bar:
-            while piece := answer.read(PIECE):
+            while piece := response.read(PIECE):
                 file.write(piece)
                 digest.update(piece)
                 bar.update(len(piece))
-            got = file.tell()
-    if total is not None and got != total:
-        raise OSError(f'only {got} of {total} bytes came')
+            received = file.tell()
+    if total is not None and received != total:
+        raise OSError(f'only {received} of {total} bytes received')
     return digest.hexdigest()
+
+
+def read_checkpoint(file: BinaryIO, name: str) -> dict[str, torch.Tensor]:
+    """
+    Read the parameters in a checkpoint: the file itself, or its entry ``state_dict``.
+
+    Nothing in the file is executed: it is read with ``weights_only=True``, and a file with more
+    than tensors, numbers and containers is rejected. A prefix ``module.`` (of DataParallel) is
+    removed.
+
+    :param name: of the file, for errors.
+    :raises UnavailableError: it is damaged, no checkpoint, or requires code to be executed.
+    """
+    try:
+        content = torch.load(file, map_location='cpu', weights_only=True)
+    except Exception as error:  # damaged files raise errors of any type
+        reason = last_line(error)
+        blocked = re.search(r'GLOBAL (\S+)', str(error))
+        if blocked:
+            reason = f'it asks for {blocked[1]}, which is not plain weights and was not executed'
+        raise UnavailableError(f'{name} cannot be read as a file of weights: {reason}') from error
+    if isinstance(content, Mapping) and isinstance(content.get('state_dict'), Mapping):
+        content = content['state_dict']
+    if not isinstance(content, Mapping) or not content:
+        raise UnavailableError(
+            f'{name} holds {_kind(content)}: expected the parameters of a network by name'
+        )
+    for key, value in content.items():
+        if not isinstance(key, str) or not isinstance(value, torch.Tensor):
+            raise UnavailableError(
+                f'{name} holds {_kind(value)} as {key!r}: expected parameters by name'
+            )
+    return {key.removeprefix('module.'): value for key, value in content.items()}
+
+
+def last_line(error: Exception) -> str:
+    """Return the last line of an error of torch: those before it are a trace of the program."""
+    return str(error).strip().split('\n')[-1] or type(error).__name__
+
+
+def _kind(value: Any) -> str:
+    empty = isinstance(value, Mapping) and not value
+    return 'nothing' if empty else f'a {type(value).__name__}'
+
+
+def load_parameters(
+    network: nn.Module, parameters: Mapping[str, torch.Tensor], name: str
+) -> None:
+    """
+    Load all parameters of a network, which must be there and fit, and no others; cpu, float32.
+
+    :param network: may be on the device ``meta``, without memory of its own.
+    :param name: of the file, for errors.
+    :raises UnavailableError: a parameter is missing, unknown, of another shape, or not finite.
+    """
+    state = network.state_dict()
+    expected = {key: value for key, value in state.items() if not key.endswith(COUNTER)}
+    given = {key: value for key, value in parameters.items() if not key.endswith(COUNTER)}
+    wrong = f'{name} is no file of weights of {type(network).__name__}'
+    missing, unknown = sorted(expected.keys() - given), sorted(given.keys() - expected)
+    if missing:
+        raise UnavailableError(f'{wrong}: it lacks {_listed(missing)}')
+    if unknown:
+        raise UnavailableError(f'{wrong}: it has {_listed(unknown)}, unknown to the network')
+    floats: dict[str, torch.Tensor] = {}
+    for key, value in given.items():
+        if value.shape != expected[key].shape:
+            raise UnavailableError(
+                f'{wrong}: {key} has shape {tuple(value.shape)}, expected '
+                f'{tuple(expected[key].shape)}'
+            )
+        if not value.is_floating_point() or value.layout != torch.strided or value.is_meta:
+            raise UnavailableError(
+                f'{wrong}: {key} is of type {value.dtype}, {value.layout}, no plain floats'
+            )
+        floats[key] = value.detach().float()
+        # numpy: torch would start its threads for each of 800 parameters
+        if not np.isfinite(floats[key].numpy()).all():
+            raise UnavailableError(f'{name} is damaged: {key} holds NaN or infinite numbers')
+    counters = {
+        key: torch.zeros((), dtype=torch.long) for key in state if key.endswith(COUNTER)
+    }
+    network.load_state_dict(floats | counters, assign=True)
+
+
+def _listed(names: list[str]) -> str:
+    return repr(names[0]) + (f' and {len(names) - 1} more' if len(names) > 1 else '')

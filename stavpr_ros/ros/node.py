@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
@@ -21,10 +22,10 @@ from stavpr_ros.output_file import require_room
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.pipeline import NodeSettings, node_settings
 from stavpr_ros.pipeline.statistics import Statistics
-from stavpr_ros.ros.executor import SlowCallbackGroup
-from stavpr_ros.ros.lifecycle import ManagedNode
+from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
+from stavpr_ros.ros.health import Health, node_health
 from stavpr_ros.ros.parameters import declare_parameters, unknown_parameters
-from stavpr_ros.ros.reporter import Reporter
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.runtime import Runtime
 from stavpr_ros.ros.services import Services
 from stavpr_ros.ros.worker import STOP_TIMEOUT
@@ -47,7 +48,7 @@ class PlaceRecognitionNode(ManagedNode):
     :raises StavprError: parameters that exclude each other, or a backend that is not available.
     """
 
-    THREADS = 4  # for services, transitions and parameters, which must not delay images
+    THREADS = 4  # a transition, a service and parameters may each take long; images take the fourth
 
     def __init__(self, **options: Any) -> None:
         self._lock = (
@@ -76,13 +77,15 @@ class PlaceRecognitionNode(ManagedNode):
         self._jumps = self.get_clock().create_jump_callback(
             backwards, post_callback=self._on_clock_jump
         )
-        self._reporter = Reporter(self, self._settings.diagnostics_period)
+        self._diagnostics = DiagnosticsPublisher(
+            self, self._settings.diagnostics_period, self._health
+        )
         self._start: Timer | None = None
         if self._settings.autostart:
             self._start = self.create_timer(
                 0.0,
                 self._on_start,
-                callback_group=SlowCallbackGroup(),
+                callback_group=MutuallyExclusiveCallbackGroup(),
                 clock=Clock(clock_type=ClockType.STEADY_TIME),
             )
 
@@ -340,6 +343,11 @@ class PlaceRecognitionNode(ManagedNode):
         if runtime is not None:
             runtime.restart(f'the clock jumped back by {-jump.delta.nanoseconds / 1e9:.3f} s')
 
+    def _health(self) -> Health:
+        self.publish_map_info()
+        counts = self.statistics.counts()
+        return node_health(self.state, self.problem, self._settings, counts, self._runtime)
+
     # ~/map_info, and the end
 
     def publish_map_info(self) -> None:
@@ -360,7 +368,7 @@ class PlaceRecognitionNode(ManagedNode):
 
     def destroy_node(self) -> None:
         """End the worker, save a recorded map, log the counts, and destroy the node."""
-        self._reporter.stop()
+        self._diagnostics.stop()
         timeout = 0.2 if self.ending.is_set() else STOP_TIMEOUT + 1  # spin_until has waited before
         self.ending.set()
         # the lock may be held by a thread that loads a large map or compiles: the end does not
@@ -377,7 +385,7 @@ class PlaceRecognitionNode(ManagedNode):
                 runtime.save_at_end()
         if self.left_behind:
             self.get_logger().warning('a thread is still loading or compiling: it is abandoned')
-        counts = self.statistics.snapshot()
+        counts = self.statistics.counts()
         drops = ''.join(f', {count} {cause}' for cause, count in sorted(counts.drops.items()))
         self.get_logger().info(
             f'{counts.received} images received, {counts.answered} processed{drops}'

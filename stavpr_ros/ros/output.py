@@ -15,7 +15,6 @@ from stavpr_msgs.msg import LoopClosure, PlaceCandidates, PlaceMatch
 from stavpr_ros.mapping import GrowingMap, PlaceMap, place_thumbnail
 from stavpr_ros.pipeline.overlay import match_image
 from stavpr_ros.recognition import Match
-from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.messages import (
     candidates_message,
     image_message,
@@ -23,6 +22,7 @@ from stavpr_ros.ros.messages import (
     match_message,
     matched_pose_message,
 )
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 
 DEPTH = 50  # matches kept for slower subscribers
 IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)

@@ -18,9 +18,9 @@ from stavpr_ros.pipeline.saving import save_recorded_map
 from stavpr_ros.pipeline.statistics import WAITING, Statistics
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.input import ImageInput, OdometryInput
-from stavpr_ros.ros.lifecycle import ManagedNode
 from stavpr_ros.ros.messages import map_info_message, nanoseconds
 from stavpr_ros.ros.output import Output
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.worker import STOP_TIMEOUT, Worker
 from stavpr_ros.threads import limit_threads
 

@@ -9,8 +9,8 @@ from std_srvs.srv import Trigger
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
 from stavpr_ros.pipeline.saving import write_map
-from stavpr_ros.ros.answers import wait_for_clients
 from stavpr_ros.ros.messages import candidates_message, match_message
+from stavpr_ros.ros.rclpy_workarounds import repeat_responses
 
 if TYPE_CHECKING:
     from stavpr_ros.ros.node import PlaceRecognitionNode
@@ -35,7 +35,7 @@ class Services:
             (SetOperation, 'set_operation', self._set_operation),
         ):
             callback = self._callback(name, serve)
-            wait_for_clients(
+            repeat_responses(
                 node.create_service(kind, f'~/{name}', callback, callback_group=group)
             )
 

@@ -1,27 +1,27 @@
-"""A made-up street and two drives along it: the demonstration's world, and test data without data."""
+"""A synthetic street and two traverses of it, for the demonstration and for tests."""
 
 from stavpr_ros.demonstration.street.traverses import (
     GOOD_LIGHT,
     RAINY_DUSK,
     Conditions,
-    Drive,
+    Traverse,
     Route,
     World,
     WorldFrame,
-    first_drive,
+    first_traverse,
     ground_truth,
-    second_drive,
+    second_traverse,
 )
 
 __all__ = [
     'GOOD_LIGHT',
     'RAINY_DUSK',
     'Conditions',
-    'Drive',
+    'Traverse',
     'Route',
     'World',
     'WorldFrame',
-    'first_drive',
+    'first_traverse',
     'ground_truth',
-    'second_drive',
+    'second_traverse',
 ]

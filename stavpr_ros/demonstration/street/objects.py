@@ -1,8 +1,9 @@
 """
-Things that stand or drive in the made-up street: trees, lamps, signs, cars, vans; in numba.
+Things that stand or drive in the synthetic street: trees, lamps, signs, cars, vans; in numba.
 
-They are drawn after walls and ground, from far to near, each sample compared with the depth that is there.
-Cars are boxes that the rays enter from behind or from the side; all else is a flat card facing the camera.
+They are drawn after walls and ground, from far to near, each sample compared with the depth so
+far. Cars are boxes that the rays enter from behind or from the side; all else is a flat card
+facing the camera.
 """
 
 # Numba infers the types of kernels.
@@ -58,13 +59,18 @@ def _draw_card(color, depth, thing, bend, camera, light, fine):
     scale = focal / z
     mid = (
         columns / 2
-        + ((thing[THING_ACROSS] - across + bend[min(int(z / CELL), len(bend) - 1)]) / z - yaw) * focal
+        + ((thing[THING_ACROSS] - across + bend[min(int(z / CELL), len(bend) - 1)]) / z - yaw)
+        * focal
     )
-    half, tall = (3.3 * size, 9.0 * size) if kind == TREE else (1.5, 7.0) if kind == LAMP else (0.5, 3.2)
+    half, tall = (
+        (3.3 * size, 9.0 * size) if kind == TREE else (1.5, 7.0) if kind == LAMP else (0.5, 3.2)
+    )
     bottom = horizon + eye * scale
     for x in range(max(0, int(mid - half * scale)), min(columns, int(mid + half * scale) + 1)):
         u = (x + 0.5 - mid) / scale
-        for y in range(max(0, int((bottom - tall * scale) * fine)), min(rows, int(bottom * fine) + 1)):
+        for y in range(
+            max(0, int((bottom - tall * scale) * fine)), min(rows, int(bottom * fine) + 1)
+        ):
             if depth[y, x] < z:
                 continue
             h = (bottom - (y + 0.5) / fine) / scale
@@ -82,7 +88,7 @@ def _draw_card(color, depth, thing, bend, camera, light, fine):
 
 @njit(cache=True, error_model='numpy')
 def _tree(u, h, seed, foliage, scale):
-    """Paint a tree of unit size: trunk, then leaves with a ragged edge; `foliage` 0 is summer, 1 autumn."""
+    """Paint a tree of unit size: trunk, then ragged leaves; `foliage` 0 is summer, 1 autumn."""
     trunk = 0.13 + 0.09 * hash01(1, 1, seed) + max(0.0, 0.35 - h) * 0.2
     dx, dy = u - 0.5 * (hash01(2, 1, seed) - 0.5), (h - 5.6) / 1.12
     away = sqrt(dx * dx + dy * dy) / (2.1 + 0.5 * hash01(3, 1, seed))
@@ -128,7 +134,9 @@ def _sign(u, h, seed):
     elif shape == 1:
         edge = 0.45 - abs(u) * 1.75 - (v + 0.1)
         if edge > 0 and v > -0.35:
-            return (True, 0.78, 0.12, 0.1) if edge < 0.18 or v < -0.26 else (True, 0.95, 0.92, 0.85)
+            return (
+                (True, 0.78, 0.12, 0.1) if edge < 0.18 or v < -0.26 else (True, 0.95, 0.92, 0.85)
+            )
     elif abs(u) < 0.36 and abs(v) < 0.36:
         return (
             (True, 0.1, 0.27, 0.6)
@@ -156,7 +164,18 @@ def _draw_car(color, depth, thing, bend, camera, light, fine):
         _draw_box(color, depth, u, half, z, z + length, 0.3, 2.25, 2, seed, lens, light)
     else:
         _draw_box(
-            color, depth, u, half - 0.14, z + 0.35, z + length * 0.72, 0.85, 1.44, 1, seed, lens, light
+            color,
+            depth,
+            u,
+            half - 0.14,
+            z + 0.35,
+            z + length * 0.72,
+            0.85,
+            1.44,
+            1,
+            seed,
+            lens,
+            light,
         )
         _draw_box(color, depth, u, half, z, z + length, 0.24, 0.9, 0, seed, lens, light)
 
@@ -169,11 +188,16 @@ def _draw_shadow(color, depth, u, half, z0, z1, lens):
     if z1 < NEAREST:
         return
     near = max(z0, NEAREST)
-    first, last = int((horizon + eye * focal / z1) * fine) + 1, int((horizon + eye * focal / near) * fine) + 1
+    first, last = (
+        int((horizon + eye * focal / z1) * fine) + 1,
+        int((horizon + eye * focal / near) * fine) + 1,
+    )
     for y in range(max(0, first), min(rows, last)):
         z = eye * focal / ((y + 0.5) / fine - horizon)
         mid = columns / 2 + (u / z - yaw) * focal
-        for x in range(max(0, int(mid - half * focal / z)), min(columns, int(mid + half * focal / z) + 1)):
+        for x in range(
+            max(0, int(mid - half * focal / z)), min(columns, int(mid + half * focal / z) + 1)
+        ):
             if z0 < z < z1 and depth[y, x] > z - 0.5:
                 edge = min(z - z0, z1 - z, half - abs((x + 0.5 - mid) * z / focal))
                 dark = 1.0 - 0.68 * min(1.0, max(0.0, edge * 2.5))
@@ -184,7 +208,7 @@ def _draw_shadow(color, depth, u, half, z0, z1, lens):
 
 @njit(cache=True, error_model='numpy')
 def _draw_box(color, depth, u, half, z0, z1, low, high, part, seed, lens, light):
-    """Draw what the camera sees of a box: the face behind, one side and the top."""
+    """Draw the visible faces of a box: the one behind, one side and the top."""
     focal, horizon, yaw, eye, fine = lens
     rows, columns = depth.shape
     if z1 < NEAREST + 0.2:
@@ -250,14 +274,18 @@ def _car_paint(face, place, h, part, seed, lamps):
     if face == 1:
         wheel = min(abs(place - 0.19), abs(place - 0.8)) * 4.3
         if part != 1 and wheel * wheel + (h - 0.33) ** 2 < 0.1:
-            return (0.5, 0.5, 0.52) if wheel * wheel + (h - 0.33) ** 2 < 0.03 else (0.05, 0.05, 0.055)
+            return (
+                (0.5, 0.5, 0.52) if wheel * wheel + (h - 0.33) ** 2 < 0.03 else (0.05, 0.05, 0.055)
+            )
         if part == 1 and 0.06 < place < 0.94 and abs(place - 0.5) > 0.03 and h < 1.36:
             return 0.11, 0.13, 0.16
         if abs(place - 0.5) < 0.006 or (part == 0 and h < 0.36):
             return r * 0.45, g * 0.45, b * 0.45
         return r, g, b
     if part == 1:
-        return (0.1 + 0.1 * (h - 0.85), 0.13, 0.17) if abs(place) < 0.86 and h < 1.37 else (r, g, b)
+        return (
+            (0.1 + 0.1 * (h - 0.85), 0.13, 0.17) if abs(place) < 0.86 and h < 1.37 else (r, g, b)
+        )
     top = 0.82 if part == 0 else 1.35
     if abs(place) > 0.72 and top - 0.24 < h < top:
         return (1.3, 0.16, 0.12) if lamps > 0.05 else (0.62, 0.07, 0.06)

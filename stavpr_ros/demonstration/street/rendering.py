@@ -1,8 +1,9 @@
 """
-The camera in the made-up street: rays, light, shadows and fog, in numba.
+The camera in the synthetic street: rays, light, shadows and fog, in numba.
 
-A bend is drawn by moving the street sideways with depth, so that an image column stays a vertical plane.
-One walk along the tables finds all walls of a column; each sample then needs one comparison per wall.
+A bend is drawn by moving the street sideways with depth, so that an image column stays a vertical
+plane. One walk along the tables finds all walls of a column; each sample then needs one comparison
+per wall.
 """
 
 # Numba infers the types of kernels.
@@ -31,9 +32,8 @@ from stavpr_ros.demonstration.street.street import (
 from stavpr_ros.demonstration.street.surfaces import ground, hash01, noise, sky
 from stavpr_ros.demonstration.street.walls import roof_height, wall
 
-SAMPLES = (
-    2  # rays per pixel, one above the other: most lines of a street lean, and upright ones need no smoothing
-)
+# Rays per pixel, one above the other: most lines lean, and upright ones need no smoothing.
+SAMPLES = 2
 MOST_WALLS = 8  # walls kept per column; each is higher in the image than the one before
 BLOCK_DEPTH = 14.0  # meters from a building's front to its back
 EYE = 1.55  # height of the camera, meters
@@ -66,23 +66,24 @@ class View:
 
 
 def light_vector(
-    sun: float, azimuth: float, elevation: float, ambient: float, lamps: float, cover: float, wet: float,
-    foliage: float, sky_seed: int, fog: float, exposure: float, warmth: float, rain: float, grain: float,
+    sun: float, azimuth: float, elevation: float, ambient: float, lamps: float, cover: float,
+    wet: float, foliage: float, sky_seed: int, fog: float, exposure: float, warmth: float,
+    rain: float, grain: float,
 ) -> np.ndarray:  # fmt: skip
     """Pack the conditions for the kernels; angles in radians, from where the street began."""
-    return np.array([sun, 0.0, 0.0, sin(elevation), ambient, lamps, cover, wet, foliage, azimuth, sky_seed,
-                     fog, exposure, warmth, rain, grain])  # fmt: skip
+    return np.array([sun, 0.0, 0.0, sin(elevation), ambient, lamps, cover, wet, foliage, azimuth,
+                     sky_seed, fog, exposure, warmth, rain, grain])  # fmt: skip
 
 
 def render(
-    street: Street, heading: float, view: View, light: np.ndarray, traffic: np.ndarray, grain_seed: int,
-    width: int, height: int,
+    street: Street, heading: float, view: View, light: np.ndarray, traffic: np.ndarray,
+    grain_seed: int, width: int, height: int,
 ) -> np.ndarray:  # fmt: skip
     """
     Render one image.
 
     :param heading: direction of the street at the camera, radians from where it began.
-    :param light: what :func:`light_vector` gave.
+    :param light: from :func:`light_vector`.
     :param traffic: cars, rows as in the table of things of a :class:`Street`.
     :param grain_seed: seed of sensor noise and rain drops.
     :returns: RGB, shape (height, width, 3), uint8.
@@ -140,8 +141,16 @@ def _find_walls(lots, lot_of, bend, along, across, slope, eye, walls):
                     top = roof_height(lots, lot, place) if front else lots[lot, LOT_HEIGHT]
                     if (top - eye) / z > highest:
                         highest = (top - eye) / z
-                        walls[count, WALL_DEPTH], walls[count, WALL_TOP], walls[count, WALL_LOT] = z, top, lot
-                        walls[count, WALL_ALONG], walls[count, WALL_FRONT], walls[count, WALL_ROW] = (
+                        (
+                            walls[count, WALL_DEPTH],
+                            walls[count, WALL_TOP],
+                            walls[count, WALL_LOT],
+                        ) = z, top, lot
+                        (
+                            walls[count, WALL_ALONG],
+                            walls[count, WALL_FRONT],
+                            walls[count, WALL_ROW],
+                        ) = (
                             place,
                             front,
                             row,
@@ -175,7 +184,9 @@ def sunlit(lots, lot_of, along, across, height, light):
 def _lit_wall(lots, lot_of, walls, k, height, street_along, light):
     """Paint and light one point of a wall."""
     lot, front, row = int(walls[k, WALL_LOT]), walls[k, WALL_FRONT] > 0, int(walls[k, WALL_ROW])
-    r, g, b = wall(lots, lot, front, walls[k, WALL_ALONG], height, walls[k, WALL_DEPTH], light[LAMPS])
+    r, g, b = wall(
+        lots, lot, front, walls[k, WALL_ALONG], height, walls[k, WALL_DEPTH], light[LAMPS]
+    )
     if r > 0.9 and b < 0.75 * r and light[LAMPS] > 0:  # a lamp behind the window shines by itself
         return r * 0.75, g * 0.75, b * 0.75
     facing = light[SUN_RIGHT] * (-1 if row & 1 else 1) if front else -light[SUN_AHEAD]
@@ -237,7 +248,10 @@ def _draw_scene(color, depth, lots, lot_of, bend, seed, camera, light):
                         * (0.35 + 0.9 * noise((along + z) * 0.5, u * 0.9, 77))
                     )
                     ripple = 0.5 * (hash01(x, y, 31) - 0.5)
-                    if count > 0 and ripple - eye - rise * walls[0, WALL_DEPTH] < walls[0, WALL_TOP]:
+                    if (
+                        count > 0
+                        and ripple - eye - rise * walls[0, WALL_DEPTH] < walls[0, WALL_TOP]
+                    ):
                         mirrored = max(0.0, ripple - eye - rise * walls[0, WALL_DEPTH])
                         mr, mg, mb = _lit_wall(
                             lots, lot_of, walls, 0, mirrored, along + walls[0, WALL_DEPTH], light
@@ -247,7 +261,9 @@ def _draw_scene(color, depth, lots, lot_of, bend, seed, camera, light):
                     r, g, b = r + (mr - r) * shine, g + (mg - g) * shine, b + (mb - b) * shine
             else:
                 z = FAR
-                if y & 1 and depth[y - 1, x] == FAR:  # clouds are soft: one ray per pixel is enough
+                if (
+                    y & 1 and depth[y - 1, x] == FAR
+                ):  # clouds are soft: one ray per pixel is enough
                     depth[y, x] = z
                     for channel in range(3):
                         color[y, x, channel] = color[y - 1, x, channel]
@@ -286,15 +302,19 @@ def _expose(color, depth, light, seed, image):
                     if channel == 1
                     else b * (1 - light[WARMTH])
                 )
-                value = 1.585 * value * power / (value * power + 0.714)  # highlights roll off as on film
-                spot = hash01(x * 3 + channel, y, seed) + hash01(x * 3 + channel, y, seed + 1) - 1.0
+                value = (
+                    1.585 * value * power / (value * power + 0.714)
+                )  # highlights roll off as on film
+                spot = (
+                    hash01(x * 3 + channel, y, seed) + hash01(x * 3 + channel, y, seed + 1) - 1.0
+                )
                 value += light[NOISE] * 2.4 * spot
                 image[y, x, channel] = int(min(255.0, max(0.0, value * 255.0 + 0.5)))
 
 
 @njit(cache=True, error_model='numpy')
 def _streak(image, rain, seed):
-    """Draw drops that fall through the picture while the shutter is open."""
+    """Draw drops that fall through the image while the shutter is open."""
     rows, columns, _ = image.shape
     for drop in range(int(rain * 0.0032 * rows * columns)):
         x = hash01(drop, 1, seed) * columns

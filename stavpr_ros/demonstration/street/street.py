@@ -1,9 +1,10 @@
 """
-The layout of a made-up street: which building, hedge, tree and lamp stands where.
+The layout of a synthetic street: which building, hedge, tree and lamp stands where.
 
-A street is cut into cells of half a meter along its center line. For each of its four rows (the near and the
-far row on the left and on the right) a cell names the lot that stands there, so that the renderer finds what
-a ray meets without searching. Positions are (along the route, to the right of its center line), in meters.
+A street is cut into cells of half a meter along its center line. For each of its four rows (the
+near and the far row on the left and on the right) a cell names the lot that stands there, so that
+the renderer finds the lot at a ray without searching. Positions are (along the route, to the right
+of its center line), in meters.
 """
 
 from dataclasses import dataclass
@@ -45,9 +46,10 @@ THING_KIND, THING_ALONG, THING_ACROSS, THING_SIZE, THING_SEED = range(5)
 TREE, LAMP, SIGN, CAR, VAN = range(5)
 
 PALETTE = (
-    (0.74, 0.70, 0.62), (0.80, 0.76, 0.68), (0.62, 0.36, 0.28), (0.55, 0.29, 0.23), (0.82, 0.68, 0.44),
-    (0.70, 0.55, 0.36), (0.58, 0.62, 0.64), (0.44, 0.47, 0.50), (0.60, 0.67, 0.58), (0.78, 0.58, 0.48),
-    (0.86, 0.83, 0.78), (0.52, 0.58, 0.66), (0.47, 0.40, 0.36), (0.71, 0.46, 0.36), (0.88, 0.79, 0.58),
+    (0.74, 0.70, 0.62), (0.80, 0.76, 0.68), (0.62, 0.36, 0.28), (0.55, 0.29, 0.23),
+    (0.82, 0.68, 0.44), (0.70, 0.55, 0.36), (0.58, 0.62, 0.64), (0.44, 0.47, 0.50),
+    (0.60, 0.67, 0.58), (0.78, 0.58, 0.48), (0.86, 0.83, 0.78), (0.52, 0.58, 0.66),
+    (0.47, 0.40, 0.36), (0.71, 0.46, 0.36), (0.88, 0.79, 0.58),
 )  # fmt: skip
 
 
@@ -56,12 +58,12 @@ class Street:
     """
     One street as the tables that the renderer reads.
 
-    :param length: meters that can be driven; the tables reach :data:`VIEW` further.
+    :param length: meters of the route; the tables reach :data:`VIEW` further.
     :param lots: one row per lot, columns LOT_*, shape (lots, 16), float64.
     :param lot_of: lot in each cell of the four rows, shape (4, cells), int32.
     :param curvature: curvature of the center line, positive to the right, shape (cells,), 1/meter.
     :param things: trees, lamps, signs, shape (things, 5), columns THING_*, float64.
-    :param seed: what it grew from; also the seed of its ground.
+    :param seed: of its layout and of its ground.
     """
 
     length: float
@@ -72,17 +74,19 @@ class Street:
     seed: int
 
 
-def grow_street(seed: int, length: float, bends: float = 1.0) -> Street:
+def make_street(seed: int, length: float, bends: float = 1.0) -> Street:
     """
     Make a street from a seed.
 
     :param seed: any integer; equal seeds give equal streets on every machine.
-    :param length: meters that can be driven.
+    :param length: meters of the route.
     :param bends: factor on the curvature; 0 is a straight street.
     :raises SettingsError: the length is not a positive number of meters.
     """
     if not 0 < length < 1e5:
-        raise SettingsError(f'length of the street is {length} m; expected more than 0 and less than 100000')
+        raise SettingsError(
+            f'length of the street is {length} m; expected more than 0 and less than 100000'
+        )
     cells = int(np.ceil((length + VIEW) / CELL)) + 1
     lots: list[tuple[float, ...]] = []
     lot_of = np.zeros((4, cells), np.int32)
@@ -120,8 +124,12 @@ def _draw_lot(dice: Random, row: int, start: float) -> tuple[float, ...]:
         kind = SIDE_STREET if roll < 0.1 else PARK if roll < 0.24 else BUILDING
     style = (PLASTER, PLASTER, BRICK, BRICK, BRICK, OFFICE, HALL)[int(dice.random() * 7)]
     length = _between(dice, 7, 19) if style != HALL else _between(dice, 14, 26)
-    height = {PLASTER: _between(dice, 6, 19), BRICK: _between(dice, 6, 21), OFFICE: _between(dice, 15, 32),
-              HALL: _between(dice, 5, 8)}[style]  # fmt: skip
+    height = {
+        PLASTER: _between(dice, 6, 19),
+        BRICK: _between(dice, 6, 21),
+        OFFICE: _between(dice, 15, 32),
+        HALL: _between(dice, 5, 8),
+    }[style]
     setback = _between(dice, 15.0, 18.0)
     gable = float(dice.random() < 0.3 and style in (PLASTER, BRICK))
     if not near:
@@ -137,9 +145,10 @@ def _draw_lot(dice: Random, row: int, start: float) -> tuple[float, ...]:
         )
     color = PALETTE[int(dice.random() * len(PALETTE))]
     light = _between(dice, 0.82, 1.12)
-    return (start, round(length / CELL) * CELL, setback, height, kind, *(part * light for part in color),
-            _between(dice, 3.6, 4.6), _between(dice, 2.7, 3.6), _between(dice, 1.9, 3.9),
-            _between(dice, 0.38, 0.68), style, gable, int(dice.random() * 2**30), dice.random())  # fmt: skip
+    return (start, round(length / CELL) * CELL, setback, height, kind,
+            *(part * light for part in color), _between(dice, 3.6, 4.6), _between(dice, 2.7, 3.6),
+            _between(dice, 1.9, 3.9), _between(dice, 0.38, 0.68), style, gable,
+            int(dice.random() * 2**30), dice.random())  # fmt: skip
 
 
 def _draw_curvature(dice: Random, cells: int) -> np.ndarray:
@@ -154,7 +163,7 @@ def _draw_curvature(dice: Random, cells: int) -> np.ndarray:
 
 
 def _plant(dice: Random, lots: np.ndarray, lot_of: np.ndarray) -> np.ndarray:
-    """Draw what stands on the pavements and in the parks."""
+    """Draw the trees, lamps and signs on the pavements and in the parks."""
     things = []
     end = lot_of.shape[1] * CELL
     for row, side in ((LEFT_NEAR, -1), (RIGHT_NEAR, 1)):
@@ -176,9 +185,19 @@ def _plant(dice: Random, lots: np.ndarray, lot_of: np.ndarray) -> np.ndarray:
             avenue = avenue * 0.75 + dice.random() * 0.25  # trees come in groups
             roll = dice.random()
             if kind == BUILDING:
-                pick = TREE if roll < avenue * 0.9 else LAMP if roll < 0.65 else SIGN if roll < 0.78 else -1
+                pick = (
+                    TREE
+                    if roll < avenue * 0.9
+                    else LAMP
+                    if roll < 0.65
+                    else SIGN
+                    if roll < 0.78
+                    else -1
+                )
                 if pick >= 0:
                     size = _between(dice, 0.6, 1.1)
-                    things.append((pick, at, side * _between(dice, 6.1, 6.5), size, dice.random() * 2**30))
+                    things.append(
+                        (pick, at, side * _between(dice, 6.1, 6.5), size, dice.random() * 2**30)
+                    )
             at += _between(dice, 7, 15)
     return np.array(sorted(things, key=lambda thing: thing[1]), np.float64).reshape(-1, 5)

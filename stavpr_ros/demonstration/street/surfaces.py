@@ -1,9 +1,9 @@
 """
-Hashes and noise in numba, and what the ground and the sky of the made-up street are painted with.
+Hashes, noise, and the paint of the ground and the sky of the synthetic street, in numba.
 
-Paint is red, green and blue in [0, 1] before light, fog and exposure, as a function of a point. Randomness is
-a hash of whole numbers: the same point has the same paint in every image, on every machine. The arithmetic is
-float64 because it is scalar, and float32 would gain nothing.
+Paint is red, green and blue in [0, 1] before light, fog and exposure, as a function of a point.
+Randomness is a hash of whole numbers: the same point has the same paint in every image, on every
+machine. The arithmetic is float64 because it is scalar: float32 would be no faster.
 """
 
 # Numba infers the types of kernels.
@@ -15,7 +15,12 @@ from numba import njit
 
 from stavpr_ros.demonstration.street.street import PARK, ROAD_HALF_WIDTH, SIDE_STREET
 
-_X, _Y, _SEED, _MIX = 0x2545F4914F6CDD1D, 0x369DEA0F31A53F85, 0x1B873593CC9E2D51, 0x5851F42D4C957F2D
+_X, _Y, _SEED, _MIX = (
+    0x2545F4914F6CDD1D,
+    0x369DEA0F31A53F85,
+    0x1B873593CC9E2D51,
+    0x5851F42D4C957F2D,
+)
 _HALF = ROAD_HALF_WIDTH
 
 
@@ -53,7 +58,7 @@ def noise(x, y, seed):
 
 @njit(cache=True, error_model='numpy')
 def ground(along, across, kind, seed, far):
-    """Paint a point of road, pavement, side street or park; `kind` is that of the lot beside it."""
+    """Paint a point of road, pavement, side street or park; `kind`: of the lot beside it."""
     fine = max(0.0, 1.0 - far / 30.0)
     coarse = noise(along * 0.35, across * 0.8, seed)
     grain = 0.9 + 0.16 * coarse
@@ -83,9 +88,9 @@ def _asphalt(along, across, side, seed, grain, fine):
     if hash01(cell, 1, seed) < 0.35:  # a repaired trench
         left = -4.5 + 7.0 * hash01(cell, 2, seed)
         near = 5.0 * hash01(cell, 4, seed)
-        if near < x < near + 1.2 + 3.5 * hash01(cell, 5, seed) and left < across < left + 0.8 + 2.0 * hash01(
-            cell, 3, seed
-        ):
+        if near < x < near + 1.2 + 3.5 * hash01(
+            cell, 5, seed
+        ) and left < across < left + 0.8 + 2.0 * hash01(cell, 3, seed):
             tar *= 0.72
     if side < _HALF:
         cx, cy = 1.5 + 6.0 * hash01(cell, 6, seed), -3.0 + 6.0 * hash01(cell, 7, seed)
@@ -140,8 +145,8 @@ def sky(azimuth, rise, cover, seed, glow):
     body = 0.97 - 0.12 * cover * cover - 0.12 * cover * (cloud - 0.4)
     r, g, b = r + (body - r) * amount, g + (body - g) * amount, b + (body * 1.02 - b) * amount
     r, g, b = r + glow * 0.5, g + glow * 0.42, b + glow * 0.25
-    if rise < 0.13 and rise < 0.055 + 0.05 * sin(azimuth * 3.0 + 1.0) * sin(azimuth * 7.0) + 0.02 * noise(
-        azimuth * 40, 0.0, 5
-    ):
+    if rise < 0.13 and rise < 0.055 + 0.05 * sin(azimuth * 3.0 + 1.0) * sin(
+        azimuth * 7.0
+    ) + 0.02 * noise(azimuth * 40, 0.0, 5):
         return 0.5, 0.56, 0.6  # hills
     return r, g, b

@@ -1,9 +1,9 @@
 """
-A made-up street and two drives along it, for the demonstration and for tests without data.
+A synthetic street and two traverses of it, for the demonstration and for tests without data.
 
-The second drive sees the street in other light and weather, from the other lane, past other cars, at a
-varying speed with a stop, and leaves it for a detour that the first drive has never seen. Everything grows
-from one seed.
+The second traverse has other light and weather, the other lane, other cars and a varying speed
+with a stop, and leaves the street for a detour that is not on the first. Everything follows from
+one seed.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,21 +23,21 @@ from stavpr_ros.demonstration.street.street import (
     SIDE_STREET,
     VAN,
     Street,
-    grow_street,
+    make_street,
 )
 from stavpr_ros.demonstration.street.surfaces import hash01, noise
 from stavpr_ros.errors import InputError, SettingsError
 
 RATE = 5.0  # images per second
 LANE = 1.0  # meters from the center line to the middle of a lane
-EPOCH = 1_750_000_000 * 10**9  # stamp of the first drive's first image, ns
+EPOCH = 1_750_000_000 * 10**9  # stamp of the first traverse's first image, ns
 SECOND_EPOCH = EPOCH + 123 * 86_400 * 10**9  # four months later
 
 
 @dataclass(frozen=True)
 class Conditions:
     """
-    How the world looks from one drive.
+    Light, weather, camera and traffic of one traverse.
 
     :param sun: strength of direct sunlight; 0 is none.
     :param sun_azimuth: where the sun stands, degrees to the right of the street's first direction.
@@ -74,7 +74,9 @@ class Conditions:
 
     def __post_init__(self) -> None:
         if not 0 < self.sun_elevation < 90:
-            raise SettingsError(f'sun_elevation is {self.sun_elevation}; expected degrees between 0 and 90')
+            raise SettingsError(
+                f'sun_elevation is {self.sun_elevation}; expected degrees between 0 and 90'
+            )
         if abs(self.lane) > 4:
             raise SettingsError(f'lane is {self.lane} m; expected -4 to 4, the width of the road')
         for name in (
@@ -95,19 +97,19 @@ class Conditions:
 
 GOOD_LIGHT = Conditions()
 RAINY_DUSK = Conditions(
-    sun=0.0, ambient=0.5, exposure=0.82, warmth=-0.07, clouds=1.0, fog=0.005, rain=0.4, noise=0.009,
-    lamps=0.12, autumn=0.6, lane=-LANE, shake=0.25, traffic=2,
+    sun=0.0, ambient=0.5, exposure=0.82, warmth=-0.07, clouds=1.0, fog=0.005, rain=0.4,
+    noise=0.009, lamps=0.12, autumn=0.6, lane=-LANE, shake=0.25, traffic=2,
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class WorldFrame:
     """
-    One image of a drive.
+    One image of a traverse.
 
     :param image: RGB, shape (height, width, 3), uint8.
     :param stamp: nanoseconds.
-    :param position: meters along the first drive's route; nan where that route was left.
+    :param position: meters along the first traverse's route; nan off that route.
     """
 
     image: np.ndarray
@@ -118,7 +120,7 @@ class WorldFrame:
 @dataclass(frozen=True)
 class World:
     """
-    A street, and another one that the second drive takes as a detour.
+    A synthetic street, and another one that is the detour of the second traverse.
 
     :param seed: any integer from 0; equal seeds give equal worlds.
     :param length: meters of the street.
@@ -139,24 +141,26 @@ class World:
                 f'seed of the world is {self.seed!r}; expected an integer from 0 to 2**31 - 1'
             )
         if not 0 < self.detour_from <= self.detour_to < self.length:
-            raise SettingsError(f'detour from {self.detour_from} m to {self.detour_to} m; expected both '
-                                f'inside the street of {self.length} m, in this order')  # fmt: skip
+            raise SettingsError(
+                f'detour from {self.detour_from} m to {self.detour_to} m; expected both inside the '
+                f'street of {self.length} m, in this order'
+            )
 
     @cached_property
     def street(self) -> Street:
-        """The street of the first drive."""
-        return grow_street(self.seed, self.length)
+        """The street of the first traverse."""
+        return make_street(self.seed, self.length)
 
     @cached_property
     def detour(self) -> Street:
         """The street of the detour, entered and left by sharp turns."""
-        return grow_street(self.seed + 50_021, self.detour_length)
+        return make_street(self.seed + 50_021, self.detour_length)
 
 
 @dataclass(frozen=True)
 class Route:
     """
-    Where each image of a drive is taken.
+    Position of each image of a traverse.
 
     :param along: meters along the street that the camera is in, shape (images,).
     :param detour: whether that is the detour, shape (images,), bool.
@@ -166,9 +170,9 @@ class Route:
     detour: np.ndarray
 
 
-class Drive(Sequence[WorldFrame]):
+class Traverse(Sequence[WorldFrame]):
     """
-    A drive through a world: a sequence of images, rendered when they are asked for.
+    A traverse of a world: a sequence of images, rendered on access.
 
     :param world: the world.
     :param route: where the images are taken.
@@ -182,7 +186,9 @@ class Drive(Sequence[WorldFrame]):
         size: tuple[int, int] = (320, 240),
     ) -> None:  # fmt: skip
         if min(size) < 16:
-            raise SettingsError(f'size of the images is {size}; expected a width and a height of 16 or more')
+            raise SettingsError(
+                f'size of the images is {size}; expected a width and a height of 16 or more'
+            )
         self.route, self.conditions, self.size = route, conditions, size
         self.position = np.where(route.detour, np.nan, route.along)
         self.stamps = epoch + np.arange(len(route.along), dtype=np.int64) * round(1e9 / RATE)
@@ -191,7 +197,9 @@ class Drive(Sequence[WorldFrame]):
         self._headings = [
             np.concatenate([[0.0], np.cumsum(street.curvature) * CELL]) for street in self._streets
         ]
-        self._parked = [_park_cars(street, c.traffic + turn) for turn, street in enumerate(self._streets)]
+        self._parked = [
+            _park_cars(street, c.traffic + turn) for turn, street in enumerate(self._streets)
+        ]
         self._light = light_vector(
             c.sun, radians(c.sun_azimuth), radians(c.sun_elevation), c.ambient, c.lamps, c.clouds,
             min(1.0, c.rain * 1.2), c.autumn, 1000 + c.traffic * 77, c.fog, c.exposure,
@@ -211,7 +219,7 @@ class Drive(Sequence[WorldFrame]):
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
         if not -len(self) <= index < len(self):
-            raise IndexError(f'image {index} of a drive of {len(self)}')
+            raise IndexError(f'image {index} of a traverse of {len(self)}')
         k = index % len(self)
         return WorldFrame(self._render(k), int(self.stamps[k]), float(self.position[k]))
 
@@ -221,14 +229,20 @@ class Drive(Sequence[WorldFrame]):
 
     def _render(self, k: int) -> np.ndarray:
         c, along, turn = self.conditions, float(self.route.along[k]), int(self.route.detour[k])
-        # Swaying and shaking belong to the place: where the vehicle stands, nothing moves but traffic.
+        # Sway and shake depend on the place: while the vehicle stands, only traffic moves.
         sway = noise(along / 17.0, 0.0, c.traffic) - 0.5
         bump = hash01(int(along * 10), 3, c.traffic) + hash01(int(along * 10), 4, c.traffic) - 1.0
         view = View(along, c.lane + 0.5 * sway, radians(c.shake) * 2.4 * bump, radians(1.2) * sway)
         traffic = np.concatenate([self._parked[turn], self._driving(k)])
         heading = float(self._headings[turn][int(along / CELL)])
         return render(
-            self._streets[turn], heading, view, self._light, traffic, k * 7919 + c.traffic, *self.size
+            self._streets[turn],
+            heading,
+            view,
+            self._light,
+            traffic,
+            k * 7919 + c.traffic,
+            *self.size,
         )
 
     def _driving(self, k: int) -> np.ndarray:
@@ -245,41 +259,50 @@ class Drive(Sequence[WorldFrame]):
         return np.array(rows, np.float64).reshape(-1, 5)
 
 
-def first_drive(world: World, places: int = 300, size: tuple[int, int] = (320, 240)) -> Drive:
-    """Drive along the street in good light, at one speed: the map."""
+def first_traverse(
+    world: World, places: int = 300, size: tuple[int, int] = (320, 240)
+) -> Traverse:
+    """Traverse along the street in good light, at one speed: the map."""
     _check_count('places', places)
     along = np.linspace(0, world.length, places, endpoint=False)
-    return Drive(world, Route(along, np.zeros(places, bool)), GOOD_LIGHT, EPOCH, size)
+    return Traverse(world, Route(along, np.zeros(places, bool)), GOOD_LIGHT, EPOCH, size)
 
 
-def second_drive(
-    world: World, images: int = 330, size: tuple[int, int] = (320, 240), conditions: Conditions = RAINY_DUSK
-) -> Drive:
-    """Drive along the street again, with a detour, a stop and other conditions: the query."""
+def second_traverse(
+    world: World,
+    images: int = 330,
+    size: tuple[int, int] = (320, 240),
+    conditions: Conditions = RAINY_DUSK,
+) -> Traverse:
+    """Traverse along the street again, with a detour, a stop and other conditions: the query."""
     _check_count('images', images)
     distance = world.length - (world.detour_to - world.detour_from) + world.detour_length
     speed = _vary_speed(world.seed, images)
     driven = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) * distance / speed.sum()
     back = world.detour_from + world.detour_length
     detour = (driven >= world.detour_from) & (driven < back)
-    along = np.where(driven < back, driven - world.detour_from * detour, driven - back + world.detour_to)
-    return Drive(world, Route(along, detour), conditions, SECOND_EPOCH, size)
+    along = np.where(
+        driven < back, driven - world.detour_from * detour, driven - back + world.detour_to
+    )
+    return Traverse(world, Route(along, detour), conditions, SECOND_EPOCH, size)
 
 
-def ground_truth(first: Drive, second: Drive) -> np.ndarray:
+def ground_truth(first: Traverse, second: Traverse) -> np.ndarray:
     """
-    Give the place of the first drive that is nearest to each image of the second.
+    Return the place of the first traverse that is nearest to each image of the second.
 
-    :returns: shape (images,), int64; -1 where the second drive was off the first one's route.
+    :returns: shape (images,), int64; -1 where the second is off the first's route.
     """
     if len(first) == 0 or np.isnan(first.position).any():
         missing = int(np.isnan(first.position).sum())
         raise InputError(
-            f'a first drive of {len(first)} places, {missing} of them without a position; '
-            'expected at least one place, and a position for all: a drive without detour'
+            f'a first traverse of {len(first)} places, {missing} of them without a position; '
+            'expected at least one place, and a position for all: a traverse without detour'
         )
     away = np.abs(second.position[:, None] - first.position[None, :])
-    return np.where(np.isnan(second.position), -1, np.argmin(np.nan_to_num(away, nan=np.inf), axis=1))
+    return np.where(
+        np.isnan(second.position), -1, np.argmin(np.nan_to_num(away, nan=np.inf), axis=1)
+    )
 
 
 def _check_count(name: str, count: int) -> None:
@@ -288,7 +311,7 @@ def _check_count(name: str, count: int) -> None:
 
 
 def _vary_speed(seed: int, images: int) -> np.ndarray:
-    """Draw a speed for each image, from half to twice the usual, with one stop of about 12 images."""
+    """Draw a speed for each image, from half to twice the usual, with a stop of some 12 images."""
     wave = np.array([noise(k / images * 9.0, 0.0, seed + 5) for k in range(images)])
     wave = (wave - wave.min()) / (wave.max() - wave.min())
     speed = 0.5 * 4.0**wave

@@ -1,4 +1,4 @@
-"""What the walls, roofs and hedges of the made-up street are painted with; in numba, as in `surfaces`."""
+"""The paint of walls, roofs and hedges of the synthetic street, in numba, as in `surfaces`."""
 
 # Numba infers the types of kernels.
 # mypy: disable-error-code="no-untyped-def"
@@ -69,7 +69,9 @@ def wall(lots, lot, front, along, height, far, lamps):
     if front and height > top:  # tiles and chimneys above the eaves
         tile = 0.8 + 0.2 * part(height * 3.0) + 2 * grain
         return (
-            (0.42 * tile, 0.25 * tile, 0.21 * tile) if seed & 1 else (0.27 * tile, 0.28 * tile, 0.31 * tile)
+            (0.42 * tile, 0.25 * tile, 0.21 * tile)
+            if seed & 1
+            else (0.27 * tile, 0.28 * tile, 0.31 * tile)
         )
     r, g, b = lots[lot, LOT_RED], lots[lot, LOT_GREEN], lots[lot, LOT_BLUE]
     shade = 1.0 + grain * 1.5
@@ -110,7 +112,7 @@ def _glass(x, y, seed, lamps):
 
 @njit(cache=True, error_model='numpy')
 def _upper_floors(lots, lot, along, height, shade, lamps):
-    """Paint what is above the ground floor, and all of a hall."""
+    """Paint the floors above the ground floor, and all of a hall."""
     seed = int(lots[lot, LOT_SEED])
     r, g, b = lots[lot, LOT_RED] * shade, lots[lot, LOT_GREEN] * shade, lots[lot, LOT_BLUE] * shade
     style, trim = lots[lot, LOT_STYLE], lots[lot, LOT_TRIM]
@@ -172,10 +174,19 @@ def _house_bay(lots, lot, along, height, x, y, bay, story, shade, lamps):
         edge = 0.16 / lots[lot, LOT_PITCH]
         bar = (seed & 4 and off < edge * 0.35) or (seed & 8 and 0.56 < y < 0.585)
         if bar or off > half - edge or y > tall - 0.05 or y < 0.3:
-            return (pale, pale, pale * 0.96) if trim > 0.3 else (0.2 * shade, 0.24 * shade, 0.23 * shade)
+            return (
+                (pale, pale, pale * 0.96)
+                if trim > 0.3
+                else (0.2 * shade, 0.24 * shade, 0.23 * shade)
+            )
         pane = seed + bay * 131 + story * 7177
         return _glass((x - 0.5 + half) / (2 * half), (y - 0.26) / (tall - 0.26), pane, lamps)
-    if seed & 16 and half <= off < half * 1.62 and 0.26 < y < tall and lots[lot, LOT_STYLE] != BRICK:
+    if (
+        seed & 16
+        and half <= off < half * 1.62
+        and 0.26 < y < tall
+        and lots[lot, LOT_STYLE] != BRICK
+    ):
         slat = 0.75 + 0.35 * part(height * 5)  # of a shutter
         return 0.3 * slat, (0.3 + 0.2 * trim) * slat, (0.45 - 0.2 * trim) * slat
     if off < half * 1.15 and (0.2 < y < 0.26 or tall < y < tall + 0.05):  # sill and lintel
@@ -223,7 +234,11 @@ def _ground_floor(lots, lot, along, height, shade, lamps):
         return _shop(along, height, top, x, seed, own, door, (r, g, b), (sr, sg, sb), lamps)
     if door and 0.34 < x < 0.66 and height < 2.7:
         panel = 0.75 if 0.4 < x < 0.6 and (0.3 < height < 1.1 or 1.4 < height < 2.4) else 1.0
-        return (sr * panel, sg * panel, sb * panel) if height < 2.5 and 0.36 < x < 0.64 else (0.85, 0.84, 0.8)
+        return (
+            (sr * panel, sg * panel, sb * panel)
+            if height < 2.5 and 0.36 < x < 0.64
+            else (0.85, 0.84, 0.8)
+        )
     if not door and (0.16 < x < 0.42 or 0.58 < x < 0.84) and 1.1 < height < top - 0.8:
         inside = (x - 0.16) / 0.26 if x < 0.5 else (x - 0.58) / 0.26
         if inside < 0.1 or inside > 0.9 or height < 1.22:
@@ -253,7 +268,9 @@ def _shop(along, height, top, x, seed, own, door, wall_color, sign_color, lamps)
     if hash01(6, 6, own) < 0.45 and top - 1.7 < height <= top - 0.95:  # an awning
         stripe = part(along * 1.5) < 0.5
         fold = 0.75 + 0.25 * (height - top + 1.7) / 0.75
-        return (0.9 * fold, 0.88 * fold, 0.82 * fold) if stripe else (sr * fold, sg * fold, sb * fold)
+        return (
+            (0.9 * fold, 0.88 * fold, 0.82 * fold) if stripe else (sr * fold, sg * fold, sb * fold)
+        )
     if 0.05 < x < 0.95 and 0.5 < height < top - 1.15:
         if (door and 0.4 < x < 0.44) or (not door and 0.49 < x < 0.51):
             return 0.18, 0.18, 0.2

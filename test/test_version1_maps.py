@@ -1,0 +1,140 @@
+"""
+Maps of format version 1, as robots have them: they load and recognize, and their keys are fixed.
+
+The files in ``data/version1`` were written by commit eb40c94, before the rename of most names, with
+its ``build_map(frames, Describer(kind, settings_class(kind)(**BACKBONE), STRIPS, PROJECTION))`` on
+the eight images ``route_images(8)`` of conftest.py. That of ``gradient_projected`` has stamps,
+identifiers, poses (x = i, that of place 3 unknown) and thumbnails 48 pixels wide. ``tiny.onnx`` and
+``tiny.pt`` are one convolution and a ReLU; the weights of the paper's networks are the random ones
+of conftest.py, whose files are equal to the bit on every machine.
+"""
+
+import json
+import zipfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from conftest import route_images
+
+from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.features import KINDS
+from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+
+FOLDER = Path(__file__).parent / 'data' / 'version1'
+PLACES = 8
+IMAGENET = {'mean': [0.485, 0.456, 0.406], 'std': [0.229, 0.224, 0.225], 'scale': 1 / 255}
+# File: kind, its settings (BACKBONE), STRIPS, and the dimensions of the PROJECTION.
+MAPS = {
+    'gradient': (
+        'gradient',
+        {'cell': 8, 'orientations': 4, 'resize': 'area', 'signed': True, 'size': 32},
+        2,
+        None,
+    ),
+    'gradient_projected': (
+        'gradient',
+        {'cell': 16, 'orientations': 8, 'resize': 'area', 'signed': True, 'size': 224},
+        7,
+        16,
+    ),
+    'onnx': (
+        'onnx',
+        IMAGENET
+        | {'layer': 'relu', 'mean': [0.5, 0.4, 0.3], 'channels': 'bgr', 'size': 32}
+        | {'model': 'tiny.onnx', 'resize': 'bilinear', 'sha256': '1b60677c8ac4ead5'},
+        4,
+        None,
+    ),
+    'torchscript': (
+        'torchscript',
+        IMAGENET
+        | {'layer': 'relu', 'channels': 'rgb', 'size': 32, 'half': True}
+        | {'model': 'tiny.pt', 'resize': 'area', 'sha256': '5994cbbd120ebce2'},
+        4,
+        None,
+    ),
+    'densenet161_places365': (
+        'densenet161_places365',
+        {'half': False, 'model': 'densenet161_places365.pth.tar', 'resize': 'bilinear'}
+        | {'sha256': 'bbeb2756675dd8e3', 'size': 32},
+        1,
+        None,
+    ),
+    'vgg16': (
+        'vgg16',
+        {'half': False, 'model': 'vgg16.pth', 'resize': 'bilinear', 'size': 32}
+        | {'sha256': '0a7ae55e899900c7'},
+        2,
+        8,
+    ),
+}
+
+
+@pytest.fixture
+def model(request, name):
+    """The file of the map's network: stored beside the map, or made anew."""
+    stored = {'onnx': 'tiny.onnx', 'torchscript': 'tiny.pt'}
+    if name in stored:
+        return str(FOLDER / stored[name])
+    made = {'densenet161_places365': 'densenet_file', 'vgg16': 'vgg_file'}
+    return str(request.getfixturevalue(made[name])) if name in made else ''
+
+
+def manifest_of(path: Path) -> dict:
+    with zipfile.ZipFile(path) as archive:
+        return json.loads(archive.read('manifest.json'))
+
+
+def test_version1_maps_cover_every_kind():
+    assert {path.stem for path in FOLDER.glob('*.stavpr')} == MAPS.keys()
+    assert {kind for kind, *_ in MAPS.values()} == KINDS.keys()
+
+
+@pytest.mark.parametrize('name', MAPS)
+def test_version1_map_loads_with_its_settings(name, tmp_path):
+    """Settings are read as written, and a map saved now has the same keys and values."""
+    place_map = load_map(FOLDER / f'{name}.stavpr')
+    kind, backbone, strips, projection = MAPS[name]
+    written = json.loads(place_map.settings.to_json())
+    if 'sha256' in backbone:
+        written['backbone']['sha256'] = written['backbone']['sha256'][:16]
+    assert (written['kind'], written['backbone'], written['strips']) == (kind, backbone, strips)
+    assert (place_map.projection is None) is (projection is None)
+    assert place_map.features.strips.shape[:2] == (strips, PLACES)
+    save_map(place_map, tmp_path / 'again')
+    assert manifest_of(tmp_path / 'again') == manifest_of(FOLDER / f'{name}.stavpr')
+
+
+@pytest.mark.filterwarnings('ignore:.torch.jit:DeprecationWarning')
+@pytest.mark.parametrize('name', MAPS)
+def test_version1_map_recognizes_its_images(name, model):
+    """Features extracted now are those of the map, and a window of three finds its places."""
+    if name == 'onnx':
+        pytest.importorskip('onnxruntime', reason='the extra onnx is not installed')
+    place_map = load_map(FOLDER / f'{name}.stavpr')
+    query = place_map.extractor(model=model).extract(route_images(PLACES))
+    torch.testing.assert_close(query.strips, place_map.features.strips, rtol=0, atol=1e-5)
+    torch.testing.assert_close(query.weights, place_map.features.weights, rtol=0, atol=1e-5)
+    settings = RecognizerSettings(0.5, sequence=SequenceSettings(3), mode='paper')
+    recognizer = PlaceRecognizer(place_map, settings)
+    matches = [recognizer.update(query[i : i + 1]) for i in range(3, 7)]
+    assert [match.place_index for match in matches] == [-1, -1, 4, 5]
+
+
+def test_version1_map_keeps_facts_of_places():
+    place_map = load_map(FOLDER / 'gradient_projected.stavpr')
+    assert place_map.stamps.tolist() == [(i + 1) * 10**9 for i in range(PLACES)]
+    assert place_map.ids == tuple(f'place {i}' for i in range(PLACES))
+    assert place_map.pose(3) is None
+    assert place_map.pose(5).tolist() == [5, 0, 0, 0, 0, 0, 1]
+    thumbnail = place_map.thumbnail(6).astype(int)
+    small = [cv2.resize(image, (48, 36)) for image in route_images(PLACES)]
+    assert np.argmin([np.abs(thumbnail - image).mean() for image in small]) == 6
+    assert place_map.projection.matrix.shape == (224, 16)
+    plain = load_map(FOLDER / 'gradient.stavpr')
+    assert (plain.has_stamps, plain.has_ids, plain.has_poses) == (False, False, False)
+    assert plain.thumbnail(0) is None
