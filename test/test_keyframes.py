@@ -42,19 +42,19 @@ def test_wrong_settings(name, value):
 
 
 def test_settings_out_of_reach():
-    for wrong in ({'degrees': 180.1}, {'change': 2.1}):
+    for wrong in ({'angle': 180.1}, {'change': 2.1}):
         with pytest.raises(SettingsError, match='no'):
             KeyframeSettings(**wrong)
-    KeyframeSettings(degrees=180, change=2)
+    KeyframeSettings(angle=180, change=2)
 
 
 def test_any():
     assert not KeyframeSettings().any
-    for name in ('seconds', 'meters', 'degrees', 'change'):
+    for name in ('interval', 'distance', 'angle', 'change'):
         assert KeyframeSettings(**{name: 0.1}).any
-    assert KeyframeSettings(degrees=1).needs_poses
-    assert KeyframeSettings(meters=1).needs_poses
-    assert not KeyframeSettings(seconds=1, change=1).needs_poses
+    assert KeyframeSettings(angle=1).needs_poses
+    assert KeyframeSettings(distance=1).needs_poses
+    assert not KeyframeSettings(interval=1, change=1).needs_poses
 
 
 def test_without_rules_every_image_is_one():
@@ -64,35 +64,35 @@ def test_without_rules_every_image_is_one():
 
 
 def test_time():
-    made = selector(seconds=0.1)
+    made = selector(interval=0.1)
     reason = made.too_soon(10 * SECOND + 99_999_999, None)
     assert '0.100 s after the last keyframe: less than 0.1 s' in reason
     assert made.too_soon(10 * SECOND, None)
     assert made.too_soon(10 * SECOND - 99_999_999, None)  # overtaken on the way
     for fine in (10 * SECOND + 100_000_000, 10 * SECOND - 100_000_000, 0):  # late, jumped back, unknown
         assert made.too_soon(fine, None) == ''
-    assert selector(stamp=0, seconds=0.1).too_soon(5, None) == ''
+    assert selector(stamp=0, interval=0.1).too_soon(5, None) == ''
 
 
 def test_motion_is_one_rule():
-    made = selector(where=pose(), meters=1, degrees=10)
+    made = selector(where=pose(), distance=1, angle=10)
     reason = made.too_soon(0, pose(0.999, -9.99))
     assert reason == 'moved 0.999 m of 1 m and turned 9.99 of 10 degrees since the last keyframe'
     assert made.too_soon(0, pose(1)) == ''
     assert made.too_soon(0, pose(0, -10.001)) == ''
-    assert 'degrees' not in selector(where=pose(), meters=1).too_soon(0, pose(0, 90))
-    assert 'm of' not in selector(where=pose(), degrees=10).too_soon(0, pose(5, 9))
+    assert 'degrees' not in selector(where=pose(), distance=1).too_soon(0, pose(0, 90))
+    assert 'm of' not in selector(where=pose(), angle=10).too_soon(0, pose(5, 9))
 
 
 def test_motion_without_odometry():
-    for made in (KeyframeSelector(KeyframeSettings(degrees=5)), selector(where=pose(), meters=1)):
+    for made in (KeyframeSelector(KeyframeSettings(angle=5)), selector(where=pose(), distance=1)):
         assert 'no odometry' in made.too_soon(20 * SECOND, None)
     # the rule came on after the last keyframe, of which no pose is known
-    assert selector(meters=1).too_soon(20 * SECOND, pose()) == ''
+    assert selector(distance=1).too_soon(20 * SECOND, pose()) == ''
 
 
 def test_all_rules_must_agree():
-    made = selector(where=pose(), seconds=1, meters=1)
+    made = selector(where=pose(), interval=1, distance=1)
     assert 's after' in made.too_soon(10_500_000_000, pose(5))
     assert 'moved' in made.too_soon(12 * SECOND, pose(0.5))
     assert made.too_soon(12 * SECOND, pose(5)) == ''
@@ -108,7 +108,7 @@ def test_change_of_the_picture(route):
 
 
 def test_asking_changes_nothing(route):
-    made = selector(where=pose(), image=route[0], seconds=1, meters=1, change=0.1)
+    made = selector(where=pose(), image=route[0], interval=1, distance=1, change=0.1)
     for _ in range(2):
         assert made.too_soon(20 * SECOND, pose(9)) == ''
         assert made.too_alike(route[9]) == ''
@@ -119,19 +119,19 @@ def test_asking_changes_nothing(route):
 def test_settings_change_while_it_runs(route):
     """The last keyframe is kept, also what no rule asked for when it came."""
     made = selector(where=pose(), image=route[0])
-    for rules in ({'seconds': 1}, {'meters': 1}):
+    for rules in ({'interval': 1}, {'distance': 1}):
         made.settings = KeyframeSettings(**rules)
         assert made.too_soon(10 * SECOND, pose())
     made.settings = KeyframeSettings(change=0.1)
     assert made.too_alike(route[0])
     made.reset()
     assert made.too_alike(route[0]) == ''
-    made.settings = KeyframeSettings(seconds=1, meters=1)
+    made.settings = KeyframeSettings(interval=1, distance=1)
     assert made.too_soon(10 * SECOND, pose()) == ''
 
 
 def test_a_pose_that_is_none():
-    made = selector(where=pose(), meters=1)
+    made = selector(where=pose(), distance=1)
     for call in (lambda wrong: made.too_soon(1, wrong), lambda wrong: made.accept(1, wrong, PICTURE)):
         with pytest.raises(InputError):
             call(np.full(7, np.nan))
@@ -140,7 +140,7 @@ def test_a_pose_that_is_none():
 
 def test_a_keyframe_is_kept_though_its_arrays_are_reused(route):
     where, image = pose(), route[0].copy()
-    made = selector(where=where, image=image, meters=1, change=0.1)
+    made = selector(where=where, image=image, distance=1, change=0.1)
     where[0], image[:] = 50, route[9]
     assert made.too_soon(0, pose(0.5))
     assert made.too_alike(route[0])
@@ -274,13 +274,13 @@ def test_keyframes_in_time_and_picture(route):
     alone = build_map(frames[57:58], FeatureExtractor(), progress=False)
     np.testing.assert_allclose(built.features.strips[:, 19], alone.features.strips[:, 0], atol=1e-6)
     assert built.thumbnails[19] == alone.thumbnails[0]
-    slow = build_map(frames, FeatureExtractor(), progress=False, keyframes=KeyframeSettings(seconds=7))
+    slow = build_map(frames, FeatureExtractor(), progress=False, keyframes=KeyframeSettings(interval=7))
     assert slow.ids == tuple(str(i) for i in range(0, 60, 7))
 
 
 def test_the_selector_decides(route):
     """The same places as the selector's own answers, over the border of a batch."""
-    frames, settings = drive(route[:50], shown=2), KeyframeSettings(seconds=3, change=0.1)
+    frames, settings = drive(route[:50], shown=2), KeyframeSettings(interval=3, change=0.1)
     selector, expected = KeyframeSelector(settings), []
     for frame in frames:
         if not selector.too_soon(frame.stamp, None) and not selector.too_alike(frame.image):

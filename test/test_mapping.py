@@ -146,12 +146,12 @@ def test_keyframes_in_space(route, known):
     frames, poses = drive(route[:20]), straight(20)
     poses[4] = np.nan
     if known == 'trajectory':
-        trajectory = Trajectory(gap=1.5)
+        trajectory = Trajectory(max_gap=1.5)
         for frame, pose in zip(frames, poses, strict=True):
             if not np.isnan(pose[0]):
                 trajectory.add(frame.stamp, pose)
         poses = trajectory
-    built = build_map(frames, FeatureExtractor(), poses, progress=False, keyframes=KeyframeSettings(meters=2))
+    built = build_map(frames, FeatureExtractor(), poses, progress=False, keyframes=KeyframeSettings(distance=2))
     assert built.ids == ('0', '2', *map(str, range(5, 20, 2)))  # of 4 nothing is known
     assert built.poses[:, 0].tolist() == [0, 2, *range(5, 20, 2)]
     every = build_map(frames, FeatureExtractor(), poses, progress=False)
@@ -175,10 +175,10 @@ def test_poses_that_do_not_fit(route):
     built = build_map(frames, extractor, straight(20) * 2, progress=False)
     assert built.pose(3).tolist() == [6, 0, 0, 0, 0, 0, 1]
     with pytest.raises(SettingsError, match='without poses'):
-        build_map(frames, extractor, progress=False, keyframes=KeyframeSettings(degrees=1))
+        build_map(frames, extractor, progress=False, keyframes=KeyframeSettings(angle=1))
     nowhere = Trajectory()
     with pytest.raises(InputError, match=r'none of 20 images became a place.*no odometry'):
-        build_map(frames, extractor, nowhere, progress=False, keyframes=KeyframeSettings(meters=1))
+        build_map(frames, extractor, nowhere, progress=False, keyframes=KeyframeSettings(distance=1))
     assert build_map(frames, extractor, nowhere, progress=False).poses is None
 
 

@@ -88,11 +88,11 @@ def test_keyframes(map_file, route):
     assert outcomes[1].cause == 'not a keyframe'
     assert 'differs by 0.0000' in outcomes[1].reason
     assert outcomes[-1].window == tuple(stamp * SECOND for stamp in (1, 4, 5, 6, 7))
-    pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(seconds=2.0)))
+    pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(interval=2.0)))
     outcomes = show(pipeline, route[5:7], first=7)
     assert answers(outcomes) == [Status.SKIPPED, Status.MATCH]
     assert 'less than 2 s' in outcomes[0].reason
-    pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(meters=3.0)))
+    pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(distance=3.0)))
     outcomes = show(pipeline, route[7:9], first=9) + show(pipeline, route[8:14], first=10, poses=True)
     assert outcomes[0].cause == outcomes[1].cause == 'no odometry'
     # the last keyframe had no pose, which cannot object; then it is every third meter

@@ -13,7 +13,8 @@ from PIL import Image
 
 from stavpr_ros.errors import ImageError
 from stavpr_ros.sources import files, open_source
-from stavpr_ros.sources.encodings import decode_compressed, decode_compressed_message, decode_message
+from stavpr_ros.sources.files import decode_compressed
+from stavpr_ros.sources.encodings import decode_compressed_message, decode_message
 
 # the color at each pixel of the top-left 2x2, in reading order
 PATTERNS = {'rggb': (0, 1, 1, 2), 'bggr': (2, 1, 1, 0), 'gbrg': (1, 2, 0, 1), 'grbg': (1, 0, 2, 1)}
@@ -93,7 +94,7 @@ def test_no_image(data):
 
 def test_a_file_that_is_cut_off():
     data = encoded('.png', np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8))
-    with pytest.raises(ImageError, match='is damaged or cut off: copy or record anew') as caught:
+    with pytest.raises(ImageError, match='is damaged or cut off: copy or record it again') as caught:
         decode_compressed(data[:-30])
     assert caught.value.kind == 'damaged'
 
@@ -182,7 +183,7 @@ def test_the_bytes_decide(transport):
 )
 def test_depth_is_refused_by_name(transport):
     png = encoded('.png', np.zeros((4, 4), np.uint8))  # a picture, so that nothing but the name is wrong
-    with pytest.raises(ImageError, match='holds depth or measurements, not a picture') as caught:
+    with pytest.raises(ImageError, match='holds depth or measurements, not an image') as caught:
         decode_compressed_message(compressed(transport, png))
     assert repr(transport) in str(caught.value)
     assert caught.value.kind == 'depth'

@@ -95,10 +95,10 @@ def test_the_last_rows_padding_may_be_missing():
         ({'encoding': 'nv24', 'height': 2, 'step': 4, 'data': bytes(23)}, 'cut off', 'expected 24'),
         ({'encoding': 'bayer_rggb16', 'step': 7}, 'step', 'expected 8'),
         ({'encoding': '32FC1'}, 'depth', 'depth'),
-        ({'encoding': '32FC1x'}, 'encoding', "'32FC1x' is not read"),
-        ({'encoding': '8UC2'}, 'encoding', "'8UC2' is not read"),
-        ({'encoding': 'bayer_rggb9'}, 'encoding', "'bayer_rggb9' is not read: expected one of rgb8"),
-        ({'encoding': ''}, 'encoding', 'is not read'),
+        ({'encoding': '32FC1x'}, 'encoding', "'32FC1x' is not supported"),
+        ({'encoding': '8UC2'}, 'encoding', "'8UC2' is not supported"),
+        ({'encoding': 'bayer_rggb9'}, 'encoding', "'bayer_rggb9' is not supported: expected one of rgb8"),
+        ({'encoding': ''}, 'encoding', 'is not supported'),
     ],
 )
 def test_lying_headers(change, kind, text):

@@ -13,8 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from stavpr_ros.errors import InputError, SettingsError, SourceError
 from stavpr_ros.mapping import Trajectory, distance, rotation
-from stavpr_ros.sources.bag import RAW
-from stavpr_ros.sources.bag_odometry import ODOMETRY, read_odometry
+from stavpr_ros.sources.bag import ODOMETRY, RAW, read_odometry
 
 SECOND = 10**9
 
@@ -51,7 +50,7 @@ def test_between_two_poses():
 
 
 def test_before_after_and_nothing():
-    trajectory = Trajectory(patience=0.5)
+    trajectory = Trajectory(timeout=0.5)
     assert trajectory.at(SECOND) is None
     trajectory.add(2 * SECOND, turned(0, x=1))
     trajectory.add(3 * SECOND, turned(0, x=2))
@@ -62,7 +61,7 @@ def test_before_after_and_nothing():
 
 
 def test_no_line_is_drawn_over_a_long_silence():
-    trajectory = Trajectory(patience=0.5, gap=2)
+    trajectory = Trajectory(timeout=0.5, max_gap=2)
     for second in (1, 3, 6):
         trajectory.add(second * SECOND, turned(0, x=second))
     assert trajectory.at(2 * SECOND)[0] == 2
@@ -81,7 +80,7 @@ def test_an_answer_is_a_copy():
 
 
 def test_late_poses_are_sorted_in_and_equal_stamps_replaced():
-    trajectory = Trajectory(patience=0.5)
+    trajectory = Trajectory(timeout=0.5)
     for stamp, x in ((10, 0), (20, 10), (15, 8), (20, 12)):
         trajectory.add(stamp * SECOND // 10, turned(0, x=x))
     assert len(trajectory) == 3
@@ -90,7 +89,7 @@ def test_late_poses_are_sorted_in_and_equal_stamps_replaced():
 
 
 def test_a_clock_that_jumps_back_makes_it_forget():
-    trajectory = Trajectory(patience=0.5)
+    trajectory = Trajectory(timeout=0.5)
     for stamp in (10 * SECOND, 11 * SECOND, 10_500_000_000):
         trajectory.add(stamp, turned(0))
     assert len(trajectory) == 3
@@ -136,7 +135,7 @@ def test_no_pose(pose, words):
 def test_no_stamp_and_no_settings():
     with pytest.raises(InputError, match='stamp 0'):
         Trajectory().add(0, turned(0))
-    for wrong in ({'patience': -1}, {'patience': math.nan}, {'capacity': 0}, {'gap': math.nan}):
+    for wrong in ({'timeout': -1}, {'timeout': math.nan}, {'capacity': 0}, {'max_gap': math.nan}):
         with pytest.raises(SettingsError, match=next(iter(wrong))):
             Trajectory(**wrong)
 
@@ -180,7 +179,7 @@ def test_rotations_turn_evenly_on_the_shorter_arc(first, angle, part, flip, axis
     part = (stamp - SECOND) / SECOND
     pose = trajectory.at(stamp)
     assert pose[0] == pytest.approx(-4 + 10 * part)
-    assert same_rotation(pose[3:], after(angle * part), 2e-6)  # nearly parallel ones go straight
+    assert same_rotation(pose[3:], after(angle * part), 1e-12)
     assert np.linalg.norm(pose[3:]) == pytest.approx(1, abs=1e-12)
     assert rotation(start, end) == pytest.approx(abs(angle), abs=1e-6)
 

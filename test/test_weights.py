@@ -287,7 +287,7 @@ def test_nothing_in_a_file_is_executed(tmp_path):
         with pytest.raises(UnavailableError, match=r'some\.pth cannot be read as a file of weights'):
             read(tmp_path, hostile)
         assert not mark.exists()
-    with pytest.raises(UnavailableError, match=r'asks for posix\.mkdir, .* not executed'):
+    with pytest.raises(UnavailableError, match=r'requires posix\.mkdir, .* not executed'):
         read(tmp_path, old)
 
 

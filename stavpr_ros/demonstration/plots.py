@@ -4,7 +4,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-
 from stavpr_ros.errors import InputError
 from stavpr_ros.evaluation import plots
 from stavpr_ros.evaluation.plots import MatchPair, Outcome
@@ -19,7 +18,9 @@ def outcomes_of(result: TraverseEvaluation) -> list[Outcome]:
     if result.true_places is None or result.correct is None:
         return ['match' if accepted else 'no match' for accepted in result.accepted]
     names: list[Outcome] = []
-    for accepted, correct, truth in zip(result.accepted, result.correct, result.true_places, strict=True):
+    for accepted, correct, truth in zip(
+        result.accepted, result.correct, result.true_places, strict=True
+    ):
         missed: Outcome = 'unseen' if truth < 0 else 'no match'
         names.append(('right' if correct else 'wrong') if accepted else missed)
     return names
@@ -56,7 +57,9 @@ def _pair(
     place = int(result.matched[image])
     shown = place_map.thumbnail(place) if place >= 0 else None
     if shown is not None:
-        shown = cv2.resize(shown, (picture.shape[1], picture.shape[0]), interpolation=cv2.INTER_CUBIC)
+        shown = cv2.resize(
+            shown, (picture.shape[1], picture.shape[0]), interpolation=cv2.INTER_CUBIC
+        )
     return MatchPair(picture, shown, _caption(result, image), outcome)
 
 
@@ -66,7 +69,12 @@ def _matrix(features: LocalFeatures, place_map: PlaceMap) -> np.ndarray:
 
 
 def draw_result(
-    result: TraverseEvaluation, query: PlaceMap, place_map: PlaceMap, threshold: float, title: str, folder: Path
+    result: TraverseEvaluation,
+    query: PlaceMap,
+    place_map: PlaceMap,
+    threshold: float,
+    title: str,
+    folder: Path,
 ) -> None:
     """
     Draw the page ``demo.png``, and its parts in pictures of their own.
@@ -91,6 +99,8 @@ def draw_result(
         result.headline,
     )
     plots.match_overview(folder / 'matches.png', pairs)
-    plots.distance_matrix(folder / 'distance_matrix.png', matrix, result.matched, truth, result.tolerance)
+    plots.distance_matrix(
+        folder / 'distance_matrix.png', matrix, result.matched, truth, result.tolerance
+    )
     unseen = np.zeros(len(outcomes), bool) if truth is None else truth < 0
     plots.distance_over_time(folder / 'distance_over_time.png', best, threshold, outcomes, unseen)
