@@ -1,4 +1,14 @@
-"""Installs the Python package the way that colcon and ``ros2 run`` expect it."""
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Package description for both ways to install: ``colcon build`` and ``pip install .``.
+
+Both install the command ``stavpr`` on the PATH, and the executables of ``ros2 run`` as plain
+scripts in ``lib/stavpr_ros``. The latter are data files, not entry points: pip writes entry
+points of any name into ``bin``, where ``node`` or ``record`` would be too generic, and the
+scripts that setuptools generates for entry points require the distributions below by name, which
+Debian's packages provide under other names.
+"""
 
 from glob import glob
 from pathlib import Path
@@ -8,37 +18,66 @@ from setuptools import find_packages, setup
 NAME = 'stavpr_ros'
 EXECUTABLES = ('node', 'build_map', 'replay', 'demo', 'record', 'evaluate', 'experiments')
 
+# The command `evaluate` is part of every installation.
+EVALUATION = ['jinja2>=3.1', 'scikit-learn>=1.4']
+TEST = ['hypothesis>=6.98', 'pytest>=7.4', 'PyYAML>=6.0']
+LINT = [
+    'flake8>=7.0',
+    'flake8-builtins>=2.1',
+    'flake8-comprehensions>=3.14',
+    'flake8-import-order>=0.18',
+    'flake8-quotes>=3.3',
+    'mypy>=1.11',
+    'pre-commit>=3.6',
+    'pydocstyle>=6.3',
+    'ruff>=0.9',
+]
+
 
 def files_in(folder: str) -> list[str]:
-    """List the files of a folder, as paths relative to this one."""
+    """List the files of a folder, relative to this one."""
     return sorted(path for path in glob(f'{folder}/*') if Path(path).is_file())
 
 
 setup(
     name=NAME,
     version='0.1.0',
-    description='STA-VPR place recognition: spatio-temporal alignment of image sequences, as a ROS 2 node.',
+    description='STA-VPR place recognition by spatio-temporal alignment, as a ROS 2 node.',
     license='Apache-2.0',
     author='The stavpr_ros authors',
     maintainer='The stavpr_ros maintainers',
     maintainer_email='maintainers@stavpr-ros.org',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['py.typed', '**/*.css', '**/*.html', '**/*.jinja', '**/*.js']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', files_in('config')),
         (f'share/{NAME}/launch', files_in('launch')),
+        (f'lib/{NAME}', [f'scripts/{name}' for name in EXECUTABLES]),
     ],
     python_requires='>=3.11',
-    install_requires=['setuptools'],
+    install_requires=[
+        'llvmlite',  # the version that numba pins
+        'matplotlib>=3.6',
+        'numba>=0.59',
+        'numpy>=1.26',
+        'opencv-python-headless>=4.6',
+        'pillow>=10.2',
+        'rosbags>=0.10',
+        'scipy>=1.11',
+        'torch>=2.2',
+        'tqdm>=4.66',
+        *EVALUATION,
+    ],
     extras_require={
         'cuda': ['numba-cuda>=0.30'],
-        'evaluation': ['scikit-learn'],
-        'onnx': ['onnx', 'onnxruntime'],
-        'test': ['pytest'],
+        'dev': [*TEST, *LINT],
+        'docs': ['myst-parser>=2.0', 'sphinx>=7.2'],
+        'evaluation': EVALUATION,
+        'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
+        'test': TEST,
     },
-    zip_safe=True,
-    entry_points={
-        'console_scripts': [f'{name} = {NAME}.commands.{name}:main' for name in EXECUTABLES],
-    },
+    zip_safe=False,
+    entry_points={'console_scripts': [f'stavpr = {NAME}.commands.stavpr:main']},
 )

@@ -99,7 +99,7 @@ def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
     from sensor_msgs.msg import Image
 
     from stavpr_msgs.msg import PlaceMatch
-    from stavpr_ros.ros.discovery import Introduction
+    from stavpr_ros.ros.discovery import Discovery
     from stavpr_ros.ros.process import ros_node, spin_until
 
     listener = Listener()
@@ -109,8 +109,8 @@ def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
         publisher = node.create_publisher(Image, 'image', qos_profile_sensor_data)
         node.create_subscription(PlaceMatch, '/stavpr/match', listener.on_match, QoSProfile(depth=1000))
         spin_until(node, lambda: publisher.get_subscription_count() > 0)
-        introduction = Introduction(node, lambda: node.get_subscriptions_info_by_topic('/image'), 10.0)
-        spin_until(node, introduction.done)
+        discovery = Discovery(node, lambda: node.get_subscriptions_info_by_topic('/image'))
+        spin_until(node, discovery.done)
         memory_start, began = memory(pid), time.monotonic()
         by_minute = [memory_start]
         minute = node.create_timer(60.0, lambda: by_minute.append(memory(pid)))

@@ -1,8 +1,8 @@
 """
-Make a map while driving: ros2 launch stavpr_ros mapping.launch.py image:=/camera/image_raw.
+Record a map: ros2 launch stavpr_ros mapping.launch.py image:=/camera/image_raw save_path:=FILE.
 
-With map_path, a map goes on growing. What has grown is written to save_path at the end,
-or by the service save_map.
+With map_path, a map is extended. The service save_map saves the map at any time, save_path at the
+end.
 """
 
 from launch.actions import LogInfo
@@ -11,25 +11,14 @@ from launch.substitutions import LaunchConfiguration
 from launch import LaunchDescription
 from stavpr_ros.ros.launching import node_launch
 
-PARAMETERS = (
-    'map_path',
-    'features',
-    'keyframe_interval',
-    'keyframe_distance',
-    'keyframe_angle',
-    'keyframe_change',
-    'max_places',
-    'save_path',
-)
-
 
 def generate_launch_description() -> LaunchDescription:
     """Describe the node in operation mapping."""
     how_to_save = LogInfo(
         msg=[
-            'to save the map before the end (at the end, save_path does): ros2 service call ',
+            'to save the map before the end (save_path saves it at the end): ros2 service call ',
             LaunchConfiguration('namespace'),
             '/stavpr/save_map stavpr_msgs/srv/SaveMap "{path: FILE}"',
         ]
     )
-    return node_launch(PARAMETERS, how_to_save, operation='mapping')
+    return node_launch(how_to_save, operation='mapping')

@@ -11,23 +11,9 @@ from launch_ros.actions import Node
 from launch import LaunchContext, LaunchDescription
 from stavpr_ros.ros.launching import PACKAGE, node_launch, remappings
 
-PARAMETERS = (
-    'operation',
-    'map_path',
-    'threshold',
-    'mode',
-    'sequence_length',
-    'exclude_places',
-    'keyframe_interval',
-    'keyframe_distance',
-    'keyframe_angle',
-    'keyframe_change',
-    'geometric_check',
-)
-
 
 def _replay(context: LaunchContext) -> list[Node]:
-    """Start the replay with the options that are given; it waits until the node listens."""
+    """Start the replay with the given options; it waits for the subscription of the node."""
     words = [LaunchConfiguration('bag')]
     for option in ('topic', 'rate'):
         if LaunchConfiguration(option).perform(context):
@@ -50,26 +36,29 @@ def _replay(context: LaunchContext) -> list[Node]:
 
 def generate_launch_description() -> LaunchDescription:
     """Describe the node and the replay."""
-    truth = ['true', 'false']
+    booleans = ['true', 'false']
     own = [
         DeclareLaunchArgument('bag', description='ROS 1 or ROS 2 bag, or folder of images'),
         DeclareLaunchArgument(
-            'topic', default_value='', description='image topic in the bag; empty: there is one only'
+            'topic', default_value='', description='image topic in the bag; empty: the only one'
         ),
         DeclareLaunchArgument(
             'rate',
             default_value='',
-            description='factor on the recorded pace, or images per second of a folder; empty: 1, or 10',
+            description='factor on the recorded rate, or Hz of a folder; empty: 1, or 10',
         ),
         DeclareLaunchArgument(
             'lossless',
             default_value='false',
-            choices=truth,
-            description='send the next image when the last one is answered; rate is left empty then',
+            choices=booleans,
+            description='publish each image after the match of the last one; leave rate empty',
         ),
         DeclareLaunchArgument(
-            'shutdown', default_value='false', choices=truth, description='end the node with the replay'
+            'shutdown',
+            default_value='false',
+            choices=booleans,
+            description='shut down the node after the replay',
         ),
     ]
-    described = node_launch(PARAMETERS, OpaqueFunction(function=_replay))
+    described = node_launch(OpaqueFunction(function=_replay))
     return LaunchDescription([*own, *described.entities])

@@ -1,4 +1,4 @@
-"""A file that is written at the end, looked at before the work."""
+"""Check of an output file before the work starts."""
 
 import os
 
@@ -7,9 +7,9 @@ from stavpr_ros.errors import SourceError
 
 def require_room(path: str) -> None:
     """
-    Refuse a file that could not be written.
+    Reject a file that cannot be written.
 
-    :raises SourceError: it is a folder, or there is no folder that it could be in.
+    :raises SourceError: it is a folder, or its folder is missing or write-protected.
     """
     if os.path.isdir(path):
         raise SourceError(f'{path} is a folder: name a file in it')

@@ -1,4 +1,4 @@
-"""How our processes take signals."""
+"""Signal handling of every executable."""
 
 import signal
 from collections.abc import Iterator
@@ -19,26 +19,26 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
 
 def obey_signals() -> None:
     """
-    Make the first SIGINT or SIGTERM raise KeyboardInterrupt, and the process deaf to further ones.
+    Raise KeyboardInterrupt on the first SIGINT or SIGTERM, and ignore further ones.
 
-    ``ros2 launch`` sends a second SIGINT while the first is being obeyed. What the parent process had in
-    mind for the signals (a shell ignores SIGINT for what it starts in the background) does not count.
+    ``ros2 launch`` sends a second SIGINT during the shutdown. The handlers replace those
+    inherited: a shell ignores SIGINT for background processes.
     """
     signal.signal(signal.SIGINT, _on_signal)
     signal.signal(signal.SIGTERM, _on_signal)
 
 
 def interrupted() -> bool:
-    """Tell whether a signal has come."""
+    """Return whether a signal was received."""
     return _State.received
 
 
 @contextmanager
 def signals_deferred() -> Iterator[None]:
     """
-    Note signals instead of raising KeyboardInterrupt, which is raised at the end.
+    Raise the KeyboardInterrupt of a signal at the end of the block instead of within.
 
-    For calls into rclpy: an exception in the middle of its C++ comes out as another one.
+    For calls into rclpy: an exception within its C++ comes out as another one.
     """
     _State.deferred = True
     try:

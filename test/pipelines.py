@@ -1,4 +1,4 @@
-"""Engines for made-up routes, and images shown to them."""
+"""Pipelines on synthetic routes, and images for them."""
 
 from contextlib import contextmanager
 
@@ -6,17 +6,17 @@ import numpy as np
 
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
+from stavpr_ros.pipeline.saving import write_map
 from stavpr_ros.sources.frame import ImageRecord
 from stavpr_ros.threads import limit_threads
 
 LENGTH, EXCLUDED = 5, 10
 SECOND = 10**9
-IDENTITY = [0.0, 0.0, 0.0, 1.0]
 
 
 def settings_of(**changes):
     short = {'sequence': SequenceSettings(LENGTH), 'nms_radius': 5, 'exclude_places': EXCLUDED}
-    return PipelineSettings(**short | changes)
+    return PipelineSettings(**{'backend': 'cpu'} | short | changes)
 
 
 def message(image):
@@ -24,28 +24,51 @@ def message(image):
 
 
 def at(i):
-    return np.array([float(i), 0, 0, *IDENTITY])
+    return np.array([float(i), 0, 0, 0, 0, 0, 1])
 
 
-def show(pipeline, images, first=0, poses=False):
-    """Image i of all is stamped i + 1 seconds and, if at all, taken at x = i."""
+def process(pipeline, images, first=0, poses=False):
+    """Image i of all is stamped i + 1 seconds and, with poses, taken at x = i."""
     return [
         pipeline.process(message(image), (i + 1) * SECOND, at(i) if poses else None)
         for i, image in enumerate(images, first)
     ]
 
 
-def as_if_saved(pipeline):
-    """Take every place for written to a file."""
-    pipeline.save_state.written = pipeline.save_state.grown
+def recorded(route, operation='mapping', count=30, **changes):
+    """A pipeline in an operation, on a saved map of the route; in loop_closure, on the route itself."""
+    pipeline = Pipeline(settings_of(**changes), 'mapping')
+    process(pipeline, route[:count], poses=True)
+    mark_saved(pipeline)
+    if operation != 'mapping':
+        pipeline.change(operation=operation)
+    if operation == 'loop_closure':
+        process(pipeline, route[:count], poses=True)
+    return pipeline
 
 
-def answers(outcomes):
-    return [outcome.status for outcome in outcomes]
+def localizing(map_file, **changes):
+    """A pipeline that localizes on a map file."""
+    pipeline = Pipeline(settings_of(**changes))
+    pipeline.change(loaded=read_map(map_file, pipeline.settings))
+    return pipeline
 
 
-def stamps_of(place_map):
-    return [] if place_map is None else [int(stamp) // SECOND for stamp in place_map.stamps]
+def mark_saved(pipeline):
+    """Mark every place as written to a file."""
+    pipeline.save_state.saved = pipeline.save_state.recorded
+
+
+def save(pipeline, path, overwrite=False):
+    return write_map(pipeline, lambda function: function(), str(path), overwrite)
+
+
+def statuses(matches):
+    return [match.status for match in matches]
+
+
+def stamps_of(places):
+    return [] if places is None else [int(stamp) // SECOND for stamp in places.stamps]
 
 
 @contextmanager
@@ -56,10 +79,3 @@ def one_thread():
         yield
     finally:
         limit_threads(0)
-
-
-def localizing(map_file, **changes):
-    """An pipeline that localizes on a map's file."""
-    pipeline = Pipeline(settings_of(**changes))
-    pipeline.use(read_map(map_file, pipeline.settings))
-    return pipeline

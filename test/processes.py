@@ -24,9 +24,8 @@ from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 
 DOMAIN = 1 + os.getpid() % 100
-PATIENCE = 60.0  # seconds until something that should happen counts as not happening
-SETTLING = 0.2  # seconds until an endpoint that has just been discovered is matched
-UNHEARD = 25.0  # seconds without an answer until a request counts as lost on its way
+TIMEOUT = 60.0  # seconds until an expected event counts as missing
+RESEND = 20  # attempts to receive a response until a probe is sent again
 RELIABLE = QoSProfile(depth=1000)
 TAKEN_RELIABLY = {
     'qos_overrides./image.subscription.reliability': 'reliable',
@@ -49,13 +48,16 @@ class Process:
         }
         with log.open('w') as output:
             self.popen = subprocess.Popen(
-                [executable(name), *arguments], env=environment, stdout=output, stderr=subprocess.STDOUT
+                [executable(name), *arguments],
+                env=environment,
+                stdout=output,
+                stderr=subprocess.STDOUT,
             )
 
     def output(self) -> str:
         return self.log.read_text()
 
-    def wait(self, timeout: float = PATIENCE) -> int:
+    def wait(self, timeout: float = TIMEOUT) -> int:
         return self.popen.wait(timeout)
 
     def stop(self, number: int = signal.SIGINT) -> int:
@@ -63,7 +65,7 @@ class Process:
         return self.wait()
 
     def end(self) -> None:
-        """Make sure that it is gone, gently if that does."""
+        """End the process, by force if an interrupt does not suffice."""
         if self.popen.poll() is None:
             self.popen.send_signal(signal.SIGINT)
         try:
@@ -76,15 +78,17 @@ class Process:
 
 def node_process(log: Path, **parameters: object) -> Process:
     """Start the node with parameters."""
-    options = [option for name, value in parameters.items() for option in ('-p', f'{name}:={value}')]
+    options = [
+        option for name, value in parameters.items() for option in ('-p', f'{name}:={value}')
+    ]
     return Process(log, 'node', '--ros-args', *options)
 
 
 class Bench:
     """
-    A node in the test's own process: publishes images, hears answers, calls services.
+    A node in the test's own process: publishes images, receives matches, calls services.
 
-    :param images: QoS of the images; with RELIABLE, and a node that takes them so, none is lost on its way.
+    :param images: QoS of the images; RELIABLE loses none if the node subscribes so too.
     """
 
     def __init__(self, images: QoSProfile = qos_profile_sensor_data) -> None:
@@ -104,17 +108,17 @@ class Bench:
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
     def until(self, condition: Callable[[], bool], what: str) -> None:
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while not condition():
-            assert time.monotonic() < end, f'waited {PATIENCE:g} s in vain for {what}'
+            assert time.monotonic() < end, f'{what}: not within {TIMEOUT:g} s'
             self.executor.spin_once(timeout_sec=0.05)
 
     def wait_for_node(self) -> None:
         """
-        Wait until the node hears images and its answers are heard.
+        Wait until the node receives images and its matches arrive.
 
-        A matched publisher does not mean that the other side has matched too, and a best-effort
-        subscriber drops what comes before: so empty images are sent until they are answered.
+        A matched publisher does not imply a matched subscriber on the other side, and a
+        best-effort one loses earlier images: so empty images are sent until one has a match.
         """
         self.until(lambda: self.publisher.get_subscription_count() > 0, 'the node')
         before, sent = len(self.answers), 0
@@ -122,25 +126,26 @@ class Bench:
         probe.header.frame_id = 'probe'
         while len(self.answers) == before:
             sent += 1
-            assert sent < 2 * PATIENCE
+            assert sent < 2 * TIMEOUT
             probe.header.stamp.nanosec = sent
             self.publisher.publish(probe)
             self.executor.spin_once(timeout_sec=0.5)
-        # the node hears us now, so the last probe is answered too
-        self.until(lambda: self.answers[-1].header.stamp.nanosec == sent, 'the answer to the last probe')
+        self.until(
+            lambda: self.answers[-1].header.stamp.nanosec == sent, 'the answer to the last probe'
+        )
         self.probes = len(self.answers) - before
 
     def publish_anew(self) -> None:
-        """Take another publisher of images."""
+        """Replace the publisher of images."""
         self.node.destroy_publisher(self.publisher)
         self.publisher = self.node.create_publisher(Image, 'image', self.images)
 
     def wait_for_nobody(self) -> None:
-        """Wait until no node subscribes to the images any more."""
+        """Wait until no node subscribes to the images."""
         self.until(lambda: self.publisher.get_subscription_count() == 0, 'the node to be gone')
 
     def ask(self, image: Image) -> PlaceMatch:
-        """Publish one image and return its answer."""
+        """Publish one image and return its match."""
         before = len(self.answers)
         self.publisher.publish(image)
         self.until(lambda: len(self.answers) > before, 'an answer')
@@ -148,14 +153,14 @@ class Bench:
         return self.answers[-1]
 
     def ask_until_answered(self, image: Image) -> PlaceMatch:
-        """Publish one image and return its answer, whatever other answers are on their way."""
+        """Publish one image and return its match, while others may arrive."""
         found: list[PlaceMatch] = []
         again = time.monotonic()
 
         def answered() -> bool:
             nonlocal again
             found[:] = [a for a in self.answers if a.header == image.header]
-            if not found and time.monotonic() >= again:  # best effort may lose it, after many large ones
+            if not found and time.monotonic() >= again:  # best effort may lose it
                 self.publisher.publish(image)
                 again = time.monotonic() + 5.0
             return bool(found)
@@ -166,37 +171,56 @@ class Bench:
     def call(self, kind: type, name: str, **fields: object) -> Any:
         """Call a service of the node, such as ``reset``, and return its response."""
         futures: list[Any] = []
-        with self.request(futures, kind, name, lambda: any(f.done() for f in futures), **fields):
-            return next(future for future in futures if future.done()).result()
+        with self.request(futures, kind, name, lambda: futures[0].done(), **fields):
+            return futures[0].result()
 
     @contextmanager
     def request(
-        self, futures: list[Any], kind: type, name: str, heard: Callable[[], bool], **fields: object
+        self,
+        futures: list[Any],
+        kind: type,
+        name: str,
+        effect: Callable[[], bool],
+        **fields: object,
     ) -> Iterator[Client]:
         """
-        Send a request to a service of the node, and again until it is heard; the client lives in the block.
+        Send a request to a service of the node and wait for an effect; the client lives in the
+        block.
 
-        A client that sees the service may not have been seen by it, or what it sees may be that of the node
-        before: then a request is lost.
-
-        :param futures: of the answers, is filled.
+        :param futures: receives the future of the response.
         """
         client = self.node.create_client(kind, f'/stavpr/{name}')
-        if not client.service_is_ready():
-            self.until(client.service_is_ready, f'the service {name}')
-            time.sleep(SETTLING)  # it is known, but not matched yet: what is sent now may be lost
-        began = time.monotonic()
-
-        def sent_and_heard() -> bool:
-            if time.monotonic() >= began + len(futures) * UNHEARD:
-                futures.append(client.call_async(kind.Request(**fields)))
-            return heard()
-
         try:
-            self.until(sent_and_heard, f'an effect of {name}')
+            self._wait_for_discovery()
+            self.until(client.service_is_ready, f'the service {name}')
+            futures.append(client.call_async(kind.Request(**fields)))
+            self.until(effect, f'an effect of {name}')
             yield client
         finally:
             self.node.destroy_client(client)
+
+    def _wait_for_discovery(self) -> None:
+        """
+        Wait until the node has discovered the endpoints made so far.
+
+        It has when it responds to a client that was made after them. A request of that client may
+        be lost, so it is repeated: the service may be that of a previous node.
+        """
+        probe = self.node.create_client(GetState, '/stavpr/get_state')
+        responses: list[Any] = []
+        attempts = 0
+
+        def responded() -> bool:
+            nonlocal attempts
+            if attempts % RESEND == 0 and probe.service_is_ready():
+                responses.append(probe.call_async(GetState.Request()))
+            attempts += bool(responses)
+            return any(response.done() for response in responses)
+
+        try:
+            self.until(responded, 'a response of the node')
+        finally:
+            self.node.destroy_client(probe)
 
     def set_parameter(self, name: str, value: object) -> tuple[bool, str]:
         values = [Parameter(name, value=value).to_parameter_msg()]
@@ -208,28 +232,30 @@ class Bench:
         return str(self.call(GetState, 'get_state').current_state.label)
 
     def until_state(self, label: str) -> None:
-        """Wait until the node is in a state; what leads there may still be under way."""
+        """Wait until the node is in a state; the transition may still be under way."""
         self.until(lambda: self.state() == label, f'state {label}')
 
     def transition(self, label: str) -> bool:
-        """Ask for a transition: configure, activate, deactivate, cleanup, shutdown."""
-        return bool(self.call(ChangeState, 'change_state', transition=Transition(label=label)).success)
+        """Request a transition: configure, activate, deactivate, cleanup, shutdown."""
+        return bool(
+            self.call(ChangeState, 'change_state', transition=Transition(label=label)).success
+        )
 
     def listen(self, kind: type, topic: str, qos: object = 50) -> list[Any]:
         """Return a list that fills with the messages of a topic; see ``until``."""
-        heard: list[Any] = []
-        self.node.create_subscription(kind, topic, heard.append, qos)
-        return heard
+        received: list[Any] = []
+        self.node.create_subscription(kind, topic, received.append, qos)
+        return received
 
     def until_diagnosed(self, part: str, level: bytes, words: str = '') -> DiagnosticStatus:
-        """Wait until the diagnostics of a part (input, map, recognition, processing) say so."""
+        """Wait for a level and words of a part: input, map, recognition, processing."""
 
-        def said() -> bool:
+        def reported() -> bool:
             status = self.diagnostics.get(part)
             return status is not None and status.level == level and words in status.message
 
         self.diagnostics.pop(part, None)
-        self.until(said, f'diagnostics of {part} at level {level!r} with {words!r}')
+        self.until(reported, f'diagnostics of {part} at level {level!r} with {words!r}')
         return self.diagnostics[part]
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:

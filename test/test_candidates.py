@@ -12,7 +12,8 @@ from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.errors import InputError
 from stavpr_ros.recognition import Candidate, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.candidates import ranked_candidates
-from stavpr_ros.recognition.robust.options import ROBUST, evidence, relative_distance
+from stavpr_ros.recognition.robust.hysteresis import evidence, score
+from stavpr_ros.recognition.robust.options import ROBUST
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 
@@ -64,13 +65,13 @@ def test_an_example_by_hand():
     assert ranked == [Candidate(10, 0.05), Candidate(14, float(np.float32(0.2))), Candidate(0, 0.5)]
 
 
-def test_relative_distances_are_evidence_against_the_nearest():
+def test_scores_are_evidence_against_the_nearest():
     costs, places = np.array([-3.0, -1.0, -2.875], np.float32), np.array([0, 50, 100])
     found = ranked_candidates(nearest_of(costs, places, 0.125), (costs, places), 3, 10, relative=True)
     assert found == [
         Candidate(0, 0.125),
-        Candidate(100, relative_distance(evidence(-2.875, -3.0))),
-        Candidate(50, relative_distance(evidence(-1.0, -3.0))),
+        Candidate(100, score(evidence(-2.875, -3.0))),
+        Candidate(50, score(evidence(-1.0, -3.0))),
     ]
     assert found[2].distance == 1 > found[1].distance > found[0].distance
 

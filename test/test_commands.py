@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import route_images
-from processes import PATIENCE, Process, executable
+from processes import TIMEOUT, Process, executable
 from test_trajectory import write_odometry
 
 from stavpr_msgs.msg import AlignedImages, LoopClosure, PlaceMatch
@@ -30,7 +30,7 @@ from stavpr_ros.sources.frame import ImageRecord
 
 def run(name, *arguments):
     command = [executable(name), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False)
 
 
 def write_images(folder, images):
@@ -363,7 +363,7 @@ def test_demo_that_is_ended_leaves_nobody_behind(drive, tmp_path):
     output = tmp_path / 'output'
     arguments = ['--map', str(drive), '--query', str(drive), '--threshold', '0.3', '--output', str(output)]
     demo = Process(tmp_path / 'demo.log', 'demo', *arguments)
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while not (output / 'record.log').exists():
         assert time.monotonic() < end
         assert demo.popen.poll() is None, demo.output()

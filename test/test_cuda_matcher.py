@@ -11,6 +11,9 @@ from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.features.extractor import FeatureSettings
+from stavpr_ros.recognition.robust.znorm import ZNormalization
+from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
+from stavpr_ros.recognition.sequence_search import LmDtwSearch
 
 SIMULATOR = os.environ.get('NUMBA_ENABLE_CUDASIM') == '1'
 SHORT = SequenceSettings(length=3, beta=2.0)
@@ -30,6 +33,7 @@ def matcher_class():
         runtime()
     except UnavailableError as error:
         pytest.skip(f'{error}; the same test runs in the simulator')
+    from stavpr_ros.alignment.cuda import dtw, lm_dtw
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dtw, 'BLOCK', 4)
@@ -69,7 +73,7 @@ def expected_row(reference, query, i, settings):
 def test_distances_of_every_strategy(matcher_class, strategy, xi, precision):
     reference, query = features(7, zero=[(1, 2)]), features(3, seed=1, zero=[(0, 0)])
     settings = SpatialSettings(strategy, 0.7, xi)
-    matcher = matcher_class(reference, settings, SHORT, precision)
+    matcher = matcher_class(reference, settings, precision)
     assert matcher.places == 7
     matrix = matcher.distance_matrix(query.strips, query.weights)
     assert matrix.dtype == torch.float32
@@ -84,7 +88,7 @@ def test_distances_of_every_strategy(matcher_class, strategy, xi, precision):
 def test_half_width_is_not_full_width(matcher_class):
     reference, query = features(7), features(1, seed=1)
     rows = [
-        matcher_class(reference, SpatialSettings(), SHORT, precision)
+        matcher_class(reference, SpatialSettings(), precision)
         .distances(query.strips[:, 0], query.weights[:, 0])
         .cpu()
         for precision in ('float32', 'float16')
@@ -98,15 +102,15 @@ def test_maps_and_batches_in_pieces(matcher_class, monkeypatch, precision):
     from stavpr_ros.recognition import cuda_matcher
 
     reference, query = features(11), features(5, seed=1)
-    whole = matcher_class(reference, SpatialSettings(), SHORT, precision)
+    whole = matcher_class(reference, SpatialSettings(), precision)
     expected = whole.distance_matrix(query.strips, query.weights).cpu().numpy()
     monkeypatch.setattr(cuda_matcher, 'BLOCK_WORDS', 4 * W * W * 2)
     monkeypatch.setattr(cuda_matcher, 'QUERIES', 2)
     monkeypatch.setattr(cuda_matcher, 'PLACES_IN_PIECES', 3)
-    pieces = matcher_class(reference, SpatialSettings(), SHORT, precision)
+    pieces = matcher_class(reference, SpatialSettings(), precision)
     got = pieces.distance_matrix(query.strips, query.weights).cpu().numpy()
     np.testing.assert_allclose(got, expected, rtol=0, atol=TOLERANCE)
-    holistic = matcher_class(reference, SpatialSettings('none'), SHORT, precision)
+    holistic = matcher_class(reference, SpatialSettings('none'), precision)
     row = holistic.distances(query.strips[:, 0], query.weights[:, 0]).cpu().numpy()
     kept = rounded(reference, precision)
     expected = expected_row(kept, rounded(query, precision), 0, SpatialSettings('none'))
@@ -114,10 +118,10 @@ def test_maps_and_batches_in_pieces(matcher_class, monkeypatch, precision):
 
 
 def same(a, b):
-    """Two answers are one."""
-    if a[0] is None or b[0] is None:
-        return a[0] is b[0] and a[1].shape == b[1].shape == (0, 2)
-    (match, path), (twin, twin_path) = a, b
+    """Two matches of a window are one."""
+    match, twin, path, twin_path = a.nearest, b.nearest, a.path, b.path
+    if match is None or twin is None:
+        return match is twin and path.shape == twin_path.shape == (0, 2)
     fields = ('first', 'last', 'distance', 'second_best_index')
     equal = all(getattr(match, name) == getattr(twin, name) for name in fields)
     runners = np.array_equal(match.second_best_distance, twin.second_best_distance, equal_nan=True)
@@ -127,45 +131,56 @@ def same(a, b):
 @pytest.mark.parametrize(('n', 'length', 'beta'), [(19, 3, 2.0), (1, 2, 1.5), (4, 3, 3.0)])
 @pytest.mark.parametrize('nms_radius', [0, 3])
 def test_the_window_rolls_like_the_one_of_the_cpu(matcher_class, n, length, beta, nms_radius):
-    from stavpr_ros.recognition.cpu_matcher import CpuMatcher
-
     sequence = SequenceSettings(length=length, beta=beta)
-    reference = features(n)
-    matcher = matcher_class(reference, SpatialSettings(), sequence)
-    twin = CpuMatcher(reference, SpatialSettings(), sequence)
+    search, twin = searches(n, sequence)
     rng = np.random.default_rng(n)
     for t in range(2 * length + 2):
         row = np.round(rng.random(n, np.float32), 1)
         row[rng.random(n) < 0.2] = np.inf
-        matcher.push(torch.from_numpy(row).to(matcher.distances(*first_image(reference)).device))
-        twin.push(torch.from_numpy(row))
-        assert len(matcher) == len(twin) == min(t + 1, length)
+        push(search, twin, torch.from_numpy(row))
         if t + 1 >= length:
-            answer, expected = matcher.match(nms_radius), twin.match(nms_radius)
+            answer, expected = search(nms_radius), twin(nms_radius)
             assert same(answer, expected), (answer, expected)
-    matcher.reset()
-    assert len(matcher) == 0
-    assert matcher.match(nms_radius)[0] is None
+            for one, other in zip(answer.sequences(), expected.sequences(), strict=True):
+                np.testing.assert_array_equal(one, other)
+    search.buffer.clear()
+    assert len(search.buffer) == 0
+    assert search(nms_radius).nearest is None
+
+
+def searches(places, sequence=SHORT):
+    """LM-DTW over a window on the device, and over one of the CPU."""
+    from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
+
+    buffer = SequenceBuffer(sequence.length, places, sequence.k)
+    twin = LmDtwSearch(buffer, ZNormalization(places, False, False))
+    return CudaLmDtwSearch(places, sequence), twin
+
+
+def push(search, twin, row):
+    search.buffer.push(row.to(search.buffer.memory.device))
+    twin.buffer.push(row.cpu())
 
 
 def first_image(x):
     return x.strips[:, 0], x.weights[:, 0]
 
 
-def test_a_drive_is_recognized_with_cures_between(matcher_class):
+def test_a_traverse_is_recognized_from_normalized_rows(matcher_class):
     reference = features(12)
-    matcher = matcher_class(reference, SpatialSettings(xi=2), SHORT)
+    matcher = matcher_class(reference, SpatialSettings(xi=2))
+    search, _ = searches(12)
     for place in range(5, 8):
         row = matcher.distances(reference.strips[:, place], reference.weights[:, place])
-        matcher.push((row - row.mean()) / row.std())
-    match, path = matcher.match(nms_radius=2)
-    assert (match.first, match.last) == (5, 7)
-    assert path.tolist() == [[0, 5], [1, 6], [2, 7]]
+        search.buffer.push((row - row.mean()) / row.std())
+    found = search(2)
+    assert (found.nearest.first, found.nearest.last) == (5, 7)
+    assert found.path.tolist() == [[0, 5], [1, 6], [2, 7]]
 
 
 def test_rows_that_were_given_out_stay_as_they_were(matcher_class):
     reference = features(6)
-    matcher = matcher_class(reference, SpatialSettings(), SHORT)
+    matcher = matcher_class(reference, SpatialSettings())
     first = matcher.distances(*first_image(reference))
     kept = first.clone()
     matcher.distances(reference.strips[:, 3], reference.weights[:, 3])
@@ -175,40 +190,42 @@ def test_rows_that_were_given_out_stay_as_they_were(matcher_class):
 @pytest.mark.parametrize('strategy', ['adaptive', 'none'])
 def test_an_empty_map_has_no_match(matcher_class, strategy):
     query = features(1)
-    matcher = matcher_class(features(3)[0:0], SpatialSettings(strategy), SHORT)
+    matcher = matcher_class(features(3)[0:0], SpatialSettings(strategy))
     assert matcher.places == 0
+    search, _ = searches(0)
     for _ in range(3):
         row = matcher.distances(*first_image(query))
         assert row.shape == (0,)
-        matcher.push(row)
-    match, path = matcher.match(20)
-    assert match is None
-    assert path.shape == (0, 2)
+        search.buffer.push(row)
+    found = search(20)
+    assert found.nearest is None
+    assert found.path.shape == (0, 2)
 
 
 def test_settings_that_do_not_fit_the_map(matcher_class):
     with pytest.raises(SettingsError, match='xi = 5'):
-        matcher_class(features(3), SpatialSettings(xi=5), SHORT)
+        matcher_class(features(3), SpatialSettings(xi=5))
     with pytest.raises(InputError, match='at least 4'):
-        matcher_class(features(3, strips=3), SpatialSettings('sliding_window'), SHORT)
+        matcher_class(features(3, strips=3), SpatialSettings('sliding_window'))
 
 
 @pytest.mark.skipif(SIMULATOR, reason='sizes of a real map take a real device')
 @pytest.mark.parametrize('precision', ['float32', 'float16'])
 def test_a_large_map_on_the_device(matcher_class, monkeypatch, precision):
+    from stavpr_ros.alignment.cuda import dtw, lm_dtw
     from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 
     monkeypatch.setattr(dtw, 'BLOCK', 128)
     monkeypatch.setattr(lm_dtw, 'BLOCK', 128)
     reference, query = features(30_000, strips=7), features(25, seed=1, strips=7)
     settings, sequence = SpatialSettings(xi=3), SequenceSettings()
-    matcher = matcher_class(reference, settings, sequence, precision)
-    twin = CpuMatcher(reference, settings, sequence, precision)
+    matcher = matcher_class(reference, settings, precision)
+    twin = CpuMatcher(reference, settings, precision)
+    search, twin_search = searches(len(reference), sequence)
     matrix = matcher.distance_matrix(query.strips, query.weights)
     expected = twin.distance_matrix(rounded(query, precision).strips, query.weights)
     apart = (matrix.cpu() - expected).abs() > TOLERANCE
     assert apart.float().mean() < 1e-4  # near-ties
     for row in matrix:
-        matcher.push(row)
-        twin.push(row.cpu())
-    assert same(matcher.match(20), twin.match(20))
+        push(search, twin_search, row)
+    assert same(search(20), twin_search(20))

@@ -1,4 +1,4 @@
-"""What the node says of its health: every level with its message, from hand-made states."""
+"""Diagnostics of every state: levels, messages and values."""
 
 import math
 from dataclasses import replace
@@ -8,14 +8,14 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.serialization import deserialize_message, serialize_message
 
-from stavpr_ros.pipeline.health import Health
-from stavpr_ros.pipeline.statistics import Snapshot, StageTime
+from stavpr_ros.pipeline.statistics import Counts, StageTime
 from stavpr_ros.ros.diagnostics import diagnostic_array
+from stavpr_ros.ros.health import Health
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 PARTS = ('input', 'map', 'recognition', 'processing')
 
-SNAPSHOT = Snapshot(
+COUNTS = Counts(
     uptime=100.0,
     received=3000,
     answered=2990,
@@ -23,24 +23,17 @@ SNAPSHOT = Snapshot(
     rate_out=29.9,
     received_age=0.02,
     answered_age=0.03,
-    drops={},
-    recent_drops={},
     statuses={'warming up': 19, 'no match': 971, 'match': 2000},
     recent_statuses={'no match': 99, 'match': 200},
     status='match',
-    reason='',
     place=17,
     distance=0.4217,
     stages={'waiting': StageTime(1.0, 2.0), 'matching': StageTime(11.5, 22.25)},
     total=StageTime(12.5, 24.0),
     work=StageTime(11.5, 22.25),
-    gaps=0,
-    longest_gap=0.0,
-    jumps_back=0,
-    longest_jump_back=0.0,
 )
 HEALTH = Health(
-    snapshot=SNAPSHOT,
+    counts=COUNTS,
     state='active',
     topic='/camera/image',
     transport='raw',
@@ -64,10 +57,11 @@ HEALTH = Health(
 
 
 def status(part, health=HEALTH, **changes):
-    """One status; changes are of the snapshot where it has such a field, else of the health."""
-    fields = Snapshot.__dataclass_fields__
-    snapshot = replace(health.snapshot, **{k: v for k, v in changes.items() if k in fields})
-    health = replace(health, snapshot=snapshot, **{k: v for k, v in changes.items() if k not in fields})
+    """Return one status, and the levels of the others; changes are of the counts or the health."""
+    fields = Counts.__dataclass_fields__
+    counts = replace(health.counts, **{k: v for k, v in changes.items() if k in fields})
+    changes = {k: v for k, v in changes.items() if k not in fields}
+    health = replace(health, counts=counts, **changes)
     statuses = diagnostic_array(health, '/robot/stavpr', Time(sec=7, nanosec=8)).status
     levels = {s.name.split(': ')[1]: s.level for s in statuses}
     found = next(s for s in statuses if s.name == f'robot/stavpr: {part}')
@@ -76,7 +70,7 @@ def status(part, health=HEALTH, **changes):
 
 
 def check(part, level, message, *, others_are=OK, **changes):
-    """Compare one status and see to it that the change concerns no other part."""
+    """Compare one status, and check that the change affects no other part."""
     found, others = status(part, **changes)
     assert (found.level, found.message) == (level, message)
     assert set(others.values()) == {others_are}, others
@@ -86,7 +80,7 @@ def values(part, **changes):
     return {value.key: value.value for value in status(part, **changes)[0].values}
 
 
-def test_array_is_stamped_named_and_travels():
+def test_array_of_a_node_is_stamped_named_and_serializable():
     array = diagnostic_array(HEALTH, '/robot/stavpr', Time(sec=7, nanosec=8))
     assert (array.header.stamp.sec, array.header.stamp.nanosec) == (7, 8)
     assert [s.name for s in array.status] == [f'robot/stavpr: {part}' for part in PARTS]
@@ -94,17 +88,30 @@ def test_array_is_stamped_named_and_travels():
     assert deserialize_message(serialize_message(array), DiagnosticArray) == array
 
 
-def test_healthy():
-    check('input', OK, '30.0 images a second on /camera/image')
+def test_array_of_a_healthy_node_is_ok():
+    check('input', OK, '30.0 images per second on /camera/image')
     check('map', OK, '1000 places of route.map')
-    message = '200 of 299 images matched in the last 10 s; last answer: match, place 17, distance 0.422'
-    check('recognition', OK, message)
-    check('processing', OK, '11.5 ms an image, 29.9 answered a second')
+    recent = '200 of 299 images matched in the last 10 s'
+    check('recognition', OK, f'{recent}; last result: match, place 17, distance 0.422')
+    check('processing', OK, '11.5 ms an image, 29.9 results per second')
 
 
-def test_just_activated():
-    new = {'uptime': 1.9, 'received': 0, 'received_age': None, 'rate_in': 0.0, 'recent_statuses': {}}
-    new |= {'status': '', 'place': -1, 'distance': math.nan, 'work': None, 'total': None, 'stages': {}}
+def test_array_after_activation_is_ok():
+    new = {
+        'uptime': 1.9,
+        'received': 0,
+        'received_age': None,
+        'rate_in': 0.0,
+        'recent_statuses': {},
+    }
+    new |= {
+        'status': '',
+        'place': -1,
+        'distance': math.nan,
+        'work': None,
+        'total': None,
+        'stages': {},
+    }
     check('input', OK, 'waiting for the first image on /camera/image', **new)
     check('processing', OK, 'no image in the last 10 s', **new)
     check('recognition', OK, 'warming up: 0 of 20 images', window=0, **new)
@@ -114,13 +121,13 @@ def test_just_activated():
 @pytest.mark.parametrize(
     ('state', 'message'),
     [
-        ('unconfigured', "'ros2 lifecycle set /robot/stavpr configure' takes it further"),
-        ('inactive', "'ros2 lifecycle set /robot/stavpr activate' takes it further"),
+        ('unconfigured', "run 'ros2 lifecycle set /robot/stavpr configure'"),
+        ('inactive', "run 'ros2 lifecycle set /robot/stavpr activate'"),
         ('finalized', ''),
         ('configuring', ''),
     ],
 )
-def test_not_active_is_no_fault(state, message):
+def test_array_of_an_inactive_node_is_ok(state, message):
     """Whatever would be wrong with an active node."""
     wrong = {'received_age': 60.0, 'publishers': 0, 'missing': 'threshold', 'odometry': 'never'}
     wrong |= {'recent_drops': {'queue full': 3, 'invalid: size': 2}, 'state': state}
@@ -133,152 +140,178 @@ def test_not_active_is_no_fault(state, message):
 class TestInput:
     """Images that do not come, or not as they should."""
 
-    def test_silence_begins_after_two_seconds(self):
+    def test_input_after_two_silent_seconds_is_a_warning(self):
         assert status('input', received_age=2.0)[0].level == OK
         assert status('input', received_age=2.1)[0].level == WARN
 
-    def test_no_publisher(self):
+    def test_input_without_publisher_names_the_remedy(self):
         remedy = (
-            "no publisher; look for the camera's topic with 'ros2 topic list' and remap to it: "
-            '--ros-args -r image:=TOPIC'
+            "no publisher; find the camera's topic with 'ros2 topic list', remap to it "
+            'with --ros-args -r image:=TOPIC'
         )
         never = {'received_age': None, 'received': 0, 'publishers': 0, 'uptime': 2.1}
         check('input', WARN, f'no image yet on /camera/image: {remedy}', **never)
-        check('input', WARN, f'no image for 12 s on /camera/image: {remedy}', received_age=12.3, publishers=0)
+        check(
+            'input',
+            WARN,
+            f'no image for 12 s on /camera/image: {remedy}',
+            received_age=12.3,
+            publishers=0,
+        )
 
-    def test_silent_publisher(self):
-        rest = 'there, but silent; is the bag paused, the camera off?'
-        check('input', WARN, f'no image for 3 s on /camera/image: 1 publisher {rest}', received_age=3.0)
+    def test_input_of_a_silent_publisher_is_a_warning(self):
+        rest = 'there, but silent; check for a paused bag or a camera that is off'
+        check(
+            'input',
+            WARN,
+            f'no image for 3 s on /camera/image: 1 publisher {rest}',
+            received_age=3.0,
+        )
         message = f'no image yet on /camera/image: 2 publishers {rest}'
         check('input', WARN, message, received_age=None, received=0, publishers=2)
 
-    def test_incompatible_and_nothing_comes(self):
+    def test_input_of_an_incompatible_publisher_is_an_error(self):
         never = {'received_age': None, 'received': 0, 'incompatible': 1}
         message = 'no image yet on /camera/image: 1 publisher refused for QoS: set reliability'
         check('input', ERROR, message, remedy='set reliability', **never)
         assert "'ros2 topic info --verbose /camera/image'" in status('input', **never)[0].message
 
-    def test_the_refused_publisher_has_gone(self):
-        gone = {'received_age': 5.0, 'incompatible': 1, 'publishers': 0, 'remedy': 'set reliability'}
+    def test_input_after_the_incompatible_publisher_has_gone_ignores_it(self):
+        gone = {
+            'received_age': 5.0,
+            'incompatible': 1,
+            'publishers': 0,
+            'remedy': 'set reliability',
+        }
         found, _ = status('input', **gone)
         assert found.level == WARN
         assert 'no publisher' in found.message
-        check('input', OK, '30.0 images a second on /camera/image', incompatible=1, publishers=1)
+        check('input', OK, '30.0 images per second on /camera/image', incompatible=1, publishers=1)
 
-    def test_incompatible_while_another_works(self):
-        message = '1 publisher refused for QoS, while images of others come: set reliability'
+    def test_input_of_compatible_and_incompatible_publishers_is_a_warning(self):
+        message = '1 publisher refused for QoS, while images of others arrive: set reliability'
         check('input', WARN, message, incompatible=1, publishers=2, remedy='set reliability')
 
-    def test_incompatible_before_the_first_image_is_not_yet_judged(self):
-        young = {'received_age': None, 'received': 0, 'uptime': 1.0, 'incompatible': 1, 'publishers': 2}
+    def test_input_before_the_first_image_is_ok(self):
+        young = {
+            'received_age': None,
+            'received': 0,
+            'uptime': 1.0,
+            'incompatible': 1,
+            'publishers': 2,
+        }
         check('input', OK, 'waiting for the first image on /camera/image', **young)
 
-    def test_lost_in_transport(self):
+    def test_input_with_lost_images_names_the_remedy(self):
         message = (
             '1 image lost in transport in the last 10 s: give the publisher a bigger shared-memory '
             "segment (README, 'If images are lost')"
         )
         check('input', WARN, message, recent_drops={'lost in transport': 1})
         long_ago = {'drops': {'lost in transport': 9}}
-        check('input', OK, '30.0 images a second on /camera/image', **long_ago)
+        check('input', OK, '30.0 images per second on /camera/image', **long_ago)
 
-    def test_some_images_are_invalid(self):
+    def test_input_with_invalid_images_counts_kinds(self):
         drops = {'invalid: size': 2, 'queue': 4, 'invalid: encoding': 1}
         message = '3 images in the last 10 s were invalid (size 2, encoding 1): see the log'
         check('input', WARN, message, recent_drops=drops)
 
-    @pytest.mark.parametrize('status', ['match', 'no match', 'warming up', 'mapped'])
-    def test_one_valid_image_is_enough(self, status):
-        mixed = {'invalid image': 30, status: 1}
+    @pytest.mark.parametrize('valid', ['match', 'no match', 'warming up', 'mapped'])
+    def test_input_with_one_valid_image_is_a_warning(self, valid):
+        mixed = {'invalid image': 30, valid: 1}
         found, _ = status('input', recent_drops={'invalid: size': 30}, recent_statuses=mixed)
         assert found.level == WARN
 
-    @pytest.mark.parametrize('status', ['invalid image', 'dropped', 'not ready', 'skipped'])
-    def test_all_images_are_invalid(self, status):
+    @pytest.mark.parametrize('other', ['invalid image', 'dropped', 'not ready', 'skipped'])
+    def test_input_without_a_valid_image_is_an_error(self, other):
         message = (
             'all images in the last 10 s were invalid (depth 30): see the log, and '
-            'docs/node.md for what is read'
+            'docs/node.md for the supported encodings'
         )
         drops = {'invalid: depth': 30, 'max_rate': 5}
-        check('input', ERROR, message, recent_drops=drops, recent_statuses={status: 30})
+        check('input', ERROR, message, recent_drops=drops, recent_statuses={other: 30})
         standing = drops | {'not a keyframe': 5}
-        assert status('input', recent_drops=standing, recent_statuses={status: 30})[0].level == WARN
+        assert status('input', recent_drops=standing, recent_statuses={other: 30})[0].level == WARN
 
-    def test_odometry(self):
+    def test_input_without_odometry_is_a_warning(self):
         rest = 'start it, compare its topic and its stamps'
-        message = f'odometry, which a parameter needs, came never: {rest}'
+        message = f'odometry, required by a parameter, was never received: {rest}'
         check('input', WARN, message, odometry='never')
-        message = f'odometry, which a parameter needs, comes no more: {rest}'
+        message = f'odometry, required by a parameter, has stopped: {rest}'
         check('input', WARN, message, odometry='stale')
-        check('input', OK, '30.0 images a second on /camera/image', odometry='fresh')
+        check('input', OK, '30.0 images per second on /camera/image', odometry='fresh')
 
-    def test_several_faults_are_all_told_the_worst_first(self):
+    def test_input_with_several_faults_lists_the_worst_first(self):
         drops = {'lost in transport': 1, 'invalid: size': 2}
         found, _ = status('input', recent_drops=drops, recent_statuses={}, odometry='stale')
         assert found.level == ERROR
-        said = found.message.split('; ')
-        assert [text.split()[0] for text in said] == ['all', '1', 'odometry,']
+        texts = found.message.split('; ')
+        assert [text.split()[0] for text in texts] == ['all', '1', 'odometry,']
 
 
 class TestMap:
     """The map, whatever the state of the node."""
 
-    def test_a_problem(self):
+    def test_map_with_a_problem_is_an_error_unless_one_is_in_use(self):
         problem = 'route.map: not there'
         for state in ('active', 'inactive', 'unconfigured'):
             check('map', ERROR, problem, problem=problem, state=state, map_state='none', places=0)
         message = f'{problem}; the map in use has 1000 places'
         check('map', WARN, message, problem=problem)
 
-    def test_none(self):
+    def test_map_that_is_missing_is_a_warning_while_active(self):
         message = 'no map: set map_path or call ~/load_map'
         nothing = {'map_state': 'none', 'map_path': '', 'places': 0}
         check('map', WARN, message, **nothing)
         check('map', OK, message, state='inactive', **nothing)
 
-    def test_loading(self):
+    def test_map_during_loading_is_ok(self):
         check('map', OK, 'loading route.map', map_state='loading', places=0)
-        message = 'loading route.map; until then the old one is used, of 1000 places'
+        message = 'loading route.map; the old map of 1000 places is used meanwhile'
         check('map', OK, message, map_state='loading')
 
-    def test_growing_and_full(self):
+    def test_map_that_is_full_is_a_warning(self):
         check('map', OK, 'growing: 1 place of at most 20000', map_state='growing', places=1)
         remedy = 'save it with ~/save_map, then raise max_places'
         message = f'full: mapping stopped at 20000 places (max_places); {remedy}'
         check('map', WARN, message, map_state='full', places=20000)
         check('map', OK, message, map_state='full', places=20000, state='inactive')
 
-    def test_saved_nowhere(self):
+    def test_map_without_a_file_is_named_so(self):
         check('map', OK, '1000 places of a map without a file', map_path='')
 
 
 class TestRecognition:
     """Whether there are answers, and which."""
 
-    def test_something_is_missing(self):
+    def test_recognition_without_a_threshold_is_a_warning(self):
         missing = "parameter 'threshold' is not set"
-        check('recognition', WARN, f'no match is possible: {missing}', missing=missing, threshold=None)
+        check(
+            'recognition',
+            WARN,
+            f'no match is possible: {missing}',
+            missing=missing,
+            threshold=None,
+        )
 
-    def test_a_map_being_loaded_is_no_fault(self):
+    def test_recognition_while_the_first_map_is_loaded_is_ok(self):
         loading = {'map_state': 'loading', 'places': 0, 'missing': 'a map is being loaded'}
         check('recognition', OK, 'waiting for the map', **loading)
         old = {'map_state': 'loading', 'missing': "parameter 'threshold' is not set"}
         assert status('recognition', **old)[0].level == WARN
 
-    def test_mapping_recognizes_nothing(self):
+    def test_recognition_in_operation_mapping_is_ok(self):
         message = 'mapping: images become places, none is recognized'
         check('recognition', OK, message, operation='mapping', missing='threshold', window=0)
 
-    def test_warming_up(self):
+    def test_recognition_with_a_partial_window_is_ok(self):
         check('recognition', OK, 'warming up: 7 of 20 images', window=7)
 
-    def test_rejected(self):
-        message = (
-            '200 of 299 images matched in the last 10 s; last answer: no match, distance 0.422 (too far)'
-        )
+    def test_recognition_after_a_rejection_gives_the_reason(self):
+        message = '200 of 299 images matched in the last 10 s; last result: no match, distance 0.422 (too far)'
         check('recognition', OK, message, status='no match', place=-1, reason='too far')
 
-    def test_only_judged_images_count(self):
+    def test_recognition_counts_only_matches_and_rejections(self):
         statuses = {'match': 1, 'no match': 1, 'skipped': 90, 'warming up': 8}
         found, _ = status('recognition', recent_statuses=statuses)
         assert found.message.startswith('1 of 2 images matched')
@@ -290,38 +323,42 @@ FULL = {'queue full': 120}
 class TestProcessing:
     """Whether the worker keeps up."""
 
-    LOST = '120 images dropped in the last 10 s, since the queue was full: 30.0 come a second'
+    LOST = '120 images dropped in the last 10 s, the queue was full: 30.0 images per second arrive'
 
-    def test_too_slow(self):
-        message = f'{self.LOST}, and one takes 62.5 ms, so 16.0 can be done: set max_rate or keyframe_*, '
+    def test_processing_below_the_rate_of_images_names_remedies(self):
+        message = f'{self.LOST}, one takes 62.5 ms, so 16.0 per second are possible: '
+        message += 'set max_rate or keyframe_*, '
         slow = {'recent_drops': FULL, 'work': StageTime(62.5, 80.0)}
         check('processing', WARN, f'{message}precision float16, a smaller map', **slow)
         check('processing', WARN, f'{message}a smaller map', precision='float16', **slow)
 
-    def test_internal_errors_are_the_worst(self):
+    def test_processing_with_internal_errors_is_an_error(self):
         message = '2 images failed in the last 10 s by an internal error: see the log'
         check('processing', ERROR, message, recent_drops=FULL | {'internal error': 2})
         assert status('processing', drops={'internal error': 2})[0].level == OK
 
-    def test_bursts(self):
+    def test_processing_with_bursts_names_queue_size(self):
         message = (
-            f'{self.LOST}, and one takes 11.5 ms, which is fast enough: they come in bursts; raise queue_size'
+            f'{self.LOST}, one takes 11.5 ms, which is fast enough: they arrive in bursts; '
+            'raise queue_size'
         )
         check('processing', WARN, message, recent_drops=FULL)
 
-    def test_none_was_finished(self):
-        message = f'{self.LOST}, and none was finished; is a map being loaded, the machine busy?'
+    def test_processing_without_a_result_names_causes(self):
+        message = f'{self.LOST}, none was finished; check for a map being loaded or a busy machine'
         check('processing', WARN, message, recent_drops=FULL, work=None, total=None)
 
-    def test_drops_of_other_causes_or_long_ago_are_no_fault(self):
-        message = '11.5 ms an image, 29.9 answered a second'
+    def test_processing_with_other_or_old_drops_is_ok(self):
+        message = '11.5 ms an image, 29.9 results per second'
         wanted = {'max_rate': 90, 'not a keyframe': 5, 'not ready': 3}
         check('processing', OK, message, recent_drops=wanted, drops=wanted | {'queue full': 7})
 
 
-def test_values_of_input():
+def test_values_of_input_are_complete():
     drops = {'invalid: cut off': 3, 'lost in transport': 4, 'no odometry': 5, 'max_rate': 6}
-    assert values('input', drops=drops, recent_drops={'lost in transport': 1}, gaps=2, longest_gap=1.5) == {
+    assert values(
+        'input', drops=drops, recent_drops={'lost in transport': 1}, gaps=2, longest_gap=1.5
+    ) == {
         'topic': '/camera/image',
         'transport': 'raw',
         'publishers': '1',
@@ -343,7 +380,7 @@ def test_values_of_input():
     }
 
 
-def test_values_of_map():
+def test_values_of_map_are_complete():
     assert values('map', map_path='') == {
         'state': 'loaded',
         'path': 'none',
@@ -353,7 +390,7 @@ def test_values_of_map():
     }
 
 
-def test_values_of_recognition():
+def test_values_of_recognition_are_complete():
     assert values('recognition', answered_age=None) == {
         'operation': 'localization',
         'mode': 'robust',
@@ -365,16 +402,20 @@ def test_values_of_recognition():
         'last_place': '17',
         'last_distance': '0.422',
         'last_answer_age_s': 'none',
-        'verdicts_warming_up': '19',
-        'verdicts_no_match': '971',
-        'verdicts_match': '2000',
+        'statuses_warming_up': '19',
+        'statuses_no_match': '971',
+        'statuses_match': '2000',
     }
     nothing = values('recognition', place=-1, distance=math.nan, threshold=None, status='')
-    assert {nothing[key] for key in ('last_place', 'last_distance', 'threshold', 'last_status')} == {'none'}
+    assert {
+        nothing[key] for key in ('last_place', 'last_distance', 'threshold', 'last_status')
+    } == {'none'}
 
 
-def test_values_of_processing():
-    found = values('processing', drops={'queue full': 6, 'invalid: size': 1}, recent_drops={'queue full': 2})
+def test_values_of_processing_are_complete():
+    found = values(
+        'processing', drops={'queue full': 6, 'invalid: size': 1}, recent_drops={'queue full': 2}
+    )
     assert found == {
         'state': 'active',
         'uptime_s': '100.000',
@@ -396,4 +437,8 @@ def test_values_of_processing():
         'waiting_max_ms': '2.000',
         'matching_max_ms': '22.250',
     }
-    assert not [key for key in values('processing', stages={}, total=None, work=None) if key.endswith('_ms')]
+    assert not [
+        key
+        for key in values('processing', stages={}, total=None, work=None)
+        if key.endswith('_ms')
+    ]

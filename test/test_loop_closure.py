@@ -16,9 +16,11 @@ from stavpr_ros.alignment.velocity import best_velocity_match, match_velocities
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition import RecognizerSettings, Status
-from stavpr_ros.recognition.loop_closer import FORGOTTEN, LEAST_PLACES, ROOM, LoopCloser
-from stavpr_ros.recognition.robust.options import PAPER, ROBUST, Track, evidence, relative_distance
-from stavpr_ros.recognition.robust.znorm import FLAT, MEMORY, PRIOR
+from stavpr_ros.recognition.loop_closer import EVICTED, LEAST_PLACES, LoopCloser, choose_loop_backend
+from stavpr_ros.recognition.robust.hysteresis import Hysteresis, evidence, score
+from stavpr_ros.recognition.robust.options import PAPER, ROBUST
+from stavpr_ros.recognition.robust.znorm import MEMORY, MIN_DEVIATION, PRIOR
+from stavpr_ros.recognition.route_features import ROOM, RouteFeatures
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 SECOND = 10**9
@@ -76,7 +78,7 @@ class PlainCloser:
         self.a = adaptive_weights(W, settings.spatial, np.dtype(np.float32))
         self.mean, self.variance = np.zeros(n, np.float32), np.ones(n, np.float32)
         self.seen = np.full(n, PRIOR, np.float32)
-        self.rows, self.track = [], Track()
+        self.rows, self.track = [], Hysteresis()
 
     def distances(self, image, last):
         from stavpr_ros.alignment.cpu import dot
@@ -94,7 +96,7 @@ class PlainCloser:
         if last - first >= LEAST_PLACES:
             live = self.distances(image, last)[first:]
             if robust_options.query_znorm:
-                live = (live - live.mean()) / np.float32(max(live.std(), FLAT))
+                live = (live - live.mean()) / np.float32(max(live.std(), MIN_DEVIATION))
             row[first:last] = live
             if robust_options.reference_znorm:
                 self.learn(slice(first, last), live)
@@ -120,7 +122,7 @@ class PlainCloser:
             return best_match(found, self.settings.nms_radius)
         if not (robust_options.query_znorm or robust_options.reference_znorm):
             known = window[np.isfinite(window)]
-            scale = scale / np.float32(max(known.std() if known.size else 0, FLAT))
+            scale = scale / np.float32(max(known.std() if known.size else 0, MIN_DEVIATION))
         self.found = found = match_velocities(window, VelocitySettings(), self.mean, scale)
         return best_velocity_match(found, self.settings.nms_radius)
 
@@ -140,8 +142,8 @@ class PlainCloser:
         other = nearest.second_best_distance
         if self.settings.applied_options.hysteresis:
             seen = self.track.follow(nearest.middle, seen)
-        rival = other if math.isnan(other) else relative_distance(evidence(other, cost))
-        return relative_distance(seen), rival
+        rival = other if math.isnan(other) else score(evidence(other, cost))
+        return score(seen), rival
 
 
 CHOICES = {
@@ -189,7 +191,7 @@ def test_a_limit_that_is_never_reached_changes_nothing(laps, mode, limit):
     settings = RecognizerSettings(1.0, sequence=SHORT, nms_radius=5, mode=mode)
     bounded, unbounded = (LoopCloser(settings, 12, laps.settings, limit=value) for value in (limit, None))
     for i in range(len(laps)):
-        same(bounded.add(laps[i : i + 1]), unbounded.add(laps[i : i + 1]))
+        same(bounded.update(laps[i : i + 1]), unbounded.update(laps[i : i + 1]))
         assert bounded.ranked(3) == unbounded.ranked(3)
     np.testing.assert_array_equal(bounded.newest_row(), unbounded.newest_row())
     assert bounded.first == unbounded.first == 0
@@ -212,41 +214,59 @@ def test_memory_is_bounded_and_an_eighth_is_forgotten_at_a_time(laps):
     closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=80)
     for i in range(len(laps)):
         closer.update(laps[i : i + 1])
-        forgotten = max(0, -(-(i + 1 - 80) // (80 // FORGOTTEN))) * (80 // FORGOTTEN)
+        forgotten = max(0, -(-(i + 1 - 80) // (80 // EVICTED))) * (80 // EVICTED)
         assert (closer.first, len(closer)) == (forgotten, i + 1 - forgotten)
         assert len(closer) <= 80
         assert len(closer.newest_row()) == max(0, len(closer) - 12)
-    assert closer._route.room == 80
-    assert closer._window._window.rows().shape[1] < 80 + 16 + SHORT.k
+    assert closer.features().strips.shape == (7, len(closer), 16)
+
+
+def route_of(features, centering, limit=None):
+    """The features as a closer holds them, an eighth of the limit evicted at a time, and how many are."""
+    route, evicted = RouteFeatures(features.settings, centering, limit), 0
+    for i in range(len(features)):
+        if route.count == limit:
+            evicted += limit // EVICTED
+            route.evict(limit // EVICTED)
+            expected = features.strips[:, evicted:i].mean(dim=1)
+            torch.testing.assert_close(route.mean, expected if centering else 0 * expected, atol=1e-6, rtol=0)
+        route.append(features[i : i + 1])
+    return route, evicted
 
 
 @pytest.mark.parametrize('limit', [None, 90])
-def test_what_is_kept_is_what_came_less_its_mean(laps, limit):
-    """Without having been kept twice: also after the mean was moved and places were forgotten many times."""
-    closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit)
-    moved = 0
-    for i in range(len(laps)):
-        before = closer._route._mean
-        closer.update(laps[i : i + 1])
-        moved += closer._route._mean is not before
-        if limit and closer.first and closer._route._mean is not before:
-            # before the newest image was taken in
-            expected = laps.strips[:, closer.first : i].mean(dim=1)
-            torch.testing.assert_close(closer._route._mean, expected, atol=1e-6, rtol=0)
-    assert moved > 20
-    came = laps.strips[:, closer.first :]
-    expected = came - closer._route._mean[:, None]
+def test_route_features_with_centering_are_the_original_ones_less_their_mean(laps, limit):
+    """Also after the mean has moved, and places were evicted, many times."""
+    route, evicted = route_of(laps, True, limit)
+    came = laps.strips[:, evicted:]
+    expected = came - route.mean[:, None]
     expected /= expected.norm(dim=2, keepdim=True)
-    expected[(came == 0).all(dim=2)] = 0
-    assert (expected == 0).all(dim=2).any()
-    torch.testing.assert_close(closer._route.strips[:, : len(closer)], expected, atol=2e-6, rtol=0)
+    zero = (came == 0).all(dim=2)
+    assert zero.any()
+    expected[zero] = 0
+    torch.testing.assert_close(route.strips[:, : route.count], expected, atol=2e-6, rtol=0)
+    original = route.original()
+    torch.testing.assert_close(original.strips, came, atol=2e-6, rtol=0)
+    assert not original.strips[zero].any()
+    assert torch.equal(original.weights, laps.weights[:, evicted:])
+    assert route.room == (limit or 512)
 
 
-def test_without_centering_features_are_kept_as_they_came(laps):
-    closer = LoopCloser(settings_of(ROBUST.without('mean_centering')), 12, laps.settings, limit=83)
-    drive(closer, laps)
-    assert closer.first == 300
-    torch.testing.assert_close(closer._route.strips[:, :75], laps.strips[:, 300:], atol=0, rtol=0)
+def test_route_features_without_centering_are_the_original_ones(laps):
+    route, evicted = route_of(laps, False, 83)
+    assert evicted == 300
+    assert torch.equal(route.strips[:, :75], laps.strips[:, 300:])
+    assert torch.equal(route.original().strips, laps.strips[:, 300:])
+
+
+def test_a_closer_returns_the_features_of_its_route(laps):
+    closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=80)
+    assert len(closer.features()) == 0
+    drive(closer, laps[:200])
+    found, came = closer.features(), laps[closer.first : 200]
+    assert found.settings == laps.settings
+    torch.testing.assert_close(found.strips, came.strips, atol=2e-6, rtol=0)
+    assert torch.equal(found.weights, came.weights)
 
 
 def blurred(features, seed=0, noise=0.25):
@@ -265,7 +285,7 @@ def test_a_track_goes_on_over_the_shift(laps):
     blur = blurred(laps[157:162])
     for i in range(5):
         assert persistent.first == (20 if i > 3 else 0)
-        one, other = persistent.add(blur[i : i + 1]), alone.add(blur[i : i + 1])
+        one, other = persistent.update(blur[i : i + 1]), alone.update(blur[i : i + 1])
     assert persistent.first == 20
     assert one.sequence.middle == other.sequence.middle
     assert one.sequence.distance < other.sequence.distance
@@ -289,7 +309,6 @@ def test_places_younger_than_so_many_seconds_are_left_out(laps):
             old += 1
         expected = min(i + 1 - 7, old) if stamps[i] else i + 1 - 7
         assert len(closer.newest_row()) == max(0, expected)
-    assert 0 < len(closer._young) < 12
 
 
 def test_exactly_so_many_seconds_is_old_enough(laps):
@@ -304,10 +323,9 @@ def test_no_seconds_or_no_stamps_is_the_count_alone(laps):
     unknown = LoopCloser(settings_of(ROBUST), 12, laps.settings, exclude_seconds=5.0)
     for i in range(150):
         image = laps[i : i + 1]
-        answer = plain.add(image)
-        same(answer, stamped.add(image, 7 + i))
-        same(answer, unknown.add(image, 0))
-        assert len(stamped._young) == len(unknown._young) == 0
+        answer = plain.update(image)
+        same(answer, stamped.update(image, 7 + i))
+        same(answer, unknown.update(image, 0))
 
 
 def test_seconds_and_a_limit(laps):
@@ -317,9 +335,9 @@ def test_seconds_and_a_limit(laps):
     assert all(answer.sequence is None for answer in answers)
     assert answers[-1].status is Status.NO_MATCH
     assert 'old enough' in answers[-1].reason
-    assert len(closer._young) == len(closer) <= 80
+    assert len(closer) <= 80
+    assert len(closer.newest_row()) == 0
     closer.update(laps[:1], 6 * SECOND)
-    assert len(closer._young) == 1
     assert len(closer.newest_row()) == len(closer) - 12
 
 
@@ -331,14 +349,11 @@ def test_a_reset_begins_a_new_window_and_keeps_the_route(laps):
     stamps = [10_000 * SECOND + i * SECOND for i in range(150)]
     for i in range(100):
         closer.update(laps[i : i + 1], stamps[i])
-    shift, scale = closer._window.calibration.shift_and_scale(80)
     assert closer.ranked(2)
     closer.reset()
     assert closer.window_fill == 0
     assert closer.ranked(2) == []
     assert len(closer) == 100
-    for after, kept in zip(closer._window.calibration.shift_and_scale(80), (shift, scale), strict=True):
-        np.testing.assert_array_equal(after, kept)
     for i in range(100, 150):  # the clock jumped back
         answer = closer.update(laps[i : i + 1], stamps[i] - 9_900 * SECOND)
         young = min(i + 1 - 100, 8)
@@ -350,15 +365,25 @@ def test_a_reset_begins_a_new_window_and_keeps_the_route(laps):
             assert (i - answer.newest_index) % 60 == 0
 
 
+def test_a_reset_keeps_the_statistics_of_the_places(laps):
+    one, other = (LoopCloser(settings_of(ROBUST), 12, laps.settings) for _ in range(2))
+    drive(one, laps[:100])
+    drive(other, laps[:100])
+    one.reset()
+    for i in range(100, 110):
+        one.update(laps[i : i + 1])
+        other.update(laps[i : i + 1])
+        np.testing.assert_array_equal(one.newest_row(), other.newest_row())
+
+
 def test_a_reset_ends_the_track(laps):
     one, other = (LoopCloser(settings_of(ROBUST), 12, laps.settings) for _ in range(2))
     drive(one, laps[:100])
     drive(other, laps[:100])
     one.reset()
-    other._window.clear()  # the window alone
-    again = blurred(laps[96:101])  # one place ahead of the last window
-    fresh, tracked = drive(one, again)[-1], drive(other, again)[-1]
-    assert fresh.sequence.middle == tracked.sequence.middle == 38
+    blur = blurred(laps[100:105])
+    fresh, tracked = drive(one, blur)[-1], drive(other, blur)[-1]
+    assert fresh.sequence.middle == tracked.sequence.middle == 42
     assert fresh.sequence.distance > tracked.sequence.distance
 
 
@@ -422,3 +447,23 @@ def test_the_smallest_limit_that_is_allowed_works(exclude):
 def test_seconds_that_are_refused(laps, seconds):
     with pytest.raises(SettingsError, match='exclude_seconds'):
         LoopCloser(settings_of(ROBUST), 12, laps.settings, exclude_seconds=seconds)
+
+
+# ------------------------------------------------ backend and precision
+
+
+@pytest.mark.parametrize(
+    ('backend', 'precision', 'words'),
+    [('cuda', 'float32', 'cuda'), ('auto', 'float16', 'float16'), ('cpu', 'float16', 'float16'), ('tpu', 'float32', 'tpu')],
+)
+def test_a_backend_or_precision_without_loop_closure_is_refused_by_name(laps, backend, precision, words):
+    with pytest.raises(SettingsError, match=words):
+        choose_loop_backend(backend, precision)
+    with pytest.raises(SettingsError, match=words):
+        LoopCloser(settings_of(ROBUST), 12, laps.settings, backend=backend, precision=precision)
+
+
+@pytest.mark.parametrize('backend', ['auto', 'cpu'])
+def test_loop_closure_takes_the_cpu(laps, backend):
+    assert choose_loop_backend(backend, 'float32') == 'cpu'
+    assert len(LoopCloser(settings_of(ROBUST), 12, laps.settings, backend=backend)) == 0

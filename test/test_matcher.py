@@ -10,11 +10,14 @@ from hypothesis import strategies as st
 from stavpr_ros.alignment import (
     SequenceSettings,
     SpatialSettings,
+    VelocitySettings,
     align_sequence,
     best_match,
+    best_velocity_match,
     holistic_distances,
     image_distances,
     match_sequence,
+    match_velocities,
     strip_distances,
 )
 from stavpr_ros.errors import SettingsError
@@ -25,6 +28,9 @@ from stavpr_ros.mapping import build_map, extract_features
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.matcher import make_matcher
+from stavpr_ros.recognition.robust.znorm import ZNormalization
+from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
+from stavpr_ros.recognition.sequence_search import LmDtwSearch, VelocitySearch
 from stavpr_ros.sources import open_source
 
 # of a number kept in float16, relative; so also of a product of unit-norm features, at most
@@ -44,8 +50,8 @@ def random_features(W, n, d, seed=0):
     return LocalFeatures(torch.from_numpy(strips).float(), torch.from_numpy(weights).float(), settings)
 
 
-def make(features, spatial=None, precision='float32', length=5):
-    return CpuMatcher(features, spatial or SpatialSettings(), SequenceSettings(length), precision)
+def make(features, spatial=None, precision='float32'):
+    return CpuMatcher(features, spatial or SpatialSettings(), precision)
 
 
 # ------------------------------------------------ distances
@@ -105,32 +111,57 @@ def test_features_that_do_not_lie_in_one_piece():
 # ------------------------------------------------ the window
 
 
+def window_and_search(n, velocity=False):
+    """An empty window over n places, and its search without z-normalization."""
+    sequence = SequenceSettings(5)
+    buffer = SequenceBuffer(5, n, sequence.k)
+    search = VelocitySearch if velocity else LmDtwSearch
+    return buffer, search(buffer, ZNormalization(n, False, False))
+
+
 @pytest.mark.parametrize('n', [1, 7, 16, 100])
-def test_window_and_match(n):
-    """Whatever the ring's turn, the answer is that of the plain functions on the last l rows."""
-    matcher = make(random_features(7, n, 8))
+def test_search_of_a_rolling_window_equals_the_plain_functions(n):
+    """Whatever the ring's turn: the result of the plain functions on the last l rows."""
+    buffer, search = window_and_search(n)
     rows = np.random.default_rng(0).random((23, n), np.float32)
     for i, row in enumerate(rows):
-        matcher.push(torch.from_numpy(row))
-        assert len(matcher) == min(i + 1, 5)
-        if len(matcher) == 5:
-            nearest, path = matcher.match(3)
+        buffer.push(torch.from_numpy(row))
+        if buffer.full:
+            found = search(3)
             window = rows[i - 4 : i + 1]
-            expected = best_match(match_sequence(window, SequenceSettings(5)), 3)
-            assert repr(nearest) == repr(expected)  # a second best's distance may be NaN
+            matches = match_sequence(window, SequenceSettings(5))
+            expected = best_match(matches, 3)
+            assert repr(found.nearest) == repr(expected)  # a second best's distance may be NaN
             aligned = align_sequence(window, expected.first, SequenceSettings(5))
-            np.testing.assert_array_equal(path, aligned.path)
-    matcher.reset()
-    assert len(matcher) == 0
+            np.testing.assert_array_equal(found.path, aligned.path)
+            for one, other in zip(found.sequences(), (matches.distances, matches.middles), strict=True):
+                np.testing.assert_array_equal(one, other)
 
 
-def test_no_places_no_match():
-    matcher = make(random_features(7, 0, 8))
+@pytest.mark.parametrize('n', [1, 16, 1050])
+def test_velocity_search_of_a_rolling_window_equals_the_plain_functions(n):
+    buffer, search = window_and_search(n, velocity=True)
+    rows = np.random.default_rng(1).random((13, n), np.float32)
+    for i, row in enumerate(rows):
+        buffer.push(torch.from_numpy(row))
+        if buffer.full:
+            found, window = search(3), rows[i - 4 : i + 1]
+            scale = np.full(n, 1 / max(window.std(), np.float32(1e-3)), np.float32)
+            matches = match_velocities(window, VelocitySettings(), np.zeros(n, np.float32), scale)
+            assert repr(found.nearest) == repr(best_velocity_match(matches, 3))
+            np.testing.assert_array_equal(found.sequences()[0], matches.distances)
+            assert found.path[[0, -1], 1].tolist() == [found.nearest.first, found.nearest.last]
+
+
+@pytest.mark.parametrize('velocity', [False, True])
+def test_no_places_no_match(velocity):
+    buffer, search = window_and_search(0, velocity)
     for _ in range(5):
-        matcher.push(torch.empty(0))
-    nearest, path = matcher.match(3)
-    assert nearest is None
-    assert path.shape == (0, 2)
+        buffer.push(torch.empty(0))
+    found = search(3)
+    assert found.nearest is None
+    assert found.path.shape == (0, 2)
+    assert [len(values) for values in found.sequences()] == [0, 0]
 
 
 # ------------------------------------------------ half width
@@ -171,4 +202,4 @@ def test_half_width_answers_on_real_images(data_folder):
 
 def test_no_such_precision():
     with pytest.raises(SettingsError, match='float8'):
-        make_matcher(random_features(7, 4, 8), SpatialSettings(), SequenceSettings(), 'cpu', 'float8')
+        make_matcher(random_features(7, 4, 8), SpatialSettings(), 'cpu', 'float8')

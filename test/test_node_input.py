@@ -160,7 +160,7 @@ class TestImages:
             return 'had no odometry of their time: compare the stamps' in message
 
         bench.until(compared, 'a word on the stamps')
-        bench.until_diagnosed('input', WARN, 'comes no more')
+        bench.until_diagnosed('input', WARN, 'has stopped')
         camera.set(keyframe_distance=0.0, keyframe_angle=0.0)
         assert camera.show(next(images)).status == WARMING_UP
         bench.until(lambda: wheels.get_subscription_count() == 0, 'the end of the subscription')

@@ -1,47 +1,149 @@
-"""The table of parameters is the one source: configuration file and README are made from it."""
+"""The table of parameters: files generated from it, and the settings built from it."""
 
+import subprocess
+import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 import yaml
 
-from stavpr_ros.ros.parameter_table import configuration_yaml, documentation_markdown
-from stavpr_ros.ros.parameters import PARAMETERS
+from stavpr_ros.alignment.settings import STRATEGIES
+from stavpr_ros.devices import BACKENDS
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.features.registry import KINDS
+from stavpr_ros.parameters import (
+    BASIC,
+    BY_NAME,
+    GROUPS,
+    PARAMETERS,
+    configuration_yaml,
+    documentation_markdown,
+)
+from stavpr_ros.pipeline import OPERATIONS, NodeSettings, PipelineSettings, node_settings
+from stavpr_ros.recognition.matcher import PRECISIONS
+from stavpr_ros.recognition.robust.options import MODES
+from stavpr_ros.recognition.verification import METHODS
 
 ROOT = Path(__file__).resolve().parents[1]
-REMEDY = 'write it anew: python3 -m stavpr_ros.ros.parameters'
+REMEDY = 'generate it: python3 -m stavpr_ros.parameters'
+DEFAULTS = {row.name: row.default for row in PARAMETERS}
 
 
-def test_configuration_file_is_the_table():
+def test_files_are_generated_from_the_table():
     written = (ROOT / 'config' / 'stavpr.yaml').read_text()
-    assert written == configuration_yaml(PARAMETERS), REMEDY
+    assert written == configuration_yaml(), REMEDY
+    assert (ROOT / 'docs' / 'parameters.md').read_text() == documentation_markdown(), REMEDY
     values = yaml.safe_load(written)['/**']['ros__parameters']
+    assert values == DEFAULTS
+    assert [type(value) for value in values.values()] == [type(row.default) for row in PARAMETERS]
+
+
+def test_rows_are_consistent():
+    assert len(GROUPS[BASIC]) <= 14
+    assert len(BY_NAME) == len(PARAMETERS)
     for row in PARAMETERS:
-        assert values[row.name] == row.default
-        assert type(values[row.name]) is type(row.default), row.name
+        assert row.sentence.endswith('.'), row.name
+        assert not row.bounds or row.bounds[0] <= row.default <= row.bounds[1], row.name
+        assert not row.choices or row.default in row.choices, row.name
 
 
-def test_readme_documents_the_table():
-    assert documentation_markdown(PARAMETERS) in (ROOT / 'README.md').read_text(), REMEDY
+def test_choices_are_those_of_the_library():
+    """The table is imported by launch files and names them once more."""
+    library = {
+        'operation': OPERATIONS,
+        'mode': MODES,
+        'features': tuple(KINDS),
+        'geometric_check': ('none', *METHODS),
+        'backend': BACKENDS,
+        'strategy': STRATEGIES,
+        'precision': PRECISIONS,
+    }
+    assert {name: BY_NAME[name].choices for name in library} == library
 
 
-@pytest.mark.parametrize('row', PARAMETERS, ids=lambda row: row.name)
-def test_rows_are_complete(row):
-    assert row.sentence.endswith('.')
-    if row.bounds is not None:
-        assert row.bounds[0] <= row.default <= row.bounds[1]
-    if row.choices:
-        assert row.default in row.choices
-    assert row.descriptor().read_only is (row.when == 'start')
-    assert 'can be set' in row.descriptor().additional_constraints
+def test_importing_the_table_is_light():
+    code = 'import sys, stavpr_ros.parameters; print(*sys.modules)'
+    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert not {'torch', 'numba', 'numpy', 'cv2', 'rclpy'} & set(run.stdout.split())
 
 
-def test_defaults_are_the_librarys():
-    """The node in its default configuration is the recognizer in its default configuration."""
-    from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-    from stavpr_ros.recognition import RecognizerSettings
+def test_default_values_give_default_settings():
+    settings = node_settings(DEFAULTS)
+    expected = PipelineSettings()
+    assert settings.pipeline.keyframes.change == DEFAULTS['keyframe_change']
+    for field in fields(PipelineSettings):
+        if field.name != 'keyframes':  # the library takes every image by default
+            assert getattr(settings.pipeline, field.name) == getattr(expected, field.name), field.name
+    for field in fields(NodeSettings):
+        if field.name != 'pipeline':
+            assert getattr(settings, field.name) == DEFAULTS[field.name]
 
-    values = {row.name: row.default for row in PARAMETERS}
-    assert SpatialSettings(values['strategy'], values['sigma'], values['xi'] or None) == SpatialSettings()
-    assert SequenceSettings(values['sequence_length'], values['beta']) == SequenceSettings()
-    assert values['nms_radius'] == RecognizerSettings(1.0).nms_radius
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'attribute', 'expected'),
+    [
+        ('xi', 3, 'spatial.xi', 3),
+        ('sigma', 2.0, 'spatial.sigma', 2.0),
+        ('strategy', 'vanilla', 'spatial.strategy', 'vanilla'),
+        ('vertical', True, 'spatial.vertical', True),
+        ('sequence_length', 7, 'sequence.length', 7),
+        ('beta', 3.0, 'sequence.beta', 3.0),
+        ('threshold', 0.3, 'threshold', 0.3),
+        ('keyframe_interval', 1.5, 'keyframes.seconds', 1.5),
+        ('keyframe_distance', 2.5, 'keyframes.meters', 2.5),
+        ('keyframe_angle', 3.5, 'keyframes.degrees', 3.5),
+        ('geometric_check', 'sift', 'geometric.method', 'sift'),
+    ],
+)
+def test_a_value_reaches_its_setting(name, value, attribute, expected):
+    setting = node_settings(DEFAULTS | {name: value}).pipeline
+    for part in attribute.split('.'):
+        setting = getattr(setting, part)
+    assert setting == expected
+
+
+@pytest.mark.parametrize(
+    ('values', 'words'),
+    [
+        ({'strategy': 'teleport'}, "strategy = 'teleport' is unknown: take one of adaptive"),
+        ({'threshold': 0.0}, 'threshold = 0 would match nothing'),
+        ({'operation': 'loop_closure', 'backend': 'cuda'}, 'backend cuda, precision float32: loop'),
+        ({'operation': 'loop_closure', 'precision': 'float16'}, 'precision float16: loop closure'),
+        ({'operation': 'loop_closure', 'strategy': 'none'}, 'take strategy adaptive or vanilla'),
+        ({'operation': 'loop_closure', 'vertical': True}, 'without vertical alignment'),
+        ({'operation': 'loop_closure', 'max_places': 100}, 'take at least 103'),
+        (
+            {'operation': 'mapping', 'geometric_check': 'orb', 'thumbnail_width': 0},
+            'geometric_check = orb with thumbnail_width = 0',
+        ),
+    ],
+)
+def test_invalid_values_are_rejected_by_name(values, words, monkeypatch):
+    monkeypatch.setattr('stavpr_ros.pipeline.settings.choose_backend', lambda wish: wish)
+    with pytest.raises(SettingsError, match=words):
+        node_settings(DEFAULTS | values)
+
+
+@pytest.mark.parametrize(
+    ('mode', 'operation', 'backend', 'available', 'expected'),
+    [
+        ('robust', 'localization', 'auto', 'cuda', 'extraction on cuda, image distances on cuda (float32), '
+         'sequences on cpu'),
+        ('paper', 'localization', 'auto', 'cuda', 'extraction on cuda, image distances on cuda (float32), '
+         'sequences on cuda'),
+        ('robust', 'loop_closure', 'auto', 'cuda', 'extraction on cuda, image distances on cpu (float32), '
+         'sequences on cpu'),
+        ('robust', 'localization', 'cpu', 'cuda', 'backend cpu: extraction on cpu, image distances on cpu'),
+        ('robust', 'mapping', 'auto', '', 'backend auto (no device): extraction on cpu'),
+    ],
+)  # fmt: skip
+def test_backend_summary_names_the_device_of_each_stage(
+    monkeypatch, mode, operation, backend, available, expected
+):
+    module = 'stavpr_ros.pipeline.settings'
+    chosen = available or 'cpu'
+    monkeypatch.setattr(f'{module}.choose_backend', lambda wish: chosen if wish == 'auto' else wish)
+    monkeypatch.setattr(f'{module}.why_no_cuda', lambda: '' if available else 'no device')
+    summary = PipelineSettings(mode=mode, backend=backend).backend_summary(operation)
+    assert expected in summary

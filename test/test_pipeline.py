@@ -1,4 +1,4 @@
-"""The pipeline without ROS: what each operation does, and how one becomes another."""
+"""The operations of the pipeline, and the changes between them; without ROS."""
 
 import itertools
 from dataclasses import replace
@@ -12,23 +12,25 @@ from pipelines import (
     EXCLUDED,
     LENGTH,
     SECOND,
-    answers,
-    as_if_saved,
     at,
     localizing,
+    mark_saved,
     one_thread,
+    process,
+    recorded,
+    save,
     settings_of,
-    show,
     stamps_of,
+    statuses,
 )
-from stavpr_ros.pipeline.outcome import place_picture
 
 from stavpr_ros.alignment import SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import save_map
-from stavpr_ros.pipeline import OPERATIONS, Pipeline, Status, place_facts, read_map
-from stavpr_ros.recognition import PlaceRecognizer
+from stavpr_ros.mapping import load_map, place_at, place_thumbnail, save_map
+from stavpr_ros.pipeline import OPERATIONS, Pipeline, read_map
+from stavpr_ros.recognition import PlaceRecognizer, Status
+from stavpr_ros.recognition.loop_closer import LoopCloser
 
 
 @pytest.fixture(scope='module', autouse=True)
@@ -37,279 +39,294 @@ def _one_thread():
         yield
 
 
+def same_recognition(match, core):
+    """Every field that the recognizer fills."""
+    assert match.status is core.status
+    assert (match.reason, match.relative) == (core.reason, core.relative)
+    assert repr(match.sequence) == repr(core.sequence)
+    np.testing.assert_array_equal(match.path, core.path)
+
+
 @pytest.mark.parametrize(('mode', 'threshold'), [('paper', 0.2), ('robust', None)])
-def test_localization_is_the_recognizer(map_file, small_map, route, mode, threshold):
+def test_localization_returns_the_matches_of_the_recognizer(
+    map_file, small_map, route, mode, threshold
+):
     pipeline = localizing(map_file, mode=mode, threshold=threshold)
     images = route[20:32] + route_images(4, seed=9)
-    core = PlaceRecognizer(small_map, pipeline.settings.recognition(threshold or 1.0))
-    outcomes = show(pipeline, images)
-    for i, outcome in enumerate(outcomes):
-        recognition = core.add(pipeline.extractor.extract([images[i]]))
-        assert outcome.status.name.replace('_', ' ').lower() == recognition.status.value
-        assert repr(outcome.sequence) == repr(recognition.sequence)
-        np.testing.assert_array_equal(outcome.path, recognition.path)
-        assert outcome.window_stamps == tuple((j + 1) * SECOND for j in range(max(0, i - 4), i + 1))
-        assert (outcome.image_index, outcome.first_image_index, outcome.inliers) == (-1, -1, -1)
-        assert outcome.places is pipeline.places
-        assert outcome.threshold == (threshold or 1.0)
-        assert set(outcome.stages) == {'decoding', 'description', 'matching', 'check'}
-    assert answers(outcomes).count(Status.MATCH) >= 8
+    core = PlaceRecognizer(small_map, pipeline.settings.recognition('localization'))
+    matches = process(pipeline, images)
+    for i, match in enumerate(matches):
+        same_recognition(match, core.update(pipeline.extractor.extract([images[i]])))
+        assert match.window_stamps == tuple((j + 1) * SECOND for j in range(max(0, i - 4), i + 1))
+        assert (match.image_index, match.first_image_index, match.inliers) == (-1, -1, -1)
+        assert match.threshold == (threshold or 1.0)
+        assert set(match.stages) == {'decoding', 'extraction', 'matching', 'verification'}
+    assert statuses(matches).count(Status.MATCH) >= 8
     assert (pipeline.map_state, pipeline.window_fill, pipeline.missing) == ('loaded', LENGTH, '')
 
 
-def test_what_is_missing_is_said(map_file, route):
+def test_missing_map_or_threshold_is_the_reason(map_file, route):
     pipeline = Pipeline(settings_of(mode='paper'))
     assert (pipeline.map_state, pipeline.places, pipeline.window_fill) == ('none', None, 0)
     assert 'map_path' in pipeline.missing
-    (outcome,) = show(pipeline, route[:1])
-    assert (outcome.status, outcome.reason) == (Status.NOT_READY, pipeline.missing)
-    assert outcome.cause == 'not ready'
-    pipeline.use(read_map(map_file, pipeline.settings))
+    (match,) = process(pipeline, route[:1])
+    assert (match.status, match.reason) == (Status.NOT_READY, pipeline.missing)
+    assert match.cause == 'not ready'
+    pipeline.change(loaded=read_map(map_file, pipeline.settings))
     assert (pipeline.map_state, len(pipeline.places)) == ('loaded', 60)
     assert 'threshold' in pipeline.missing
-    assert show(pipeline, route[:1])[0].reason == pipeline.missing
+    assert process(pipeline, route[:1])[0].reason == pipeline.missing
     pipeline.change(replace(pipeline.settings, threshold=0.2))
-    assert answers(show(pipeline, route[:LENGTH]))[-1] is Status.MATCH
+    assert statuses(process(pipeline, route[:LENGTH]))[-1] is Status.MATCH
     pipeline.change(replace(pipeline.settings, threshold=None))
-    assert answers(show(pipeline, route[:1])) == [Status.NOT_READY]
-    assert pipeline.map_state == 'loaded'
+    assert statuses(process(pipeline, route[:1])) == [Status.NOT_READY]
+    pipeline.change(replace(pipeline.settings, threshold=0.2))  # images are missing from the window
+    assert statuses(process(pipeline, route[:1])) == [Status.WARMING_UP]
 
 
-def test_mapping_grows_a_map_with_all_that_is_known(route):
+def test_mapping_records_places(route):
     pipeline = Pipeline(settings_of(thumbnail_width=64), 'mapping')
     assert (pipeline.map_state, pipeline.missing, len(pipeline.places)) == ('growing', '', 0)
-    outcomes = show(pipeline, route[:4], poses=True) + show(pipeline, route[4:8], first=4)
-    assert answers(outcomes) == [Status.MAPPED] * 8
-    assert [outcome.image_index for outcome in outcomes] == list(range(8))
-    assert all(outcome.recognition is None and outcome.reason == '' for outcome in outcomes)
-    grown = pipeline.places_as_map()
-    assert stamps_of(grown) == list(range(1, 9))
-    np.testing.assert_array_equal(grown.poses[:4], [at(i) for i in range(4)])
-    assert np.isnan(grown.poses[4:]).all()
-    described = FeatureExtractor().extract(route[:8])
-    torch.testing.assert_close(grown.features.strips, described.strips, atol=1e-6, rtol=0)
-    picture = grown.thumbnail(3)
-    assert picture.shape == (48, 64, 3)
+    matches = process(pipeline, route[:4], poses=True) + process(pipeline, route[4:8], first=4)
+    assert statuses(matches) == [Status.MAPPED] * 8
+    assert [match.image_index for match in matches] == list(range(8))
+    assert all(match.sequence is None and match.reason == '' for match in matches)
+    places = pipeline.places.snapshot()
+    assert stamps_of(places) == list(range(1, 9))
+    np.testing.assert_array_equal(places.poses[:4], [at(i) for i in range(4)])
+    assert np.isnan(places.poses[4:]).all()
+    features = FeatureExtractor().extract(route[:8])
+    torch.testing.assert_close(places.features.strips, features.strips, atol=1e-6, rtol=0)
+    thumbnail = places.thumbnail(3)
+    assert thumbnail.shape == (48, 64, 3)
     small = cv2.resize(route[3], (64, 48), interpolation=cv2.INTER_AREA).astype(float)
-    assert np.abs(picture - small).mean() < 20 < np.abs(grown.thumbnail(5) - small).mean()
+    assert np.abs(thumbnail - small).mean() < 20 < np.abs(places.thumbnail(5) - small).mean()
 
 
-def test_a_map_that_is_full_is_left_as_it_is(route):
+def test_mapping_stops_at_max_places(route):
     pipeline = Pipeline(settings_of(max_places=100), 'mapping')
-    outcomes = show(pipeline, (route + route)[:103])
-    assert answers(outcomes) == [Status.MAPPED] * 100 + [Status.NOT_READY] * 3
-    assert outcomes[-1].cause == 'map full'
-    assert 'max_places = 100' in outcomes[-1].reason
-    assert (pipeline.map_state, stamps_of(pipeline.places_as_map())) == ('full', list(range(1, 101)))
-    pipeline.set_operation('localization')
-    assert len(pipeline.places) == 100
+    matches = process(pipeline, (route + route)[:103])
+    assert statuses(matches) == [Status.MAPPED] * 100 + [Status.NOT_READY] * 3
+    assert matches[-1].cause == 'map full'
+    assert 'max_places = 100' in matches[-1].reason
+    assert (pipeline.map_state, stamps_of(pipeline.places)) == ('full', list(range(1, 101)))
 
 
-def test_mapping_continues_a_map(map_file, small_map, route):
+def test_mapping_extends_a_map(map_file, small_map, route, tmp_path):
     pipeline = Pipeline(settings_of(), 'mapping')
-    pipeline.use(read_map(map_file, pipeline.settings))
-    assert len(pipeline.places) == 60
-    (outcome,) = show(pipeline, route[:1], first=60)
-    assert (outcome.status, outcome.image_index) == (Status.MAPPED, 60)
-    grown = pipeline.places_as_map()
-    assert stamps_of(grown) == list(range(1, 62))
-    assert grown.ids[:60] == small_map.ids
-    torch.testing.assert_close(grown.features.strips[:, :60], small_map.features.strips, atol=0, rtol=0)
+    pipeline.change(loaded=read_map(map_file, pipeline.settings))
+    (match,) = process(pipeline, route[:1], first=60)
+    assert (match.status, match.image_index) == (Status.MAPPED, 60)
+    save(pipeline, tmp_path / 'extended.stavpr')
+    places = load_map(tmp_path / 'extended.stavpr')
+    assert stamps_of(places) == list(range(1, 62))
+    assert places.ids[:60] == small_map.ids
+    strips = places.features.strips[:, :60]
+    torch.testing.assert_close(strips, small_map.features.strips, atol=0, rtol=0)
 
 
 @pytest.mark.parametrize('exclude_seconds', [0.0, 30.0])
-def test_loop_closure_is_the_loop_closer(route, exclude_seconds):
+def test_loop_closure_returns_the_matches_of_the_loop_closer(route, exclude_seconds):
     pipeline = Pipeline(settings_of(exclude_seconds=exclude_seconds), 'loop_closure')
     images = route[:40] * 2
-    core = pipeline.settings.loop_closer(pipeline.extractor, 0.8)
-    for i, outcome in enumerate(show(pipeline, images, poses=True)):
-        recognition = core.add(pipeline.extractor.extract([images[i]]), (i + 1) * SECOND)
-        assert outcome.recognition.status is recognition.status
-        assert repr(outcome.sequence) == repr(recognition.sequence)
-        np.testing.assert_array_equal(outcome.path, recognition.path)
-        assert (outcome.image_index, len(outcome.window_stamps)) == (i, min(i + 1, LENGTH))
-        assert outcome.first_image_index == max(0, i - LENGTH + 1)
-        if recognition.sequence is not None:
-            assert recognition.path[:, 1].max() <= i - max(EXCLUDED, exclude_seconds)
+    core = LoopCloser(
+        replace(pipeline.settings.recognition('loop_closure'), threshold=0.8),
+        EXCLUDED,
+        pipeline.extractor.settings,
+        limit=20000,
+        exclude_seconds=exclude_seconds,
+    )
+    for i, match in enumerate(process(pipeline, images, poses=True)):
+        same_recognition(match, core.update(pipeline.extractor.extract([images[i]]), (i + 1) * SECOND))
+        assert (match.image_index, len(match.window_stamps)) == (i, min(i + 1, LENGTH))
+        assert match.first_image_index == max(0, i - LENGTH + 1)
+        if match.sequence is not None:
+            assert match.path[:, 1].max() <= i - max(EXCLUDED, exclude_seconds)
         if i >= 40 + LENGTH:
-            assert (outcome.status, recognition.newest_index) == (Status.MATCH, i - 40)
+            assert (match.status, match.newest_index) == (Status.MATCH, i - 40)
     assert (pipeline.map_state, len(pipeline.places)) == ('growing', 80)
 
 
-def test_loop_closure_forgets_and_indices_stay(route):
-    """At most 100 places: every index of every answer means the image that it meant when it came."""
+def test_loop_closure_evicts_places_and_indices_stay(route):
+    """At most 100 places: every index of every match refers to the image of that number."""
     pipeline = Pipeline(settings_of(max_places=100, candidates=4), 'loop_closure')
     images = route * 4
     closed, firsts = 0, set()
     for i, image in enumerate(images):
-        (outcome,) = show(pipeline, [image], first=i, poses=True)
-        first = outcome.places.first
-        firsts.add(first)
-        assert len(outcome.places) <= 100
-        assert (outcome.image_index, first + len(outcome.places) - 1) == (i, i)
-        told = {outcome.image_index, *(candidate.place for candidate in outcome.candidates)}
-        if outcome.status is Status.MATCH:
-            told |= {int(place) for place in outcome.path[:, 1]}
-            assert min(told) >= first
+        (match,) = process(pipeline, [image], first=i, poses=True)
+        places = pipeline.places
+        firsts.add(places.first)
+        assert len(places) <= 100
+        assert (match.image_index, places.first + len(places) - 1) == (i, i)
+        indices = {match.image_index, *(candidate.place for candidate in match.candidates)}
+        if match.status is Status.MATCH:
+            indices |= {int(place) for place in match.path[:, 1]}
+            assert min(indices) >= places.first
             if i >= 60 + LENGTH:
-                assert outcome.newest_index == i - 60
+                assert match.newest_index == i - 60
                 closed += 1
-        for place in told:
-            facts = place_facts(outcome.places, place)
-            assert (facts.stamp, facts.pose[0]) == ((place + 1) * SECOND, place)
+        for index in indices:
+            place = place_at(places, index)
+            assert (place.stamp, place.pose[0]) == ((index + 1) * SECOND, index)
     assert closed == 240 - 60 - LENGTH
     assert firsts == set(range(0, 145, 12))  # an eighth of 100 at a time
     for place in (150, 200, 239):
-        kept = place_picture(pipeline.places, place).astype(float)
-        assert np.abs(kept - images[place]).mean() < 20 < np.abs(kept - images[place - 5]).mean()
-    saved = pipeline.places_as_map()
-    assert stamps_of(saved) == list(range(145, 241))
+        thumbnail = place_thumbnail(pipeline.places, place).astype(float)
+        errors = [np.abs(thumbnail - images[i]).mean() for i in (place, place - 5)]
+        assert errors[0] < 20 < errors[1]
+    assert stamps_of(pipeline.places) == list(range(145, 241))
 
 
-# ------------------------------------------------ from one to another
+# ------------------------------------------------ changes of operation and map
 
 
 @pytest.mark.parametrize('images', [(6, 0, 6), (0, 6, 0), (6, 6, 6)])
-def test_every_change_of_operation(route, images):
-    """A grown route is the map from then on, an empty one loses nothing: against a list of stamps."""
+def test_every_change_of_operation_keeps_the_places(route, images):
+    """A recorded route becomes the map, an empty one loses nothing: against a list of stamps."""
     for names in itertools.product(OPERATIONS, repeat=3):
         pipeline = Pipeline(settings_of(), names[0])
-        held, grown, came, full = [], [], 0, 0
+        held, new_route, count_before, fill = [], [], 0, 0
         for name, count in zip(names, images, strict=True):
             if name != pipeline.operation:
-                held, grown, full = grown or held, [], 0
-                as_if_saved(pipeline)
-                pipeline.set_operation(name)
+                held, new_route, fill = new_route or held, [], 0
+                mark_saved(pipeline)
+                pipeline.change(operation=name)
             assert pipeline.operation == name
-            outcomes = show(pipeline, route[came : came + count], first=came)
-            new = list(range(came + 1, came + count + 1))
-            came += count
+            matches = process(pipeline, route[count_before : count_before + count], first=count_before)
+            new = list(range(count_before + 1, count_before + count + 1))
+            count_before += count
             if name == 'mapping':
                 held = held + new
-                assert set(answers(outcomes)) <= {Status.MAPPED}
-                assert [outcome.image_index for outcome in outcomes] == [held.index(stamp) for stamp in new]
+                assert set(statuses(matches)) <= {Status.MAPPED}
+                assert [match.image_index for match in matches] == [held.index(stamp) for stamp in new]
             elif name == 'loop_closure':
-                grown = grown + new
-                assert set(answers(outcomes)) <= {Status.WARMING_UP, Status.NO_MATCH}
+                new_route = new_route + new
+                assert set(statuses(matches)) <= {Status.WARMING_UP, Status.NO_MATCH}
             elif not held:
-                assert set(answers(outcomes)) <= {Status.NOT_READY}
+                assert set(statuses(matches)) <= {Status.NOT_READY}
             else:
-                warming = min(count, max(0, LENGTH - 1 - full))
-                assert answers(outcomes)[: warming + 1].count(Status.WARMING_UP) == warming
-                full += count
-            assert stamps_of(pipeline.places_as_map()) == (grown or held), names
-            shown = held if name != 'loop_closure' else grown
-            assert (0 if pipeline.places is None else len(pipeline.places)) == len(shown)
-            assert pipeline.map_state == {
-                'localization': 'loaded' if held else 'none', 'mapping': 'growing', 'loop_closure': 'growing'
-            }[name]  # fmt: skip
+                warming = min(count, max(0, LENGTH - 1 - fill))
+                assert statuses(matches)[: warming + 1].count(Status.WARMING_UP) == warming
+                fill += count
+            assert stamps_of(pipeline.places) == (new_route if name == 'loop_closure' else held), names
+            if new_route or held:
+                assert stamps_of(pipeline.snapshot('x', True).places) == (new_route or held)
+            state = 'growing' if name != 'localization' else 'loaded' if held else 'none'
+            assert pipeline.map_state == state
 
 
-def test_no_places_are_lost_unless_they_were_given_up(map_file, route):
+def test_unsaved_places_are_not_lost(map_file, route):
     pipeline = Pipeline(settings_of(), 'mapping')
-    show(pipeline, route[:7])
+    process(pipeline, route[:7])
     loaded = read_map(map_file, pipeline.settings)
     for change in ({'operation': 'loop_closure'}, {'loaded': loaded}):
         with pytest.raises(InputError, match='7 places that are not saved'):
             pipeline.change(**change)
         assert (pipeline.operation, len(pipeline.places), pipeline.path) == ('mapping', 7, '')
-    pipeline.set_operation('localization')
+    pipeline.change(operation='localization')
     assert (len(pipeline.places), pipeline.unsaved) == (7, 7)
-    pipeline.use(loaded)  # given up
+    pipeline.change(loaded=loaded)  # discards them
     assert (len(pipeline.places), pipeline.path, pipeline.unsaved) == (60, map_file, 0)
-    pipeline.set_operation('loop_closure')
-    show(pipeline, route[:3])
-    with pytest.raises(InputError, match='route so far would be lost'):
-        pipeline.use(loaded)
+    pipeline.change(operation='loop_closure')
+    process(pipeline, route[:3])
+    with pytest.raises(InputError, match='recorded route would be lost'):
+        pipeline.change(loaded=loaded)
     assert len(pipeline.places) == 3
-    pipeline.set_operation('localization')
-    assert (len(pipeline.places), pipeline.path, pipeline.unsaved) == (3, '', 3)  # no file holds this map
+    pipeline.change(operation='localization')
+    assert (len(pipeline.places), pipeline.path, pipeline.unsaved) == (3, '', 3)
     with pytest.raises(InputError, match='3 places that are not saved'):
-        pipeline.set_operation('loop_closure')
+        pipeline.change(operation='loop_closure')
     pipeline.change(operation='localization', loaded=loaded)
     assert pipeline.path == map_file
 
 
-def test_a_grown_map_recognizes(route):
+def test_saved_places_may_be_replaced(map_file, route, tmp_path):
     pipeline = Pipeline(settings_of(), 'mapping')
-    show(pipeline, route[:40])
-    pipeline.set_operation('localization')
-    outcomes = show(pipeline, route[10:20])
-    assert answers(outcomes) == [Status.WARMING_UP] * 4 + [Status.MATCH] * 6
-    assert [outcome.newest_index for outcome in outcomes[4:]] == list(range(14, 20))
-    pipeline.set_operation('mapping')
-    assert show(pipeline, route[40:41], first=40)[0].image_index == 40
+    process(pipeline, route[:4])
+    save(pipeline, tmp_path / 'recorded.stavpr')
+    pipeline.change(loaded=read_map(map_file, pipeline.settings))
+    assert (len(pipeline.places), pipeline.path) == (60, map_file)
+    process(pipeline, route[4:5])
+    pipeline.change(operation='localization')
+    assert (pipeline.unsaved, len(pipeline.places)) == (1, 61)
 
 
-def test_an_operation_that_does_not_do_changes_nothing(map_file, route):
-    pipeline = localizing(map_file, max_places=50)  # fewer than the map has: it cannot be continued
-    show(pipeline, route[:LENGTH])
+def test_a_recorded_map_is_recognized_and_extended(route):
+    pipeline = recorded(route, 'localization', 40)
+    matches = process(pipeline, route[10:20])
+    assert statuses(matches) == [Status.WARMING_UP] * 4 + [Status.MATCH] * 6
+    assert [match.newest_index for match in matches[4:]] == list(range(14, 20))
+    pipeline.change(operation='mapping')
+    assert process(pipeline, route[40:41], first=40)[0].image_index == 40
+
+
+def test_a_failed_change_of_operation_changes_nothing(map_file, route):
+    pipeline = localizing(map_file, max_places=50)  # less than the map: it cannot be extended
+    process(pipeline, route[:LENGTH])
     places = pipeline.places
     for name, error, words in (
         ('teleport', SettingsError, 'localization, mapping, loop_closure'),
         ('mapping', InputError, 'a map of 60 places does not fit'),
     ):
         with pytest.raises(error, match=words):
-            pipeline.set_operation(name)
-        assert (pipeline.operation, pipeline.places, pipeline.window_fill) == ('localization', places, LENGTH)
-    assert show(pipeline, route[5:6], first=5)[0].newest_index == 5
-    pipeline.set_operation('localization')  # it is that already: the window stays
-    assert show(pipeline, route[6:7], first=6)[0].newest_index == 6
+            pipeline.change(replace(pipeline.settings, threshold=1e-9), name)
+        assert (pipeline.operation, pipeline.places) == ('localization', places)
+        assert (pipeline.window_fill, pipeline.threshold) == (LENGTH, 1.0)
+    assert process(pipeline, route[5:6], first=5)[0].newest_index == 5
+    pipeline.change(operation='localization')  # the current one: the window stays
+    assert process(pipeline, route[6:7], first=6)[0].newest_index == 6
+
+
+@pytest.mark.parametrize(
+    ('changes', 'words'),
+    [({'backend': 'cuda'}, 'backend cuda'), ({'precision': 'float16'}, 'precision float16')],
+)
+def test_loop_closure_rejects_cuda_and_float16(changes, words):
+    with pytest.raises(SettingsError, match=words):
+        Pipeline(settings_of(**changes), 'loop_closure')
 
 
 @pytest.mark.parametrize('operation', OPERATIONS)
-def test_a_map_that_does_not_fit_changes_nothing(operation, small_map, map_file, route, tmp_path):
-    """Three strips, and xi = 5 (localization, loop closure); more places than max_places (mapping)."""
+def test_a_map_that_does_not_fit_changes_nothing(
+    operation, small_map, map_file, route, tmp_path
+):
+    """Three strips with xi = 5 (localization, loop closure); more than max_places (mapping)."""
     pipeline = Pipeline(settings_of(spatial=SpatialSettings(xi=5), max_places=100), operation)
-    pipeline.use(read_map(map_file, pipeline.settings))
-    few = Pipeline(settings_of(max_places=120), 'mapping')
-    few.use(read_map(map_file, few.settings))
-    show(few, route[:50])
+    pipeline.change(loaded=read_map(map_file, pipeline.settings))
     path = str(tmp_path / 'bad.stavpr')
     if operation == 'mapping':
-        few.save(path, overwrite=False)
+        larger = Pipeline(settings_of(max_places=120), 'mapping')
+        larger.change(loaded=read_map(map_file, larger.settings))
+        process(larger, route[:50])
+        save(larger, path)
     else:
-        three = FeatureExtractor(strips=3)
-        narrow = replace(small_map, features=three.extract(route), projection=None)
-        save_map(narrow, path)
-    show(pipeline, route[:LENGTH])
-    pipeline.save(str(tmp_path / 'saved.stavpr'), overwrite=False)
-    before = (pipeline.places, len(pipeline.places), pipeline.extractor, pipeline.window_fill, pipeline.path)
-    loaded = read_map(path, pipeline.settings)
+        features = FeatureExtractor(strips=3).extract(route)
+        save_map(replace(small_map, features=features, projection=None), path)
+    if operation != 'loop_closure':  # whose recorded route would be lost
+        process(pipeline, route[:LENGTH])
+        save(pipeline, tmp_path / 'saved.stavpr')
+
+    def state():
+        places = pipeline.places
+        return places, len(places), pipeline.extractor, pipeline.window_fill, pipeline.path
+
+    before, loaded = state(), read_map(path, pipeline.settings)
     with pytest.raises((InputError, SettingsError)):
-        pipeline.use(loaded)
-    assert (pipeline.places, len(pipeline.places), pipeline.extractor, pipeline.window_fill, pipeline.path) == before
-    outcome = show(pipeline, route[5:6], first=5)[0]
-    expected = {'localization': Status.MATCH, 'mapping': Status.MAPPED, 'loop_closure': Status.NO_MATCH}
-    assert outcome.status is expected[operation]
+        pipeline.change(loaded=loaded)
+    assert state() == before
+    expected = {'localization': Status.MATCH, 'mapping': Status.MAPPED}
+    match = process(pipeline, route[5:6], first=5)[0]
+    assert match.status is expected.get(operation, Status.WARMING_UP)
 
 
-def test_a_map_in_loop_closure_gives_the_kind_of_features(map_file, route):
+def test_loop_closure_takes_the_kind_of_features_of_the_map(map_file, route):
     pipeline = Pipeline(settings_of(), 'loop_closure')
-    pipeline.use(read_map(map_file, pipeline.settings))
-    assert (len(pipeline.places), pipeline.path) == (0, '')  # the map's file is not the route's
+    pipeline.change(loaded=read_map(map_file, pipeline.settings))
+    assert (len(pipeline.places), pipeline.path) == (0, '')  # the map file is not that of the route
     assert pipeline.extractor.settings.projection is not None
-    pipeline.set_operation('localization')
+    pipeline.change(operation='localization')
     assert (len(pipeline.places), pipeline.path) == (60, map_file)
-    pipeline.set_operation('loop_closure')
-    show(pipeline, route[:8])
+    pipeline.change(operation='loop_closure')
+    process(pipeline, route[:8])
     assert pipeline.places.features.strips.shape == (7, 8, 64)
-    assert stamps_of(pipeline.places_as_map()) == list(range(1, 9))
     assert not pipeline.save_state.owns(map_file)
-
-
-def test_a_grown_map_is_not_lost_to_another(map_file, route, tmp_path):
-    pipeline = Pipeline(settings_of(), 'mapping')
-    show(pipeline, route[:4])
-    loaded = read_map(map_file, pipeline.settings)
-    with pytest.raises(InputError, match='4 places that are not saved'):
-        pipeline.use(loaded)
-    assert len(pipeline.places) == 4
-    pipeline.save(str(tmp_path / 'grown.stavpr'), overwrite=False)
-    pipeline.use(loaded)
-    assert (len(pipeline.places), pipeline.path) == (60, map_file)
-    show(pipeline, route[4:5])
-    pipeline.set_operation('localization')
-    assert (pipeline.unsaved, len(pipeline.places)) == (1, 61)
-    pipeline.use(loaded)  # given up
-    assert (pipeline.unsaved, len(pipeline.places)) == (0, 60)

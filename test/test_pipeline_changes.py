@@ -1,4 +1,4 @@
-"""The pipeline without ROS: what changes while it runs, errors in the middle of images, questions, saving."""
+"""The pipeline in operation: live settings, keyframes, invalid images, resets, relocalization, saving."""
 
 import itertools
 import os
@@ -9,20 +9,22 @@ import pytest
 from pipelines import (
     LENGTH,
     SECOND,
-    answers,
-    as_if_saved,
     localizing,
     message,
     one_thread,
+    process,
+    recorded,
+    save,
     settings_of,
-    show,
     stamps_of,
+    statuses,
 )
 
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, MapFileError
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.mapping.keyframes import KeyframeSettings
-from stavpr_ros.pipeline import OPERATIONS, Pipeline, Status, read_map
+from stavpr_ros.pipeline import OPERATIONS, Pipeline
+from stavpr_ros.recognition import Status
 from stavpr_ros.recognition.verification import GeometricSettings
 
 
@@ -32,211 +34,200 @@ def _one_thread():
         yield
 
 
-def test_the_threshold_and_the_number_of_candidates_change_with_a_full_window(map_file, route):
+def test_threshold_and_candidates_change_with_a_full_window(map_file, route):
     pipeline = localizing(map_file, candidates=3)
-    outcome = show(pipeline, route[:LENGTH])[-1]
-    assert (outcome.status, len(outcome.candidates)) == (Status.MATCH, 3)
-    assert outcome.candidates[0].place == outcome.sequence.middle
+    match = process(pipeline, route[:LENGTH])[-1]
+    assert (match.status, len(match.candidates)) == (Status.MATCH, 3)
+    assert match.candidates[0].place == match.sequence.middle
     pipeline.change(replace(pipeline.settings, threshold=1e-9, candidates=0))
-    outcome = show(pipeline, route[5:6], first=5)[0]
-    assert (outcome.status, outcome.threshold, outcome.candidates) == (Status.NO_MATCH, 1e-9, ())
-    pipeline.change(replace(pipeline.settings, threshold=None, candidates=1))  # mode robust has a default
-    outcome = show(pipeline, route[6:7], first=6)[0]
-    assert (outcome.status, outcome.newest_index, outcome.threshold) == (Status.MATCH, 6, 1.0)
-    assert len(outcome.candidates) == 1
+    match = process(pipeline, route[5:6], first=5)[0]
+    assert (match.status, match.threshold, match.candidates) == (Status.NO_MATCH, 1e-9, ())
+    pipeline.change(replace(pipeline.settings, threshold=None, candidates=1))
+    match = process(pipeline, route[6:7], first=6)[0]  # the default of mode robust
+    assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 6, 1.0)
+    assert len(match.candidates) == 1
 
 
-def test_the_threshold_of_a_route_changes_with_a_full_window(route):
+def test_candidates_are_listed_on_request_only(map_file, route):
+    pipeline = localizing(map_file, candidates=3)
+    pipeline.list_candidates = False
+    assert process(pipeline, route[:LENGTH])[-1].candidates == ()
+
+
+def test_threshold_of_loop_closure_changes_with_a_full_window(route):
     pipeline = Pipeline(settings_of(), 'loop_closure')
-    assert show(pipeline, route[:20] * 2)[-1].status is Status.MATCH
+    assert process(pipeline, route[:20] * 2)[-1].status is Status.MATCH
     pipeline.change(replace(pipeline.settings, threshold=1e-9))
-    outcome = show(pipeline, route[:1])[0]
-    assert (outcome.status, outcome.recognition.threshold) == (Status.NO_MATCH, 1e-9)
+    match = process(pipeline, route[:1])[0]
+    assert (match.status, match.threshold) == (Status.NO_MATCH, 1e-9)
     assert len(pipeline.places) == 41
 
 
-def test_changes_leave_a_growing_map_alone(route):
-    """In mode paper without a threshold, which mapping does not ask for; the last keyframe stays as well."""
-    pipeline = Pipeline(settings_of(mode='paper', keyframes=KeyframeSettings(change=0.01)), 'mapping')
-    show(pipeline, route[:3])
+def test_live_settings_keep_a_growing_map_and_the_last_keyframe(route):
+    """In mode paper without a threshold, which mapping does not need."""
+    settings = settings_of(mode='paper', keyframes=KeyframeSettings(change=0.01))
+    pipeline = Pipeline(settings, 'mapping')
+    process(pipeline, route[:3])
     growing = pipeline.places
     for threshold in (None, 0.2, 0.3, None):
         pipeline.change(replace(pipeline.settings, threshold=threshold, candidates=3))
         assert pipeline.places is growing
-        assert answers(show(pipeline, route[2:3], first=2)) == [Status.SKIPPED]
+        assert statuses(process(pipeline, route[2:3], first=2)) == [Status.SKIPPED]
     assert pipeline.unsaved == len(growing) == 3
 
 
-def test_a_threshold_that_comes_and_goes_loses_no_route(route):
+def test_a_route_is_kept_while_the_threshold_is_not_set(route):
     pipeline = Pipeline(settings_of(mode='paper', threshold=0.1), 'loop_closure')
-    show(pipeline, route[:7])
+    process(pipeline, route[:7])
     pipeline.change(replace(pipeline.settings, threshold=None))
-    assert answers(show(pipeline, route[:1])) == [Status.NOT_READY]
+    assert statuses(process(pipeline, route[:1])) == [Status.NOT_READY]
     assert 'threshold' in pipeline.missing
-    assert stamps_of(pipeline.places_as_map()) == list(range(1, 8))
+    assert stamps_of(pipeline.places) == list(range(1, 8))
 
 
-def test_keyframes(map_file, route):
-    """Each rule; an image that is none changes nothing, and rules change with the last keyframe kept."""
-    rules = KeyframeSettings(change=0.01)
-    pipeline = localizing(map_file, keyframes=rules)
+def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
+    pipeline = localizing(map_file, keyframes=KeyframeSettings(change=0.01))
     still = [route[0]] * 3 + route[1:LENGTH]
-    outcomes = show(pipeline, still, poses=True)
-    assert answers(outcomes) == [
+    matches = process(pipeline, still, poses=True)
+    assert statuses(matches) == [
         Status.WARMING_UP, Status.SKIPPED, Status.SKIPPED, *[Status.WARMING_UP] * 3, Status.MATCH
     ]  # fmt: skip
-    assert outcomes[1].cause == 'not a keyframe'
-    assert 'differs by 0.0000' in outcomes[1].reason
-    assert outcomes[-1].window == tuple(stamp * SECOND for stamp in (1, 4, 5, 6, 7))
+    assert matches[1].cause == 'not a keyframe'
+    assert 'differs by 0.0000' in matches[1].reason
+    assert matches[-1].window_stamps == tuple(stamp * SECOND for stamp in (1, 4, 5, 6, 7))
     pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(interval=2.0)))
-    outcomes = show(pipeline, route[5:7], first=7)
-    assert answers(outcomes) == [Status.SKIPPED, Status.MATCH]
-    assert 'less than 2 s' in outcomes[0].reason
+    matches = process(pipeline, route[5:7], first=7)
+    assert statuses(matches) == [Status.SKIPPED, Status.MATCH]
+    assert 'less than 2 s' in matches[0].reason
     pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(distance=3.0)))
-    outcomes = show(pipeline, route[7:9], first=9) + show(pipeline, route[8:14], first=10, poses=True)
-    assert outcomes[0].cause == outcomes[1].cause == 'no odometry'
-    # the last keyframe had no pose, which cannot object; then it is every third meter
-    assert [outcome.status is Status.SKIPPED for outcome in outcomes[2:]] == [False, True, True] * 2
-    assert 'of 3 m' in outcomes[3].reason
+    matches = process(pipeline, route[7:9], first=9)
+    assert matches[0].cause == matches[1].cause == 'no odometry'
+    # the last keyframe has no pose, so that the next image is one; then it is every third meter
+    matches = process(pipeline, route[8:14], first=10, poses=True)
+    assert [match.status is Status.SKIPPED for match in matches] == [False, True, True] * 2
+    assert 'of 3 m' in matches[1].reason
 
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
-def test_the_geometric_check(operation, small_map, route, tmp_path):
-    """Accepts, rejects by its parameter, and rejects where there is no picture; it is changed live."""
-    pipeline = Pipeline(settings_of(candidates=2), 'mapping')
-    show(pipeline, route[:30])
-    as_if_saved(pipeline)
-    pipeline.set_operation(operation)
-    if operation == 'loop_closure':
-        show(pipeline, route[:30])
-    assert {outcome.inliers for outcome in show(pipeline, route[:LENGTH])} == {-1}
-    least = GeometricSettings(min_inliers=100)
-    pipeline.change(replace(pipeline.settings, geometric=least))
-    accepted = show(pipeline, route[5:6], first=5)[0]
+def test_geometric_check_accepts_and_rejects(operation, route):
+    pipeline = recorded(route, operation, candidates=2)
+    assert {match.inliers for match in process(pipeline, route[:LENGTH])} == {-1}
+    check = GeometricSettings(min_inliers=100)
+    pipeline.change(replace(pipeline.settings, geometric=check))
+    accepted = process(pipeline, route[5:6], first=5)[0]
     assert (accepted.status, accepted.reason, accepted.newest_index) == (Status.MATCH, '', 5)
     assert accepted.inliers >= 100
-    for more, answer in ((0, Status.MATCH), (1, Status.NO_MATCH)):  # the same images once more
+    for more, status in ((0, Status.MATCH), (1, Status.NO_MATCH)):  # the same images again
         pipeline.reset()
-        show(pipeline, route[:LENGTH])
-        just = replace(least, min_inliers=accepted.inliers + more)
+        process(pipeline, route[:LENGTH])
+        just = replace(check, min_inliers=accepted.inliers + more)
         pipeline.change(replace(pipeline.settings, geometric=just))
-        outcome = show(pipeline, route[5:6], first=5)[0]
-        assert (outcome.status, outcome.inliers) == (answer, accepted.inliers)
-    pipeline.change(replace(pipeline.settings, geometric=replace(least, min_inliers=5000)))
-    rejected = show(pipeline, route[6:7], first=6)[0]
-    assert (rejected.status, rejected.place_index) == (Status.NO_MATCH, -1)
-    assert rejected.sequence.middle == 4
-    assert f'{rejected.inliers} inliers are fewer than 5000' in rejected.reason
-    assert len(rejected.candidates) == 2
+        match = process(pipeline, route[5:6], first=5)[0]
+        assert (match.status, match.inliers) == (status, accepted.inliers)
+    assert (match.place_index, match.sequence.middle % 30) == (-1, 3)
+    assert f'{match.inliers} inliers are fewer than {match.inliers + 1}' in match.reason
+    assert len(match.candidates) == 2
     pipeline.change(replace(pipeline.settings, geometric=None))
-    assert answers(show(pipeline, route[7:8])) == [Status.MATCH]
+    assert statuses(process(pipeline, route[7:8])) == [Status.MATCH]
 
 
-def test_the_geometric_check_of_a_map_without_pictures(small_map, route, tmp_path):
+def test_geometric_check_rejects_without_thumbnails(small_map, route, tmp_path):
     save_map(replace(small_map, thumbnails=()), tmp_path / 'blind.stavpr')
-    pipeline = Pipeline(settings_of(geometric=GeometricSettings()))
-    pipeline.use(read_map(str(tmp_path / 'blind.stavpr'), pipeline.settings))
-    outcome = show(pipeline, route[:LENGTH])[-1]
-    assert (outcome.status, outcome.inliers) == (Status.NO_MATCH, -1)
-    assert 'keeps no pictures' in outcome.reason
+    pipeline = localizing(str(tmp_path / 'blind.stavpr'), geometric=GeometricSettings())
+    match = process(pipeline, route[:LENGTH])[-1]
+    assert (match.status, match.inliers) == (Status.NO_MATCH, -1)
+    assert 'no thumbnails' in match.reason
 
 
-# ------------------------------------------------ errors in the middle, resets, questions
+# ------------------------------------------------ errors, resets, relocalization
 
 
-class Stumbles:
-    """A extractor, or a thumbnail maker, that does not do when it is asked to."""
+class Failing:
+    """A function that raises ``error`` while that is set."""
 
-    def __init__(self, wrapped):
-        self.wrapped, self.error = wrapped, None
+    def __init__(self, function):
+        self.function, self.error = function, None
 
     def __call__(self, *arguments):
         if self.error is not None:
             raise self.error
-        return self.wrapped(*arguments)
+        return self.function(*arguments)
 
 
 @pytest.mark.parametrize('operation', OPERATIONS)
-def test_an_error_in_the_middle_of_an_image_changes_nothing(operation, route, monkeypatch):
-    """Another pipeline does not see the bad images: both say the same of the good ones."""
-    pipeline, other = (
-        Pipeline(settings_of(keyframes=KeyframeSettings(change=0.01)), 'mapping') for _ in range(2)
-    )
-    for each in (pipeline, other):
-        show(each, route[:30], poses=True)
-        as_if_saved(each)
-        each.set_operation(operation)
-    describe = Stumbles(pipeline.extractor.describe)
-    monkeypatch.setattr(pipeline.extractor, 'describe', describe)
-    thumbnail = Stumbles(lambda image, width: b'')
+def test_an_invalid_image_changes_nothing(operation, route, monkeypatch):
+    """Another pipeline does not get the invalid images: both return the same for the valid ones."""
+    keyframes = KeyframeSettings(change=0.01)
+    pipeline, other = (recorded(route, operation, keyframes=keyframes) for _ in range(2))
+    extract = Failing(pipeline.extractor.extract)
+    monkeypatch.setattr(pipeline.extractor, 'extract', extract)
+    thumbnail = Failing(lambda image, width: b'')
     monkeypatch.setattr('stavpr_ros.pipeline.operations.encode_thumbnail', thumbnail)
     cut_off = message(route[0])
     object.__setattr__(cut_off, 'data', cut_off.data[:100])
-    for i, image in enumerate(route[:30] if operation != 'mapping' else route[30:40]):
+    for i, image in enumerate(route[:12] if operation != 'mapping' else route[30:42]):
         broken = pipeline.process(cut_off, i)
         assert (broken.status, broken.cause) == (Status.INVALID_IMAGE, 'invalid: cut off')
-        describe.error = ImageError('not finite', kind='features')
+        extract.error = ImageError('not finite', kind='features')
         broken = pipeline.process(message(route[59]), i)
         assert (broken.cause, broken.reason) == ('invalid: features', 'not finite')
-        describe.error = FeatureMismatchError('another kind')
+        extract.error = FeatureMismatchError('another kind')
         assert pipeline.process(message(route[59]), i).cause == 'invalid: FeatureMismatchError'
-        describe.error = None
+        extract.error = None
         if operation != 'localization':
             thumbnail.error = InputError('no JPEG')
             assert pipeline.process(message(route[59]), i).cause == 'invalid: InputError'
             thumbnail.error = None
         with pytest.raises(InputError, match='quaternion of zeros'):
             pipeline.process(message(route[59]), i, np.zeros(7))
-        (good,), (expected,) = (show(each, [image], first=50 + i, poses=True) for each in (pipeline, other))
-        assert (good.status, good.window_stamps, good.image_index) == (expected.status, expected.window_stamps, expected.image_index)
-        assert repr(good.candidates) == repr(expected.candidates)
-        if good.recognition is not None:
-            assert repr(good.sequence) == repr(expected.sequence)
-    assert stamps_of(pipeline.places_as_map()) == stamps_of(other.places_as_map())
+        good, expected = (
+            process(each, [image], first=50 + i, poses=True)[0] for each in (pipeline, other)
+        )
+        for name in ('status', 'window_stamps', 'image_index', 'candidates'):
+            assert getattr(good, name) == getattr(expected, name)
+        assert repr(good.sequence) == repr(expected.sequence)
+    assert stamps_of(pipeline.places) == stamps_of(other.places)
     assert good.status is not Status.WARMING_UP
 
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
-def test_a_reset_empties_the_window_and_keeps_the_places(operation, route):
-    pipeline = Pipeline(settings_of(keyframes=KeyframeSettings(change=0.01)), 'mapping')
-    show(pipeline, route[:30])
-    as_if_saved(pipeline)
-    pipeline.set_operation(operation)
-    if operation == 'loop_closure':
-        show(pipeline, route[:30])
-    show(pipeline, route[:LENGTH])
+def test_reset_empties_the_window_and_keeps_the_places(operation, route):
+    pipeline = recorded(route, operation, keyframes=KeyframeSettings(change=0.01))
+    process(pipeline, route[:LENGTH])
     assert pipeline.window_fill == LENGTH
     places = len(pipeline.places)
     pipeline.reset()
     assert (pipeline.window_fill, len(pipeline.places)) == (0, places)
-    outcomes = show(pipeline, route[4 : 4 + LENGTH], first=100)  # the first looks like the last keyframe
-    assert answers(outcomes) == [Status.WARMING_UP] * 4 + [Status.MATCH]
-    assert outcomes[-1].window == tuple((101 + i) * SECOND for i in range(LENGTH))
+    matches = process(pipeline, route[4 : 4 + LENGTH], first=100)  # the first equals the last keyframe
+    assert statuses(matches) == [Status.WARMING_UP] * 4 + [Status.MATCH]
+    assert matches[-1].window_stamps == tuple((101 + i) * SECOND for i in range(LENGTH))
     if operation == 'loop_closure':
-        assert outcomes[-1].first_image_index == places
-    assert outcomes[-1].newest_index == 8
+        assert matches[-1].first_image_index == places
+    assert matches[-1].newest_index == 8
 
 
-def test_relocalize_answers_for_the_window_as_it_is(map_file, route):
+def test_relocalize_returns_the_match_of_the_window(map_file, route):
     pipeline = Pipeline(settings_of())
     with pytest.raises(InputError, match='map_path'):
         pipeline.relocalize(3)
-    pipeline.set_operation('mapping')
-    with pytest.raises(InputError, match='mapping recognizes nothing'):
+    pipeline.change(operation='mapping')
+    with pytest.raises(InputError, match='mapping recognizes no places'):
         pipeline.relocalize(3)
     pipeline = localizing(map_file, candidates=2)
     for i in range(LENGTH):
         with pytest.raises(InputError, match=f'{i} of 5 images in the window'):
             pipeline.relocalize(3)
-        outcome = show(pipeline, route[i : i + 1], first=i)[0]
-    told, ranked = pipeline.relocalize(4)
-    assert (told.status, told.recognition, told.window_stamps) == (Status.MATCH, outcome.recognition, outcome.window_stamps)
-    assert len(ranked) == 4
-    assert tuple(ranked[:2]) == outcome.candidates
-    assert min(abs(a.place - b.place) for a, b in itertools.combinations(ranked, 2)) > 5
-    assert pipeline.relocalize(0)[1] == []
-    pipeline.process(message(np.zeros((0, 0, 3), np.uint8)), 0)  # bad: the window is as it was
-    assert pipeline.relocalize(4) == (told, ranked)
+        last = process(pipeline, route[i : i + 1], first=i)[0]
+    match = pipeline.relocalize(4)
+    assert (match.status, match.sequence) == (Status.MATCH, last.sequence)
+    assert match.window_stamps == last.window_stamps
+    assert len(match.candidates) == 4
+    assert match.candidates[:2] == last.candidates
+    pairs = itertools.combinations(match.candidates, 2)
+    assert min(abs(a.place - b.place) for a, b in pairs) > 5
+    assert pipeline.relocalize(0).candidates == ()
+    pipeline.process(message(np.zeros((0, 0, 3), np.uint8)), 0)  # invalid: the window is unchanged
+    assert pipeline.relocalize(4).candidates == match.candidates
     pipeline.reset()
     with pytest.raises(InputError, match='0 of 5'):
         pipeline.relocalize(3)
@@ -245,38 +236,39 @@ def test_relocalize_answers_for_the_window_as_it_is(map_file, route):
 # ------------------------------------------------ saving
 
 
-def test_saving(route, tmp_path, monkeypatch):
-    path = tmp_path / 'grown.stavpr'
-    pipeline = Pipeline(settings_of(mode='paper'), 'loop_closure')
-    with pytest.raises(InputError, match='threshold'):
-        pipeline.save(str(path), overwrite=True)
-    pipeline.set_operation('localization')
-    with pytest.raises(InputError, match='map_path'):
-        pipeline.save(str(path), overwrite=True)
-    pipeline.set_operation('mapping')
-    with pytest.raises(InputError, match='no places'):
-        pipeline.save(str(path), overwrite=True)
-    assert not path.exists()
-    show(pipeline, route[:3])
+@pytest.mark.parametrize(
+    ('operation', 'words'),
+    [('loop_closure', 'threshold'), ('localization', 'map_path'), ('mapping', 'no places')],
+)
+def test_saving_nothing_is_an_error(operation, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        save(Pipeline(settings_of(mode='paper'), operation), tmp_path / 'map.stavpr', overwrite=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_saving_is_atomic_and_overwrites_on_request_only(route, tmp_path, monkeypatch):
+    path = tmp_path / 'recorded.stavpr'
+    pipeline = Pipeline(settings_of(), 'mapping')
+    process(pipeline, route[:3])
     with pytest.raises(MapFileError, match='make it first'):
-        pipeline.save(str(tmp_path / 'missing' / 'grown.stavpr'), overwrite=True)
-    assert (pipeline.save(str(path), overwrite=False), pipeline.path, pipeline.unsaved) == (3, str(path), 0)
+        save(pipeline, tmp_path / 'missing' / 'recorded.stavpr')
+    assert (save(pipeline, path), pipeline.path, pipeline.unsaved) == (3, str(path), 0)
     assert stamps_of(load_map(path)) == [1, 2, 3]
-    show(pipeline, route[3:4], first=3)
-    with pytest.raises(MapFileError, match='is there already'):
-        pipeline.save(str(path), overwrite=False)
+    process(pipeline, route[3:4], first=3)
+    with pytest.raises(MapFileError, match='exists already'):
+        save(pipeline, path)
     assert pipeline.unsaved == 1
     content = path.read_bytes()
 
-    def fails(*arguments):
+    def fail(*arguments):
         raise OSError('the disk is full')
 
     with monkeypatch.context() as disk:
-        disk.setattr(os, 'replace', fails)
-        with pytest.raises(MapFileError, match='what was there is untouched'):
-            pipeline.save(str(path), overwrite=True)
+        disk.setattr(os, 'replace', fail)
+        with pytest.raises(MapFileError):
+            save(pipeline, path, overwrite=True)
     assert (path.read_bytes(), pipeline.unsaved) == (content, 1)
-    assert [file.name for file in tmp_path.iterdir()] == ['grown.stavpr']
-    assert pipeline.save(str(path), overwrite=True) == 4
+    assert [file.name for file in tmp_path.iterdir()] == ['recorded.stavpr']
+    assert save(pipeline, path, overwrite=True) == 4
     assert stamps_of(load_map(path)) == [1, 2, 3, 4]
-    assert show(pipeline, route[4:5], first=4)[0].image_index == 4  # and it goes on
+    assert process(pipeline, route[4:5], first=4)[0].image_index == 4

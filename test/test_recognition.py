@@ -10,7 +10,7 @@ from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.sequence_buffer import DistanceWindow
+from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 
@@ -112,7 +112,7 @@ def test_features_that_are_not_finite_are_refused_and_change_nothing(small_map, 
 
 def test_one_image_at_a_time(small_map):
     with pytest.raises(InputError, match='2 images'):
-        recognizer(small_map).add(small_map.features[:2])
+        recognizer(small_map).update(small_map.features[:2])
 
 
 def test_settings_out_of_range(small_map):
@@ -141,16 +141,53 @@ def test_reset_empties_the_window(small_map):
     assert one.update(small_map.features[:1]).status is Status.WARMING_UP
 
 
-def test_the_window_is_the_last_rows_in_order():
-    window = DistanceWindow(3, 2, 4)
+def test_sequence_buffer_holds_the_last_rows_in_order():
+    buffer = SequenceBuffer(3, 2, 4)
     for value in range(8):
-        window.push(np.array([value, -value], np.float32))
-        assert len(window) == min(value + 1, 3)
-        if window.full:
-            rows = window.rows()
+        buffer.push(torch.tensor([value, -value], dtype=torch.float32), 10 * value)
+        assert len(buffer) == min(value + 1, 3)
+        assert buffer.stamps == tuple(10 * i for i in range(max(0, value - 2), value + 1))
+        if buffer.full:
+            rows = buffer.rows()
             assert rows[:, 0].tolist() == [value - 2, value - 1, value]
-            assert rows.flags.c_contiguous
-            assert np.isinf(rows[:, 2:]).all()
+            assert rows.is_contiguous()
+            assert torch.isinf(rows[:, 2:]).all()
+    buffer.clear()
+    assert (len(buffer), buffer.known, buffer.stamps) == (0, 0, ())
+    assert torch.isinf(buffer.rows()).all()
+
+
+def test_sequence_buffer_that_grows_and_evicts_keeps_its_rows():
+    buffer = SequenceBuffer(2, 3, 4)
+    buffer.push(torch.tensor([1.0, 2.0]))
+    assert buffer.known == 2
+    buffer.grow(5)
+    buffer.push(torch.tensor([3.0, 4.0, 5.0, 6.0]))
+    assert buffer.rows()[:, :5].tolist() == [[1, 2, np.inf, np.inf, np.inf], [3, 4, 5, 6, np.inf]]
+    buffer.evict(1)
+    assert (buffer.first, buffer.known, buffer.places) == (1, 3, 5)
+    assert buffer.rows()[:, :5].tolist() == [[2, np.inf, np.inf, np.inf, np.inf], [4, 5, 6, np.inf, np.inf]]
+
+
+@pytest.mark.parametrize('value', [np.nan, -np.inf])
+def test_sequence_buffer_refuses_a_bad_row_and_is_unchanged(value):
+    buffer = SequenceBuffer(2, 3, 4)
+    buffer.push(torch.tensor([1.0, np.inf, 2.0]), 5)
+    before = buffer.rows().clone()
+    with pytest.raises(InputError, match='1 NaN or -inf among 3'):
+        buffer.push(torch.tensor([1.0, value, 2.0]), 6)
+    assert torch.equal(buffer.rows(), before)
+    assert (len(buffer), buffer.stamps) == (1, (5,))
+
+
+@pytest.mark.parametrize('mode', ['paper', 'robust'])
+def test_a_match_has_the_stamps_of_its_window(small_map, mode):
+    one = recognizer(small_map, mode=mode)
+    for i in range(7):
+        match = one.update(small_map.features[i : i + 1], 100 + i)
+        assert match.window_stamps == tuple(range(100 + max(0, i - 4), 101 + i))
+    one.reset()
+    assert one.update(small_map.features[:1], 3).window_stamps == (3,)
 
 
 def test_an_unseen_stretch_is_far(small_map, route):

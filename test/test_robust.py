@@ -16,23 +16,26 @@ from stavpr_ros.evaluation.warp import warp_indices
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import build_map, extract_features
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.loop_closer import GROWTH, ROOM, LoopCloser
+from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.robust.centering import MeanCentering
-from stavpr_ros.recognition.robust.options import (
+from stavpr_ros.recognition.robust.hysteresis import (
     AHEAD,
     CHANCE,
     FADING,
+    Hysteresis,
+    evidence,
+    expected_second_best,
+    score,
+)
+from stavpr_ros.recognition.robust.options import (
     LOOP_THRESHOLD,
     PAPER,
     ROBUST,
     RobustOptions,
-    Track,
-    evidence,
-    expected_second_best,
     options_of,
-    relative_distance,
 )
-from stavpr_ros.recognition.robust.znorm import MEMORY, PRIOR, Calibration
+from stavpr_ros.recognition.robust.znorm import MEMORY, PRIOR, ZNormalization
+from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
 from stavpr_ros.sources import open_source
 
 SHORT = SequenceSettings(length=5, beta=2.0)
@@ -52,7 +55,7 @@ def test_choices_of_options():
     assert not PAPER.any
     assert RobustOptions.only('velocity_search') == RobustOptions(False, False, False, True, False, False)
     assert not ROBUST.without('mean_centering', 'velocity_search').mean_centering
-    assert ROBUST.without('mean_centering').speeds
+    assert ROBUST.without('mean_centering').velocity_search
     for wrong in (lambda: ROBUST.without('hope'), lambda: RobustOptions.only('hope'), lambda: options_of('hope')):
         with pytest.raises(SettingsError, match='hope'):
             wrong()
@@ -65,13 +68,13 @@ def test_choices_of_options():
 def test_evidence_and_distance():
     assert evidence(-2.0, -0.5) == -3.5
     assert evidence(-2.0, math.nan) == -4.0
-    assert relative_distance(CHANCE) == relative_distance(5.0) == relative_distance(math.inf) == 1
-    assert relative_distance(CHANCE - 2) == pytest.approx(math.exp(-1))
-    assert 0 < relative_distance(-50) < 1e-9
+    assert score(CHANCE) == score(5.0) == score(math.inf) == 1
+    assert score(CHANCE - 2) == pytest.approx(math.exp(-1))
+    assert 0 < score(-50) < 1e-9
 
 
 def test_a_track_fades_and_ends_where_the_place_jumps():
-    track = Track()
+    track = Hysteresis()
     assert track.follow(10, -4.0) == -4.0
     assert track.follow(11, 0.0) == pytest.approx(-4 + FADING)
     assert track.follow(11 + AHEAD, 0.0) == pytest.approx(-4 + 2 * FADING)
@@ -122,7 +125,7 @@ def test_calibration_is_the_running_mean_and_variance():
     rng = np.random.default_rng(0)
     start, rows = rng.normal(3, 2, (6, 9)), rng.normal(1, 4, (MEMORY + 40, 9)).astype(np.float32)
     start[2, 2:5] = np.nan
-    calibration = Calibration(9)
+    calibration = ZNormalization(9)
     calibration.start_from(start)
 
     normal = (start - np.nanmean(start, 1)[:, None]) / np.nanstd(start, 1)[:, None]
@@ -145,7 +148,7 @@ def test_calibration_is_the_running_mean_and_variance():
 
 
 def test_calibration_of_maps_too_small_to_know_themselves():
-    calibration = Calibration(3)
+    calibration = ZNormalization(3)
     calibration.start_from(np.full((3, 3), np.nan))
     np.testing.assert_array_equal(calibration.shift_and_scale(3), ([0, 0, 0], [1, 1, 1]))
     flat = calibration.normalized(np.full(3, 0.5, np.float32))
@@ -255,10 +258,10 @@ def test_the_latest_images_are_no_places(laps):
     assert len(closer.newest_row()) == 30
 
 
-def test_the_mean_that_is_taken_off_is_that_of_the_route_so_far(laps):
-    closer = LoopCloser(RecognizerSettings(1.0, mode='robust'), 10, laps.settings)
+def test_route_features_grown_are_centered_by_a_mean_at_most_an_eighth_old(laps):
+    route = RouteFeatures(laps.settings, True, None)
     for i in range(100):
-        closer.update(laps[i : i + 1])
+        route.append(laps[i : i + 1])
     counts = [1]
     while counts[-1] < 100:
         counts.append(int(counts[-1] * GROWTH) + 1)
@@ -266,7 +269,7 @@ def test_the_mean_that_is_taken_off_is_that_of_the_route_so_far(laps):
     mean = laps.strips[:, :last].mean(dim=1, keepdim=True)
     expected = laps.strips[:, :100] - mean
     expected /= expected.norm(dim=2, keepdim=True)
-    torch.testing.assert_close(closer._route.strips[:, :100], expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(route.strips[:, :100], expected, atol=1e-5, rtol=0)
 
 
 def test_what_a_loop_closer_refuses(laps, small_map):
@@ -411,5 +414,5 @@ def test_a_route_that_has_just_begun_closes_no_loops_by_chance():
         images = [frame.image for frame, _ in zip(first_traverse(World(seed)), range(130), strict=False)]
         features = extractor.extract(images)
         closer = LoopCloser(RecognizerSettings(LOOP_THRESHOLD, mode='robust'), 50, features.settings)
-        found = [closer.update(features[i : i + 1]).place for i in range(len(images))]
+        found = [closer.update(features[i : i + 1]).place_index for i in range(len(images))]
         assert sum(place >= 0 for place in found) <= 2

@@ -1,173 +1,144 @@
-"""What has grown is written at the end, and no file of another map is replaced."""
-
-import threading
-from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
+"""A recorded map is saved at the end, and no file of another map is overwritten."""
 
 import pytest
-from pipelines import settings_of, show
+from pipelines import localizing, process, save, settings_of
 
-from stavpr_ros.errors import StavprError
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.pipeline import Pipeline, read_map
-from stavpr_ros.ros.runtime import Runtime
-from stavpr_ros.ros.saving import write_at_the_end, write_map
-from stavpr_ros.ros.worker import Worker
+from stavpr_ros.pipeline.saving import save_recorded_map, write_map
 
 
 class Log:
-    """A logger that remembers."""
+    """A logger that keeps its lines."""
 
     def __init__(self):
-        self.said = []
+        self.lines = []
 
     def __getattr__(self, level):
-        return lambda text: self.said.append((level, text))
+        return lambda text: self.lines.append((level, text))
 
 
 @pytest.fixture
 def mapping(route):
     pipeline = Pipeline(settings_of(), 'mapping')
-    show(pipeline, route[:7])
+    process(pipeline, route[:7])
     return pipeline
 
 
-def at_the_end(pipeline, path):
+def at_the_end(pipeline, path, on_worker=lambda function: function()):
     log = Log()
-    write_at_the_end(pipeline, lambda function: function(), str(path), log)
-    return log.said
+    save_recorded_map(pipeline, on_worker, str(path), log)
+    return log.lines
 
 
-def test_what_has_grown_is_written_once(mapping, route, tmp_path):
+def test_unsaved_places_are_saved_once(mapping, route, tmp_path):
     path = tmp_path / 'route.stavpr'
     assert at_the_end(mapping, path)[-1] == ('info', f'7 places written to {path}')
     assert len(load_map(path)) == 7
-    assert at_the_end(mapping, path) == []  # nothing new
-    show(mapping, route[7:9], first=7)
+    assert at_the_end(mapping, path) == []
+    process(mapping, route[7:9], first=7)
     assert at_the_end(mapping, path)[-1] == ('info', f'9 places written to {path}')  # its own file
 
 
-def test_a_file_of_another_map_stays(mapping, route, tmp_path):
+def test_a_file_of_another_map_is_not_overwritten(mapping, route, tmp_path):
     path = tmp_path / 'route.stavpr'
     for there in (path, tmp_path / 'route-2.stavpr'):
         there.write_bytes(b'yesterday')
     assert at_the_end(mapping, path)[-1][1].endswith('route-3.stavpr')
-    show(mapping, route[7:9], first=7)
-    assert at_the_end(mapping, path)[-1][1].endswith('route-3.stavpr')  # again: it is this map's
+    process(mapping, route[7:9], first=7)
+    assert at_the_end(mapping, path)[-1][1].endswith('route-3.stavpr')  # its own file now
     assert path.read_bytes() == b'yesterday'
     assert len(load_map(tmp_path / 'route-3.stavpr')) == 9
 
 
-def test_a_copy_elsewhere_does_not_make_the_file_another_maps(small_map, route, tmp_path):
+def test_a_map_saved_elsewhere_still_owns_its_file(small_map, route, tmp_path):
     path = str(tmp_path / 'route.stavpr')
     save_map(small_map, path)
     pipeline = Pipeline(settings_of(), 'mapping')
-    pipeline.use(read_map(path, pipeline.settings))
-    pipeline.save(str(tmp_path / 'backup.stavpr'), overwrite=False)
-    show(pipeline, route[:2])
+    pipeline.change(loaded=read_map(path, pipeline.settings))
+    save(pipeline, tmp_path / 'backup.stavpr')
+    process(pipeline, route[:2])
     assert at_the_end(pipeline, path)[-1] == ('info', f'62 places written to {path}')
 
 
-def test_what_is_lost_is_said(mapping, route, tmp_path):
-    assert at_the_end(mapping, '') == [
-        ('warning', '7 places are in no file: neither save_path nor ~/save_map named one')
-    ]
+def test_lost_places_are_logged(mapping, tmp_path):
+    lost = [('warning', '7 recorded places are lost: set save_path, or call ~/save_map')]
+    assert at_the_end(mapping, '') == lost
     level, text = at_the_end(mapping, tmp_path / 'missing' / 'route.stavpr')[-1]
     assert (level, 'does not exist' in text) == ('error', True)
-    mapping.set_operation('localization')  # it is the map now, and still in no file
-    assert at_the_end(mapping, '')[0][0] == 'warning'
-    path = tmp_path / 'route.stavpr'
-    assert at_the_end(mapping, path)[-1] == ('info', f'7 places written to {path}')
+    mapping.change(operation='localization')  # the recorded map is in no file still
+    assert at_the_end(mapping, '') == lost
 
 
-def test_a_route_that_closes_loops_is_written_where_a_file_is_named(route, tmp_path):
+def test_a_busy_worker_is_logged(mapping):
+    def busy(function):
+        raise TimeoutError
+
+    assert at_the_end(mapping, 'x', busy) == [
+        ('error', 'the map is not saved: the worker is still busy at the end of the node')
+    ]
+
+
+def test_a_route_of_loop_closure_is_saved_to_save_path_only(route, tmp_path):
+    path = tmp_path / 'loop.stavpr'
     pipeline = Pipeline(settings_of(), 'loop_closure')
-    show(pipeline, route[:9])
+    process(pipeline, route[:9])
     assert at_the_end(pipeline, '') == []
-    at_the_end(pipeline, tmp_path / 'loop.stavpr')
-    assert len(load_map(tmp_path / 'loop.stavpr')) == 9
-    show(pipeline, route[9:11], first=9)
-    pipeline.set_operation('localization')  # now it is the map, and goes to its file all the same
-    at_the_end(pipeline, tmp_path / 'loop.stavpr')
-    assert len(load_map(tmp_path / 'loop.stavpr')) == 11
+    at_the_end(pipeline, path)
+    assert len(load_map(path)) == 9
+    process(pipeline, route[9:11], first=9)
+    pipeline.change(operation='localization')  # the route is the map now
+    at_the_end(pipeline, path)
+    assert len(load_map(path)) == 11
 
 
-def test_a_route_does_not_replace_the_map_that_it_was_begun_with(small_map, route, tmp_path):
-    path = tmp_path / 'route.stavpr'
-    save_map(small_map, path)
+def test_a_route_does_not_overwrite_the_map_of_its_features(map_file, route, tmp_path):
     pipeline = Pipeline(settings_of(), 'loop_closure')
-    pipeline.use(read_map(str(path), pipeline.settings))
-    show(pipeline, route[:9])
+    path = tmp_path / 'route.stavpr'
+    save(localizing(map_file), path)
+    pipeline.change(loaded=read_map(str(path), pipeline.settings))
+    process(pipeline, route[:9])
     assert at_the_end(pipeline, path)[-1][1].endswith('route-2.stavpr')
     assert (len(load_map(path)), len(load_map(tmp_path / 'route-2.stavpr'))) == (60, 9)
 
 
-def test_places_that_come_while_it_is_written_are_unsaved(mapping, route, tmp_path):
+def test_places_recorded_during_writing_are_unsaved(mapping, route, tmp_path):
     calls = []
 
     def on_worker(function):
         if calls:
-            show(mapping, route[7:10], first=7)
+            process(mapping, route[7:10], first=7)
         calls.append(function)
         return function()
 
-    assert write_map(mapping, on_worker, str(tmp_path / 'route.stavpr'), overwrite=False) == 7
-    assert (mapping.unsaved, mapping.path) == (3, str(tmp_path / 'route.stavpr'))
+    path = str(tmp_path / 'route.stavpr')
+    assert write_map(mapping, on_worker, path, overwrite=False) == 7
+    assert (mapping.unsaved, mapping.path) == (3, path)
 
 
 @pytest.mark.parametrize('another', [False, True])
-def test_another_map_is_not_taken_for_the_one_that_was_written(another, mapping, small_map, tmp_path):
-    """While it is written, what grew becomes the map, and another one may be loaded."""
-    path, other = (str(tmp_path / name) for name in ('route.stavpr', 'other.stavpr'))
-    save_map(small_map, other)
+def test_a_map_loaded_during_writing_keeps_its_own_state(another, mapping, map_file, tmp_path):
+    path = str(tmp_path / 'route.stavpr')
 
     def on_worker(function):
         result = function()
-        mapping.set_operation('localization')
+        mapping.change(operation='localization')
         if another:
-            mapping.use(read_map(other, mapping.settings))
+            mapping.change(loaded=read_map(map_file, mapping.settings))
         return result
 
     write_map(mapping, on_worker, path, overwrite=False)
-    assert (mapping.unsaved, mapping.path) == (0, other if another else path)
-    assert mapping.save_state.owns(other) == another
+    assert (mapping.unsaved, mapping.path) == (0, map_file if another else path)
+    assert mapping.save_state.owns(map_file) == another
 
 
-def test_two_that_write_at_once_write_what_they_say(mapping, route, tmp_path):
-    """A service, and a transition on another thread: what came after both is unsaved."""
+def test_concurrent_writes_count_their_own_places(mapping, route, tmp_path):
+    """A service, and a transition on another thread: places after both are unsaved."""
     path = str(tmp_path / 'route.stavpr')
-    snapshots = [mapping.to_save(path, overwrite=True)]
-    show(mapping, route[7:9], first=7)
-    snapshots.append(mapping.to_save(path, overwrite=True))
-    show(mapping, route[9:10], first=9)
+    snapshots = [mapping.snapshot(path, overwrite=True)]
+    process(mapping, route[7:9], first=7)
+    snapshots.append(mapping.snapshot(path, overwrite=True))
+    process(mapping, route[9:10], first=9)
     for snapshot in reversed(snapshots):
-        mapping.saved(path, snapshot)
+        snapshot.mark_saved(path)
     assert mapping.unsaved == 1
-
-
-@pytest.mark.parametrize('busy', [False, True])
-def test_who_asks_a_worker_that_is_stopped_is_told(busy):
-    """Before or after it is stopped; it must not wait for ever."""
-    begun, go_on = threading.Event(), threading.Event()
-
-    def work(item):
-        begun.set()
-        go_on.wait(30)
-
-    worker = Worker(work, 2)
-    owner = SimpleNamespace(_worker=worker, _node=SimpleNamespace(ending=threading.Event()))
-    with ThreadPoolExecutor(2) as pool:
-        if busy:
-            worker.put(1)
-            begun.wait(30)
-            asked = pool.submit(Runtime._on_worker, owner, lambda: 7)
-            stopped = pool.submit(worker.stop)
-            while not worker._stopping:
-                pass
-            go_on.set()
-            stopped.result(30)
-        else:
-            worker.stop()
-            asked = pool.submit(Runtime._on_worker, owner, lambda: 7)
-        with pytest.raises(StavprError, match='no longer configured'):
-            asked.result(30)

@@ -138,7 +138,7 @@ def test_what_is_refused():
     with pytest.raises(InputError, match='shift'):
         match_velocities(np.zeros((3, 4)), VelocitySettings(), shift=np.zeros(3))
     for speeds in ((), (-1.0,), (np.nan,)):
-        with pytest.raises(SettingsError, match='velocity_search'):
+        with pytest.raises(SettingsError, match='speeds'):
             VelocitySettings(speeds)
     with pytest.raises(SettingsError, match='penalty'):
         VelocitySettings(penalty=-1)

@@ -5,7 +5,7 @@ import oracle
 import pytest
 import torch
 
-from stavpr_ros.alignment import SequenceSettings, SpatialSettings
+from stavpr_ros.alignment import SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
@@ -46,7 +46,7 @@ def test_against_the_oracle(n, strategy, xi):
     """Cell by cell as the method says: the inner alignment has its own central cell and no band."""
     reference, query = random_features(n), random_features(2, seed=1)
     spatial = SpatialSettings(strategy, 1.0, xi, vertical=True)
-    matcher = CpuMatcher(reference, spatial, SequenceSettings())
+    matcher = CpuMatcher(reference, spatial)
     found = matcher.distance_matrix(query.strips, query.weights).numpy()
     x = cut_cells(query.strips, (4, 2)).double().numpy()
     y = cut_cells(reference.strips, (4, 2)).double().numpy()
@@ -82,7 +82,7 @@ def test_what_is_refused(small_map):
     with pytest.raises(SettingsError, match='vertical'):
         SpatialSettings('none', vertical=True)
     with pytest.raises(SettingsError, match='cuda'):
-        make_matcher(random_features(3), spatial, SequenceSettings(), 'cuda', 'float32')
+        make_matcher(random_features(3), spatial, 'cuda', 'float32')
 
 
 def test_a_drone_that_flies_higher(data_folder):

@@ -1,57 +1,112 @@
-"""The worker's slot: newest kept, oldest dropped, nothing ends the thread."""
+"""The worker: newest items kept, oldest dropped, nothing ends the thread."""
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from stavpr_ros.errors import StavprError
 from stavpr_ros.ros.worker import Worker
 
+TIMEOUT = 30
 
-def test_oldest_is_dropped_while_busy():
-    begun, go_on, seen = threading.Event(), threading.Event(), []
 
-    def process(item):
-        begun.set()
-        assert go_on.wait(10)
-        seen.append(item)
+@pytest.fixture
+def make():
+    """Make a worker; it is stopped with the test."""
+    made = []
 
-    worker = Worker(process, capacity=2)
+    def make(process=lambda item: None, capacity=1, ending=None):
+        made.append(Worker(process, capacity, ending or threading.Event()))
+        return made[-1]
+
+    yield make
+    for worker in made:
+        worker.stop()
+
+
+class Busy:
+    """Processes an item when it may go on."""
+
+    def __init__(self):
+        self.begun, self.go_on, self.seen = threading.Event(), threading.Event(), []
+
+    def __call__(self, item=None):
+        self.begun.set()
+        assert self.go_on.wait(TIMEOUT)
+        self.seen.append(item)
+
+
+def test_worker_busy_drops_oldest_items(make):
+    busy = Busy()
+    worker = make(busy, capacity=2)
     assert worker.put(0) is None
-    assert begun.wait(10)
+    assert busy.begun.wait(TIMEOUT)
     assert [worker.put(item) for item in (1, 2, 3, 4)] == [None, None, 1, 2]
-    go_on.set()
-    worker.call(lambda: None).result(10)  # calls go first, so ask until the items are done
-    while len(seen) < 3:
-        worker.call(lambda: None).result(10)
-    worker.stop()
-    assert seen == [0, 3, 4]
+    assert worker.waiting == 2
+    busy.go_on.set()
+    while len(busy.seen) < 3:
+        worker.run(lambda: None)
+    assert busy.seen == [0, 3, 4]
 
 
-def test_an_item_that_fails_does_not_end_the_thread():
+def test_clear_returns_waiting_items(make):
+    busy = Busy()
+    worker = make(busy, capacity=3)
+    for item in range(3):
+        worker.put(item)
+        assert busy.begun.wait(TIMEOUT)
+    assert worker.clear() == [1, 2]
+    busy.go_on.set()
+    worker.run(lambda: None)
+    assert busy.seen == [0]
+
+
+def test_failing_item_does_not_end_the_thread(make):
     seen = []
-
-    def process(item):
-        seen.append(1 / item)
-
-    worker = Worker(process, capacity=5)
+    worker = make(lambda item: seen.append(1 / item), capacity=5)
     for item in (1, 0, 2):
         worker.put(item)
     while len(seen) < 2:
-        assert worker.call(lambda: True).result(10)
-    worker.stop()
+        worker.run(lambda: None)
     assert seen == [1, 0.5]
 
 
-def test_a_call_after_the_end_is_cancelled():
-    worker = Worker(lambda item: None, capacity=1)
-    worker.stop()
-    assert worker.call(lambda: 7).cancelled()
-
-
-def test_calls_return_and_raise():
-    worker = Worker(lambda item: None, capacity=1)
-    assert worker.call(lambda: 7).result(10) == 7
+def test_run_returns_and_raises_on_the_thread(make):
+    worker = make()
+    assert worker.run(threading.current_thread).name == 'recognition'
     with pytest.raises(ZeroDivisionError):
-        worker.call(lambda: 1 / 0).result(10)
-    assert worker.call(threading.current_thread).result(10).name == 'recognition'
-    worker.stop()
+        worker.run(lambda: 1 / 0)
+
+
+@pytest.mark.parametrize('busy', [False, True])
+def test_run_on_stopped_worker_raises(busy, make):
+    """Called before or after the worker is stopped; the caller does not wait forever."""
+    work = Busy()
+    worker = make(work, 2)
+    with ThreadPoolExecutor(1) as pool:
+        if busy:
+            worker.put(1)
+            assert work.begun.wait(TIMEOUT)
+            waiting = worker.call(lambda: 7)
+            stopped = pool.submit(worker.stop)
+            while not worker.call(lambda: None).cancelled():
+                pass  # until stop() has begun
+            work.go_on.set()
+            assert stopped.result(TIMEOUT)
+            assert waiting.cancelled()
+        else:
+            assert worker.stop()
+    with pytest.raises(StavprError, match='no longer configured'):
+        worker.run(lambda: 7)
+
+
+def test_run_raises_when_the_node_ends(make):
+    ending, busy = threading.Event(), Busy()
+    worker = make(busy, ending=ending)
+    worker.put(1)
+    assert busy.begun.wait(TIMEOUT)
+    ending.set()
+    with pytest.raises(StavprError, match='the node ends'):
+        worker.run(lambda: 7)
+    busy.go_on.set()

@@ -52,8 +52,6 @@ def match_velocities(
     :param shift, scale: the costs are (window - shift) * scale, shape (n,) each; None for 0 and 1.
     :raises InputError: wrong shape or type, NaN.
     """
-    from stavpr_ros.alignment.cpu.velocity import match_at_velocities
-
     D = no_nan(float_array(window, 'image distances', 2), 'image distances')
     l, n = D.shape
     shift = np.zeros(n, D.dtype) if shift is None else np.asarray(shift, D.dtype)
@@ -62,13 +60,28 @@ def match_velocities(
         raise InputError(
             f'window {D.shape}, shift {shift.shape}, scale {scale.shape}: expected (l, n), (n,), (n,), l >= 1'
         )
-    matches = VelocityMatches(np.empty(n, D.dtype), *(np.zeros(n, np.int32) for _ in range(3)))
+    return match_scaled(D, shift, scale, settings)
+
+
+def match_scaled(
+    window: np.ndarray, shift: np.ndarray, scale: np.ndarray, settings: VelocitySettings
+) -> VelocityMatches:
+    """
+    Match a window that is known to be good; nothing is checked or copied (see :func:`match_velocities`).
+
+    :param window: shape (l, n or more), C-contiguous.
+    :param shift, scale: shape (n,), of the window's type.
+    """
+    from stavpr_ros.alignment.cpu.velocity import match_at_velocities
+
+    n, dtype = len(shift), window.dtype
+    matches = VelocityMatches(np.empty(n, dtype), *(np.zeros(n, np.int32) for _ in range(3)))
     match_at_velocities(
-        D,
+        window,
         shift,
         scale,
-        settings.steps(l),
-        D.dtype.type(settings.penalty),
+        settings.steps(len(window)),
+        dtype.type(settings.penalty),
         matches.distances,
         matches.firsts,
         matches.middles,

@@ -3,36 +3,37 @@
 import sys
 
 from stavpr_ros.errors import StavprError
+from stavpr_ros.parameters import PARAMETERS
 from stavpr_ros.signals import interrupted, obey_signals
 from stavpr_ros.threads import wait_passively
 
 HELP = """usage: node [--ros-args -p map_path:=FILE -p threshold:=VALUE [-p NAME:=VALUE ...]
             [-r image:=TOPIC]]
 
-A managed (lifecycle) node, which configures and activates itself. It recognizes where the images of the
-topic `image` (sensor_msgs/Image) were taken on the route of a map (operation localization), makes a map
-of them (mapping), or finds places that they have passed before (loop_closure), with poses from `odom`.
+A lifecycle node that configures and activates itself. It recognizes the places of the images on
+the topic `image` (sensor_msgs/Image) on the route of a map (operation localization), records a map
+(mapping), or recognizes places that the route has passed before (loop_closure), with poses from
+`odom`.
 
-It publishes one ~/match (stavpr_msgs/PlaceMatch) for every image received, with a status; for accepted
-matches also ~/place_index, ~/distance, ~/pose and ~/loop_closure; ~/candidates, ~/match_image, ~/map_info
-and /diagnostics. Services: ~/load_map, ~/save_map, ~/reset, ~/relocalize, ~/set_operation.
+It publishes one ~/match (stavpr_msgs/PlaceMatch) for every image received, with a status; for
+accepted matches also ~/place_index, ~/distance, ~/pose and ~/loop_closure; ~/candidates,
+~/match_image, ~/map_info and /diagnostics. Services: ~/load_map, ~/save_map, ~/reset,
+~/relocalize, ~/set_operation.
 
-Make the map with `build_map`. Without a map (in mode paper: or a threshold) the node stays up and
-answers NOT_READY with the reason; both can be set later.
+Build a map with `build_map`. Without a map (in mode paper: or a threshold) the node publishes the
+status NOT_READY with the reason; set them later by ~/load_map and the parameter threshold.
 
 parameters:
 {parameters}
-exit codes: 0 stopped by a signal, 1 a parameter or the backend does not do
+exit codes: 0 stopped by a signal, 1 an invalid parameter, or the backend is not available
 """
 
 
 def _help() -> str:
-    from stavpr_ros.ros.parameters import PARAMETERS
-
-    rows = [
-        f'  {row.name} (default {row.default!r})\n      {row.descriptor().description}\n'
-        for row in PARAMETERS
-    ]
+    rows = []
+    for row in PARAMETERS:
+        unit = f' [{row.unit}]' if row.unit else ''
+        rows.append(f'  {row.name} (default {row.default!r})\n      {row.sentence}{unit}\n')
     return HELP.format(parameters=''.join(rows))
 
 
@@ -48,7 +49,7 @@ def main(args: list[str] | None = None) -> int:
         return _run(args)
     except KeyboardInterrupt:
         return 0
-    except Exception:  # an interrupt in the middle of a foreign library comes out as another exception
+    except Exception:  # an interrupt inside a foreign library may be raised as another exception
         if interrupted():
             return 0
         raise

@@ -1,10 +1,11 @@
-"""``ros2 run stavpr_ros record``: write matches, or loop closures, to a file, one JSON object a line."""
+"""``record``: write matches, or loop closures, to a file, one JSON object per line."""
 
 import argparse
 import json
 import math
 import sys
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
 from stavpr_ros.errors import SettingsError, StavprError
@@ -13,7 +14,7 @@ from stavpr_ros.signals import obey_signals
 if TYPE_CHECKING:
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
 
-_STATUSES = (
+STATUSES = (
     'WARMING_UP',
     'NO_MATCH',
     'MATCH',
@@ -23,62 +24,55 @@ _STATUSES = (
     'SKIPPED',
     'MAPPED',
 )
-TOPICS = {'matches': '/stavpr/match', 'loop closures': '/stavpr/loop_closure'}
+"""Names of the constants of ``stavpr_msgs/PlaceMatch``, in the order of their values."""
 
-LISTENING = 'recording {topic}'  # said when no message can be missed any more
+MATCHES, LOOP_CLOSURES = 'matches', 'loop closures'
+TOPICS = {MATCHES: '/stavpr/match', LOOP_CLOSURES: '/stavpr/loop_closure'}
 
 EPILOG = """
-The keys are the fields of stavpr_msgs/PlaceMatch, the status by its name, or with --loop-closures those
-of stavpr_msgs/LoopClosure. Stamps are nanoseconds, numbers that are not there are null; the path is a list
-of [query_index, map_index], pairs are [query_index, query_stamp, place_index, place_stamp], a pose is
-[x, y, z, qx, qy, qz, qw], null without odometry. received is the time of arrival (ns, system clock).
+The keys are the fields of stavpr_msgs/PlaceMatch, the status by its name, or with --loop-closures
+those of stavpr_msgs/LoopClosure. Stamps are in nanoseconds, missing numbers are null; the path is
+a list of [query_index, place_index], pairs are [query_index, query_stamp, place_index,
+place_stamp], a pose is [x, y, z, qx, qy, qz, qw], null without odometry. received is the time of
+arrival (ns, system clock).
 
-exit codes: 0 done (--count reached, or stopped by a signal), 1 the file cannot be written, 2 usage,
-130 stopped by a signal before it began
+exit codes: 0 done (--count reached, or stopped by a signal), 1 the file cannot be written,
+2 usage, 130 stopped by a signal before the start
 """
-
-
-def _stamp(time: Any) -> int:
-    return int(time.sec) * 10**9 + int(time.nanosec)
-
-
-def _pose(pose: Any) -> list[float]:
-    p, o = pose.position, pose.orientation
-    return [p.x, p.y, p.z, o.x, o.y, o.z, o.w]
-
-
-def _plain(message: 'PlaceMatch | LoopClosure', replaced: dict[str, Any]) -> dict[str, Any]:
-    """
-    Return a message as plain values for JSON.
-
-    :param replaced: values of fields that are written in another way.
-    """
-    record: dict[str, Any] = {'stamp': _stamp(message.header.stamp), 'frame_id': message.header.frame_id}
-    for name, kind in message.get_fields_and_field_types().items():
-        value = getattr(message, name)
-        if name in replaced:
-            record[name] = replaced[name]
-        elif kind == 'builtin_interfaces/Time':
-            record[name] = _stamp(value)
-        elif name != 'header':
-            record[name] = None if isinstance(value, float) and math.isnan(value) else value
-    return record
 
 
 def match_record(message: 'PlaceMatch') -> dict[str, Any]:
     """Return a match as plain values for JSON."""
-    path = [[pair.query_index, pair.map_index] for pair in message.path]
-    return _plain(message, {'status': _STATUSES[message.status], 'path': path})
+    return _record(message) | {'status': STATUSES[message.status]}
 
 
 def loop_closure_record(message: 'LoopClosure') -> dict[str, Any]:
     """Return a loop closure as plain values for JSON."""
-    pairs = [
-        [pair.query_index, _stamp(pair.query_stamp), pair.place_index, _stamp(pair.place_stamp)]
-        for pair in message.pairs
-    ]
-    poses = [_pose(pose) if message.has_poses else None for pose in (message.query_pose, message.place_pose)]
-    return _plain(message, {'pairs': pairs, 'query_pose': poses[0], 'place_pose': poses[1]})
+    poses = {name: _pose(getattr(message, name)) for name in ('query_pose', 'place_pose')}
+    return _record(message) | (poses if message.has_poses else dict.fromkeys(poses))
+
+
+def _record(message: Any) -> dict[str, Any]:
+    """Return the fields of a message, its header as ``stamp`` and ``frame_id``."""
+    header = {'stamp': _plain(message.header.stamp), 'frame_id': message.header.frame_id}
+    names = [name for name in message.get_fields_and_field_types() if name != 'header']
+    return header | {name: _plain(getattr(message, name)) for name in names}
+
+
+def _plain(value: Any) -> Any:
+    """Return stamps as nanoseconds, other messages as lists of their fields, NaN as None."""
+    if hasattr(value, 'nanosec'):
+        return int(value.sec) * 10**9 + int(value.nanosec)
+    if hasattr(value, 'get_fields_and_field_types'):
+        return [_plain(getattr(value, name)) for name in value.get_fields_and_field_types()]
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _pose(pose: Any) -> list[float]:
+    position, orientation = _plain(pose)
+    return [*position, *orientation]
 
 
 def main(args: list[str] | None = None) -> int:
@@ -95,50 +89,58 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _run(given: list[str]) -> int:
-    parser = argparse.ArgumentParser(
-        prog='record',
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument('--output', required=True, metavar='FILE', help='the file to write (JSON lines)')
-    parser.add_argument(
-        '--loop-closures',
-        dest='what',
-        action='store_const',
-        const='loop closures',
-        default='matches',
-        help='loop closures (of operation loop_closure) instead of matches',
-    )
-    parser.add_argument('--topic', help=f'topic of either ({", or ".join(TOPICS.values())})')
-    parser.add_argument('--count', type=int, default=0, help='end after so many (0 = go on)')
     from stavpr_ros.ros.process import own_arguments
 
-    arguments = parser.parse_args(own_arguments(given))
+    arguments = _parser().parse_args(own_arguments(given))
     with open(arguments.output, 'w') as file:
-        written = _record(arguments, file, given)
-    print(f'{written} {arguments.what} written to {arguments.output}')
+        written = _write_messages(arguments, file, given)
+    print(f'{written} {arguments.kind} written to {arguments.output}')
     return 0
 
 
-def _record(arguments: argparse.Namespace, file: TextIO, ros_arguments: list[str]) -> int:
-    """Write what is heard until a signal or the count; return how many."""
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='record',
+        description=__doc__.partition(': ')[2],
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        '--output', required=True, metavar='FILE', help='the file to write (JSON lines)'
+    )
+    parser.add_argument(
+        '--loop-closures',
+        dest='kind',
+        action='store_const',
+        const=LOOP_CLOSURES,
+        default=MATCHES,
+        help='loop closures (of operation loop_closure) instead of matches',
+    )
+    parser.add_argument('--topic', help=f'their topic ({", or ".join(TOPICS.values())})')
+    parser.add_argument('--count', type=int, default=0, help='number of messages (0 = no limit)')
+    return parser
+
+
+def _write_messages(arguments: argparse.Namespace, file: TextIO, ros_arguments: list[str]) -> int:
+    """Write messages until a signal or the count; return their number."""
     import rclpy
     from rclpy.exceptions import InvalidTopicNameException
     from rclpy.qos import QoSProfile
 
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
-    from stavpr_ros.ros.discovery import Introduction
+    from stavpr_ros.ros.discovery import Discovery
     from stavpr_ros.ros.process import ros_node, spin_until
 
     written = 0
-    loops = arguments.what == 'loop closures'
-    kind, as_record = (LoopClosure, loop_closure_record) if loops else (PlaceMatch, match_record)
+    kinds: dict[str, Any] = {
+        MATCHES: (PlaceMatch, match_record),
+        LOOP_CLOSURES: (LoopClosure, loop_closure_record),
+    }
+    message_type, record_of = kinds[arguments.kind]
 
     def write(message: Any) -> None:
         nonlocal written
-        record = as_record(message) | {'received': time.time_ns()}
-        file.write(json.dumps(record) + '\n')
+        file.write(json.dumps(record_of(message) | {'received': time.time_ns()}) + '\n')
         file.flush()
         written += 1
 
@@ -148,14 +150,17 @@ def _record(arguments: argparse.Namespace, file: TextIO, ros_arguments: list[str
     try:
         with ros_node(lambda: rclpy.create_node('stavpr_record'), ros_arguments) as node:
             subscription = node.create_subscription(
-                kind, arguments.topic or TOPICS[arguments.what], write, QoSProfile(depth=1000)
+                message_type,
+                arguments.topic or TOPICS[arguments.kind],
+                write,
+                QoSProfile(depth=1000),
             )
             topic = subscription.topic_name
-            introduction = Introduction(node, lambda: node.get_publishers_info_by_topic(topic), timeout=10.0)
+            discovery = Discovery(node, lambda: node.get_publishers_info_by_topic(topic))
             print(f'waiting for a publisher of {topic}', flush=True)
             spin_until(node, lambda: subscription.get_publisher_count() > 0)
-            spin_until(node, lambda: introduction.done() or complete())
-            print(LISTENING.format(topic=topic), flush=True)
+            spin_until(node, lambda: discovery.done() or complete())
+            print(f'recording {topic}', flush=True)  # no message is missed from now on
             spin_until(node, complete)
     except InvalidTopicNameException as error:
         raise SettingsError(str(error)) from error

@@ -1,4 +1,4 @@
-"""``replay``: publish the images of a bag or folder, at a pace or as fast as the node answers."""
+"""``replay``: publish the images of a bag or folder, at a pace or each after the last result."""
 
 import argparse
 import math
@@ -12,33 +12,33 @@ from tqdm import tqdm
 
 from stavpr_ros.errors import ImageError, SettingsError, StavprError
 from stavpr_ros.ros.process import own_arguments, ros_node
-from stavpr_ros.ros.replay import NoAnswerError, NobodyListensError, Replayer, ReplaySettings
+from stavpr_ros.ros.replay import NoResultError, NoSubscriberError, Replayer, ReplaySettings
 from stavpr_ros.ros.transport import prepare_transport
 from stavpr_ros.signals import interrupted, obey_signals
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord
 
-DONE, BAD_INPUT, BAD_USAGE, NOBODY_LISTENS, NO_ANSWER, INTERRUPTED = 0, 1, 2, 3, 4, 130
+DONE, BAD_INPUT, BAD_USAGE, NO_SUBSCRIBER, NO_RESULT, INTERRUPTED = 0, 1, 2, 3, 4, 130
 FOLDER_RATE = 10.0
 
 EPILOG = """\
 examples:
-  ros2 run stavpr_ros replay drive.bag
+  ros2 run stavpr_ros replay traverse.bag
         a ROS 1 bag with one image topic, at its recorded pace, on the topic image
-  ros2 run stavpr_ros replay drive --topic /camera/image_raw --rate 2
+  ros2 run stavpr_ros replay traverse --topic /camera/image_raw --rate 2
         a ROS 2 bag, twice as fast
-  ros2 run stavpr_ros replay drive.mcap --lossless
-        as fast as the node answers on /stavpr/match; nothing is dropped
+  ros2 run stavpr_ros replay traverse.mcap --lossless
+        each image after the result of the last one on /stavpr/match; nothing is dropped
   ros2 run stavpr_ros replay photos --rate 5 --ros-args -r image:=/camera/image
         a folder of images, 5 per second, on another topic
 
 exit codes:
   0    all images were published, and arrived where that can be known
-  1    the bag or folder cannot be read, or not one of its images
+  1    the bag or folder cannot be read, or none of its images
   2    wrong usage
-  3    nobody listened within --wait seconds
-  4    an image was not answered (--lossless) or not acknowledged
+  3    no subscriber within --wait seconds
+  4    no result for an image (--lossless), or no acknowledgment
   130  interrupted
 """
 
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     Run the command.
 
-    :param arguments: without the program's name; the process's own if not given.
+    :param arguments: without the program's name; the process's own if None.
     :returns: exit code, see ``--help``.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
@@ -57,22 +57,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('replay: interrupted', file=sys.stderr)
         return INTERRUPTED
-    except (InvalidTopicNameException, SettingsError) as error:
-        print(f'replay: error: {error}', file=sys.stderr)
-        return BAD_USAGE
-    except StavprError as error:
+    except (InvalidTopicNameException, StavprError) as error:
         print(f'replay: error: {error}', file=sys.stderr)
         return _exit_code(error)
-    except Exception:  # an interrupt in the middle of a foreign library comes out as another exception
+    except Exception:  # an interrupt within a foreign library comes out as another exception
         if interrupted():
             return INTERRUPTED
         raise
 
 
-def _exit_code(error: StavprError) -> int:
-    if isinstance(error, NobodyListensError):
-        return NOBODY_LISTENS
-    return NO_ANSWER if isinstance(error, NoAnswerError) else BAD_INPUT
+def _exit_code(error: Exception) -> int:
+    if isinstance(error, InvalidTopicNameException | SettingsError):
+        return BAD_USAGE
+    if isinstance(error, NoSubscriberError):
+        return NO_SUBSCRIBER
+    return NO_RESULT if isinstance(error, NoResultError) else BAD_INPUT
 
 
 def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
@@ -92,46 +91,47 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
     else:
         records, rate = source.records(), options.rate or 1.0
     settings = ReplaySettings(
-        options.publish_to, options.match_topic, rate, options.lossless, options.timeout, options.wait
+        options.publish_to,
+        options.match_topic,
+        rate,
+        options.lossless,
+        options.timeout,
+        options.wait,
     )
-    # no bar where there is no terminal
+    # no bar without a terminal
     with tqdm(total=len(source), unit='image', desc='replay', disable=None) as bar:
-        report = _play(records, settings, ros_arguments, notify, bar.update)
+        report = _replay(records, settings, ros_arguments, notify, bar.update)
     print(f'{report}, {len(skipped)} skipped')
     return BAD_INPUT if len(skipped) == len(source) else DONE
 
 
-def _play(
+def _replay(
     records: Iterator[ImageRecord],
     settings: ReplaySettings,
     ros_arguments: list[str],
     notify: Callable[[str], None],
     count: Callable[[], object],
 ) -> str:
-    """Replay over ROS and say in words what was done."""
+    """Replay over ROS; return a summary."""
     prepare_transport()
     with ros_node(lambda: rclpy.create_node('stavpr_replay'), ros_arguments) as node:
         replayer = Replayer(node, settings, notify)
         try:
-            return _feed(replayer, records, count)
+            replayer.wait_for_subscribers()
+            began = time.monotonic()
+            for record in records:
+                replayer.send(record)
+                count()
+            seconds = time.monotonic() - began
+            replayer.finish()
         finally:
             replayer.close()
-
-
-def _feed(replayer: Replayer, records: Iterator[ImageRecord], count: Callable[[], object]) -> str:
-    replayer.wait_for_listeners()
-    began = time.monotonic()
-    for record in records:
-        replayer.send(record)
-        count()
-    seconds = time.monotonic() - began
-    replayer.finish()
-    answers = ''
-    if replayer.settings.lossless:
-        answers = f', {replayer.resent} sent again, {replayer.dropped} dropped'
+    results = ''
+    if settings.lossless:
+        results = f', {replayer.resent} sent again, {replayer.dropped} dropped'
     return (
-        f'{replayer.published} images published on {replayer.publisher.topic_name} in {seconds:.1f} s '
-        f'({replayer.published / max(seconds, 1e-9):.1f} per second){answers}'
+        f'{replayer.published} images published on {replayer.publisher.topic_name} '
+        f'in {seconds:.1f} s ({replayer.published / max(seconds, 1e-9):.1f} per second){results}'
     )
 
 
@@ -147,35 +147,35 @@ def _parser() -> argparse.ArgumentParser:
         metavar='BAG',
         help='a ROS 2 bag (folder, .db3 or .mcap file), a ROS 1 .bag, or a folder of images',
     )
-    parser.add_argument('--topic', help='image topic in the bag; needed if there are several')
+    parser.add_argument('--topic', help='image topic in the bag; needed if it has several')
     parser.add_argument(
-        '--publish-to', default='image', metavar='TOPIC', help='where to publish (%(default)s)'
+        '--publish-to', default='image', metavar='TOPIC', help='topic of the images (%(default)s)'
     )
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument(
         '--rate',
         type=_positive,
         metavar='R',
-        help=f'factor on the recorded pace (1), or images per second of a folder ({FOLDER_RATE:g})',
+        help=f'factor on the recorded pace (1); for a folder images per second ({FOLDER_RATE:g})',
     )
     pace.add_argument(
-        '--lossless', action='store_true', help='send the next image when the node has answered the last one'
+        '--lossless', action='store_true', help='send each image after the result of the last one'
     )
     parser.add_argument(
         '--match-topic',
         default='stavpr/match',
         metavar='TOPIC',
-        help='where the node answers, one message per image, for --lossless (%(default)s)',
+        help='topic of the results, one message per image, for --lossless (%(default)s)',
     )
     parser.add_argument(
         '--timeout',
         type=_positive,
         default=20.0,
         metavar='S',
-        help='seconds to wait for an answer before an image is sent again; 3 tries (%(default)g)',
+        help='seconds without a result until an image is sent again; 3 tries (%(default)g)',
     )
     parser.add_argument(
-        '--wait', type=_positive, metavar='S', help='seconds to wait for a listener (for ever)'
+        '--wait', type=_positive, metavar='S', help='seconds to wait for a subscriber'
     )
     return parser
 

@@ -1,7 +1,15 @@
 """Processing of one image, without ROS: localization, mapping, loop closure."""
 
 from stavpr_ros.pipeline.pipeline import Pipeline
-from stavpr_ros.pipeline.settings import OPERATIONS, PipelineSettings
-from stavpr_ros.pipeline.start import read_map
+from stavpr_ros.pipeline.settings import OPERATIONS, NodeSettings, PipelineSettings, node_settings
+from stavpr_ros.pipeline.start import LoadedMap, read_map
 
-__all__ = ['OPERATIONS', 'Pipeline', 'PipelineSettings', 'read_map']
+__all__ = [
+    'OPERATIONS',
+    'LoadedMap',
+    'NodeSettings',
+    'Pipeline',
+    'PipelineSettings',
+    'node_settings',
+    'read_map',
+]

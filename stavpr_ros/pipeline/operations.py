@@ -1,227 +1,100 @@
-"""The three operations: what becomes of an image once it is described."""
+"""The three operations: each updates its places, its recognizer, or both with one image."""
 
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import GrowingMap, PlaceMap, encode_thumbnail
-from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.recognition import Match, PlaceRecognizer, Status
-from stavpr_ros.recognition.match import Candidate
+from stavpr_ros.recognition.loop_closer import LoopCloser
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
+class Observation:
     """
-    One described image and what is known of it.
+    One image and its features.
 
-    :param features: those of one image.
-    :param image: RGB.
+    :param features: of one image.
+    :param image: RGB, uint8, shape (h, w, 3).
     :param stamp: ns, 0 = unknown.
     :param pose: shape (7,), or None.
-    :param thumbnail_width: pixels of the picture to be kept, 0 = none.
     """
 
     features: LocalFeatures
     image: np.ndarray
     stamp: int
     pose: np.ndarray | None
-    thumbnail_width: int
-
-    def thumbnail(self) -> bytes:
-        """Return the picture to be kept, as JPEG; empty = none."""
-        return encode_thumbnail(self.image, self.thumbnail_width) if self.thumbnail_width else b''
 
 
-class Operation(Protocol):
-    """What is done with described images."""
-
-    name: str
-    extractor: FeatureExtractor
-
-    @property
-    def places(self) -> PlaceMap | GrowingMap:
-        """What indices in answers mean."""
-
-    @property
-    def full(self) -> bool:
-        """No further place can be taken in."""
-
-    @property
-    def window_fill(self) -> int:
-        """Images in the window."""
-
-    @property
-    def newest_place(self) -> int:
-        """The place that the newest image has become, -1 = it has not."""
-
-    def update(self, observed: Observed) -> Match:
-        """Take in an image."""
-
-    def ranked(self, count: int) -> list[Candidate]:
-        """Return the nearest places of the window answered last."""
-
-    def set_threshold(self, threshold: float) -> None:
-        """Change the threshold."""
-
-    def reset(self) -> None:
-        """Empty the window."""
-
-    def map(self) -> PlaceMap:
-        """Return the places as a map of its own."""
-
-
+@dataclass(eq=False)
 class Localization:
-    """
-    Recognizes places of a fixed map.
+    """Recognizes places of a fixed map."""
 
-    :param place_map: the map.
-    :param extractor: that of the map.
-    """
+    name: ClassVar[str] = 'localization'
+    extractor: FeatureExtractor
+    places: PlaceMap
+    recognizer: PlaceRecognizer
 
-    name = 'localization'
-    full = False
-    newest_place = -1
-
-    def __init__(
-        self, place_map: PlaceMap, extractor: FeatureExtractor, settings: PipelineSettings, threshold: float
-    ) -> None:
-        self.extractor = extractor
-        self._map = place_map
-        self._recognizer = PlaceRecognizer(
-            place_map, settings.recognition(threshold), settings.backend, settings.precision
-        )
-
-    @property
-    def places(self) -> PlaceMap:
-        """The map."""
-        return self._map
-
-    @property
-    def window_fill(self) -> int:
-        """Images in the window."""
-        return self._recognizer.window_fill
-
-    def update(self, observed: Observed) -> Match:
-        """Recognize the window that ends with an image."""
-        return self._recognizer.update(observed.features)
-
-    def ranked(self, count: int) -> list[Candidate]:
-        """Return the nearest places of the window answered last."""
-        return self._recognizer.ranked(count)
-
-    def set_threshold(self, threshold: float) -> None:
-        """Change the threshold."""
-        self._recognizer.set_threshold(threshold)
-
-    def reset(self) -> None:
-        """Empty the window."""
-        self._recognizer.reset()
-
-    def map(self) -> PlaceMap:
-        """Return the map."""
-        return self._map
+    def update(self, observation: Observation) -> Match:
+        """Match the window that ends with an image."""
+        return self.recognizer.update(observation.features)
 
 
+@dataclass(eq=False)
 class Mapping:
     """
-    Makes every image a place of a growing map.
+    Adds every image to a growing map as a place.
 
-    :param growing: the map, empty or not.
-    :param extractor: that of the map.
+    :param thumbnail_width: pixels, 0 = no thumbnails.
     """
 
-    name = 'mapping'
-    window_fill = 0
+    name: ClassVar[str] = 'mapping'
+    extractor: FeatureExtractor
+    places: GrowingMap
+    thumbnail_width: int
+    recognizer: None = None
 
-    def __init__(self, growing: GrowingMap, extractor: FeatureExtractor) -> None:
-        self.extractor, self._growing = extractor, growing
-        self.newest_place = -1
-
-    @property
-    def places(self) -> GrowingMap:
-        """The map so far."""
-        return self._growing
-
-    @property
-    def full(self) -> bool:
-        """No further place can be taken in."""
-        return self._growing.full
-
-    def update(self, observed: Observed) -> Match:
-        """Make an image a place."""
-        self.newest_place = self._growing.add(
-            observed.features, observed.stamp, pose=observed.pose, thumbnail=observed.thumbnail()
-        )
-        return Match(Status.MAPPED)
-
-    def ranked(self, count: int) -> list[Candidate]:
-        """Return nothing: nothing is recognized."""
-        return []
-
-    def set_threshold(self, threshold: float) -> None:
-        """Do nothing: nothing is recognized."""
-
-    def reset(self) -> None:
-        """Do nothing: there is no window, and the places stay."""
-
-    def map(self) -> PlaceMap:
-        """Return a map of the places so far."""
-        return self._growing.snapshot()
+    def update(self, observation: Observation) -> Match:
+        """Add an image as a place."""
+        thumbnail = make_thumbnail(observation.image, self.thumbnail_width)
+        return Match(Status.MAPPED, image_index=_add(self.places, observation, thumbnail))
 
 
-class LoopClosure:
+@dataclass(eq=False)
+class LoopClosing:
     """
-    Recognizes places that the same route has passed before; its oldest ones are forgotten when it is full.
+    Recognizes places that the route has passed before; a full route evicts its oldest places.
 
-    :param extractor: makes the features of the route.
+    :param places: the route, with the places of the recognizer.
+    :param thumbnail_width: pixels, 0 = no thumbnails.
     """
 
-    name = 'loop_closure'
-    full = False
+    name: ClassVar[str] = 'loop_closure'
+    extractor: FeatureExtractor
+    places: GrowingMap
+    recognizer: LoopCloser
+    thumbnail_width: int
 
-    def __init__(self, extractor: FeatureExtractor, settings: PipelineSettings, threshold: float) -> None:
-        self.extractor = extractor
-        self._closer = settings.loop_closer(extractor, threshold)
-        self._route = GrowingMap(extractor.settings, extractor.projection, settings.max_places)
+    def update(self, observation: Observation) -> Match:
+        """Add an image as a place, and match the window that ends with it."""
+        # first, since it may fail: recognizer and route stay in step
+        thumbnail = make_thumbnail(observation.image, self.thumbnail_width)
+        match = self.recognizer.update(observation.features, observation.stamp)
+        self.places.forget(self.recognizer.first - self.places.first)
+        return replace(match, image_index=_add(self.places, observation, thumbnail))
 
-    @property
-    def places(self) -> GrowingMap:
-        """The route so far."""
-        return self._route
 
-    @property
-    def window_fill(self) -> int:
-        """Images in the window."""
-        return self._closer.window_fill
+Operation = Localization | Mapping | LoopClosing
 
-    @property
-    def newest_place(self) -> int:
-        """The place that the newest image has become."""
-        return self._route.first + len(self._route) - 1
 
-    def update(self, observed: Observed) -> Match:
-        """Make an image a place, and recognize the window that ends with it."""
-        thumbnail = observed.thumbnail()  # first, since it may fail: closer and route stay in step
-        match = self._closer.update(observed.features, observed.stamp)
-        self._route.forget(self._closer.first - self._route.first)
-        self._route.add(observed.features, observed.stamp, pose=observed.pose, thumbnail=thumbnail)
-        return match
+def make_thumbnail(image: np.ndarray, width: int) -> bytes:
+    """Return a thumbnail as JPEG; empty for width 0."""
+    return encode_thumbnail(image, width) if width else b''
 
-    def ranked(self, count: int) -> list[Candidate]:
-        """Return the nearest places of the window answered last."""
-        return self._closer.ranked(count)
 
-    def set_threshold(self, threshold: float) -> None:
-        """Change the threshold."""
-        self._closer.set_threshold(threshold)
-
-    def reset(self) -> None:
-        """Empty the window; the route stays."""
-        self._closer.reset()
-
-    def map(self) -> PlaceMap:
-        """Return a map of the route so far."""
-        return self._route.snapshot()
+def _add(places: GrowingMap, observation: Observation, thumbnail: bytes) -> int:
+    return places.add(
+        observation.features, observation.stamp, pose=observation.pose, thumbnail=thumbnail
+    )

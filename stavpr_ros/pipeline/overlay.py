@@ -1,15 +1,17 @@
-"""One image that shows a query beside the place that it was matched with, fast enough for every frame."""
+"""Draws a query beside the place that it was matched with, fast enough for every frame."""
 
 import cv2
 import numpy as np
 
 from stavpr_ros.errors import InputError
 
-RIGHT, WRONG, NO_MATCH = (46, 125, 80), (190, 58, 48), (200, 150, 40)  # RGB
+RIGHT, NO_MATCH = (46, 125, 80), (200, 150, 40)  # RGB
 _INK, _PAPER, _EMPTY = (32, 34, 38), (250, 250, 248), (226, 226, 222)
 
 
-def match_image(query: np.ndarray, place: np.ndarray | None, text: str, accepted: bool) -> np.ndarray:
+def match_image(
+    query: np.ndarray, place: np.ndarray | None, text: str, accepted: bool
+) -> np.ndarray:
     """
     Put a query and the place it was matched with side by side, with a line of text below.
 
@@ -20,7 +22,9 @@ def match_image(query: np.ndarray, place: np.ndarray | None, text: str, accepted
     :returns: RGB, shape (h + bar, 2 w + gap, 3), uint8.
     """
     for name, image in (('query', query), ('place', place)):
-        if image is not None and (image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8):
+        if image is not None and (
+            image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8
+        ):
             raise InputError(
                 f'{name} has shape {image.shape} and type {image.dtype}; expected (h, w, 3) uint8'
             )
@@ -35,7 +39,9 @@ def match_image(query: np.ndarray, place: np.ndarray | None, text: str, accepted
         if place.shape[:2] != (height, width):
             shrinks = place.shape[0] > height
             place = cv2.resize(
-                place, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+                place,
+                (width, height),
+                interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR,
             )
         sheet[:height, width + gap :] = place
     strip = sheet[height:]
@@ -45,7 +51,7 @@ def match_image(query: np.ndarray, place: np.ndarray | None, text: str, accepted
 
 
 def _write(area: np.ndarray, text: str, size: float, centered: bool = False) -> None:
-    """Write a line into a part of an image, in letters of about `size` pixels or as small as fits."""
+    """Write a line into a part of an image, in letters of `size` pixels or smaller."""
     height, width = area.shape[:2]
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, size / 22
     across, up = cv2.getTextSize(text, font, scale, 1)[0]

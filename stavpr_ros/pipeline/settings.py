@@ -1,14 +1,18 @@
-"""Settings of the pipeline."""
+"""Settings of the pipeline and of the node, built from the values of the parameters."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
+from stavpr_ros.devices import choose_backend, why_no_cuda
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import KINDS, settings_from_json
 from stavpr_ros.mapping.keyframes import KeyframeSettings
+from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.recognition import RecognizerSettings
-from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.recognition.loop_closer import least_limit
 from stavpr_ros.recognition.robust.options import LOOP_THRESHOLD, THRESHOLD, options_of
 from stavpr_ros.recognition.verification import GeometricSettings
 
@@ -18,20 +22,18 @@ OPERATIONS = ('localization', 'mapping', 'loop_closure')
 @dataclass(frozen=True)
 class PipelineSettings:
     """
-    How images are turned into answers; the fields are the node's parameters of these names.
+    Settings of the pipeline.
 
-    :param threshold: a window is matched when its distance is below it; None = the mode's default, which
-        mode paper does not have.
-    :param features: kind of the features of a route that is begun without a map.
+    Fields that are not explained here are parameters, see :mod:`stavpr_ros.parameters`.
+
+    :param threshold: a window is matched when its distance is below it; None = the default of the
+        mode, mode paper has none.
+    :param backend: ``auto``, ``cpu`` or ``cuda``.
+    :param features: kind of the features of a route that starts without a map.
     :param feature_settings: settings of that kind as a JSON object, '' = its defaults.
-    :param exclude_places: the latest places that are not compared in operation loop_closure.
-    :param exclude_seconds: nor are places younger than this.
-    :param max_places: most places of a growing map. When it is full, mapping stops, and loop closure forgets
-        the oldest eighth of its route.
-    :param thumbnail_width: pixels of the pictures that growing maps keep, 0 = none.
-    :param candidates: nearest places that are told for every window.
-    :param geometric: the geometric check of matches, None = none.
-    :raises SettingsError: a value that cannot be meant, or values that do not go together.
+    :param candidates: nearest places that every match lists.
+    :param geometric: the geometric check of matches, None = off.
+    :raises SettingsError: a value out of range, or values that exclude each other.
     """
 
     threshold: float | None = None
@@ -39,7 +41,7 @@ class PipelineSettings:
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
     nms_radius: int = 20
     mode: str = 'robust'
-    backend: str = 'cpu'
+    backend: str = 'auto'
     precision: str = 'float32'
     model_path: str = ''
     features: str = 'gradient'
@@ -54,12 +56,16 @@ class PipelineSettings:
 
     def __post_init__(self) -> None:
         if self.threshold == 0:
-            raise SettingsError('threshold = 0 would match nothing: set it above 0, or negative = not set')
+            raise SettingsError(
+                'threshold = 0 would match nothing: set it above 0, or negative = not set'
+            )
         if self.features not in KINDS:
-            raise SettingsError(f'features {self.features!r} are unknown: take one of {", ".join(KINDS)}')
+            raise SettingsError(
+                f'features {self.features!r} are unknown: take one of {", ".join(KINDS)}'
+            )
         if self.feature_settings:
             settings_from_json(self.features, self.feature_settings)
-        self.recognition(self.threshold or THRESHOLD)
+        self.recognition('localization')
 
     def applied_threshold(self, operation: str) -> float | None:
         """Return the threshold in force; distances of mode robust mean the same on every route."""
@@ -69,31 +75,152 @@ class PipelineSettings:
             return None
         return LOOP_THRESHOLD if operation == 'loop_closure' else THRESHOLD
 
-    def recognition(self, threshold: float) -> RecognizerSettings:
-        """Return the recognizer's part."""
-        return RecognizerSettings(threshold, self.spatial, self.sequence, self.nms_radius, self.mode)
+    def recognition(self, operation: str) -> RecognizerSettings:
+        """Return settings of the recognizer; without a threshold, with one that is not applied."""
+        threshold = self.applied_threshold(operation) or THRESHOLD
+        return RecognizerSettings(
+            threshold, self.spatial, self.sequence, self.nms_radius, self.mode
+        )
+
+    def require_operation(self, operation: str) -> None:
+        """
+        Refuse an operation that these settings exclude.
+
+        :raises SettingsError: names the settings.
+        """
+        if operation not in OPERATIONS:
+            raise SettingsError(
+                f'operation {operation!r} is unknown: take one of {", ".join(OPERATIONS)}'
+            )
+        if self.geometric is not None and operation != 'localization' and not self.thumbnail_width:
+            raise SettingsError(
+                f'geometric_check = {self.geometric.method} with thumbnail_width = 0 and '
+                f'operation {operation}: the check compares images with thumbnails'
+            )
+        if operation == 'loop_closure':
+            self._require_loop_closure()
+
+    def _require_loop_closure(self) -> None:
+        spatial = self.spatial
+        if spatial.vertical or spatial.strategy not in ('adaptive', 'vanilla'):
+            raise SettingsError(
+                f'operation loop_closure with strategy {spatial.strategy}, vertical '
+                f'{spatial.vertical}: take strategy adaptive or vanilla, without vertical '
+                'alignment'
+            )
+        if self.backend == 'cuda' or self.precision != 'float32':
+            raise SettingsError(
+                f'operation loop_closure with backend {self.backend}, precision '
+                f'{self.precision}: loop closure matches on the CPU in float32; take backend '
+                'auto or cpu, and precision float32'
+            )
+        least = least_limit(self.exclude_places, self.sequence.length)
+        if self.max_places < least:
+            raise SettingsError(
+                f'max_places = {self.max_places} leaves too few beyond exclude_places = '
+                f'{self.exclude_places}: take at least {least}'
+            )
+
+    def matching_backend(self, operation: str) -> str:
+        """
+        Return the backend of the image distances, ``cpu`` or ``cuda``.
+
+        :raises UnavailableError: ``cuda`` is set and not available.
+        """
+        return 'cpu' if operation == 'loop_closure' else choose_backend(self.backend)
+
+    def backend_summary(self, operation: str) -> str:
+        """Return one line for the log: the device of each stage, and why."""
+        why = f' ({why_no_cuda() or "CUDA is available"})' if self.backend == 'auto' else ''
+        stages = f'backend {self.backend}{why}: extraction on {choose_backend(self.backend)}'
+        if operation == 'mapping':
+            return stages
+        matching = self.matching_backend(operation)
+        # mode robust matches sequences on the CPU only
+        sequences = 'cpu' if options_of(self.mode).any else matching
+        return (
+            f'{stages}, image distances on {matching} ({self.precision}), sequences on {sequences}'
+        )
 
     def extractor(self) -> FeatureExtractor:
         """
-        Make the extractor of a route that is begun without a map.
+        Make the extractor of a route that starts without a map.
 
-        :raises StavprError: the features' settings do not do, a model's file is not there.
+        :raises StavprError: invalid settings of the features, or a missing model file.
         """
         backbone = None
         if self.feature_settings or self.model_path:
-            backbone = settings_from_json(self.features, self.feature_settings or '{}', self.model_path)
-        return FeatureExtractor(self.features, backbone, device=self.backend)
+            backbone = settings_from_json(
+                self.features, self.feature_settings or '{}', self.model_path
+            )
+        return FeatureExtractor(self.features, backbone, device=choose_backend(self.backend))
 
-    def loop_closer(self, extractor: FeatureExtractor, threshold: float) -> LoopCloser:
-        """
-        Make what closes loops, with an empty route.
 
-        :raises SettingsError: settings that it does not have.
-        """
-        return LoopCloser(
-            self.recognition(threshold),
-            self.exclude_places,
-            extractor.settings,
-            limit=self.max_places,
-            exclude_seconds=self.exclude_seconds,
-        )
+@dataclass(frozen=True, kw_only=True)
+class NodeSettings:
+    """
+    Settings of the node, parameters of these names.
+
+    :param pipeline: settings of the pipeline.
+    :raises SettingsError: the operation and the settings of the pipeline exclude each other.
+    """
+
+    operation: str
+    map_path: str
+    autostart: bool
+    image_transport: str
+    queue_size: int
+    max_rate: float
+    max_stamp_gap: float
+    odometry_timeout: float
+    save_path: str
+    map_frame: str
+    diagnostics_period: float
+    verbosity: str
+    threads: int
+    pipeline: PipelineSettings
+
+    def __post_init__(self) -> None:
+        self.pipeline.require_operation(self.operation)
+
+    @property
+    def needs_odometry(self) -> bool:
+        """Whether poses are used, for keyframes or for the places of a growing map."""
+        return self.pipeline.keyframes.needs_poses or self.operation != 'localization'
+
+
+def node_settings(values: Mapping[str, Any]) -> NodeSettings:
+    """
+    Build the settings from the values of all parameters.
+
+    :param values: name to value.
+    :raises SettingsError: a value out of range, or values that exclude each other.
+    :raises UnavailableError: the backend is not available.
+    """
+    for name, value in values.items():
+        choices = BY_NAME[name].choices
+        if choices and value not in choices:
+            raise SettingsError(f'{name} = {value!r} is unknown: take one of {", ".join(choices)}')
+    values = {**values, 'threshold': None if values['threshold'] < 0 else values['threshold']}
+    method = values['geometric_check']
+    pipeline = PipelineSettings(
+        spatial=SpatialSettings(
+            values['strategy'], values['sigma'], values['xi'] or None, values['vertical']
+        ),
+        sequence=SequenceSettings(values['sequence_length'], values['beta']),
+        keyframes=KeyframeSettings(
+            values['keyframe_interval'],
+            values['keyframe_distance'],
+            values['keyframe_angle'],
+            values['keyframe_change'],
+        ),
+        geometric=None if method == 'none' else GeometricSettings(method, values['min_inliers']),
+        **_of_same_name(PipelineSettings, values),
+    )
+    choose_backend(pipeline.backend)
+    return NodeSettings(pipeline=pipeline, **_of_same_name(NodeSettings, values))
+
+
+def _of_same_name(settings: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of parameters that are fields of the same name."""
+    return {name: value for name, value in values.items() if name in settings.__annotations__}

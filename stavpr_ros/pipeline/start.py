@@ -1,21 +1,23 @@
-"""How an operation begins: everything that may fail, and takes long, before anything is changed."""
+"""Start of an operation: all that may fail or takes long, before the pipeline is changed."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.devices import choose_backend
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap, load_map
-from stavpr_ros.pipeline.operations import Localization, LoopClosure, Mapping, Observed, Operation
-from stavpr_ros.pipeline.settings import OPERATIONS, PipelineSettings
+from stavpr_ros.pipeline.operations import Localization, LoopClosing, Mapping, Operation
+from stavpr_ros.pipeline.settings import PipelineSettings
+from stavpr_ros.recognition import PlaceRecognizer
+from stavpr_ros.recognition.loop_closer import LoopCloser
 
 BLANK = np.zeros((480, 640, 3), np.uint8)
 
 
 @dataclass(frozen=True)
 class LoadedMap:
-    """A map that was read, and what describes images as its were."""
+    """A map, its file, and the extractor of its features."""
 
     path: str
     places: PlaceMap
@@ -26,54 +28,78 @@ def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
     """
     Read a map, on any thread.
 
-    :raises StavprError: the file or the model does not do.
+    :raises StavprError: an invalid file, or a missing model.
     """
     place_map = load_map(path)
-    return LoadedMap(path, place_map, place_map.extractor(settings.backend, settings.model_path))
+    extractor = place_map.extractor(choose_backend(settings.backend), settings.model_path)
+    return LoadedMap(path, place_map, extractor)
 
 
-def begin(
-    name: str, settings: PipelineSettings, place_map: PlaceMap | None, extractor: FeatureExtractor | None
+def start_operation(
+    name: str,
+    settings: PipelineSettings,
+    place_map: PlaceMap | None,
+    extractor: FeatureExtractor | None,
 ) -> Operation | None:
     """
-    Begin an operation; None where it lacks a map or a threshold.
+    Start an operation; None for localization without a map.
 
-    :param place_map: recognized on, or gone on with; loop closure begins a route of its own.
-    :param extractor: that of the map; None without one, growing maps then take that of the settings.
-    :raises StavprError: no such operation, settings that do not do, or a model that is not there.
+    :param place_map: the map to localize on, or to extend; loop closure starts a route of its own.
+    :param extractor: of the map; None = of the settings, for growing maps.
+    :raises StavprError: an unknown operation, invalid settings, or a missing model.
     """
-    if name not in OPERATIONS:
-        raise SettingsError(f'operation {name!r} is unknown: take one of {", ".join(OPERATIONS)}')
-    threshold = settings.applied_threshold(name)
+    settings.require_operation(name)
     if name == 'localization':
-        if place_map is None or extractor is None or threshold is None:
+        if place_map is None or extractor is None:
             return None
-        return _warmed(Localization(place_map, extractor, settings, threshold), settings)
+        recognizer = PlaceRecognizer(
+            place_map,
+            settings.recognition(name),
+            settings.matching_backend(name),
+            settings.precision,
+        )
+        _warm_up(recognizer, extractor, settings.sequence.length)
+        return Localization(extractor, place_map, recognizer)
     extractor = extractor or settings.extractor()
     if name == 'mapping':
-        return _mapping(settings, place_map, extractor)
-    if threshold is None:
-        return None
-    loops = LoopClosure(extractor, settings, threshold)
-    # with next to nothing excluded, so that few images do
-    _warmed(LoopClosure(extractor, replace(settings, exclude_places=1), threshold), settings, more=8)
-    return loops
+        extractor.extract([BLANK])
+        return Mapping(
+            extractor, _growing(settings, place_map, extractor), settings.thumbnail_width
+        )
+    closer = _loop_closer(settings, settings.exclude_places, extractor)
+    # a closer that excludes next to nothing needs few images to warm up
+    _warm_up(_loop_closer(settings, 1, extractor), extractor, settings.sequence.length + 8)
+    return LoopClosing(
+        extractor, _growing(settings, None, extractor), closer, settings.thumbnail_width
+    )
 
 
-def _mapping(settings: PipelineSettings, place_map: PlaceMap | None, extractor: FeatureExtractor) -> Operation:
+def _growing(
+    settings: PipelineSettings, place_map: PlaceMap | None, extractor: FeatureExtractor
+) -> GrowingMap:
     if place_map is not None:
-        growing = GrowingMap.from_map(place_map, settings.max_places)
-    else:
-        growing = GrowingMap(extractor.settings, extractor.projection, settings.max_places)
-    extractor.extract([BLANK])
-    return Mapping(growing, extractor)
+        return GrowingMap.from_map(place_map, settings.max_places)
+    return GrowingMap(extractor.settings, extractor.projection, settings.max_places)
 
 
-def _warmed(operation: Operation, settings: PipelineSettings, more: int = 0) -> Operation:
-    """Compile and touch everything once, so that the first image is as fast as the rest."""
-    features = operation.extractor.extract([BLANK])
-    for _ in range(settings.sequence.length + more):
-        operation.update(Observed(features, BLANK, 0, None, 0))
-    operation.ranked(2)
-    operation.reset()
-    return operation
+def _loop_closer(
+    settings: PipelineSettings, exclude: int, extractor: FeatureExtractor
+) -> LoopCloser:
+    return LoopCloser(
+        settings.recognition('loop_closure'),
+        exclude,
+        extractor.settings,
+        limit=settings.max_places,
+        exclude_seconds=settings.exclude_seconds,
+    )
+
+
+def _warm_up(
+    recognizer: PlaceRecognizer | LoopCloser, extractor: FeatureExtractor, images: int
+) -> None:
+    """Compile and allocate everything, so that the first image is as fast as the others."""
+    features = extractor.extract([BLANK])
+    for _ in range(images):
+        recognizer.update(features)
+    recognizer.ranked(2)
+    recognizer.reset()

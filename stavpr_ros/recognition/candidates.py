@@ -1,4 +1,4 @@
-"""The nearest places of a window, one a nms_radius: what a geometric check may choose from."""
+"""Candidates of a window: the nearest places after non-maximum suppression."""
 
 import math
 
@@ -7,7 +7,7 @@ import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.errors import InputError
 from stavpr_ros.recognition.match import Candidate
-from stavpr_ros.recognition.robust.options import evidence, relative_distance
+from stavpr_ros.recognition.robust.hysteresis import evidence, score
 
 
 def ranked_candidates(
@@ -20,15 +20,15 @@ def ranked_candidates(
     """
     Rank places by non-maximum suppression: around a place that is taken no other one is.
 
-    The first is the nearest sequence as it was answered, the second its second best. O(count x n).
+    The first is the nearest sequence, the second its second best. O(count x n).
 
-    :param nearest: the nearest sequence as it was answered; None if there is none.
+    :param nearest: the nearest sequence as it was matched; None if there is none.
     :param sequences: costs of all sequences, shape (n,), +inf where there is none, and their places, shape
         (n,), whole numbers, in any order; of equal costs the first is taken.
     :param count: most candidates, at least 0.
     :param nms_radius: candidates are more than so many places from each other.
-    :param relative: the answer's distance is relative to chance; the others' are so by their evidence
-        against the nearest.
+    :param relative: the distance of the nearest is a score of mode robust; those of the others are then scores
+        of their evidence against the nearest.
     :raises InputError: count below 0.
     """
     if count < 0:
@@ -44,12 +44,14 @@ def ranked_candidates(
         cost = float(costs[at])
         if math.isinf(cost):
             break
-        distance = relative_distance(evidence(cost, best)) if relative else cost
+        distance = score(evidence(cost, best)) if relative else cost
         found.append(Candidate(int(places[at]), distance))
     return found
 
 
-def nearest_places(distances: np.ndarray, places: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def distinct_places(
+    distances: np.ndarray, places: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the nearest distinct places, nearest first (the lowest index on a tie).
 

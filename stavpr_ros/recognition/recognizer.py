@@ -1,8 +1,7 @@
-"""Frame by frame: the distances of the newest image, the window's best sequence, the status."""
+"""Frame by frame: the distances of the newest image, the nearest sequence of the window, the status."""
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -11,23 +10,24 @@ from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.features import LocalFeatures
+from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition.candidates import nearest_places, ranked_candidates
+from stavpr_ros.recognition.candidates import distinct_places, ranked_candidates
 from stavpr_ros.recognition.match import Candidate, Match, Status
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust.centering import MeanCentering
-from stavpr_ros.recognition.robust.options import (
-    RobustOptions,
-    Track,
+from stavpr_ros.recognition.robust.hysteresis import (
+    Hysteresis,
     evidence,
     expected_second_best,
-    options_of,
-    relative_distance,
+    score,
 )
-from stavpr_ros.recognition.robust.window import CalibratedWindow
+from stavpr_ros.recognition.robust.options import RobustOptions, options_of
+from stavpr_ros.recognition.robust.znorm import ZNormalization
+from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
+from stavpr_ros.recognition.sequence_search import LmDtwSearch, Search, VelocitySearch, WindowMatch
 
-PLACES_TO_START_FROM = 100  # whose distances to the map start the calibration
+PLACES_TO_START_FROM = 100  # places whose distances to the map start the z-normalization
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,9 @@ class RecognizerSettings:
     :param spatial: how two images are compared.
     :param sequence: how a window is matched.
     :param nms_radius: the second best's midpoint is more than so many places from the nearest one's.
-    :param mode: ``paper``, or ``robust``, with all robust_options of :class:`stavpr_ros.recognition.robust.options.RobustOptions`.
-    :param robust_options: another choice of robust_options than the mode's.
+    :param mode: ``paper``, or ``robust``, with all options of
+        :class:`stavpr_ros.recognition.robust.options.RobustOptions`.
+    :param robust_options: another choice of options than the mode's.
     """
 
     threshold: float
@@ -57,21 +58,36 @@ class RecognizerSettings:
             raise SettingsError(f'nms_radius = {self.nms_radius} must be at least 0 places')
         if options_of(self.mode).second_best_margin and self.robust_options is None and self.threshold > 1:
             raise SettingsError(
-                f'threshold = {self.threshold}: distances of mode robust end at 1, which is chance'
+                f'threshold = {self.threshold}: distances of mode robust end at 1, the chance level'
             )
 
     @property
     def applied_options(self) -> RobustOptions:
-        """The robust_options that are applied."""
+        """The options that are applied."""
         return options_of(self.mode) if self.robust_options is None else self.robust_options
 
 
-class WindowAnswers:
-    """The window answered last: what recognition on a map and on a route's own past can both tell of it."""
+class SequenceRecognizer:
+    """
+    The window of a query and its match; base of :class:`PlaceRecognizer` and ``LoopCloser``.
 
-    _settings: RecognizerSettings
-    _window: 'Window'
-    _nearest: SequenceMatch | None  # as it was answered last
+    :param settings: see :class:`RecognizerSettings`.
+    :param feature_settings: how the features are made.
+    :param places: number of places n.
+    """
+
+    def __init__(
+        self, settings: RecognizerSettings, feature_settings: FeatureSettings, places: int
+    ) -> None:
+        options, sequence = settings.applied_options, settings.sequence
+        self._settings, self._feature_settings = settings, feature_settings
+        self._znorm = ZNormalization(places, options.query_znorm, options.reference_znorm)
+        self._buffer = SequenceBuffer(sequence.length, places, sequence.k)
+        search = VelocitySearch if options.velocity_search else LmDtwSearch
+        self._search: Search = search(self._buffer, self._znorm)
+        self._hysteresis = Hysteresis()
+        self._window = WindowMatch()  # of the newest image
+        self._nearest: SequenceMatch | None = None
 
     @property
     def settings(self) -> RecognizerSettings:
@@ -81,7 +97,7 @@ class WindowAnswers:
     @property
     def window_fill(self) -> int:
         """Images in the window, up to l."""
-        return len(self._window)
+        return len(self._buffer)
 
     def set_threshold(self, threshold: float) -> None:
         """
@@ -93,17 +109,18 @@ class WindowAnswers:
 
     def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return the nearest places of the window answered last, nearest first, each once.
+        Return the nearest places of the newest window, nearest first, each once.
 
-        :returns: places, int64, and the distances of their sequences, at most ``count`` of each.
+        :returns: places, int64, and the costs of their sequences, at most ``count`` of each.
         """
-        return nearest_places(*self._window.sequences(), count)
+        return distinct_places(*self._window.sequences(), count)
 
     def ranked(self, count: int) -> list[Candidate]:
         """
-        Rank places for the window answered last, no two of them neighbors, nearest first.
+        Rank places for the newest window, no two of them neighbors, nearest first.
 
-        The first is the answer's nearest place, matched or not, with its distance, the second its second best.
+        The first is the nearest place of the match, accepted or not, with its distance, the second its second
+        best.
 
         :param count: most candidates, at least 0.
         :returns: none before the first full window.
@@ -118,16 +135,81 @@ class WindowAnswers:
             settings.applied_options.second_best_margin,
         )
 
+    def newest_row(self) -> np.ndarray:
+        """
+        Return the distances of the newest image to every place, z-normalized as they are matched.
 
-class PlaceRecognizer(WindowAnswers):
+        :returns: shape (n,), float32; lower is nearer.
+        """
+        buffer = self._buffer
+        return self._znorm.scaled(buffer.rows()[-1, : buffer.places].cpu().numpy())
+
+    def _clear_window(self) -> None:
+        self._buffer.clear()
+        self._hysteresis.reset()
+        self._window, self._nearest = WindowMatch(), None
+
+    def _require_one_image(self, features: LocalFeatures, where: str) -> None:
+        features.require_same_settings(self._feature_settings, where)
+        if len(features) != 1:
+            raise InputError(f'features of {len(features)} images came: expected those of one')
+        require_finite(features, 'the image')
+
+    def _match(self, row: torch.Tensor, stamp: int) -> Match:
+        """Push the distances of the newest image; match the window, if it is full."""
+        if self._znorm.query or self._znorm.reference:
+            normalized = self._znorm.normalized(row.cpu().numpy())
+            self._buffer.push(torch.from_numpy(normalized), stamp)
+            self._znorm.observe(normalized)
+        else:
+            self._buffer.push(row.to(self._buffer.memory.device), stamp)
+        return replace(self._match_window(), window_stamps=self._buffer.stamps)
+
+    def _match_window(self) -> Match:
+        threshold, length = self._settings.threshold, self._settings.sequence.length
+        if not self._buffer.full:
+            reason = f'{len(self._buffer)} of {length} images in the window'
+            return Match(Status.WARMING_UP, reason, threshold)
+        self._window = self._search(self._settings.nms_radius)
+        self._nearest, relative = self._window.nearest, self._settings.applied_options.second_best_margin
+        if self._nearest is None:
+            return Match(Status.NO_MATCH, 'the map is empty', threshold)
+        if relative:
+            self._nearest = self._scored(self._nearest)
+        status, reason = Status.MATCH, ''
+        if not self._nearest.distance < threshold:
+            status = Status.NO_MATCH
+            reason = (
+                f'nearest distance {self._nearest.distance:.4f} is not below the threshold {threshold:.4f}'
+            )
+        return Match(status, reason, threshold, self._nearest, self._window.path, relative)
+
+    def _scored(self, nearest: SequenceMatch) -> SequenceMatch:
+        """Return the match with scores of mode robust for distances; that of the nearest has memory."""
+        cost, other = nearest.distance, nearest.second_best_distance
+        costs, places = self._window.sequences()
+        elsewhere = np.abs(places - nearest.middle) > self._settings.nms_radius
+        sequences = int(np.count_nonzero(np.isfinite(costs) & elsewhere))
+        value = evidence(cost, expected_second_best(other, sequences))
+        if self._settings.applied_options.hysteresis:
+            value = self._hysteresis.follow(nearest.middle, value)
+        second_best = other if math.isnan(other) else score(evidence(other, cost))
+        return replace(nearest, distance=score(value), second_best_distance=second_best)
+
+
+class PlaceRecognizer(SequenceRecognizer):
     """
     Recognizes places of one map, one image at a time.
 
+    The matcher holds features of its own, unless they are the map's unchanged (float32, without mean
+    centering, on the CPU): then both share the memory. For a map of
+    :func:`stavpr_ros.mapping.open_map`, the matcher's are the only ones in memory.
+
     :param place_map: the reference map.
     :param settings: see :class:`RecognizerSettings`.
-    :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``. With robust_options, image distances are
+    :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``. In mode robust, image distances are
         computed there and sequences on the CPU.
-    :param precision: how the map's features are kept, ``float32`` or ``float16``; see
+    :param precision: of the map's features in the matcher, ``float32`` or ``float16``; see
         :func:`stavpr_ros.recognition.matcher.make_matcher`.
     :raises UnavailableError: no such backend here.
     :raises SettingsError: settings that do not fit the map (xi > W).
@@ -141,26 +223,24 @@ class PlaceRecognizer(WindowAnswers):
         backend: str = 'cpu',
         precision: str = 'float32',
     ) -> None:
-        features, robust_options = place_map.features, settings.applied_options
+        super().__init__(settings, place_map.settings, len(place_map))
+        features, options = place_map.features[:], settings.applied_options
         require_finite(features, 'the map')
-        self._feature_settings = place_map.settings
-        self._settings = settings
-        self._centering = MeanCentering(features) if robust_options.mean_centering else None
+        self._centering = MeanCentering(features) if options.mean_centering else None
         if self._centering is not None:
             features = self._centering.places(features)
-        self._matcher = make_matcher(
-            features, settings.spatial, settings.sequence, choose_backend(backend), precision
-        )
-        self._window = self._matcher
-        self._newest_row = torch.empty(0)
-        self._track = Track()
-        self._nearest = None
-        if robust_options.any:
-            self._window = window = CalibratedWindow(self.places, settings.sequence, robust_options)
-            window.calibration.start_from(self._distances_to_itself(features))
+        backend = choose_backend(backend)
+        self._matcher = make_matcher(features, settings.spatial, backend, precision)
+        if options.reference_znorm:
+            self._znorm.start_from(self._distances_to_itself(features))
+        if backend == 'cuda' and not options.any:
+            from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
+
+            search = CudaLmDtwSearch(len(place_map), settings.sequence)
+            self._search, self._buffer = search, search.buffer
 
     def _distances_to_itself(self, features: LocalFeatures) -> np.ndarray:
-        """Distances of some places to all but their neighbors, which are NaN, shape (m, n)."""
+        """Return the distances of some places to all but their neighbors, which are NaN, shape (m, n)."""
         n = len(features)
         some = np.unique(np.linspace(0, max(n - 1, 0), min(n, PLACES_TO_START_FROM)).astype(int))
         if not n:
@@ -175,111 +255,46 @@ class PlaceRecognizer(WindowAnswers):
         return self._matcher.places
 
     def reset(self) -> None:
-        """Forget the images of the window, and what was learned from them and those before."""
-        self._window.reset()
-        self._track = Track()
-        self._nearest = None
+        """Drop the images of the window, and the running statistics of the query."""
+        self._clear_window()
+        self._znorm.reset()
         if self._centering is not None:
             self._centering.reset()
 
     def distances(self, features: LocalFeatures) -> np.ndarray:
         """
-        Distances of images to every place; centered, if at all, by the map's mean.
+        Return the distances of images to every place; centered, if at all, by the map's mean.
 
         :param features: those of Q images, strips (W, Q, d), made with the settings of the map.
         :returns: shape (Q, n), float32.
         :raises FeatureMismatchError: made with other settings.
         :raises InputError: features that are not finite.
         """
-        self._check(features)
+        features.require_same_settings(self._feature_settings, 'the map')
+        require_finite(features, 'the image')
         if self._centering is not None:
             features = self._centering.places(features)
         return self._matcher.distance_matrix(features.strips, features.weights).cpu().numpy()
 
-    def update(self, features: LocalFeatures) -> Match:
+    def update(self, features: LocalFeatures, stamp: int = 0) -> Match:
         """
-        Take in the next image and answer for the window that ends with it.
+        Add the next image and match the window that ends with it.
 
         An error leaves the window as it was.
 
         :param features: those of one image, strips (W, 1, d).
+        :param stamp: when it was taken, ns; 0 = unknown.
         :raises FeatureMismatchError: made with other settings than the map's.
         :raises InputError: not one image, or features that are not finite.
         """
-        self._check(features)
-        if len(features) != 1:
-            raise InputError(f'features of {len(features)} images came: expected those of one')
+        self._require_one_image(features, 'the map')
         strips = features.strips[:, 0]
         if self._centering is not None:
             strips = self._centering.next_query(strips)
-        self._newest_row = self._matcher.distances(strips, features.weights[:, 0])
-        self._window.push(self._newest_row)
-        match = answer(self._window, self._settings, self._track)
-        self._nearest = match.sequence
-        return match
-
-    def newest_row(self) -> np.ndarray:
-        """Distances of the newest image to every place as they are matched, shape (n,), float32."""
-        if isinstance(self._window, CalibratedWindow):
-            return self._window.newest_row()
-        return self._newest_row.cpu().numpy()
-
-    def _check(self, features: LocalFeatures) -> None:
-        features.require_same_settings(self._feature_settings, 'the map')
-        require_finite(features, 'the image')
-
-
-class Window(Protocol):
-    """What holds the last l images' distances and matches them: a matcher, or a calibrated window."""
-
-    def __len__(self) -> int: ...
-
-    def reset(self) -> None: ...
-
-    def push(self, row: torch.Tensor) -> None: ...
-
-    def match(self, nms_radius: int) -> tuple[SequenceMatch | None, np.ndarray]: ...
-
-    def sequences(self) -> tuple[np.ndarray, np.ndarray]: ...
-
-
-def answer(window: Window, settings: RecognizerSettings, track: Track) -> Match:
-    """Match a window, if it is full, and give the status."""
-    threshold, length = settings.threshold, settings.sequence.length
-    if len(window) < length:
-        reason = f'{len(window)} of {length} images in the window'
-        return Match(Status.WARMING_UP, reason, threshold)
-    nearest, path = window.match(settings.nms_radius)
-    if nearest is None:
-        return Match(Status.NO_MATCH, 'the map is empty', threshold)
-    relative = settings.applied_options.second_best_margin
-    if relative:
-        rivals = _count_rivals(window, nearest, settings.nms_radius)
-        nearest = _relative_to_chance(
-            nearest, rivals, track if settings.applied_options.hysteresis else Track()
-        )
-    status, reason = Status.MATCH, ''
-    if not nearest.distance < threshold:
-        status = Status.NO_MATCH
-        reason = f'nearest distance {nearest.distance:.4f} is not below the threshold {threshold:.4f}'
-    return Match(status, reason, threshold, nearest, path, relative)
-
-
-def _count_rivals(window: Window, nearest: SequenceMatch, nms_radius: int) -> int:
-    """Count the sequences outside the nms_radius of the nearest."""
-    costs, places = window.sequences()
-    return int(np.count_nonzero(np.isfinite(costs) & (np.abs(places - nearest.middle) > nms_radius)))
-
-
-def _relative_to_chance(nearest: SequenceMatch, rivals: int, track: Track) -> SequenceMatch:
-    """Judge the sequence and its rival by their evidence instead of their costs."""
-    cost, other = nearest.distance, nearest.second_best_distance
-    seen = track.follow(nearest.middle, evidence(cost, expected_second_best(other, rivals)))
-    rival = other if math.isnan(other) else relative_distance(evidence(other, cost))
-    return replace(nearest, distance=relative_distance(seen), second_best_distance=rival)
+        return self._match(self._matcher.distances(strips, features.weights[:, 0]), stamp)
 
 
 def require_finite(features: LocalFeatures, where: str) -> None:
-    """Refuse NaN and infinite numbers, which no sum of unit-norm features hides."""
+    """Reject NaN and infinite numbers, which no sum of unit-norm features hides."""
     if not bool(torch.isfinite(features.strips.sum())):
         raise InputError(f'features of {where} are not finite: they are damaged')

@@ -1,59 +1,120 @@
-"""The rolling buffer: one row of image distances for each of the last l query images."""
+"""The window of the query: one row of image distances, and one stamp, for each of the last l images."""
 
-import numpy as np
+from collections import deque
+from collections.abc import Callable
+
+import torch
 
 from stavpr_ros.alignment.lm_dtw import padded_width
+from stavpr_ros.checks import no_nan
 
 
-class DistanceWindow:
+class SequenceBuffer:
     """
     A ring of the last l rows that always lies contiguous in memory, oldest row first.
 
-    Every row is written twice, l rows apart, so that the last l rows are one slice of the buffer.
+    Every row is written twice, l rows apart, so that the last l rows are one slice of the memory. Rows are
+    checked when they are pushed; the searches over the buffer trust them.
 
     :param length: rows l.
-    :param places: map images n.
-    :param k: map images a start sees, for the padding that the kernel wants.
+    :param places: places n of the map.
+    :param k: places that one start of LM-DTW sees.
+    :param row_width: words from row to row for n places and k; the padding that a kernel needs behind the
+        places is +inf.
+    :param device: of the memory.
     """
 
-    def __init__(self, length: int, places: int, k: int) -> None:
-        self._length, self._places, self._k = length, places, k
-        self._rows = np.full((2 * length, padded_width(places, k)), np.inf, np.float32)
-        self._count = 0
+    def __init__(
+        self,
+        length: int,
+        places: int,
+        k: int,
+        row_width: Callable[[int, int], int] = padded_width,
+        device: torch.device | str = 'cpu',
+    ) -> None:
+        self.length, self.k = int(length), k
+        self._row_width = row_width
+        self._first = self._known = self._count = 0
+        self._stamps: deque[int] = deque(maxlen=self.length)
+        self._allocate(places, torch.device(device))
+
+    def _allocate(self, places: int, device: torch.device) -> None:
+        self.places = places
+        self.memory = torch.full(
+            (2 * self.length, self._row_width(places, self.k)), torch.inf, device=device
+        )
+        twice = self.memory.view(2, self.length, -1)
+        self._slots = [twice[:, slot, :places] for slot in range(self.length)]
 
     def __len__(self) -> int:
-        return min(self._count, self._length)
+        return min(self._count, self.length)
 
     @property
     def full(self) -> bool:
         """As many rows as the window is long have been pushed."""
-        return self._count >= self._length
+        return self._count >= self.length
 
-    def push(self, row: np.ndarray) -> None:
+    @property
+    def stamps(self) -> tuple[int, ...]:
+        """Stamps of the images in the window, ns, oldest first."""
+        return tuple(self._stamps)
+
+    @property
+    def first(self) -> int:
+        """Index of the first place that is not evicted: the number of evicted places."""
+        return self._first
+
+    @property
+    def known(self) -> int:
+        """Places with an entry in any row of the window; all others are +inf."""
+        return self._known
+
+    @property
+    def oldest(self) -> int:
+        """Row of ``memory`` where the window begins."""
+        return self._count % self.length
+
+    def push(self, row: torch.Tensor, stamp: int = 0) -> None:
         """
         Add the distances of the newest image and drop the oldest.
 
-        :param row: shape (m,), of the first m <= n places; +inf for the others.
+        :param row: shape (m,), float32, of the first m <= n places; the others become +inf. On the
+            buffer's device.
+        :param stamp: of the image, ns; 0 = unknown.
+        :raises InputError: NaN or -inf in the row; the buffer is unchanged. Not checked on a CUDA device,
+            which would have to be waited for.
         """
-        for slot in (self._count % self._length, self._count % self._length + self._length):
-            self._rows[slot, : len(row)] = row
-            self._rows[slot, len(row) : self._places] = np.inf
+        if not row.is_cuda and not float(row.sum()) > -torch.inf:
+            no_nan(row.numpy(), 'image distances')
+        slot, m = self._slots[self._count % self.length], len(row)
+        if m == self.places:
+            slot.copy_(row)
+        else:
+            slot[:, :m], slot[:, m:] = row, torch.inf
+        self._known = max(self._known, m)
+        self._stamps.append(stamp)
         self._count += 1
 
-    def rows(self) -> np.ndarray:
-        """Return the window, shape (l, n + padding), float32, a view; +inf in the padding."""
-        first = self._count % self._length
-        return self._rows[first : first + self._length]
+    def rows(self) -> torch.Tensor:
+        """Return the window, shape (l, n + padding), float32: a view, contiguous, +inf in the padding."""
+        return self.memory[self.oldest : self.oldest + self.length]
 
-    def forget(self, count: int) -> None:
-        """Take the first places out; the others move up, and there is room for as many new ones behind."""
-        kept = self._places - count
-        self._rows[:, :kept] = self._rows[:, count : self._places]
-        self._rows[:, kept : self._places] = np.inf
+    def clear(self) -> None:
+        """Empty the window."""
+        self.memory.fill_(torch.inf)
+        self._stamps.clear()
+        self._known = self._count = 0
 
-    def widened(self, places: int) -> 'DistanceWindow':
-        """Return a window with the same rows for more places, +inf for those that are new."""
-        wider = DistanceWindow(self._length, places, self._k)
-        wider._rows[:, : self._places] = self._rows[:, : self._places]
-        wider._count = self._count
-        return wider
+    def grow(self, places: int) -> None:
+        """Make room for more places; in the rows of the window they are +inf."""
+        rows, before = self.memory, self.places
+        self._allocate(places, rows.device)
+        self.memory[:, :before] = rows[:, :before]
+
+    def evict(self, count: int) -> None:
+        """Take the oldest places out; the others move up, and as many new ones have room behind them."""
+        kept = self.places - count
+        self.memory[:, :kept] = self.memory[:, count : self.places].clone()
+        self.memory[:, kept : self.places] = torch.inf
+        self._known = max(0, self._known - count)
+        self._first += count

@@ -1,8 +1,7 @@
-"""Knowing that other nodes have discovered ours."""
+"""Checks that other nodes have discovered this one."""
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters
@@ -10,68 +9,59 @@ from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.task import Future
 
-SETTLE_SECONDS = 2.0
-"""How long a node may take to show its parameter service; some tools have none."""
+SERVICE_SECONDS = 2.0
+"""Time in which a node shows its parameter service; some tools have none."""
 
 
-@dataclass
-class _Inquiry:
-    """A request to another node: its answer proves that it has heard of our topics."""
-
-    client: Client
-    answer: Future | None = field(default=None)
-
-    def done(self) -> bool:
-        """Tell whether the answer is here, asking as soon as that is possible."""
-        if self.answer is None and self.client.service_is_ready():
-            self.answer = self.client.call_async(GetParameters.Request())
-        return self.answer is not None and self.answer.done()
-
-
-class Introduction:
+class Discovery:
     """
-    Finds out when the nodes at the other end of our topics know of us; that we know of them is not enough.
+    Finds out when the nodes at the other end of our topics have discovered us.
 
-    DDS does not tell when a remote endpoint has found ours. But discovery is told in order, and the
-    topics of a request come after those made before it: a node that answers knows all. Nodes serve
-    parameter requests by themselves; one that shows no such service is given ``SETTLE_SECONDS``.
+    A matched endpoint on our side does not imply a matched one on theirs, and DDS does not report
+    it. But endpoints are announced in order, those of a request after those made before: a node
+    that responds to a request has discovered our topics. Nodes serve parameter requests by
+    default.
 
     :param node: ours, with its publishers and subscriptions made; the caller spins it.
-    :param endpoints: returns the endpoints at the other end, as ``get_publishers_info_by_topic`` does.
-    :param timeout: seconds after which it is taken for done in any case.
+    :param endpoints: returns the other endpoints, as ``get_publishers_info_by_topic`` does.
+    :param timeout: seconds after which discovery counts as done.
     """
 
-    def __init__(self, node: Node, endpoints: Callable[[], list[Any]], timeout: float) -> None:
-        self._node = node
-        self._endpoints = endpoints
-        self._timeout = max(SETTLE_SECONDS, timeout)
-        self._inquiries: dict[str, _Inquiry] = {}
-        self._began: float | None = None
+    def __init__(
+        self, node: Node, endpoints: Callable[[], list[Any]], timeout: float = 10.0
+    ) -> None:
+        self._node, self._endpoints = node, endpoints
+        self._timeout = max(SERVICE_SECONDS, timeout)
+        self._clients: dict[str, Client] = {}
+        self._responses: dict[str, Future] = {}
+        self._start: float | None = None
 
-    def renew(self) -> None:
-        """Ask everybody once more."""
-        self._began = None
-        for inquiry in self._inquiries.values():
-            inquiry.answer = None
+    def restart(self) -> None:
+        """Request new responses."""
+        self._responses.clear()
+        self._start = None
 
     def done(self) -> bool:
-        """Tell whether everybody has answered; call it while spinning."""
-        now = time.monotonic()
-        self._began = now if self._began is None else self._began
+        """Return whether all nodes have responded, or need not; to be called while spinning."""
+        if self._start is None:
+            self._start = time.monotonic()
         names = self._names()
-        for name in names - self._inquiries.keys():
-            client = self._node.create_client(GetParameters, f'{name}/get_parameters')
-            self._inquiries[name] = _Inquiry(client)
-        silent = [name for name in names if not self._inquiries[name].done()]
-        if names and not silent:
-            return True
-        waited = now - self._began
-        if waited > SETTLE_SECONDS and all(self._inquiries[name].answer is None for name in silent):
-            return True
-        return waited > self._timeout
+        for name in names - self._responses.keys():
+            self._request(name)
+        requested = [self._responses[name] for name in names if name in self._responses]
+        waited = time.monotonic() - self._start
+        if not all(response.done() for response in requested):
+            return waited > self._timeout
+        return (bool(names) and len(requested) == len(names)) or waited > SERVICE_SECONDS
+
+    def _request(self, name: str) -> None:
+        if name not in self._clients:
+            self._clients[name] = self._node.create_client(GetParameters, f'{name}/get_parameters')
+        if self._clients[name].service_is_ready():
+            self._responses[name] = self._clients[name].call_async(GetParameters.Request())
 
     def _names(self) -> set[str]:
-        """Full names of the nodes at the other end, as far as known by now."""
+        """Return the full names of the nodes at the other end, as far as they are known."""
         return {
             f'{info.node_namespace.rstrip("/")}/{info.node_name}'
             for info in self._endpoints()

@@ -1,6 +1,5 @@
-"""What the launch files share: the arguments and the node. Imports ``launch`` and nothing that is heavy."""
+"""Arguments and node of the launch files, from the table of parameters; a light import."""
 
-from collections.abc import Sequence
 from typing import Any
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -10,57 +9,16 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchContext, LaunchDescription
+from stavpr_ros.parameters import PARAMETERS
 
 PACKAGE = 'stavpr_ros'
-
-# Parameters of the node that a launch file may offer: type and description.
-PARAMETERS: dict[str, tuple[type, str]] = {
-    'operation': (str, 'what is done with images: localization, mapping or loop_closure'),
-    'map_path': (str, 'map file, made by build_map or by the service save_map'),
-    'threshold': (float, 'a window is matched when its distance is below this'),
-    'mode': (str, 'paper: STA-VPR as published; robust: beyond it'),
-    'sequence_length': (int, 'images in the query window'),
-    'geometric_check': (str, 'check matches by keypoints: none, orb or sift'),
-    'image_transport': (str, 'raw, or compressed: sensor_msgs/CompressedImage on IMAGE/compressed'),
-    'keyframe_interval': (float, 'an image counts only so long after the last that counted, s'),
-    'keyframe_distance': (float, 'an image counts only so far from the last that counted, m, by odometry'),
-    'keyframe_angle': (float, 'or when the camera has turned so far, degrees, by odometry'),
-    'keyframe_change': (float, 'an image counts only when it differs by this from the last that counted'),
-    'features': (str, 'features of a map that is begun anew: gradient, onnx ...'),
-    'max_places': (int, 'most places of a growing map'),
-    'save_path': (str, 'file that the map is written to when the node is deactivated or ends'),
-    'exclude_places': (int, 'the latest places of the route, which are not compared'),
-    'exclude_seconds': (float, 'nor are places younger than this, s'),
-    'use_sim_time': (bool, 'take the time from the topic /clock'),
-    'autostart': (bool, 'the node configures and activates itself; false: a life-cycle manager does it'),
+TYPES: dict[str, type] = {row.name: type(row.default) for row in PARAMETERS} | {
+    'use_sim_time': bool
 }
-EVERYWHERE = ('image_transport', 'use_sim_time', 'autostart')
 
 
-def arguments(parameters: Sequence[str]) -> list[DeclareLaunchArgument]:
-    """
-    Declare the arguments of a launch file that starts the node.
-
-    :param parameters: names in :data:`PARAMETERS`, besides those that every launch file has.
-    """
-    declared = [
-        DeclareLaunchArgument('image', default_value='image', description='topic of the images'),
-        DeclareLaunchArgument('odom', default_value='odom', description='topic of the odometry'),
-        DeclareLaunchArgument('namespace', default_value='', description='namespace of node and topics'),
-        DeclareLaunchArgument(
-            'params_file',
-            default_value=PathJoinSubstitution([FindPackageShare(PACKAGE), 'config', 'stavpr.yaml']),
-            description='file of all parameters',
-        ),
-    ]
-    for name in (*parameters, *EVERYWHERE):
-        description = f'{PARAMETERS[name][1]}; empty: as params_file has it'
-        declared.append(DeclareLaunchArgument(name, default_value='', description=description))
-    return declared
-
-
-def remappings() -> list[tuple[str | LaunchConfiguration, Any]]:
-    """Return the topics that arguments name."""
+def remappings() -> list[tuple[str, Any]]:
+    """Return the remappings of the topics that are arguments."""
     image = LaunchConfiguration('image')
     return [
         ('image', image),
@@ -69,19 +27,50 @@ def remappings() -> list[tuple[str | LaunchConfiguration, Any]]:
     ]
 
 
-def node(parameters: Sequence[str], **fixed: object) -> OpaqueFunction:
+def node_launch(*others: Any, **fixed: object) -> LaunchDescription:
     """
-    Start the node with the arguments that are given; the others are left to the parameter file.
+    Describe the launch of the node; every parameter is an argument.
 
-    :param parameters: as in :func:`arguments`.
-    :param fixed: parameters that the launch file itself decides.
+    :param others: further actions, after the node.
+    :param fixed: parameters that the launch file sets itself.
     """
+    return LaunchDescription([*_arguments(fixed), _node(fixed), *others])
+
+
+def _arguments(fixed: dict[str, object]) -> list[DeclareLaunchArgument]:
+    sentences = {row.name: row.sentence for row in PARAMETERS}
+    sentences['use_sim_time'] = 'Take the time from the topic /clock.'
+    return [
+        DeclareLaunchArgument('image', default_value='image', description='topic of the images'),
+        DeclareLaunchArgument('odom', default_value='odom', description='topic of the odometry'),
+        DeclareLaunchArgument(
+            'namespace', default_value='', description='namespace of node and topics'
+        ),
+        DeclareLaunchArgument(
+            'params_file',
+            default_value=PathJoinSubstitution(
+                [FindPackageShare(PACKAGE), 'config', 'stavpr.yaml']
+            ),
+            description='file of all parameters',
+        ),
+        *(
+            DeclareLaunchArgument(
+                name, default_value='', description=f'{sentence} Empty: as set in params_file.'
+            )
+            for name, sentence in sentences.items()
+            if name not in fixed
+        ),
+    ]
+
+
+def _node(fixed: dict[str, object]) -> OpaqueFunction:
+    """Start the node with the given arguments; the others are left to the parameter file."""
 
     def start(context: LaunchContext) -> list[Node]:
         given = {
-            name: ParameterValue(LaunchConfiguration(name), value_type=PARAMETERS[name][0])
-            for name in (*parameters, *EVERYWHERE)
-            if LaunchConfiguration(name).perform(context)
+            name: ParameterValue(LaunchConfiguration(name), value_type=kind)
+            for name, kind in TYPES.items()
+            if name not in fixed and LaunchConfiguration(name).perform(context)
         }
         return [
             Node(
@@ -96,14 +85,3 @@ def node(parameters: Sequence[str], **fixed: object) -> OpaqueFunction:
         ]
 
     return OpaqueFunction(function=start)
-
-
-def node_launch(parameters: Sequence[str], *others: Any, **fixed: object) -> LaunchDescription:
-    """
-    Describe the launch of the node.
-
-    :param parameters: as in :func:`arguments`.
-    :param others: further actions, after the node's.
-    :param fixed: parameters that the launch file itself decides.
-    """
-    return LaunchDescription([*arguments(parameters), node(parameters, **fixed), *others])

@@ -1,4 +1,4 @@
-"""The node, a replay and a listener, each a process of its own: recognition as a robot would have it."""
+"""Runs the node, a replay and recorders as processes of their own: recognition as on a robot."""
 
 import json
 import math
@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,24 @@ from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
 from stavpr_ros.errors import StavprError, UnavailableError
 
-START_PATIENCE = 180.0  # seconds for the node to load the map and to compile
-PATIENCE = 20.0  # seconds for a process to end, or for a last answer to be written
-MATCHES, CLOSURES = 'matches.jsonl', 'loop_closures.jsonl'
+START_TIMEOUT = 180.0  # seconds for the node to load the map and to compile
+END_TIMEOUT = 20.0  # seconds for a process to end, or for the last record
+POLL_SECONDS = 0.05
+
+Process = subprocess.Popen[bytes]
+
+
+@dataclass(frozen=True)
+class _Recorder:
+    """A ``record`` process: its name, its options, and the file of its records."""
+
+    name: str
+    file: str
+    options: tuple[str, ...] = ()
+
+
+MATCHES = _Recorder('record', 'matches.jsonl')
+LOOP_CLOSURES = _Recorder('record_loop_closures', 'loop_closures.jsonl', ('--loop-closures',))
 
 
 def executable(name: str) -> str:
@@ -32,36 +48,125 @@ def executable(name: str) -> str:
         return str(Path(get_package_prefix('stavpr_ros')) / 'lib' / 'stavpr_ros' / name)
     except PackageNotFoundError as error:
         raise UnavailableError(
-            'the package stavpr_ros is not found: build it with colcon and source install/setup.bash'
+            'the package stavpr_ros is not found: build it with colcon and '
+            'source install/setup.bash'
         ) from error
 
 
 def private_domain() -> dict[str, str]:
-    """Return an environment in which only processes started with it meet, unless the user has chosen one."""
+    """Return an environment with a ROS domain of its own, unless the user has chosen one."""
     environment = dict(os.environ)
-    if 'ROS_DOMAIN_ID' not in environment:
-        environment['ROS_DOMAIN_ID'] = str(random.randrange(1, 100))
+    environment.setdefault('ROS_DOMAIN_ID', str(random.randrange(1, 100)))
     environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     return environment
+
+
+def run_live(
+    node_parameters: dict[str, Any],
+    query: str,
+    images: int,
+    folder: Path,
+    topic: str | None = None,
+) -> list[dict[str, Any]]:
+    """
+    Replay a query losslessly into a node and return the recorded matches.
+
+    :param node_parameters: of the node, name to value.
+    :param query: the bag or folder of images to replay.
+    :param images: number of its images.
+    :param folder: for the logs and ``matches.jsonl``.
+    :param topic: image topic of the bag; None = its only one.
+    :returns: one record per image, see the command ``record``.
+    :raises StavprError: a process failed; names its log.
+    """
+    return _replay_into_node(node_parameters, query, images, folder, topic, (MATCHES,))
+
+
+def run_loop_closure(
+    node_parameters: dict[str, Any],
+    query: str,
+    images: int,
+    folder: Path,
+    topic: str | None = None,
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """
+    Replay a traverse losslessly into a node in operation loop_closure.
+
+    ``matches.jsonl`` and ``loop_closures.jsonl`` are written into the folder. The parameters are
+    those of :func:`run_live`.
+
+    :returns: one match per image, and the loop closures; see the command ``record``.
+    :raises StavprError: a process failed; names its log.
+    """
+    parameters = node_parameters | {'operation': 'loop_closure'}
+    recorders = (MATCHES, LOOP_CLOSURES)
+    matches = _replay_into_node(parameters, query, images, folder, topic, recorders)
+    return matches, _records(folder / LOOP_CLOSURES.file)
+
+
+def _replay_into_node(
+    node_parameters: dict[str, Any],
+    query: str,
+    images: int,
+    folder: Path,
+    topic: str | None,
+    recorders: tuple[_Recorder, ...],
+) -> list[dict[str, Any]]:
+    """Run all processes; return the matches."""
+    environment = private_domain()
+    parameters = [f'{name}:={value}' for name, value in node_parameters.items()]
+    node = [executable('node'), '--ros-args', *(word for p in parameters for word in ('-p', p))]
+    replay = [executable('replay'), query, '--lossless', '--wait', '120']
+    replay += [] if topic is None else ['--topic', topic]
+    with ExitStack() as stack:
+        processes: dict[str, Process] = {}
+
+        def start(name: str, command: list[str]) -> None:
+            log = folder / f'{name}.log'
+            processes[name] = stack.enter_context(_running(command, log, environment))
+
+        def wait_until(done: Callable[[], bool], seconds: float, event: str) -> None:
+            _wait_until(done, processes, folder, seconds, event)
+
+        start('node', node)
+        for recorder in recorders:
+            file = folder / recorder.file
+            file.unlink(missing_ok=True)
+            command = [executable('record'), '--output', str(file), *recorder.options]
+            start(recorder.name, command)
+        for recorder in recorders:
+            log = folder / f'{recorder.name}.log'
+            wait_until(partial(_is_recording, log), START_TIMEOUT, 'the node')
+        with _running(replay, None, environment) as player:
+            wait_until(lambda: player.poll() is not None, math.inf, 'the end of the replay')
+        if player.returncode != 0:
+            raise StavprError(f'the replay ended with {player.returncode}, see {folder}/node.log')
+        wait_until(lambda: _complete(folder, images, recorders), END_TIMEOUT, 'the last record')
+    matches = _records(folder / MATCHES.file)
+    if len(matches) != images:
+        raise StavprError(f'{len(matches)} matches of {images} images, see the logs in {folder}')
+    return matches
 
 
 @contextmanager
 def _running(
     command: list[str], log: Path | None, environment: dict[str, str]
-) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a process, its output in a file or shown; end it gently, and in any case, at the end."""
+) -> Iterator[Process]:
+    """Run a process, its output in a file or shown; interrupt it at the end, or kill it."""
     if log is None:
         process = subprocess.Popen(command, env=environment)
     else:
         with log.open('w') as output:
-            process = subprocess.Popen(command, env=environment, stdout=output, stderr=subprocess.STDOUT)
+            process = subprocess.Popen(
+                command, env=environment, stdout=output, stderr=subprocess.STDOUT
+            )
     try:
         yield process
     finally:
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
         try:
-            process.wait(PATIENCE)
+            process.wait(END_TIMEOUT)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
@@ -69,114 +174,41 @@ def _running(
 
 def _wait_until(
     done: Callable[[], bool],
-    processes: dict[str, subprocess.Popen[bytes]],
+    processes: dict[str, Process],
     folder: Path,
     seconds: float,
-    what: str,
+    event: str,
 ) -> None:
-    """Wait for something while the processes live."""
+    """Wait for an event while the processes run."""
     end = time.monotonic() + seconds
     while not done():
         for name, process in processes.items():
             if process.poll() is not None:
-                raise StavprError(f'{name} ended with {process.returncode}, see {folder / name}.log')
+                raise StavprError(
+                    f'{name} ended with {process.returncode}, see {folder / name}.log'
+                )
         if time.monotonic() > end:
-            raise StavprError(f'{what} did not come in {seconds:g} s, see the logs in {folder}')
-        time.sleep(0.05)
+            raise StavprError(f'{event} did not come in {seconds:g} s, see the logs in {folder}')
+        time.sleep(POLL_SECONDS)
 
 
 def _is_recording(log: Path) -> bool:
-    """Tell whether a listener has said that it misses nothing any more."""
+    """Return whether a recorder has logged that it misses no more messages."""
     return any(line.startswith('recording') for line in _lines(log))
+
+
+def _complete(folder: Path, images: int, recorders: tuple[_Recorder, ...]) -> bool:
+    """Return whether every image has its match, and every accepted match its loop closure."""
+    if len(_lines(folder / MATCHES.file)) < images:
+        return False
+    if LOOP_CLOSURES not in recorders:
+        return True
+    accepted = sum(record['status'] == 'MATCH' for record in _records(folder / MATCHES.file))
+    return len(_lines(folder / LOOP_CLOSURES.file)) >= accepted
 
 
 def _lines(path: Path) -> list[str]:
     return path.read_text().splitlines() if path.exists() else []
-
-
-def run_live(
-    node_parameters: dict[str, Any], query: str, images: int, folder: Path, topic: str | None = None
-) -> list[dict[str, Any]]:
-    """
-    Replay a query, losslessly, into a node and return what a listener heard.
-
-    :param node_parameters: of the node, name to value.
-    :param query: the bag or folder of images to replay.
-    :param images: how many images it holds.
-    :param folder: where the logs and ``matches.jsonl`` are written.
-    :returns: one record an image, see the command ``record``.
-    :raises StavprError: a process failed; names its log.
-    """
-    matches = _replay_into_node(node_parameters, query, images, folder, topic, loops=False)
-    if len(matches) != images:
-        raise StavprError(f'{len(matches)} answers to {images} images were heard, see the logs in {folder}')
-    return matches
-
-
-def run_loop_closure(
-    node_parameters: dict[str, Any], drive: str, images: int, folder: Path, topic: str | None = None
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """
-    Replay a drive, losslessly, into a node that closes loops, and return what two listeners heard.
-
-    ``matches.jsonl`` and ``loop_closures.jsonl`` are written into the folder.
-
-    :returns: one answer an image, and the loop closures; see the command ``record``.
-    :raises StavprError: a process failed; names its log.
-
-    The others are as in :func:`run_live`.
-    """
-    parameters = node_parameters | {'operation': 'loop_closure'}
-    matches = _replay_into_node(parameters, drive, images, folder, topic, loops=True)
-    if len(matches) != images:
-        raise StavprError(f'{len(matches)} answers to {images} images were heard, see the logs in {folder}')
-    return matches, _records(folder / CLOSURES)
-
-
-def _replay_into_node(
-    node_parameters: dict[str, Any], query: str, images: int, folder: Path, topic: str | None, loops: bool
-) -> list[dict[str, Any]]:
-    """Run all the processes; return the answers."""
-    environment = private_domain()
-    parameters = [word for name, value in node_parameters.items() for word in ('-p', f'{name}:={value}')]
-    node = [executable('node'), '--ros-args', *parameters]
-    replay = [executable('replay'), query, '--lossless', '--wait', '120']
-    if topic is not None:
-        replay += ['--topic', topic]
-    listeners: dict[str, tuple[str, list[str]]] = {'record': (MATCHES, [])}
-    if loops:
-        listeners['record_loop_closures'] = (CLOSURES, ['--loop-closures'])
-    with ExitStack() as stack:
-        processes = {'node': stack.enter_context(_running(node, folder / 'node.log', environment))}
-        for name, (file, options) in listeners.items():
-            (folder / file).unlink(missing_ok=True)
-            log = folder / f'{name}.log'
-            log.unlink(missing_ok=True)
-            record = [executable('record'), '--output', str(folder / file), *options]
-            processes[name] = stack.enter_context(_running(record, log, environment))
-        for name in listeners:
-            log = folder / f'{name}.log'
-            _wait_until(partial(_is_recording, log), processes, folder, START_PATIENCE, 'the node')
-        with _running(replay, None, environment) as replay_process:
-            _wait_until(lambda: replay_process.poll() is not None, processes, folder, math.inf, 'the end')
-        if replay_process.returncode != 0:
-            raise StavprError(
-                f'the replay ended with {replay_process.returncode}, see also {folder}/node.log'
-            )
-        _wait_until(
-            partial(_all_heard, folder, images, loops), processes, folder, PATIENCE, 'the last answer'
-        )
-    return _records(folder / MATCHES)
-
-
-def _all_heard(folder: Path, images: int, loops: bool) -> bool:
-    """Tell whether every image is answered, and every match is there as a loop closure too."""
-    if len(_lines(folder / MATCHES)) < images:
-        return False
-    if not loops:
-        return True
-    matches = sum(record['status'] == 'MATCH' for record in _records(folder / MATCHES))
-    return len(_lines(folder / CLOSURES)) >= matches
 
 
 def _records(path: Path) -> list[dict[str, Any]]:

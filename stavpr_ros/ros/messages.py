@@ -1,4 +1,4 @@
-"""Between messages and the library's own types; no node in here."""
+"""Conversions between messages and the types of the library, without a node."""
 
 import array
 import math
@@ -7,34 +7,35 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from stavpr_msgs.msg import (
-    AlignedImages,
     AlignedPair,
-    Candidate,
-    Candidates,
+    AlignedPlaces,
     LoopClosure,
     MapInfo,
+    PlaceCandidate,
+    PlaceCandidates,
     PlaceMatch,
 )
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap, place_at
 from stavpr_ros.mapping.map_file import VERSION
-from stavpr_ros.recognition import Candidate as RankedPlace
 from stavpr_ros.recognition import Match, Status
 
 SECOND = 1_000_000_000
+MIN_VARIANCE = 0.01  # of a pose: (0.1 m)^2 and (0.1 rad)^2
 
 
 def time_message(nanoseconds: int) -> Time:
-    """Return a time; 0 is 'unknown' wherever this package uses it."""
+    """Return a time as a message; 0 means unknown."""
     return Time(sec=int(nanoseconds) // SECOND, nanosec=int(nanoseconds) % SECOND)
 
 
 def nanoseconds(time: Time) -> int:
-    """Return a time as nanoseconds."""
+    """Return a time in nanoseconds."""
     return int(time.sec) * SECOND + int(time.nanosec)
 
 
@@ -57,7 +58,7 @@ def match_message(
     header: Header, match: Match, places: PlaceMap | GrowingMap | None = None
 ) -> PlaceMatch:
     """
-    Return the match as a message.
+    Return the message of a match.
 
     :param header: of the image.
     :param places: the map that the indices of the match refer to.
@@ -88,7 +89,7 @@ def match_message(
         sequence = match.sequence
         message.sequence_first, message.sequence_last = sequence.first, sequence.last
         message.sequence_middle = sequence.middle
-        message.path = [AlignedPair(query_index=q, map_index=m) for q, m in match.path.tolist()]
+        message.path = [AlignedPair(query_index=q, place_index=m) for q, m in match.path.tolist()]
         message.second_best_index = sequence.second_best_index
         message.second_best_distance = sequence.second_best_distance
     if match.accepted and places is not None:
@@ -98,50 +99,42 @@ def match_message(
     return message
 
 
-def candidate_messages(places: PlaceMap | GrowingMap, ranked: list[RankedPlace]) -> list[Candidate]:
-    """Return nearest places as messages."""
-    messages = []
-    for candidate in ranked:
-        facts = place_at(places, candidate.place)
-        messages.append(
-            Candidate(
-                place_index=candidate.place,
-                distance=candidate.distance,
-                place_stamp=time_message(facts.stamp),
-                place_id=facts.identifier,
-            )
-        )
-    return messages
-
-
 def candidates_message(
     header: Header, match: Match, places: PlaceMap | GrowingMap | None
-) -> Candidates | None:
-    """Return the nearest places of a window, None where it has none."""
+) -> PlaceCandidates | None:
+    """Return the message of the candidates of a match, None without any."""
     if not match.candidates or places is None:
         return None
-    listed = candidate_messages(places, list(match.candidates))
-    return Candidates(header=header, threshold=match.threshold, candidates=listed)
+    message = PlaceCandidates(header=header, threshold=match.threshold)
+    for candidate in match.candidates:
+        place = place_at(places, candidate.place)
+        message.candidates.append(
+            PlaceCandidate(
+                place_index=candidate.place,
+                distance=candidate.distance,
+                place_stamp=time_message(place.stamp),
+                place_id=place.identifier,
+            )
+        )
+    return message
 
 
 def loop_closure_message(
     header: Header, match: Match, route: PlaceMap | GrowingMap | None
 ) -> LoopClosure | None:
-    """Return the loop that a match on the growing route closes; None if it is no such match."""
+    """Return the loop closure of a match on a growing route, None for any other match."""
     first = match.first_image_index
-    if not match.accepted or first < 0 or route is None or match.sequence is None:
+    if not match.accepted or first < 0 or route is None:
         return None
-    pairs = []
-    for q, m in match.path.tolist():
-        later, earlier = first + q, int(m)
-        pairs.append(
-            AlignedImages(
-                query_index=later,
-                query_stamp=time_message(place_at(route, later).stamp),
-                place_index=earlier,
-                place_stamp=time_message(place_at(route, earlier).stamp),
-            )
+    pairs = [
+        AlignedPlaces(
+            query_index=first + q,
+            query_stamp=time_message(place_at(route, first + q).stamp),
+            place_index=m,
+            place_stamp=time_message(place_at(route, m).stamp),
         )
+        for q, m in match.path.tolist()
+    ]
     middle = first + (len(match.window_stamps) - 1) // 2
     query, place = place_at(route, middle), place_at(route, match.place_index)
     message = LoopClosure(
@@ -165,13 +158,15 @@ def matched_pose_message(
     header: Header, match: Match, places: PlaceMap | GrowingMap | None, frame: str
 ) -> PoseWithCovarianceStamped | None:
     """
-    Return the pose of the place where the newest image was taken; None without a match or a known pose.
+    Return the pose of the place of the newest image; None without a match or a known pose.
 
-    The covariance is diagonal: the variance of each coordinate over the poses of the two places before and
-    after it, since a match may be a place off, and at least (0.1 m)^2 and (0.1 rad)^2. A lateral offset of
-    the camera from the mapped route is not observable by place recognition and not part of it.
+    The covariance is diagonal: the variance of each coordinate over the poses of the two places
+    before and after it, since a match may be off by a place, and at least (0.1 m)^2 and (0.1
+    rad)^2. Rotations are rotation vectors about the axes of the map. Place recognition does not
+    observe a lateral offset of the camera from the mapped route; the covariance does not include
+    it.
 
-    :param frame: of the map's poses.
+    :param frame: of the poses of the map.
     """
     if not match.accepted or places is None:
         return None
@@ -181,31 +176,16 @@ def matched_pose_message(
         return None
     first = places.first if isinstance(places, GrowingMap) else 0
     around = range(max(first, newest - 2), min(first + len(places), newest + 3))
-    near = [other for other in (place_at(places, i).pose for i in around) if other is not None]
+    near = np.array(
+        [near for near in (place_at(places, i).pose for i in around) if near is not None]
+    )
+    turns = Rotation.from_quat(near[:, 3:]) * Rotation.from_quat(pose[3:]).inv()
+    variances = np.append(np.var(near[:, :3], axis=0), np.var(turns.as_rotvec(), axis=0))
     message = PoseWithCovarianceStamped()
     message.header.stamp, message.header.frame_id = header.stamp, frame
     message.pose.pose = pose_message(pose)
-    spread = np.var([other[:3] for other in near], axis=0)
-    turns = np.var([_rotation_between(pose, other) for other in near], axis=0)
-    message.pose.covariance[::7] = np.maximum(np.append(spread, turns), 0.01)
+    message.pose.covariance[::7] = np.maximum(variances, MIN_VARIANCE)
     return message
-
-
-def _rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the rotation from a to b about the axes of the map, radians, shape (3,); for small angles."""
-    ax, ay, az, aw = a[3:]
-    bx, by, bz, bw = b[3:]
-    w = aw * bw + ax * bx + ay * by + az * bz
-    v = np.array(
-        [
-            aw * bx - ax * bw + ay * bz - az * by,
-            aw * by - ax * bz - ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx - az * bw,
-        ]
-    )
-    length = float(np.linalg.norm(v))
-    angle = 2 * math.atan2(length, abs(w)) * (1 if w >= 0 else -1)
-    return v * (angle / length) if length > 1e-12 else np.zeros(3)
 
 
 def image_message(header: Header, image: np.ndarray) -> Image:
@@ -225,12 +205,16 @@ def map_info_message(
     stamp: Time,
 ) -> MapInfo:
     """
-    Describe the map that is in use.
+    Return the description of the map in use.
 
     :param state: see the message.
     """
     message = MapInfo(
-        header=Header(stamp=stamp), operation=operation, state=state, path=path, format_version=VERSION
+        header=Header(stamp=stamp),
+        operation=operation,
+        state=state,
+        path=path,
+        format_version=VERSION,
     )
     if extractor is not None:
         settings = extractor.settings

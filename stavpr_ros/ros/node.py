@@ -3,10 +3,11 @@
 import gc
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
@@ -16,95 +17,110 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.timer import Timer
 
 from stavpr_msgs.msg import MapInfo
-from stavpr_ros.devices import why_no_cuda
 from stavpr_ros.errors import SettingsError, SourceError, StavprError
 from stavpr_ros.output_file import require_room
+from stavpr_ros.parameters import BY_NAME
+from stavpr_ros.pipeline import NodeSettings, node_settings
 from stavpr_ros.pipeline.statistics import Statistics
-from stavpr_ros.ros.executor import SlowCallbackGroup
-from stavpr_ros.ros.lifecycle import ManagedNode
-from stavpr_ros.ros.parameter_table import declare_parameters
-from stavpr_ros.ros.parameters import BY_NAME, PARAMETERS
-from stavpr_ros.ros.reporter import Reporter
+from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
+from stavpr_ros.ros.health import Health, node_health
+from stavpr_ros.ros.parameters import declare_parameters, unknown_parameters
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.runtime import Runtime
 from stavpr_ros.ros.services import Services
-from stavpr_ros.ros.settings import NodeSettings, node_settings, unknown_parameters
-from stavpr_ros.ros.worker import PATIENCE
+from stavpr_ros.ros.worker import STOP_TIMEOUT
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# Parameters that are read when the node is configured, and the services that change them
+# afterwards.
+CHANGED_BY_SERVICE = {'map_path': 'load_map', 'operation': 'set_operation'}
 
 
 class PlaceRecognitionNode(ManagedNode):
     """
-    Recognizes where images were taken; publishes one ``~/match`` for each image on ``image``.
+    Recognizes the places of images; publishes one ``~/match`` for each image on ``image``.
 
-    A managed node: configuring loads the map and the model and compiles the kernels, activating subscribes,
-    deactivating stops, cleaning up frees. With parameter ``autostart`` it configures and activates itself
-    as soon as it spins. It wants an executor that serves on threads: see :data:`THREADS`.
+    A lifecycle node: configuring loads the map and the model and compiles the kernels, activating
+    subscribes, deactivating unsubscribes, cleaning up frees everything. With parameter
+    ``autostart`` it configures and activates itself when it is spun. It needs an executor that
+    runs services on threads: see :data:`THREADS`.
 
-    :raises StavprError: parameters that cannot work together, or a backend that is not here.
+    :raises StavprError: parameters that exclude each other, or a backend that is not available.
     """
 
-    THREADS = 4  # for services, the life cycle and parameters: images wait for none of them
+    THREADS = 4  # a transition, a service and parameters may each take long; images take the fourth
 
     def __init__(self, **options: Any) -> None:
-        self._lock = threading.RLock()  # one change at a time: transitions and parameters
+        self._lock = (
+            threading.RLock()
+        )  # one change at a time: transitions, parameters, map, operation
         super().__init__('stavpr', **options)
-        for said in unknown_parameters(self._parameter_overrides):
-            self.get_logger().warning(said)
-        self._settings = node_settings(declare_parameters(self, PARAMETERS))
+        for warning in unknown_parameters(self._parameter_overrides):
+            self.get_logger().warning(warning)
+        self._settings = node_settings(declare_parameters(self))
         self._verbosity = 'default'
         self._apply_verbosity(self._settings.verbosity)
         self._runtime: Runtime | None = None
         self.statistics = Statistics()
         self.problem = ''  # why the last transition failed
         self._map_info = self.create_publisher(MapInfo, '~/map_info', LATCHED)
-        self._told: MapInfo | None = None
-        self._telling = threading.RLock()  # what was published last is what was true last
-        self._served = Services(self)
-        self.add_on_set_parameters_callback(self._on_parameters)
-        self.add_post_set_parameters_callback(self._on_parameters_set)
+        self._last_map_info: MapInfo | None = None
+        self._map_info_lock = (
+            threading.RLock()
+        )  # messages are published in the order of the changes
+        self._services = Services(self)
+        self.add_on_set_parameters_callback(self._validate_parameters)
+        self.add_post_set_parameters_callback(self._apply_parameters)
         backwards = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
         )
-        self._jumps = self.get_clock().create_jump_callback(backwards, post_callback=self._on_clock_jump)
-        self._reporter = Reporter(self, self._settings.diagnostics_period)
+        self._jumps = self.get_clock().create_jump_callback(
+            backwards, post_callback=self._on_clock_jump
+        )
+        self._diagnostics = DiagnosticsPublisher(
+            self, self._settings.diagnostics_period, self._health
+        )
         self._start: Timer | None = None
         if self._settings.autostart:
             self._start = self.create_timer(
                 0.0,
                 self._on_start,
-                callback_group=SlowCallbackGroup(),
+                callback_group=MutuallyExclusiveCallbackGroup(),
                 clock=Clock(clock_type=ClockType.STEADY_TIME),
             )
 
     @property
     def settings(self) -> NodeSettings:
-        """The parameters in force."""
+        """The settings in force."""
         return self._settings
 
     @property
     def configured(self) -> Runtime | None:
-        """What the node has while it is configured, None while it is not."""
+        """The runtime, None while the node is not configured."""
         return self._runtime
 
     @property
     def runtime(self) -> Runtime:
         """
-        What the node has while it is configured.
+        The runtime.
 
-        :raises StavprError: it is not.
+        :raises StavprError: the node is not configured.
         """
         if self._runtime is None:
             because = f' ({self.problem})' if self.problem else ''
             ended = self.state == 'finalized'
-            remedy = 'start it anew' if ended else 'configure it first, `ros2 lifecycle set NODE configure`'
+            remedy = (
+                'start it anew'
+                if ended
+                else 'configure it first, `ros2 lifecycle set NODE configure`'
+            )
             raise StavprError(f'the node is {self.state}{because}: {remedy}')
         return self._runtime
 
-    # the life cycle
+    # life cycle
 
     def _on_start(self) -> None:
-        """Configure and activate, once; again only when a parameter was changed after a failure."""
+        """Configure and activate once; again only when a parameter was changed after a failure."""
         assert self._start is not None
         self._start.cancel()
         if self.state != 'unconfigured':
@@ -113,21 +129,21 @@ class PlaceRecognitionNode(ManagedNode):
         if self.advance(self.trigger_configure):
             if not self.ending.is_set():
                 self.advance(self.trigger_activate)
-        elif self.state == 'unconfigured' and self._settings is not tried:
-            self._start.reset()  # a parameter was set while that failed
+        elif self.state == 'unconfigured' and self._settings != tried:
+            self._start.reset()  # a parameter was set during the failing transition
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Load map and model, warm the kernels, make the publishers."""
+        """Load map and model, warm up the kernels, create the publishers."""
         return self._transition('configure', self._configure, super().on_configure, state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribe to images."""
-        # publishers first: an image may come, and be answered, as soon as there is a subscription
+        # publishers first: a match may be published as soon as there is a subscription
         publishers = super().on_activate
         return self._transition('activate', lambda: publishers(state), self._activate, state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Hear no images any more."""
+        """Unsubscribe from images, and save a recorded map."""
         return self._transition('deactivate', self._deactivate, super().on_deactivate, state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -150,7 +166,7 @@ class PlaceRecognitionNode(ManagedNode):
         then: Callable[[LifecycleState], TransitionCallbackReturn],
         state: LifecycleState,
     ) -> TransitionCallbackReturn:
-        """Do what a transition means; an error leads to the error state, with its reason."""
+        """Run a transition; an error leads to the error state and is kept as the problem."""
         try:
             with self._lock:
                 act()
@@ -169,20 +185,21 @@ class PlaceRecognitionNode(ManagedNode):
         return TransitionCallbackReturn.ERROR
 
     def _configure(self) -> None:
-        settings = self._settings
-        backend, wish = settings.pipeline.backend, settings.backend
-        reason = (why_no_cuda() or 'there is a device') if wish == 'auto' else 'as asked for'
-        self.get_logger().info(f'backend {backend} ({reason})')
-        _require_room(settings.save_path)
+        self._settings = settings = self._settings_with(
+            {}
+        )  # a service may have changed the operation
+        self._log_backend()
+        _require_writable(settings.save_path)
         if settings.map_path:
-            self._tell(MapInfo(operation=settings.operation, state='loading', path=settings.map_path))
-        self._runtime = Runtime(self, settings, self.statistics)
-        self._runtime.on_loading = self.publish_map_info
+            self._publish_map_info(
+                MapInfo(operation=settings.operation, state='loading', path=settings.map_path)
+            )
+        self._runtime = Runtime(self, settings, self.statistics, self.publish_map_info)
         if missing := self._runtime.pipeline.missing:
             self.get_logger().warning(f'waiting, no image can be matched: {missing}')
         self.publish_map_info()
-        # what is there now stays: Python's collector would look through all of it again and again, half a
-        # second each time, in the middle of an image
+        # objects of the map and the model are permanent: scanning them again and again takes the
+        # garbage collector half a second each time, during an image
         gc.collect()
         gc.freeze()
 
@@ -200,19 +217,23 @@ class PlaceRecognitionNode(ManagedNode):
             if runtime is not None:
                 runtime.close()
                 del runtime
-            if self._told is not None:
-                self._tell(MapInfo(operation=self._settings.operation, state='none'))
+            if self._last_map_info is not None:
+                self._publish_map_info(MapInfo(operation=self._settings.operation, state='none'))
         gc.unfreeze()
-        gc.collect()  # runtime and worker refer to each other: the map would stay until Python tidies up
-        if self._settings.pipeline.backend == 'cuda':
-            import torch
+        # runtime and worker refer to each other: without it, the map would stay in memory
+        gc.collect()
+        import torch
 
-            torch.cuda.empty_cache()
+        torch.cuda.empty_cache()
 
-    # parameters
+    def _log_backend(self) -> None:
+        settings = self._settings
+        self.get_logger().info(settings.pipeline.backend_summary(settings.operation))
+
+    # parameters, map and operation
 
     def set_parameters(self, parameters: list[Parameter]) -> list[SetParametersResult]:
-        """Set parameters, one thread at a time: what is stored is what is in force."""
+        """Set parameters, one thread at a time: stored values are those in force."""
         with self._lock:
             return list(super().set_parameters(parameters))
 
@@ -221,95 +242,138 @@ class PlaceRecognitionNode(ManagedNode):
         with self._lock:
             return super().set_parameters_atomically(parameters)
 
-    def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Check all parameters together; apply what may change while the node runs; all of it or nothing."""
-        changes = {parameter.name: parameter.value for parameter in parameters if parameter.name in BY_NAME}
-        if not changes:
-            return SetParametersResult(successful=True)
-        try:
-            with self._lock:
-                self._change(changes)
-        except StavprError as error:
-            self.get_logger().error(str(error))
-            return SetParametersResult(successful=False, reason=str(error))
-        except Exception as error:  # would end the process
-            self.get_logger().error(traceback.format_exc())
-            return SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
-        return SetParametersResult(successful=True)
-
-    def _change(self, changes: dict[str, Any]) -> None:
-        old = self._settings
-        fixed = [n for n, value in changes.items() if BY_NAME[n].when != 'live' and value != old.values[n]]
-        if fixed and self._runtime is not None:
-            raise SettingsError(
-                f'{", ".join(fixed)} can be set only while the node is unconfigured, it is {self.state}: '
-                'clean it up first (`ros2 lifecycle set NODE deactivate`, then cleanup)'
-            )
-        settings = node_settings({**old.values, **changes})
-        if settings.save_path != old.save_path:
-            _require_room(settings.save_path)
-        if self._runtime is not None:
-            if old.map_path and not settings.map_path:
-                raise SettingsError(
-                    "map_path = '' names no file: set the new map's, the old one stays until then"
-                )
-            self._runtime.change(settings)
-        self._settings = settings
-        self._apply_verbosity(settings.verbosity)
-
-    def _on_parameters_set(self, parameters: list[Parameter]) -> None:
-        """Tell what has become of the map; try to start again where the last try failed."""
-        if self._runtime is not None:
-            self.publish_map_info()
-        elif self._start is not None and self.problem and self.state == 'unconfigured':
-            self._start.reset()
-
-    def load_again(self) -> None:
+    def load_map(self, path: str) -> None:
         """
-        Load the map of ``map_path`` once more: the file may have changed.
+        Load a map and use it.
 
-        :raises StavprError: the node is not configured, or the map does not do; the old one stays.
+        :raises StavprError: the node is not configured, or the map is invalid; the old one stays
+            in use.
         """
         with self._lock:
-            self.runtime.load(self._settings.map_path)
+            self.runtime.load(path)
+
+    def set_operation(self, operation: str) -> None:
+        """
+        Change the operation.
+
+        :raises StavprError: the node is not configured, or the operation cannot be changed.
+        """
+        with self._lock:
+            runtime, settings = self.runtime, self._settings_with({'operation': operation})
+            runtime.change(settings)
+            self._settings = settings
+            self._log_backend()
+            self.publish_map_info()
+
+    def _settings_with(self, changes: Mapping[str, Any]) -> NodeSettings:
+        """Return the settings after a change of parameters; the operation in force stays."""
+        values = {name: self.get_parameter(name).value for name in BY_NAME}
+        if self._runtime is not None:
+            values['operation'] = self._settings.operation
+        return node_settings({**values, **changes})
+
+    def _validate_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Check all parameters together; change nothing."""
+        changes = {
+            parameter.name: parameter.value
+            for parameter in parameters
+            if parameter.name in BY_NAME
+        }
+        try:
+            if changes:
+                with self._lock:
+                    self._require_valid(changes)
+        except StavprError as error:
+            self.get_logger().error(f'parameters rejected: {error}')
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _require_valid(self, changes: dict[str, Any]) -> None:
+        changes = {
+            name: value
+            for name, value in changes.items()
+            if value != self.get_parameter(name).value
+        }
+        if self._runtime is not None:
+            for name, service in CHANGED_BY_SERVICE.items():
+                if name in changes:
+                    raise SettingsError(
+                        f'{name} is read when the node is configured, it is {self.state}: call '
+                        f'the service ~/{service}'
+                    )
+            if fixed := [name for name in changes if BY_NAME[name].when != 'live']:
+                raise SettingsError(
+                    f'{", ".join(fixed)} can be set only while the node is unconfigured, it is '
+                    f'{self.state}: clean it up first (`ros2 lifecycle set NODE deactivate`, '
+                    'then cleanup)'
+                )
+        settings = self._settings_with(changes)
+        if settings.save_path != self._settings.save_path:
+            _require_writable(settings.save_path)
+
+    def _apply_parameters(self, parameters: list[Parameter]) -> None:
+        """Apply validated parameters; try to start again where the last try failed."""
+        if not any(parameter.name in BY_NAME for parameter in parameters):
+            return
+        with self._lock:
+            self._settings = self._settings_with({})
+            self._apply_verbosity(self._settings.verbosity)
+            if self._runtime is not None:
+                try:
+                    self._runtime.change(self._settings)
+                except StavprError as error:  # the node ends
+                    self.get_logger().error(f'parameters not applied: {error}')
+                self.publish_map_info()
+            elif self._start is not None and self.problem and self.state == 'unconfigured':
+                self._start.reset()
 
     def _apply_verbosity(self, verbosity: str) -> None:
-        """Log so much; what --log-level says of this node is not touched until a parameter says otherwise."""
+        """Set the log level; that of --log-level stays until the parameter is changed."""
         if verbosity != self._verbosity:
-            level = LoggingSeverity.UNSET if verbosity == 'default' else LoggingSeverity[verbosity.upper()]
+            level = (
+                LoggingSeverity.UNSET
+                if verbosity == 'default'
+                else LoggingSeverity[verbosity.upper()]
+            )
             self.get_logger().set_level(level)
         self._verbosity = verbosity
-
-    # what is told
 
     def _on_clock_jump(self, jump: Any) -> None:
         runtime = self._runtime
         if runtime is not None:
             runtime.restart(f'the clock jumped back by {-jump.delta.nanoseconds / 1e9:.3f} s')
 
+    def _health(self) -> Health:
+        self.publish_map_info()
+        counts = self.statistics.counts()
+        return node_health(self.state, self.problem, self._settings, counts, self._runtime)
+
+    # ~/map_info, and the end
+
     def publish_map_info(self) -> None:
         """Publish ``~/map_info`` if it has changed."""
-        with self._telling:
+        with self._map_info_lock:
             runtime = self._runtime
             if runtime is not None:
-                self._tell(runtime.map_info())
+                self._publish_map_info(runtime.map_info())
 
-    def _tell(self, info: MapInfo) -> None:
-        with self._telling:
+    def _publish_map_info(self, info: MapInfo) -> None:
+        with self._map_info_lock:
             info.header.stamp = self.get_clock().now().to_msg()
-            told, self._told = self._told, info
-            if told is not None:
-                told.header = info.header  # when it was told is no change
-            if told != info and self.context.ok():
+            last, self._last_map_info = self._last_map_info, info
+            if last is not None:
+                last.header = info.header  # a new stamp alone is no change
+            if last != info and self.context.ok():
                 self._map_info.publish(info)
 
     def destroy_node(self) -> None:
-        """End the worker, say what was done, and take the node down."""
-        self._reporter.stop()
-        patience = 0.2 if self.ending.is_set() else PATIENCE + 1  # spin_until has waited before
+        """End the worker, save a recorded map, log the counts, and destroy the node."""
+        self._diagnostics.stop()
+        timeout = 0.2 if self.ending.is_set() else STOP_TIMEOUT + 1  # spin_until has waited before
         self.ending.set()
-        # who holds the lock may be reading a large map, or compiling: nobody waits for that at the end
-        if self._lock.acquire(timeout=patience):
+        # the lock may be held by a thread that loads a large map or compiles: the end does not
+        # wait for it
+        if self._lock.acquire(timeout=timeout):
             try:
                 self._free()
             finally:
@@ -318,17 +382,19 @@ class PlaceRecognitionNode(ManagedNode):
             self.left_behind = True
             runtime = self._runtime
             if runtime is not None:
-                runtime.write_at_the_end()
+                runtime.save_at_end()
         if self.left_behind:
-            self.get_logger().warning('something is still being loaded or compiled: it is left to itself')
-        seen = self.statistics.snapshot()
-        drops = ''.join(f', {count} {cause}' for cause, count in sorted(seen.drops.items()))
-        self.get_logger().info(f'{seen.received} images received, {seen.answered} answered{drops}')
+            self.get_logger().warning('a thread is still loading or compiling: it is abandoned')
+        counts = self.statistics.counts()
+        drops = ''.join(f', {count} {cause}' for cause, count in sorted(counts.drops.items()))
+        self.get_logger().info(
+            f'{counts.received} images received, {counts.answered} processed{drops}'
+        )
         super().destroy_node()
 
 
-def _require_room(save_path: str) -> None:
-    """Refuse a file that cannot be written before what has grown would be lost."""
+def _require_writable(save_path: str) -> None:
+    """Refuse a file that cannot be written before a recorded map would be lost."""
     try:
         if save_path:
             require_room(save_path)

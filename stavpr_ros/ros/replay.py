@@ -1,6 +1,7 @@
-"""Publishes image records at a pace, or one by one as each is answered."""
+"""Publishes image records at a pace, or each after the result of the one before."""
 
 import array
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,35 +16,35 @@ from std_msgs.msg import Header
 
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError
-from stavpr_ros.ros.discovery import Introduction
+from stavpr_ros.ros.discovery import Discovery
 from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord
 
 SECOND = 1_000_000_000
-SLICE_SECONDS = 0.1
-"""Longest time in one wait, so that Ctrl-C is heard."""
+SPIN_SECONDS = 0.1  # until a signal is noticed
+RELIABLE = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
 
 
-class NobodyListensError(StavprError):
-    """No subscriber, or no node that answers, turned up in time."""
+class NoSubscriberError(StavprError):
+    """No subscriber, or no node that publishes results, was discovered in time."""
 
 
-class NoAnswerError(StavprError):
-    """A published image was neither answered nor acknowledged in time."""
+class NoResultError(StavprError):
+    """A published image got neither a result nor an acknowledgment in time."""
 
 
 @dataclass(frozen=True)
 class ReplaySettings:
     """
-    How to replay.
+    Settings of a replay.
 
     :param publish_to: image topic; relative names are remapped and put into the node's namespace.
-    :param match_topic: topic of the answers; heard only if lossless.
-    :param rate: factor on the recorded pace, above 0.
-    :param lossless: publish the next image when the last one is answered; the pace does not count then.
-    :param timeout: seconds to wait for the answer to one image before it is sent again.
-    :param wait: seconds to wait for listeners; None = for ever.
-    :param tries: how often one image is sent before giving up.
+    :param match_topic: topic of the results, for ``lossless``.
+    :param rate: factor on the recorded pace, above 0; without effect with ``lossless``.
+    :param lossless: publish the next image after the result of the last one.
+    :param timeout: seconds without a result after which an image is sent again.
+    :param wait: seconds to wait for subscribers; None = no limit.
+    :param tries: how often one image is sent.
     """
 
     publish_to: str = 'image'
@@ -56,7 +57,7 @@ class ReplaySettings:
 
 
 def image_message(record: ImageRecord) -> Image:
-    """Make the message of a record; its header is the recorded one."""
+    """Return the message of a record, with the recorded header."""
     message = Image(
         height=record.height,
         width=record.width,
@@ -74,59 +75,58 @@ def image_message(record: ImageRecord) -> Image:
 
 class Replayer:
     """
-    Publishes images on a node; nothing else may spin that node.
+    Publishes images on a node, which it spins.
 
-    :param node: where the publisher, and the subscription of the answers, are made.
-    :param settings: pace, topics and patience.
-    :param notify: called with what a user should know: waiting for whom, an image sent again.
+    :param node: for the publisher and the subscription of the results.
+    :param settings: of the replay.
+    :param notify: called with messages for the user: waiting for a subscriber, an image sent
+        again.
     """
 
-    def __init__(self, node: Node, settings: ReplaySettings, notify: Callable[[str], None]) -> None:
-        self.node = node
-        self.settings = settings
-        self.notify = notify
-        self.published = 0
-        self.resent = 0
-        self.dropped = 0
-        reliable = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
-        self.publisher = node.create_publisher(Image, settings.publish_to, reliable)
-        self.subscription = (
-            node.create_subscription(PlaceMatch, settings.match_topic, self._on_match, reliable)
-            if settings.lossless
-            else None
-        )
+    def __init__(
+        self, node: Node, settings: ReplaySettings, notify: Callable[[str], None]
+    ) -> None:
+        self.node, self.settings, self.notify = node, settings, notify
+        self.published = self.resent = self.dropped = 0
+        self.publisher = node.create_publisher(Image, settings.publish_to, RELIABLE)
+        self._match_topic = node.resolve_topic_name(settings.match_topic)
+        if settings.lossless:
+            node.create_subscription(PlaceMatch, settings.match_topic, self._on_match, RELIABLE)
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._introduction = Introduction(node, self._listeners, settings.timeout)
+        self._discovery = Discovery(node, self._endpoints, settings.timeout)
         self._outstanding: Header | None = None
         self._start: tuple[float, int] | None = None
 
-    def wait_for_listeners(self) -> None:
+    def wait_for_subscribers(self) -> None:
         """
-        Wait until the first image will be heard, and, if lossless, its answer too.
+        Wait until the first image, and if lossless its result, will be received.
 
-        :raises NobodyListensError: ``wait`` seconds are over.
+        :raises NoSubscriberError: not within ``wait`` seconds.
         """
-        wait = self.settings.wait
-        deadline = None if wait is None else time.monotonic() + wait
-        told = ''
-        while missing := self._missing():
-            if missing != told:
+        notified = ''
+
+        def complete() -> bool:
+            nonlocal notified
+            missing = self._missing()
+            if missing not in ('', notified):
                 self.notify(f'waiting for {missing}')
-                told = missing
-            if deadline is not None and time.monotonic() > deadline:
-                raise NobodyListensError(
-                    f'waited {wait:g} s for {missing}: expected the node to be running; start it, compare '
-                    'the topics (`ros2 topic list`) and ROS_DOMAIN_ID, or wait longer (--wait)'
-                )
-            self._spin(SLICE_SECONDS)
-        self._settle()
+                notified = missing
+            return not missing
+
+        if not self._spin_until(complete, self.settings.wait):
+            raise NoSubscriberError(
+                f'waited {self.settings.wait:g} s for {self._missing()}: expected a running node; '
+                'start it, compare the topics (`ros2 topic list`) and ROS_DOMAIN_ID, or wait '
+                'longer (--wait)'
+            )
+        self._wait_for_discovery()
 
     def send(self, record: ImageRecord) -> None:
         """
-        Publish one image when its time has come; if lossless, return when it is answered.
+        Publish one image when it is due; if lossless, return after its result.
 
-        :raises NoAnswerError: lossless, and no answer after all tries.
+        :raises NoResultError: lossless, and no result after all tries.
         """
         message = image_message(record)
         if self.settings.lossless:
@@ -140,83 +140,83 @@ class Replayer:
         """
         Wait until the last images have arrived, so that the node may be destroyed.
 
-        :raises NoAnswerError: a reliable subscriber has not acknowledged them in time.
+        :raises NoResultError: a reliable subscriber has not acknowledged them in time.
         """
-        deadline = time.monotonic() + self.settings.timeout
-        while not self.publisher.wait_for_all_acked(Duration(seconds=SLICE_SECONDS)):
-            if time.monotonic() > deadline:
-                raise NoAnswerError(
-                    f'the last images on {self.publisher.topic_name} are not acknowledged after '
-                    f'{self.settings.timeout:g} s: expected reliable subscribers to take them; is one stuck?'
-                )
-        # best-effort subscribers acknowledge nothing: an answer to a request sent after the images tells
-        self._introduction.renew()
-        self._settle()
+        timeout = self.settings.timeout
+        if not self._spin_until(lambda: self.publisher.wait_for_all_acked(Duration()), timeout):
+            raise NoResultError(
+                f'the last images on {self.publisher.topic_name} are not acknowledged after '
+                f'{timeout:g} s: expected reliable subscribers to take them; check for a busy one'
+            )
+        # best-effort subscribers acknowledge nothing: a response to a later request proves it
+        self._wait_for_discovery()
 
     def close(self) -> None:
-        """Let go of the node, which is the caller's to destroy."""
+        """Release the node; the caller destroys it."""
         self._executor.shutdown()
 
-    def _spin(self, seconds: float) -> None:
-        with signals_deferred():
-            self._executor.spin_once(timeout_sec=max(0.0, min(seconds, SLICE_SECONDS)))
+    def _spin_until(self, done: Callable[[], bool], seconds: float | None) -> bool:
+        """Spin until ``done`` returns True; return False when the time is over."""
+        end = math.inf if seconds is None else time.monotonic() + seconds
+        while not done():
+            left = end - time.monotonic()
+            if left <= 0:
+                return False
+            with signals_deferred():
+                self._executor.spin_once(timeout_sec=min(left, SPIN_SECONDS))
+        return True
 
     def _missing(self) -> str:
-        """Name who is not there yet; empty if all are."""
+        """Return the endpoint that is not discovered yet; empty = none."""
         if not self.publisher.get_subscription_count():
             return f'a subscriber of {self.publisher.topic_name}'
-        if self.subscription is not None and not self.subscription.get_publisher_count():
-            return f'a publisher of {self.subscription.topic_name}'
+        if self.settings.lossless and not self.node.count_publishers(self._match_topic):
+            return f'a publisher of {self._match_topic}'
         return ''
 
-    def _settle(self) -> None:
-        """Wait until the listeners know of us: a best-effort one loses what comes before."""
-        while not self._introduction.done():
-            self._spin(SLICE_SECONDS)
+    def _wait_for_discovery(self) -> None:
+        """Wait until the others have discovered us: best-effort ones lose earlier images."""
+        self._discovery.restart()
+        self._spin_until(self._discovery.done, None)
 
-    def _listeners(self) -> list[Any]:
-        """Endpoints of those who subscribe to the images, or answer."""
+    def _endpoints(self) -> list[Any]:
+        """Return the subscriptions to the images and the publishers of results."""
         found = self.node.get_subscriptions_info_by_topic(self.publisher.topic_name)
-        if self.subscription is not None:
-            found += self.node.get_publishers_info_by_topic(self.subscription.topic_name)
+        if self.settings.lossless:
+            found += self.node.get_publishers_info_by_topic(self._match_topic)
         return found
 
     def _wait_until_due(self, time_ns: int) -> None:
         if self._start is None:
             self._start = time.monotonic(), time_ns
         began, first_ns = self._start
-        due = began + (time_ns - first_ns) / SECOND / self.settings.rate
-        if due - time.monotonic() > 10:
-            self.notify(f'the next image comes in {due - time.monotonic():.0f} s, as recorded (see --rate)')
-        while (left := due - time.monotonic()) > 0:
-            self._spin(left)
+        left = began + (time_ns - first_ns) / SECOND / self.settings.rate - time.monotonic()
+        if left > 10:
+            self.notify(f'the next image is due in {left:.0f} s, as recorded (see --rate)')
+        self._spin_until(lambda: False, left)
 
     def _send_until_answered(self, message: Image) -> None:
         """
-        Send and wait for one answer with the same header.
+        Send an image and wait for a result with its header.
 
-        Headers may all be equal (stamps of 0), so it matters that only one image is on its way. If it was
-        sent again to a node that was only slow, a second answer comes; an equal header takes it for its own.
+        Headers may all be equal (stamps of 0), so only one image is outstanding. An image sent
+        again to a slow node has two results; with an equal header the second counts for the next
+        image.
         """
-        stamp = message.header.stamp
+        stamp, timeout = message.header.stamp, self.settings.timeout
         name = f'image {self.published + 1} (stamp {stamp.sec}.{stamp.nanosec:09d})'
-        timeout = self.settings.timeout
         for attempt in range(self.settings.tries):
             if attempt:
                 self.resent += 1
-                self.notify(f'{name}: no answer for {timeout:g} s, sent again (try {attempt + 1})')
+                self.notify(f'{name}: no result for {timeout:g} s, sent again (try {attempt + 1})')
             self._outstanding = message.header
             self.publisher.publish(message)
-            deadline = time.monotonic() + timeout
-            while self._outstanding is not None and (left := deadline - time.monotonic()) > 0:
-                self._spin(left)
-            if self._outstanding is None:
+            if self._spin_until(lambda: self._outstanding is None, timeout):
                 return
-        topic = self.subscription.topic_name if self.subscription else self.settings.match_topic
-        raise NoAnswerError(
-            f'{name} got no answer on {topic} in {self.settings.tries} tries of {timeout:g} s: expected one '
-            f'message per image; is the node alive, is it subscribed to '
-            f'{self.publisher.topic_name}? A slow one needs a longer --timeout'
+        raise NoResultError(
+            f'{name} got no result on {self._match_topic} in {self.settings.tries} tries of '
+            f'{timeout:g} s: expected one message per image; check that the node runs and '
+            f'subscribes to {self.publisher.topic_name}, or give a slow one a longer --timeout'
         )
 
     def _on_match(self, match: PlaceMatch) -> None:
@@ -225,4 +225,6 @@ class Replayer:
         self._outstanding = None
         if match.status == PlaceMatch.DROPPED:
             self.dropped += 1
-            self.notify(f'image {self.published + 1} was dropped by the node: is another camera publishing?')
+            self.notify(
+                f'image {self.published + 1} was dropped by the node: check for another publisher'
+            )

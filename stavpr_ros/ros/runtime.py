@@ -1,39 +1,35 @@
-"""What the node has while it is configured: the pipeline on its worker, the publishers, the inputs."""
+"""The configured node: the pipeline on its worker, the subscriptions and the publishers."""
 
 import math
 import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, wait
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
-from stavpr_msgs.msg import Candidate, MapInfo, PlaceMatch
-from stavpr_ros.errors import StavprError
-from stavpr_ros.pipeline import Pipeline
-from stavpr_ros.pipeline.start import LoadedMap, read_map
+from std_msgs.msg import Header
+
+from stavpr_msgs.msg import MapInfo
+from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
+from stavpr_ros.pipeline.saving import save_recorded_map
 from stavpr_ros.pipeline.statistics import WAITING, Statistics
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.input import ImageInput, OdometryInput
-from stavpr_ros.ros.lifecycle import ManagedNode
-from stavpr_ros.ros.messages import candidate_messages, map_info_message, match_message, nanoseconds
+from stavpr_ros.ros.messages import map_info_message, nanoseconds
 from stavpr_ros.ros.output import Output
-from stavpr_ros.ros.saving import write_at_the_end, write_map
-from stavpr_ros.ros.settings import NodeSettings
-from stavpr_ros.ros.worker import PATIENCE, Worker
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode
+from stavpr_ros.ros.worker import STOP_TIMEOUT, Worker
 from stavpr_ros.threads import limit_threads
 
 REPORT_PERIOD = 10.0  # seconds between repeated warnings
-NOTICE = 0.2  # seconds until it is noticed that the node ends
-
-Result = TypeVar('Result')
 
 
 @dataclass(frozen=True)
 class _Item:
-    """An image that waits: its message, when it came (seconds), and after how many restarts."""
+    """A waiting image: message, time of arrival (s), and the number of restarts before it."""
 
     message: Any
     arrival: float
@@ -42,162 +38,152 @@ class _Item:
 
 class Runtime:
     """
-    Everything between the configuration of the node and its clean-up.
+    Everything between the configuration of the node and its cleanup.
 
     :param node: the node.
-    :param settings: its parameters; what is live is changed by :meth:`change`.
-    :param statistics: where it is counted.
-    :raises StavprError: the map, the model or the settings do not do.
+    :param settings: of the node.
+    :param statistics: counts images.
+    :param on_map_change: called when the map, or its loading state, has changed.
+    :raises StavprError: invalid settings, or an invalid map or model.
+
+    ``problem`` is the error of the last map or subscription, for the diagnostics; ``loading`` the
+    path of the map that is being loaded, '' = none. ``images`` and ``odometry`` are subscriptions
+    while the node is active.
     """
 
-    def __init__(self, node: ManagedNode, settings: NodeSettings, statistics: Statistics) -> None:
+    def __init__(
+        self,
+        node: ManagedNode,
+        settings: NodeSettings,
+        statistics: Statistics,
+        on_map_change: Callable[[], None],
+    ) -> None:
         self._node, self._settings, self._statistics = node, settings, statistics
-        self._images: ImageInput | None = None
-        self._odometry: OdometryInput | None = None
+        self._on_map_change = on_map_change
+        self.images: ImageInput | None = None
+        self.odometry: OdometryInput | None = None
         self._epoch = self._pipeline_epoch = 0
         self._explained: set[str] = set()
-        self._last_match: PlaceMatch | None = None
-        self.loading = ''  # the map that is being loaded
-        self.problem = ''  # why the last map was not loaded
-        self._one_load = threading.Lock()
-        self.on_loading: Callable[[], None] = lambda: None  # called when that has changed
-        self._worker = Worker(self._answer, settings.queue_size)
+        self.last_header = Header()  # of the last image in the window
+        self.loading = self.problem = ''
+        self._load_lock = threading.Lock()
+        self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size)
-        self._made: Pipeline | None = None
+        self._pipeline: Pipeline | None = None
         try:
-            self._made = self._on_worker(lambda: self._make_pipeline(settings))
+            self._pipeline = self.worker.run(self._make_pipeline)
             if settings.map_path:
                 self.load(settings.map_path)
         except BaseException:
             self.close()
             raise
 
-    def _make_pipeline(self, settings: NodeSettings) -> Pipeline:
-        limit_threads(settings.threads)
-        return Pipeline(settings.pipeline, settings.operation)
-
-    def _on_worker(self, function: Callable[[], Result]) -> Result:
-        """Have the worker call a function; give up when the node ends meanwhile."""
-        future = self._worker.call(function)
-        while not future.done():
-            wait([future], NOTICE)
-            if self._node.ending.is_set() and not future.done():
-                raise StavprError('the node ends')
-        try:
-            return future.result()
-        except CancelledError:
-            raise StavprError('the node is no longer configured') from None
-
     @property
     def pipeline(self) -> Pipeline:
         """The pipeline; only the worker may change it."""
-        assert self._made is not None
-        return self._made
+        assert self._pipeline is not None
+        return self._pipeline
 
-    # the life cycle
+    def _make_pipeline(self) -> Pipeline:
+        limit_threads(self._settings.threads)
+        return Pipeline(self._settings.pipeline, self._settings.operation)
+
+    # life cycle
 
     def activate(self) -> None:
-        """Hear images, with an empty window: the camera may have been moved meanwhile."""
+        """Subscribe, with an empty window: the camera may have been moved since the last image."""
         self.reset()
-        s = self._settings
-        self._update_odometry(s)
-        self._images = ImageInput(
-            self._node,
-            s.image_transport,
-            self._statistics,
-            self._hand_over,
-            self._skip,
-            self.restart,
-            s.max_stamp_gap,
-            s.max_rate,
+        self._update_odometry()
+        self.images = ImageInput(
+            self._node, self._settings, self._statistics, self._enqueue, self._reject, self.restart
         )
 
     def deactivate(self) -> None:
-        """Hear nothing more; images that wait are answered as dropped, what has grown is written."""
-        self._hear_nothing()
-        write_at_the_end(self.pipeline, self._on_worker, self._settings.save_path, self._node.get_logger())
+        """Unsubscribe; publish waiting images as dropped, and save a recorded map."""
+        self._unsubscribe()
+        self._save(self.worker.run)
 
     def close(self) -> None:
-        """Hear, say and do nothing more."""
+        """Unsubscribe, save a recorded map, and end the worker and the publishers."""
         try:
-            self._hear_nothing()
-            self.write_at_the_end()
+            self._unsubscribe()
+            self.save_at_end()
         finally:
-            if not self._worker.stop():
+            if not self.worker.stop():
                 self._node.left_behind = True
             self._output.close()
 
-    def write_at_the_end(self) -> None:
-        """Write what has grown, unless the worker is busy with what may take for ever; that is said then."""
-        if self._made is None:
-            return
+    def save_at_end(self) -> None:
+        """Save a recorded map, unless the worker stays busy."""
+        self._save(lambda function: self.worker.call(function).result(STOP_TIMEOUT))
 
-        def on_worker(function: Callable[[], Result]) -> Result:
-            return self._worker.call(function).result(PATIENCE)
+    def _save(self, on_worker: Callable[[Callable[[], Any]], Any]) -> None:
+        if self._pipeline is not None:
+            log = self._node.get_logger()
+            save_recorded_map(self._pipeline, on_worker, self._settings.save_path, log)
 
-        write_at_the_end(self._made, on_worker, self._settings.save_path, self._node.get_logger())
+    def _unsubscribe(self) -> None:
+        for subscription in (self.images, self.odometry):
+            if subscription is not None:
+                subscription.close()
+        self.images = self.odometry = None
+        for item in self.worker.clear():
+            reason = 'the node was deactivated before it was processed'
+            self._drop(item.message, Status.DROPPED, reason, 'deactivated')
 
-    def _hear_nothing(self) -> None:
-        for heard in (self._images, self._odometry):
-            if heard is not None:
-                heard.close()
-        self._images = self._odometry = None
-        for item in self._worker.clear():
-            self._drop(
-                item.message, Status.DROPPED, 'the node was deactivated before its turn', 'deactivated'
-            )
+    def _update_odometry(self) -> None:
+        """Subscribe to odometry while it is needed."""
+        needed = self._settings.needs_odometry
+        if needed and self.odometry is None:
+            self.odometry = OdometryInput(self._node, self._settings.odometry_timeout)
+        elif not needed and self.odometry is not None:
+            self.odometry.close()
+            self.odometry = None
 
-    def _update_odometry(self, settings: NodeSettings) -> None:
-        """Subscribe to odometry where it is asked for, and only there."""
-        wanted = settings.wants_odometry
-        if wanted and self._odometry is None:
-            self._odometry = OdometryInput(self._node, settings.odometry_timeout)
-        elif not wanted and self._odometry is not None:
-            self._odometry.close()
-            self._odometry = None
-
-    # what may change
+    # changes
 
     def change(self, settings: NodeSettings) -> None:
         """
-        Take over live parameters, all or nothing; the map comes first, since it is what may fail.
+        Apply live parameters, or another operation.
 
-        :raises StavprError: they do not do; everything stays as it was.
+        A subscription to odometry that fails is logged and kept in ``problem``; everything else is
+        applied.
+
+        :raises StavprError: the operation cannot be changed; nothing is changed then.
         """
-        path = settings.map_path if settings.map_path != self._settings.map_path else ''
-        with self._loading(path) if path else nullcontext():
-            loaded = read_map(path, settings.pipeline) if path else None
-            if self._images is not None:
-                self._update_odometry(settings)  # may fail, and is easily undone
-            try:
-                self._on_worker(lambda: self.pipeline.change(settings.pipeline, settings.operation, loaded))
-            except BaseException:
-                if self._images is not None:
-                    self._update_odometry(self._settings)
-                raise
+        self.worker.run(lambda: self.pipeline.change(settings.pipeline, settings.operation))
         self._settings = settings
-        if loaded is not None:
-            self._tell(loaded)
-        if self._images is not None:
-            self._images.max_rate, self._images.stamps.gap = settings.max_rate, settings.max_stamp_gap
+        if self.images is not None:
+            self.images.max_rate, self.images.stamps.gap = (
+                settings.max_rate,
+                settings.max_stamp_gap,
+            )
+            try:
+                self._update_odometry()
+            except SettingsError as error:
+                self.problem = str(error)
+                self._node.get_logger().error(self.problem)
 
     def load(self, path: str) -> None:
         """
-        Read a map on this thread, while images are matched with the one that is there; then use it.
+        Load a map, on this thread, and use it; meanwhile the old one stays in use.
 
-        :raises StavprError: the file, the model or the settings do not do; the old map stays.
+        :raises StavprError: an invalid file, model or setting; the old map stays in use.
         """
         with self._loading(path):
             loaded = read_map(path, self._settings.pipeline)
-            self._on_worker(lambda: self.pipeline.use(loaded))
-        self._tell(loaded)
+            self.worker.run(lambda: self.pipeline.change(loaded=loaded))
+        places, features = loaded.places, loaded.places.features
+        self._node.get_logger().info(
+            f'map {path}: {len(places)} places, features {places.settings.kind}, '
+            f'{places.settings.strips} strips of {features.strips.shape[2]} dimensions'
+        )
 
     @contextmanager
     def _loading(self, path: str) -> Iterator[None]:
-        """Tell that a map is being loaded, if one is."""
-        with self._one_load:
+        with self._load_lock:
             self.loading, self.problem = path, ''
-            self.on_loading()
+            self._on_map_change()
             try:
                 yield
             except Exception as error:
@@ -205,42 +191,18 @@ class Runtime:
                 raise
             finally:
                 self.loading = ''
-                self.on_loading()
-
-    def _tell(self, loaded: LoadedMap) -> None:
-        places, features = loaded.places, loaded.places.features
-        self._node.get_logger().info(
-            f'map {loaded.path}: {len(places)} places, features {places.settings.kind}, '
-            f'{places.settings.strips} strips of {features.strips.shape[2]} dimensions'
-        )
-
-    def save(self, path: str, overwrite: bool) -> int:
-        """Write the map; see :meth:`Pipeline.to_save`."""
-        return write_map(self.pipeline, self._on_worker, path, overwrite)
-
-    def relocalize(self, count: int) -> tuple[PlaceMatch, list[Candidate]]:
-        """Return the answer for the window as it is, and candidates; see :meth:`Pipeline.relocalize`."""
-
-        def ask() -> tuple[PlaceMatch, list[Candidate]]:
-            # messages are made here, on the worker: a route may grow and forget before the next call
-            match, ranked = self.pipeline.relocalize(count)
-            places = self.pipeline.places
-            header = self._last_match.header if self._last_match is not None else PlaceMatch().header
-            listed = [] if places is None else candidate_messages(places, ranked)
-            return match_message(header, match, places), listed
-
-        return self._on_worker(ask)
+                self._on_map_change()
 
     def restart(self, reason: str) -> None:
-        """Begin a new window with the images that come from now on."""
-        self._node.get_logger().info(f'the window is emptied: {reason}')
+        """Empty the window before the images that arrive from now on."""
+        self._node.get_logger().info(f'window reset: {reason}')
         self._epoch += 1
-        odometry = self._odometry  # another thread may take it away
+        odometry = self.odometry  # another thread may unsubscribe
         if odometry is not None:
             odometry.trajectory.clear()
 
     def reset(self) -> None:
-        """Empty the window now; images that wait belong to none any more."""
+        """Empty the window now, and drop waiting images."""
         self._epoch += 1
         epoch = self._epoch
 
@@ -248,101 +210,10 @@ class Runtime:
             self._pipeline_epoch = epoch
             self.pipeline.reset()
 
-        self._on_worker(empty)
-
-    # images
-
-    def _hand_over(self, message: Any, arrival: float) -> None:
-        dropped = self._worker.put(_Item(message, arrival, self._epoch))
-        if dropped is not None:
-            self._drop(dropped.message, Status.DROPPED, 'newer images came before its turn', 'queue full')
-            self._node.get_logger().warning(
-                'images come faster than they can be matched, some are dropped: see /diagnostics',
-                throttle_duration_sec=REPORT_PERIOD,
-            )
-
-    def _skip(self, message: Any, reason: str) -> None:
-        self._drop(message, Status.SKIPPED, reason, 'max_rate')
-
-    def _drop(self, message: Any, status: Status, reason: str, cause: str) -> None:
-        """Answer an image that is not looked at."""
-        self._statistics.dropped(cause)
-        threshold = self.pipeline.threshold
-        threshold = math.nan if threshold is None else threshold
-        self._output.publish(message.header, Match(status, reason, threshold))
-
-    def _answer(self, item: _Item) -> None:
-        """Answer one image, on the worker's thread."""
-        if item.epoch < self._pipeline_epoch:
-            self._drop(item.message, Status.DROPPED, 'the window was emptied before its turn', 'window reset')
-            return
-        if item.epoch > self._pipeline_epoch:
-            self._pipeline_epoch = item.epoch
-            self.pipeline.reset()
-        waited = time.monotonic() - item.arrival
-        header = item.message.header
-        stamp = nanoseconds(header.stamp)
-        odometry = self._odometry  # another thread may take it away
-        pose = odometry.trajectory.at(stamp) if odometry is not None else None
-        # poses of a map are in the map's frame, those of a route that grows in the odometry's
-        grows = odometry is not None and self.pipeline.operation != 'localization'
-        frame = odometry.frame if grows and odometry is not None else self._settings.map_frame
-        self.pipeline.ranking = self._output.wants_candidates
-        try:
-            match = self.pipeline.process(item.message, stamp, pose)
-        except Exception as error:
-            self._node.get_logger().error(f'an image could not be matched: {traceback.format_exc()}')
-            reason = f'internal error: {type(error).__name__}: {error}'
-            match = Match(Status.INVALID_IMAGE, reason, cause='internal error')
-        if match.status is Status.NOT_READY and self.loading:
-            match = replace(match, reason=f'map {self.loading} is being loaded')
-        self._publish(header, match, frame, waited)
-
-    def _publish(self, header: Any, match: Match, frame: str, waited: float) -> None:
-        began = time.monotonic()
-        message = self._output.publish(header, match, self.pipeline.places, frame)
-        stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
-        if match.cause:
-            self._statistics.dropped(match.cause)
-        self._explain(match)
-        mapped = match.status is Status.MAPPED
-        if match.status in (Status.WARMING_UP, Status.NO_MATCH, Status.MATCH) or mapped:
-            self._last_match = message
-            place = message.newest_index if mapped else message.place_index
-            self._statistics.answered(match.status.name, match.reason, place, message.distance, stages)
-
-    def _explain(self, match: Match) -> None:
-        """Say what is wrong with an image, once for each kind of trouble."""
-        if match.status is Status.INVALID_IMAGE and match.cause not in self._explained:
-            self._explained.add(match.cause)
-            self._node.get_logger().warning(
-                f'image skipped: {match.reason} (said once; /diagnostics counts "{match.cause}")'
-            )
-        elif match.status is Status.NOT_READY:
-            self._node.get_logger().warning(
-                f'images arrive, but cannot be matched: {match.reason}',
-                throttle_duration_sec=REPORT_PERIOD,
-            )
-
-    # what is told of it
-
-    @property
-    def images(self) -> ImageInput | None:
-        """The subscription of images, while active."""
-        return self._images
-
-    @property
-    def odometry(self) -> OdometryInput | None:
-        """The subscription of odometry, where it is asked for, while active."""
-        return self._odometry
-
-    @property
-    def waiting(self) -> int:
-        """Images that wait."""
-        return self._worker.waiting
+        self.worker.run(empty)
 
     def map_info(self) -> MapInfo:
-        """Describe the map that is in use."""
+        """Return the description of the map in use."""
         pipeline = self.pipeline
         return map_info_message(
             pipeline.operation,
@@ -352,3 +223,85 @@ class Runtime:
             pipeline.extractor,
             self._node.get_clock().now().to_msg(),
         )
+
+    # images
+
+    def _enqueue(self, message: Any, arrival: float) -> None:
+        dropped = self.worker.put(_Item(message, arrival, self._epoch))
+        if dropped is not None:
+            self._drop(
+                dropped.message,
+                Status.DROPPED,
+                'newer images arrived before it was processed',
+                'queue full',
+            )
+            self._node.get_logger().warning(
+                'images arrive faster than they are processed, some are dropped: see /diagnostics',
+                throttle_duration_sec=REPORT_PERIOD,
+            )
+
+    def _reject(self, message: Any, reason: str) -> None:
+        self._drop(message, Status.SKIPPED, reason, 'max_rate')
+
+    def _drop(self, message: Any, status: Status, reason: str, cause: str) -> None:
+        """Publish the status of an image that is not processed."""
+        self._statistics.dropped(cause)
+        threshold = self.pipeline.threshold
+        threshold = math.nan if threshold is None else threshold
+        self._output.publish(message.header, Match(status, reason, threshold))
+
+    def _process(self, item: _Item) -> None:
+        """Process one image, on the worker."""
+        if item.epoch < self._pipeline_epoch:
+            reason = 'the window was reset before it was processed'
+            self._drop(item.message, Status.DROPPED, reason, 'window reset')
+            return
+        if item.epoch > self._pipeline_epoch:
+            self._pipeline_epoch = item.epoch
+            self.pipeline.reset()
+        waited = time.monotonic() - item.arrival
+        header = item.message.header
+        stamp = nanoseconds(header.stamp)
+        odometry = self.odometry  # another thread may unsubscribe
+        pose, frame = None, self._settings.map_frame
+        if odometry is not None:
+            pose = odometry.trajectory.at(stamp)
+            if self.pipeline.operation != 'localization':  # places have the poses of the odometry
+                frame = odometry.frame
+        self.pipeline.list_candidates = self._output.candidates_requested
+        try:
+            match = self.pipeline.process(item.message, stamp, pose)
+        except Exception as error:
+            self._node.get_logger().error(
+                f'an image could not be processed: {traceback.format_exc()}'
+            )
+            reason = f'internal error: {type(error).__name__}: {error}'
+            match = Match(Status.INVALID_IMAGE, reason, cause='internal error')
+        if match.status is Status.NOT_READY and self.loading:
+            match = replace(match, reason=f'map {self.loading} is being loaded')
+        self._publish(header, match, frame, waited)
+
+    def _publish(self, header: Header, match: Match, frame: str, waited: float) -> None:
+        began = time.monotonic()
+        message = self._output.publish(header, match, self.pipeline.places, frame)
+        stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
+        if match.cause:
+            self._statistics.dropped(match.cause)
+            self._log_cause(match)
+            return
+        self.last_header = header
+        place = message.newest_index if match.status is Status.MAPPED else message.place_index
+        self._statistics.answered(match.status.name, match.reason, place, message.distance, stages)
+
+    def _log_cause(self, match: Match) -> None:
+        """Log why an image is in no window: an invalid one once for each cause."""
+        if match.status is Status.INVALID_IMAGE and match.cause not in self._explained:
+            self._explained.add(match.cause)
+            self._node.get_logger().warning(
+                f'invalid image: {match.reason} (logged once; /diagnostics counts "{match.cause}")'
+            )
+        elif match.status is Status.NOT_READY:
+            self._node.get_logger().warning(
+                f'images arrive, but cannot be matched: {match.reason}',
+                throttle_duration_sec=REPORT_PERIOD,
+            )

@@ -1,15 +1,16 @@
-"""The node's services; each answers with a reason when it cannot do what it is asked."""
+"""The services of the node; each returns the error as its message."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
-from stavpr_ros.ros.answers import wait_for_clients
+from stavpr_ros.pipeline.saving import write_map
+from stavpr_ros.ros.messages import candidates_message, match_message
+from stavpr_ros.ros.rclpy_workarounds import repeat_responses
 
 if TYPE_CHECKING:
     from stavpr_ros.ros.node import PlaceRecognitionNode
@@ -20,7 +21,7 @@ class Services:
     """
     Serves ``~/load_map``, ``~/save_map``, ``~/reset``, ``~/relocalize`` and ``~/set_operation``.
 
-    They share a callback group of their own: while one takes its time, images and diagnostics go on.
+    They share a callback group of their own: a long request delays neither images nor diagnostics.
     """
 
     def __init__(self, node: 'PlaceRecognitionNode') -> None:
@@ -33,49 +34,46 @@ class Services:
             (Relocalize, 'relocalize', self._relocalize),
             (SetOperation, 'set_operation', self._set_operation),
         ):
-            answer = self._with_reason(serve)
-            wait_for_clients(node.create_service(kind, f'~/{name}', answer, callback_group=group))
+            callback = self._callback(name, serve)
+            repeat_responses(
+                node.create_service(kind, f'~/{name}', callback, callback_group=group)
+            )
 
-    def _with_reason(self, serve: Callable[['Runtime', Any, Any], str]) -> Callable[[Any, Any], Any]:
-        """Turn errors into answers: ``success`` and ``message``."""
+    def _callback(
+        self, name: str, serve: Callable[['Runtime', Any, Any], str]
+    ) -> Callable[[Any, Any], Any]:
+        """Return a service callback that fills ``success`` and ``message``, and logs errors."""
 
-        def answer(request: Any, response: Any) -> Any:
+        def callback(request: Any, response: Any) -> Any:
             try:
                 response.message = serve(self._node.runtime, request, response)
                 response.success = True
             except StavprError as error:
                 response.success, response.message = False, str(error)
-                self._node.get_logger().warning(f'a service could not do as it was asked: {error}')
-            except Exception as error:  # the worker was stopped, or an error of ours: the client must hear
+                self._node.get_logger().warning(f'{name} failed: {error}')
+            except (
+                Exception
+            ) as error:  # the worker was stopped, or a defect: the client must get a response
                 response.success, response.message = False, f'{type(error).__name__}: {error}'
-                self._node.get_logger().error(f'a service failed: {response.message}')
+                self._node.get_logger().error(f'{name} failed: {response.message}')
             return response
 
-        return answer
-
-    def _set_parameter(self, name: str, value: str) -> None:
-        """Set a parameter of the node, which does it: so the two ways to change something are one."""
-        result = self._node.set_parameters([Parameter(name, value=value)])[0]
-        if not result.successful:
-            raise StavprError(result.reason)
+        return callback
 
     def _load_map(self, runtime: 'Runtime', request: Any, response: Any) -> str:
         if not request.path:
-            raise StavprError("path = '' names no file: give the map's")
-        if request.path == self._node.get_parameter('map_path').value:
-            self._node.load_again()
-        else:
-            self._set_parameter('map_path', request.path)
+            raise StavprError("path = '' is no file: set the path of the map")
+        self._node.load_map(request.path)
         response.map = runtime.map_info()
-        self._node.publish_map_info()
         return f'{response.map.places} places from {request.path}'
 
     def _save_map(self, runtime: 'Runtime', request: Any, response: Any) -> str:
-        settings = self._node.settings
-        path = request.path or settings.save_path or settings.map_path
+        path = request.path or self._node.settings.save_path or runtime.pipeline.path
         if not path:
-            raise StavprError("path = '', and neither save_path nor map_path is set: name a file")
-        response.places = runtime.save(path, request.overwrite)
+            raise StavprError(
+                "path = '', save_path is not set, and the map has no file: set a path"
+            )
+        response.places = write_map(runtime.pipeline, runtime.worker.run, path, request.overwrite)
         self._node.publish_map_info()
         return f'{response.places} places to {path}'
 
@@ -84,10 +82,20 @@ class Services:
         return 'the window is empty'
 
     def _relocalize(self, runtime: 'Runtime', request: Any, response: Any) -> str:
-        count = request.count or self._node.get_parameter('candidates').value
-        response.match, response.candidates = runtime.relocalize(count)
+        count = request.count or self._node.settings.pipeline.candidates
+
+        def relocalize() -> None:
+            # messages are made on the worker: a growing route may evict places before the next
+            # call
+            pipeline, header = runtime.pipeline, runtime.last_header
+            match = pipeline.relocalize(count)
+            response.match = match_message(header, match, pipeline.places)
+            candidates = candidates_message(header, match, pipeline.places)
+            response.candidates = candidates.candidates if candidates is not None else []
+
+        runtime.worker.run(relocalize)
         return response.match.reason or f'place {response.match.place_index}'
 
     def _set_operation(self, runtime: 'Runtime', request: Any, response: Any) -> str:
-        self._set_parameter('operation', request.operation)
+        self._node.set_operation(request.operation)
         return f'operation {request.operation}'

@@ -1,31 +1,39 @@
-"""One thread does the heavy work; callbacks only hand over."""
+"""One thread does the heavy work; callbacks only enqueue."""
 
 import threading
 import traceback
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future
-from typing import Any
+from concurrent.futures import CancelledError, Future, wait
+from typing import Any, TypeVar
 
 from rclpy.logging import get_logger
 
-PATIENCE = 3.0  # seconds for what is in work when the thread is stopped: `ros2 launch` loses its own after 5
+from stavpr_ros.errors import StavprError
+
+STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end: `ros2 launch` kills after 5
+
+END_POLL = 0.2  # seconds until a waiting caller detects the end of the node
+
+Result = TypeVar('Result')
 
 
 class Worker:
     """
-    A thread that works on items, newest kept: when the slot is full, the oldest item is dropped.
+    A thread that processes items; when the queue is full, the oldest item is dropped.
 
-    Calls, such as using a map, are run by the same thread, before the next item: whatever the thread
-    owns needs no lock.
+    Calls, such as a change of the map, run on the same thread before the next item: objects that
+    the thread owns need no lock.
 
     :param process: called with each item.
-    :param capacity: items that may wait.
+    :param capacity: maximum number of waiting items.
+    :param ending: set when callers must not wait any longer.
     """
 
-    def __init__(self, process: Callable[[Any], None], capacity: int) -> None:
-        self._process = process
-        self._capacity = capacity
+    def __init__(
+        self, process: Callable[[Any], None], capacity: int, ending: threading.Event
+    ) -> None:
+        self._process, self._capacity, self._ending = process, capacity, ending
         self._items: deque[Any] = deque()
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._running: Future[Any] | None = None
@@ -36,11 +44,11 @@ class Worker:
 
     @property
     def waiting(self) -> int:
-        """Items that wait."""
+        """Number of waiting items."""
         return len(self._items)
 
     def put(self, item: Any) -> Any | None:
-        """Hand over an item; return the item that was dropped for it, if any."""
+        """Enqueue an item; return the item that was dropped for it, if any."""
         with self._changed:
             dropped = self._items.popleft() if len(self._items) >= self._capacity else None
             self._items.append(item)
@@ -48,14 +56,14 @@ class Worker:
         return dropped
 
     def clear(self) -> list[Any]:
-        """Drop the items that wait, and return them."""
+        """Remove the waiting items and return them."""
         with self._changed:
             items = list(self._items)
             self._items.clear()
         return items
 
     def call(self, function: Callable[[], Any]) -> Future[Any]:
-        """Have the thread call a function; the future holds what came of it, cancelled after the end."""
+        """Call a function on the thread; after :meth:`stop`, the future is cancelled."""
         future: Future[Any] = Future()
         with self._changed:
             if self._stopping:
@@ -65,9 +73,27 @@ class Worker:
                 self._changed.notify()
         return future
 
+    def run(self, function: Callable[[], Result]) -> Result:
+        """
+        Call a function on the thread and return its result.
+
+        :raises StavprError: the thread was stopped, or the node ends, before the call is done.
+        """
+        future = self.call(function)
+        while not future.done():
+            wait([future], END_POLL)
+            if self._ending.is_set() and not future.done():
+                raise StavprError('the node ends')
+        try:
+            return future.result()
+        except CancelledError:
+            raise StavprError('the node is no longer configured') from None
+        except TimeoutError as error:  # abandoned by stop()
+            raise StavprError(str(error)) from error
+
     def stop(self) -> bool:
         """
-        Finish what is in work, drop the rest, end the thread; what takes too long is left to itself.
+        Finish the work in progress, cancel the rest, and end the thread or abandon it.
 
         :returns: whether the thread has ended.
         """
@@ -75,11 +101,13 @@ class Worker:
             self._stopping = True
             self._changed.notify()
         if threading.current_thread() is not self._thread:
-            self._thread.join(PATIENCE)
+            self._thread.join(STOP_TIMEOUT)
         for future, _ in self._calls:
             future.cancel()
         if self._thread.is_alive() and self._running is not None and not self._running.done():
-            self._running.set_exception(TimeoutError(f'the node ended; not done within {PATIENCE:g} s'))
+            self._running.set_exception(
+                TimeoutError(f'the node ended; not done within {STOP_TIMEOUT:g} s')
+            )
         return not self._thread.is_alive()
 
     def _run(self) -> None:
@@ -99,10 +127,10 @@ class Worker:
         self._running = future
         try:
             result, error = function(), None
-        except Exception as raised:  # handed to whoever asked
+        except Exception as raised:  # handed to the caller
             result, error = None, raised
         self._running = None
-        if future.done():  # given up meanwhile
+        if future.done():  # abandoned by stop()
             return
         if error is None:
             future.set_result(result)
@@ -110,7 +138,7 @@ class Worker:
             future.set_exception(error)
 
     def _process_safely(self, item: Any) -> None:
-        """Nothing that one item does may end the thread, which would end all that come after."""
+        """Process an item; an error must not end the thread, and with it all later items."""
         try:
             self._process(item)
         except Exception:

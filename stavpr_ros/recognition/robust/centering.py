@@ -1,4 +1,4 @@
-"""Features without what all images of a drive share."""
+"""Mean centering: features without the part that all images of a traverse share."""
 
 from dataclasses import replace
 
@@ -6,12 +6,12 @@ import torch
 
 from stavpr_ros.features import LocalFeatures
 
-PRIOR = 20  # images that the map's mean counts for in the mean of the query so far
+PRIOR = 20  # images that the map's mean counts for in the running mean of the query
 
 
 class MeanCentering:
     """
-    Takes the mean off features; unit norm again afterwards, and zero features stay zero.
+    Subtracts means from features; unit norm again afterwards, zero features stay zero.
 
     :param features: those of the map, strips (W, n, d).
     """
@@ -21,17 +21,17 @@ class MeanCentering:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the query."""
-        # float64: in float32, a long drive's images would be rounded away
+        """Drop the images of the query."""
+        # float64: in float32, the images of a long traverse would be rounded away
         self._sum, self._count = self._mean.double() * PRIOR, PRIOR
 
     def places(self, features: LocalFeatures) -> LocalFeatures:
-        """Features of the map, or of a query of which nothing else is known, less the map's mean."""
+        """Return features of the map, or of single images, less the map's mean."""
         return replace(features, strips=without_mean(features.strips, self._mean))
 
     def next_query(self, strips: torch.Tensor) -> torch.Tensor:
         """
-        Features of the next image of the query less the query's mean so far, this image included.
+        Return features of the next image of the query less the query's running mean, this image included.
 
         :param strips: shape (W, d); the same is returned.
         """
@@ -42,7 +42,7 @@ class MeanCentering:
 
 
 def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
-    """Unit-norm (W, n, d) less (W, d), one strip after the other so that little memory is taken."""
+    """Return unit-norm (W, n, d) less (W, d); one strip after the other, for little memory."""
     out = torch.empty_like(strips, memory_format=torch.contiguous_format)
     for j in range(len(strips)):
         torch.sub(strips[j], mean[j], out=out[j])

@@ -1,10 +1,10 @@
 """
-Distances on a scale that all images and all places share.
+Z-normalization of image distances, over the map (query) and over time (reference).
 
-A row, the distances of one image to all places, is brought to mean 0 and deviation 1 over the places. For
-every place the mean and the deviation of its entry in the latest rows are kept, started from the map's
-distances to itself, so that a window can be brought to mean 0 and deviation 1 over the images as well.
-Causal: only rows that have come count.
+Query z-normalization brings a row, the distances of one image to all places, to mean 0 and standard deviation
+1. Reference z-normalization does the same for each place over the latest rows, against hubness: places that
+are near to every image. Its running mean and variance start from the distances of the map to itself. Causal:
+only rows that have arrived count.
 """
 
 from collections.abc import Callable
@@ -13,28 +13,28 @@ import numpy as np
 
 PRIOR = 20  # rows that the start counts for
 MEMORY = 150  # rows after which old ones fade
-FLAT = 1e-3  # deviation of a row below which it tells nothing
+MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
 
 
-class Calibration:
+class ZNormalization:
     """
-    Running statistics of the distances to each place.
+    Query z-normalization, and the running statistics of each place for reference z-normalization.
 
     :param places: number of places n.
-    :param rows: normalize rows.
-    :param columns: calibrate places.
+    :param query: normalize rows.
+    :param reference: normalize places.
     """
 
-    def __init__(self, places: int, rows: bool = True, columns: bool = True) -> None:
-        self._rows, self._columns = rows, columns
+    def __init__(self, places: int, query: bool = True, reference: bool = True) -> None:
+        self.query, self.reference = query, reference
         self._start = np.zeros(places, np.float32), np.ones(places, np.float32)
         self.reset()
 
     def start_from(self, rows: np.ndarray) -> None:
         """
-        Start from the map's distances to itself.
+        Start from the distances of the map to itself.
 
-        :param rows: some places' distances to all, shape (m, n); NaN where they are near each other.
+        :param rows: distances of some places to all, shape (m, n), float32; NaN where they are neighbors.
         """
         known = np.isfinite(rows)
         rows = np.stack([self.normalized(row) for row in rows]) if len(rows) else rows
@@ -51,7 +51,7 @@ class Calibration:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the rows that came."""
+        """Drop the rows observed so far; the start stays."""
         self._mean, self._variance = (values.copy() for values in self._start)
         self._count = np.full(len(self._mean), PRIOR, np.float32)
 
@@ -60,26 +60,26 @@ class Calibration:
         more = places - len(self._mean)
         self._change_each(lambda values, start: np.append(values, np.full(more, start, np.float32)))
 
-    def forget(self, count: int) -> None:
-        """Forget the first places; the others move up, and there is room for as many new ones behind them."""
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up, and as many new ones have room behind them."""
         self._change_each(lambda values, start: np.append(values[count:], np.full(count, start, np.float32)))
 
     def _change_each(self, change: Callable[[np.ndarray, float], np.ndarray]) -> None:
-        """Change all that is kept of every place; each comes with what a new place starts with."""
+        """Change every array of one value a place; the second argument is the value of a new place."""
         self._start = change(self._start[0], 0), change(self._start[1], 1)
         self._mean, self._variance = change(self._mean, 0), change(self._variance, 1)
         self._count = change(self._count, PRIOR)
 
     def normalized(self, row: np.ndarray) -> np.ndarray:
-        """Bring the known entries of a row to mean 0 and deviation 1, shape (n,), float32."""
-        known = row[np.isfinite(row)]
-        if not self._rows or not known.size:
+        """Return a row with mean 0 and deviation 1 of its finite entries, shape (n,), float32."""
+        known = row[np.isfinite(row)] if self.query else row[:0]
+        if not known.size:
             return row
-        return (row - known.mean()) / np.float32(max(known.std(), FLAT))
+        return (row - known.mean()) / np.float32(max(known.std(), MIN_DEVIATION))
 
     def observe(self, row: np.ndarray) -> None:
-        """Take a normalized row into the statistics of the first places."""
-        if not self._columns:
+        """Add a row, normalized if rows are, to the statistics of the first m <= n places."""
+        if not self.reference:
             return
         n = len(row)
         mean, variance, count = self._mean[:n], self._variance[:n], self._count[:n]
@@ -89,7 +89,14 @@ class Calibration:
         variance += (off * (row - mean) - variance) / count
 
     def shift_and_scale(self, places: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return what is taken off the first places' entries, and what they are multiplied with then."""
-        if not self._columns:
+        """Return mean and reciprocal deviation of the first places, shape (places,) each; a view of the mean."""
+        if not self.reference:
             return np.zeros(places, np.float32), np.ones(places, np.float32)
         return self._mean[:places], 1 / np.sqrt(np.maximum(self._variance[:places], 1e-6))
+
+    def scaled(self, rows: np.ndarray) -> np.ndarray:
+        """Return rows of the first m places, shape (..., m), with reference z-normalization, if any."""
+        if not self.reference:
+            return rows
+        shift, scale = self.shift_and_scale(rows.shape[-1])
+        return (rows - shift) * scale

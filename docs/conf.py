@@ -1,0 +1,26 @@
+"""Sphinx configuration, used by ``make docs`` and by rosdoc2."""
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+project = 'stavpr_ros'
+author = 'The stavpr_ros authors'
+copyright = '2026, The stavpr_ros authors'  # noqa: A001
+release = version = '0.1.0'
+
+extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.viewcode']
+source_suffix = {'.rst': 'restructuredtext', '.md': 'markdown'}
+exclude_patterns = ['_build']
+myst_heading_anchors = 3
+# The pages link to files of the repository as well; on the repository's own site these links work.
+suppress_warnings = ['myst.xref_missing']
+
+autodoc_default_options = {'members': True, 'show-inheritance': True, 'member-order': 'bysource'}
+autodoc_typehints = 'description'
+autodoc_typehints_description_target = 'documented'
+autodoc_mock_imports = ['onnx', 'onnxruntime', 'sklearn', 'jinja2']
+html_theme = 'alabaster'
+html_theme_options = {'page_width': '1100px', 'sidebar_width': '240px'}

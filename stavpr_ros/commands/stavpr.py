@@ -1,0 +1,108 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``stavpr COMMAND``: all executables of the package behind one name on the PATH."""
+
+from dataclasses import dataclass
+import importlib
+import importlib.util
+import sys
+
+import stavpr_ros
+
+ROS_MODULES = ('rclpy', 'ament_index_python', 'stavpr_msgs')
+
+
+@dataclass(frozen=True)
+class Command:
+    """
+    A subcommand.
+
+    :param summary: one line for the help text.
+    :param needs_ros: whether it needs a sourced ROS 2 environment.
+    """
+
+    summary: str
+    needs_ros: bool = False
+
+
+COMMANDS = {
+    'build_map': Command('build a reference map from a folder of images or a bag'),
+    'evaluate': Command('evaluate the recognition of one traverse on the map of another'),
+    'experiments': Command("reproduce the paper's tables on local data sets"),
+    'node': Command('run the place-recognition node', needs_ros=True),
+    'replay': Command('publish a bag or a folder of images to the node', needs_ros=True),
+    'record': Command('write matches or loop closures to a JSON Lines file', needs_ros=True),
+    'demo': Command('build, run and evaluate everything on a synthetic street', needs_ros=True),
+}
+
+
+def usage() -> str:
+    """Return the help text."""
+    rows = [
+        f'  {name:<12}{command.summary}{" (ROS 2)" if command.needs_ros else ""}'
+        for name, command in COMMANDS.items()
+    ]
+    return '\n'.join(
+        [
+            'usage: stavpr COMMAND [OPTION ...]',
+            '       stavpr COMMAND --help | --help | --version',
+            '',
+            'commands:',
+            *rows,
+            '',
+            'In a sourced ROS 2 workspace, `ros2 run stavpr_ros COMMAND` runs the same commands.',
+        ]
+    )
+
+
+def missing_ros_modules() -> list[str]:
+    """Return the ROS modules that a ROS command needs and that are not installed or sourced."""
+    return [name for name in ROS_MODULES if importlib.util.find_spec(name) is None]
+
+
+def forget_requirements() -> None:
+    """
+    Keep ``pkg_resources`` from checking the requirements of this distribution.
+
+    It does so when a library imports it in a script that setuptools generated for colcon, and
+    fails where a Debian package provides a requirement under another distribution name.
+    """
+    vars(sys.modules['__main__']).pop('__requires__', None)
+
+
+def main(args: list[str] | None = None) -> int:
+    """
+    Run a command.
+
+    :param args: arguments without the program name; None takes those of the process.
+    :returns: the command's exit code; 2 for a usage error or a missing ROS installation.
+    """
+    forget_requirements()
+    arguments = sys.argv[1:] if args is None else args
+    if not arguments or arguments[0] in ('-h', '--help'):
+        print(usage(), file=sys.stdout if arguments else sys.stderr)
+        return 0 if arguments else 2
+    name, rest = arguments[0], arguments[1:]
+    if name == '--version':
+        print(f'stavpr {stavpr_ros.__version__}')
+        return 0
+    if name not in COMMANDS:
+        print(
+            f'stavpr: unknown command {name!r}; choose from {", ".join(COMMANDS)}', file=sys.stderr
+        )
+        return 2
+    missing = missing_ros_modules() if COMMANDS[name].needs_ros else []
+    if missing:
+        print(
+            f'stavpr {name}: needs ROS 2, but Python finds no {", ".join(missing)}: source '
+            '/opt/ros/jazzy/setup.bash and the install/setup.bash of the workspace that colcon '
+            'built',
+            file=sys.stderr,
+        )
+        return 2
+    exit_code: int = importlib.import_module(f'stavpr_ros.commands.{name}').main(rest)
+    return exit_code
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,380 @@
+"""
+The parameters of the node: one table for validation, launch arguments and documentation.
+
+``python3 -m stavpr_ros.parameters``, in a checkout, writes ``config/stavpr.yaml`` and
+``docs/parameters.md``. Launch files read this table, so it imports nothing but the standard
+library.
+"""
+
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+WHEN = {
+    'live': 'at any time',
+    'unconfigured': 'while the node is unconfigured',
+    'start': 'at the start of the node only',
+}
+
+
+@dataclass(frozen=True)
+class NodeParameter:
+    """
+    One row of the table.
+
+    :param default: its type is the type of the parameter.
+    :param sentence: description, one or two sentences.
+    :param unit: of the value, '' = none.
+    :param when: the parameter can be set at any time, while the node is unconfigured, or at its
+        start only.
+    :param bounds: smallest and largest value, or None.
+    :param choices: the allowed values of a string, empty = any.
+    """
+
+    name: str
+    default: Any
+    sentence: str
+    unit: str = ''
+    when: Literal['live', 'unconfigured', 'start'] = 'unconfigured'
+    bounds: tuple[float, float] | None = None
+    choices: tuple[str, ...] = ()
+
+    @property
+    def literal(self) -> str:
+        """The default in YAML."""
+        if isinstance(self.default, bool):
+            return str(self.default).lower()
+        return f"'{self.default}'" if isinstance(self.default, str) else str(self.default)
+
+    @property
+    def constraints(self) -> str:
+        """Choices, and when the parameter can be set."""
+        allowed = ['one of: ' + ', '.join(self.choices)] if self.choices else []
+        return '; '.join([*allowed, f'can be set {WHEN[self.when]}'])
+
+    @property
+    def range(self) -> str:
+        """The bounds, '' = none."""
+        return f'{self.bounds[0]:g} ... {self.bounds[1]:g}' if self.bounds else ''
+
+
+BASIC = 'Basic parameters'
+GROUPS: dict[str, tuple[NodeParameter, ...]] = {
+    BASIC: (
+        NodeParameter(
+            'operation',
+            'localization',
+            'Processing of the images: localization on a fixed map, mapping (records a map), or '
+            'loop_closure (places that the same route has passed before). The service '
+            '~/set_operation changes it while the node is configured.',
+            choices=('localization', 'mapping', 'loop_closure'),
+        ),
+        NodeParameter(
+            'map_path',
+            '',
+            'Map file made by build_map or save_map. Without one, localization waits for the '
+            'service ~/load_map, and mapping starts a new map.',
+        ),
+        NodeParameter(
+            'save_path',
+            '',
+            'Where a recorded map is saved on deactivation or shutdown; an existing file of '
+            'another map is never overwritten, a numbered name is used.',
+            when='live',
+        ),
+        NodeParameter(
+            'mode',
+            'robust',
+            'Recognition method: paper is STA-VPR as published, robust adds mitigations of its '
+            'failure modes.',
+            choices=('paper', 'robust'),
+        ),
+        NodeParameter(
+            'threshold',
+            -1.0,
+            'A window is matched when its distance is below this. Negative: the default of mode '
+            'robust, 1 (chance level), or 0.8 for loop_closure; mode paper has no default and '
+            'waits for a value.',
+            'distance',
+            'live',
+            bounds=(-1.0, 1e6),
+        ),
+        NodeParameter(
+            'sequence_length', 20, 'Length l of the query window.', 'images', bounds=(2, 1000)
+        ),
+        NodeParameter(
+            'features',
+            'gradient',
+            'Kind of the features of a map that is recorded without map_path.',
+            choices=('gradient', 'onnx', 'torchscript', 'densenet161_places365', 'vgg16'),
+        ),
+        NodeParameter(
+            'exclude_places',
+            50,
+            'loop_closure: number of the latest places of the route that are not compared.',
+            'places',
+            bounds=(1, 1000000),
+        ),
+        NodeParameter(
+            'geometric_check',
+            'none',
+            'Verification of matches by keypoints and epipolar geometry: the newest image '
+            'against the thumbnail of its place.',
+            when='live',
+            choices=('none', 'orb', 'sift'),
+        ),
+        NodeParameter(
+            'keyframe_distance',
+            0.0,
+            'Minimum distance between keyframes (or minimum rotation, keyframe_angle), from '
+            'nav_msgs/Odometry on the topic odom; 0 = off.',
+            'm',
+            'live',
+            (0.0, 1e4),
+        ),
+        NodeParameter(
+            'keyframe_angle',
+            0.0,
+            'Minimum rotation between keyframes, see keyframe_distance; 0 = off.',
+            'degrees',
+            'live',
+            (0.0, 180.0),
+        ),
+        NodeParameter(
+            'keyframe_change',
+            0.004,
+            'Minimum change of the image between keyframes (1 - correlation of small gray '
+            'images), so that a robot at rest does not fill the window; 0 = off.',
+            when='live',
+            bounds=(0.0, 2.0),
+        ),
+        NodeParameter(
+            'image_transport',
+            'raw',
+            'raw: sensor_msgs/Image on the topic image; compressed: sensor_msgs/CompressedImage '
+            'on the topic image/compressed (follows a remapping of image).',
+            choices=('raw', 'compressed'),
+        ),
+        NodeParameter(
+            'backend',
+            'auto',
+            'Device of feature extraction and image distances; auto: CUDA if it is available. '
+            'Loop closure matches on the CPU and rejects cuda.',
+            choices=('auto', 'cpu', 'cuda'),
+        ),
+    ),
+    'Input': (
+        NodeParameter(
+            'queue_size',
+            4,
+            'Maximum number of waiting images; a new one drops the oldest.',
+            'images',
+            bounds=(1, 1000),
+        ),
+        NodeParameter(
+            'max_rate', 0.0, 'Maximum image rate; 0 = unlimited.', 'Hz', 'live', (0.0, 1e4)
+        ),
+        NodeParameter(
+            'keyframe_interval',
+            0.0,
+            'Minimum time between keyframes; 0 = off.',
+            's',
+            'live',
+            (0.0, 1e4),
+        ),
+        NodeParameter(
+            'max_stamp_gap',
+            2.0,
+            'A longer time between the stamps of successive images is counted as a gap in the '
+            'diagnostics.',
+            's',
+            'live',
+            (0.01, 1e6),
+        ),
+        NodeParameter(
+            'odometry_timeout',
+            0.5,
+            'Maximum age of the newest odometry message, relative to the stamp of the image.',
+            's',
+            bounds=(0.0, 60.0),
+        ),
+    ),
+    'Image comparison': (
+        NodeParameter(
+            'strategy',
+            'adaptive',
+            'Spatial alignment of the strips of two images.',
+            choices=('adaptive', 'vanilla', 'sliding_window', 'none'),
+        ),
+        NodeParameter(
+            'sigma',
+            1.0,
+            'Strength of the penalty on diagonal steps after a viewpoint change.',
+            bounds=(0.0, 100.0),
+        ),
+        NodeParameter(
+            'xi',
+            0,
+            'Restricted alignment: strips this far apart are not aligned; 0 = no restriction.',
+            'strips',
+            bounds=(0, 1000),
+        ),
+        NodeParameter(
+            'vertical',
+            False,
+            'Align the cells of two strips vertically first, for cameras that change their '
+            'height; slow.',
+        ),
+    ),
+    'Recognition': (
+        NodeParameter(
+            'beta',
+            2.0,
+            'Map images considered per query image, above 1 (mode paper).',
+            bounds=(1.01, 20.0),
+        ),
+        NodeParameter(
+            'nms_radius',
+            20,
+            'Radius of the non-maximum suppression of the second best and of the candidates.',
+            'places',
+            bounds=(0, 1000000),
+        ),
+        NodeParameter(
+            'candidates', 10, 'Number of places in ~/candidates.', 'places', 'live', (0, 1000)
+        ),
+        NodeParameter(
+            'min_inliers',
+            30,
+            'Minimum number of inliers of the geometric check; 20 is sufficient for sift.',
+            'keypoints',
+            'live',
+            (8, 100000),
+        ),
+        NodeParameter(
+            'exclude_seconds',
+            0.0,
+            'loop_closure: minimum age of the places that are compared, in addition to '
+            'exclude_places.',
+            's',
+            bounds=(0.0, 1e6),
+        ),
+    ),
+    'Recorded maps': (
+        NodeParameter(
+            'feature_settings',
+            '',
+            'Settings of the features as a JSON object; missing keys take their defaults.',
+        ),
+        NodeParameter(
+            'model_path',
+            '',
+            'File of the network, for maps of a network, if it is not where the map was built.',
+        ),
+        NodeParameter(
+            'max_places',
+            20000,
+            'Maximum number of places of a recorded map: mapping stops there, loop_closure '
+            'evicts the oldest eighth of its route.',
+            'places',
+            bounds=(100, 10000000),
+        ),
+        NodeParameter(
+            'thumbnail_width',
+            192,
+            'Width of the thumbnails of a recorded map; 0 = none.',
+            'pixels',
+            bounds=(0, 4096),
+        ),
+    ),
+    'Output': (
+        NodeParameter('map_frame', 'map', 'Frame of the poses of the map, for ~/pose.'),
+        NodeParameter(
+            'diagnostics_period', 1.0, 'Period of the diagnostics.', 's', 'start', (0.1, 60.0)
+        ),
+        NodeParameter(
+            'verbosity',
+            'default',
+            'Log level of the node; default: as set by --log-level.',
+            when='live',
+            choices=('default', 'debug', 'info', 'warn', 'error'),
+        ),
+    ),
+    'Computation and life cycle': (
+        NodeParameter(
+            'precision',
+            'float32',
+            'Precision of the features of the map in localization; float16 halves their memory '
+            'and, on large maps, the time. Loop closure rejects float16.',
+            choices=('float32', 'float16'),
+        ),
+        NodeParameter(
+            'threads',
+            0,
+            'Number of CPU threads of the numerics; 0 = all.',
+            'threads',
+            bounds=(0, 1024),
+        ),
+        NodeParameter(
+            'autostart',
+            True,
+            'The node configures and activates itself; false: a lifecycle manager does.',
+            when='start',
+        ),
+    ),
+}
+
+PARAMETERS = tuple(row for rows in GROUPS.values() for row in rows)
+BY_NAME = {row.name: row for row in PARAMETERS}
+
+
+def configuration_yaml() -> str:
+    """Return the table as a parameter file with the defaults."""
+    lines = [
+        '# Parameters of the node with their defaults, generated: python3 -m stavpr_ros.parameters'
+    ]
+    lines += ['/**:', '  ros__parameters:']
+    for group, rows in GROUPS.items():
+        lines += ['', f'    # ---- {group}{"" if group == BASIC else " (advanced)"}']
+        for row in rows:
+            unit, bounds = (
+                f' [{row.unit}]' if row.unit else '',
+                f'{row.range}; ' if row.bounds else '',
+            )
+            for text in (row.sentence + unit, bounds + row.constraints):
+                lines += textwrap.wrap(
+                    text, 98, initial_indent='    # ', subsequent_indent='    # '
+                )
+            lines.append(f'    {row.name}: {row.literal}')
+    return '\n'.join(lines) + '\n'
+
+
+def documentation_markdown() -> str:
+    """Return the table as a page of the documentation."""
+    lines = [
+        '# Parameters',
+        '',
+        'Generated by `python3 -m stavpr_ros.parameters` from the table in '
+        '`stavpr_ros/parameters.py`.',
+        'Every parameter is an argument of the launch files as well. Column "set": `live` = at '
+        'any time,',
+        '`unconfigured` = while the node is unconfigured, `start` = at the start of the node '
+        'only.',
+    ]
+    for group, rows in GROUPS.items():
+        lines += ['', f'## {group}{"" if group == BASIC else " (advanced)"}', '']
+        lines += [
+            '| parameter | default | unit | range | set | description |',
+            '|---|---|---|---|---|---|',
+        ]
+        for row in rows:
+            sentence = row.sentence + (f' ({", ".join(row.choices)})' if row.choices else '')
+            cells = (f'`{row.name}`', f'`{row.literal}`', row.unit, row.range, row.when, sentence)
+            lines.append(f'| {" | ".join(cells)} |')
+    return '\n'.join(lines) + '\n'
+
+
+if __name__ == '__main__':
+    Path('config/stavpr.yaml').write_text(configuration_yaml())
+    Path('docs/parameters.md').write_text(documentation_markdown())

@@ -1,0 +1,114 @@
+"""Saving a recorded map while images are processed; files of other maps are never overwritten."""
+
+import itertools
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from logging import Logger
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stavpr_ros.errors import StavprError
+from stavpr_ros.mapping import PlaceMap, save_map
+
+if TYPE_CHECKING:
+    from stavpr_ros.pipeline.pipeline import Pipeline
+
+OnWorker = Callable[[Callable[[], Any]], Any]
+
+
+@dataclass
+class SaveState:
+    """
+    Files that hold a map, and the number of its recorded places that are in none.
+
+    :param path: file that the map was loaded from or last saved to, '' = none.
+    :param recorded: places recorded since the map was loaded or started; ``saved`` of them are in
+        a file.
+    """
+
+    path: str = ''
+    recorded: int = 0
+    saved: int = 0
+    _files: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        if self.path:
+            self._files.add(os.path.abspath(self.path))
+
+    @property
+    def unsaved(self) -> int:
+        """Number of recorded places that are in no file."""
+        return self.recorded - self.saved
+
+    def owns(self, path: str) -> bool:
+        """Return whether a file holds, or held, this map, and may be overwritten."""
+        return os.path.abspath(path) in self._files
+
+
+@dataclass(frozen=True)
+class MapSnapshot:
+    """A map to be written, and its state when it was copied."""
+
+    places: PlaceMap
+    state: SaveState
+    recorded: int
+
+    def mark_saved(self, path: str) -> None:
+        """Update the state after writing; later places, or another map in use, are unaffected."""
+        state = self.state
+        state.path, state.saved = path, max(state.saved, self.recorded)
+        state._files.add(os.path.abspath(path))
+
+
+def write_map(pipeline: 'Pipeline', on_worker: OnWorker, path: str, overwrite: bool) -> int:
+    """
+    Write the map of the pipeline to a file, on this thread; return its number of places.
+
+    :param on_worker: calls a function on the thread of the pipeline.
+    :raises StavprError: no places, an existing file, or a file that cannot be written.
+    """
+    snapshot = on_worker(lambda: pipeline.snapshot(path, overwrite))
+    save_map(snapshot.places, path)
+    on_worker(lambda: snapshot.mark_saved(path))
+    return len(snapshot.places)
+
+
+def save_recorded_map(
+    pipeline: 'Pipeline', on_worker: OnWorker, path: str, log: 'Logger | Any'
+) -> None:
+    """
+    Write unsaved places to ``path``; log errors.
+
+    A file of another map is not overwritten, a numbered name beside it is used.
+
+    :param path: '' = nowhere; the loss is logged.
+    :param log: the logger of the node.
+    """
+    try:
+        unsaved = on_worker(lambda: pipeline.unsaved)  # includes the image being processed
+        if unsaved and path:
+            target = _free_name(path, pipeline.save_state)
+            log.info(f'writing the map to {target}')
+            places = write_map(pipeline, on_worker, target, overwrite=True)
+            log.info(f'{places} places written to {target}')
+        elif unsaved and pipeline.operation != 'loop_closure':
+            log.warning(f'{unsaved} recorded places are lost: set save_path, or call ~/save_map')
+    except TimeoutError:
+        if pipeline.unsaved:
+            log.error('the map is not saved: the worker is still busy at the end of the node')
+    except Exception as error:  # any error: the node must end, and the loss must be logged
+        log.error(
+            f'the map is not saved: {error if isinstance(error, StavprError) else repr(error)}'
+        )
+
+
+def _free_name(path: str, state: SaveState) -> str:
+    """Return the path, or the first numbered name that is free or holds this map."""
+    there = Path(path)
+    numbered = (
+        str(there.with_name(f'{there.stem}-{number}{there.suffix}'))
+        for number in itertools.count(2)
+    )
+    names = itertools.chain([path], numbered)
+    return next(name for name in names if state.owns(name) or not os.path.exists(name))

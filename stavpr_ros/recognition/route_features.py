@@ -1,0 +1,144 @@
+"""Features of a route that grows by one place at a time, mean-centered, in memory once."""
+
+import torch
+
+from stavpr_ros.features import FeatureSettings, LocalFeatures
+
+ROOM = 256  # places that there is room for at first; doubled when they are full
+GROWTH = 1.125  # the mean is updated when the route is so much longer
+PIECE = 512  # places centered at a time: the intermediate results stay in the cache
+
+
+class RouteFeatures:
+    """
+    Features of the places of a route, less their mean if that is wanted, unit norm.
+
+    With the norm that a centered feature had before it was made unit norm, the features give back the original
+    ones: nothing is held twice.
+
+    :param settings: how the features are made.
+    :param mean_centering: subtract the mean.
+    :param limit: most places there will be; None = no limit.
+    """
+
+    def __init__(self, settings: FeatureSettings, mean_centering: bool, limit: int | None) -> None:
+        self.count = 0
+        self.strips = torch.empty((settings.strips, 0, 0))  # centered, (W, room, d)
+        self._settings, self._centering, self._limit = settings, mean_centering, limit
+        self._cells: tuple[int, int] | None = None
+        self._weights = torch.empty((settings.strips, 0))
+        # (W, room): the norm of each feature less the mean; 0 for zero features
+        self._norms = torch.empty((settings.strips, 0))
+        self._sum = self._mean = torch.empty((settings.strips, 0))  # of the original features, (W, d)
+        self._next_mean = 1
+
+    @property
+    def room(self) -> int:
+        """Places that there is room for."""
+        return self.strips.shape[1]
+
+    @property
+    def newest(self) -> torch.Tensor:
+        """Centered features of the newest place, (W, 1, d)."""
+        return self.strips[:, self.count - 1 : self.count]
+
+    @property
+    def mean(self) -> torch.Tensor:
+        """The mean that is subtracted, (W, d), float32; zeros without centering."""
+        return self._mean
+
+    def original(self) -> LocalFeatures:
+        """
+        Return the features as they were appended, in memory of their own.
+
+        Without centering exactly, with it up to the rounding of float32.
+        """
+        n = self.count
+        strips = self.strips[:, :n].clone()
+        if self._centering and n:
+            norms = self._norms[:, :n, None]
+            strips *= norms
+            for j in range(len(strips)):
+                strips[j] += self._mean[j] * (norms[j] > 0)
+        return LocalFeatures(strips, self._weights[:, :n].clone(), self._settings, self._cells)
+
+    def append(self, features: LocalFeatures) -> bool:
+        """Append the features of one image, strips (W, 1, d); return whether room was made for it."""
+        strips = features.strips.cpu()
+        grows = self.count == self.room
+        if grows:
+            self._grow(strips.shape[2])
+            self._cells = features.cells
+        self.strips[:, self.count] = strips[:, 0]
+        self._weights[:, self.count] = features.weights[:, 0]
+        self._norms[:, self.count] = strips[:, 0].any(dim=1)
+        self.count += 1
+        if self._centering:
+            self._sum += strips[:, 0]
+            self._center(self.count - 1, self.count - 1, -self._mean)
+            if self.count >= self._next_mean:
+                self._move_mean(0)
+                self._next_mean = int(self.count * GROWTH) + 1
+        return grows
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the mean is then that of the others until the next eviction."""
+        kept = self.count - count
+        self._weights[:, :kept] = self._weights[:, count : self.count].clone()
+        if self._centering:
+            self._subtract_from_sum(count)
+            self.count = kept
+            self._move_mean(count)
+            self._next_mean = self.count + count + 1
+            return
+        for first in range(count, self.count, count):
+            last = min(first + count, self.count)
+            self.strips[:, first - count : last - count] = self.strips[:, first:last]
+        self.count = kept
+
+    def _grow(self, d: int) -> None:
+        """Double the room; memory that is not used yet is not touched."""
+        n, W = self.count, self._settings.strips
+        room = max(ROOM, 2 * self.room)
+        room = room if self._limit is None else min(room, self._limit)
+        strips, norms, weights = torch.empty((W, room, d)), torch.empty((W, room)), torch.empty((W, room))
+        if n:
+            strips[:, :n], norms[:, :n], weights[:, :n] = self.strips, self._norms, self._weights
+        else:
+            self._sum, self._mean = torch.zeros((W, d), dtype=torch.float64), torch.zeros((W, d))
+        self.strips, self._norms, self._weights = strips, norms, weights
+
+    def _subtract_from_sum(self, count: int) -> None:
+        """Subtract the original features of the oldest places from the sum."""
+        for j in range(len(self.strips)):
+            for low in range(0, count, PIECE):
+                piece = slice(low, min(low + PIECE, count))
+                norms = self._norms[j, piece]
+                self._sum[j] -= norms @ self.strips[j, piece] + (norms > 0).sum() * self._mean[j]
+
+    def _move_mean(self, first: int) -> None:
+        """Subtract the present mean instead of the previous one; places from ``first`` on become the first."""
+        mean = (self._sum / self.count).float()
+        self._center(first, 0, self._mean - mean)
+        self._mean = mean
+
+    def _center(self, first: int, to: int, change: torch.Tensor) -> None:
+        """
+        Add to features, and make them unit norm again; zero features stay zero.
+
+        :param first: place from which on; the last one ends up as the last of ``count``.
+        :param to: place where they are written to, at most ``first``.
+        :param change: shape (W, d).
+        """
+        for j in range(len(self.strips)):
+            strips, norms = self.strips[j], self._norms[j]
+            for low in range(to, self.count, PIECE):
+                high = min(low + PIECE, self.count)
+                source, target = slice(low + first - to, high + first - to), slice(low, high)
+                alive = norms[source, None] > 0
+                moved = strips[source] * norms[source, None]
+                moved += change[j]
+                moved *= alive
+                length = moved.norm(dim=1, keepdim=True).clamp_(min=1e-12)
+                torch.div(moved, length, out=strips[target])
+                norms[target] = (length * alive)[:, 0]

@@ -1,0 +1,185 @@
+"""
+Workarounds for rclpy and rmw_fastrtps of ROS 2 Jazzy, each with the upstream change to wait for.
+
+The tests of this module also show the failure of each without its workaround: such a test fails
+when upstream is fixed, and the workaround can go.
+"""
+
+import threading
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import Executor, ShutdownException, TimeoutException
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
+from rclpy.logging import get_logger
+from rclpy.node import Node
+from rclpy.service import Service
+
+START_POLL = 0.0005  # seconds between two checks whether a thread has begun a callback
+RESPONSE_LOST = 'failed to send response'  # part of rclpy's warning
+RESPONSE_TIMEOUT = 3.5  # seconds of attempts; callbacks have a little more when the process ends
+RESPONSE_PAUSE = (
+    0.05  # seconds between attempts; an attempt takes 0.1 s and blocks all other threads
+)
+
+_warning_filters = threading.Lock()  # they belong to the process
+
+
+class PromptExecutor(Executor):
+    """
+    Multi-threaded executor that takes the next callback when a thread has begun the last one.
+
+    Waits for ros2/rclpy#1547 (merged for later distributions): ``MultiThreadedExecutor`` submits a
+    callback again and again until a thread has begun it, and does not wait for events meanwhile.
+    Measured with images at the pace of their results on two cores: maximum latency 55 to 71 ms and
+    twice the processor time with ``MultiThreadedExecutor``, 13 ms here and with a single thread.
+    With the node itself 100 to 900 ms were seen. A node needs threads all the same, or a service
+    that loads a map stops the images.
+
+    Waits also for ros2/rclpy#1590, see ros2/rclpy#1355: what is destroyed on another thread while
+    the executor collects its entities raises ``InvalidHandle`` out of ``spin_once``.
+
+    Callbacks that raise are logged; upstream ends the process.
+
+    :param threads: callbacks that may run at once.
+    """
+
+    def __init__(self, threads: int, **options: Any) -> None:
+        super().__init__(**options)
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix='callback')
+        self._running: set[Future[None]] = set()
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """Begin the next callback, if one is ready in time."""
+        try:
+            task, _, _ = self.wait_for_ready_callbacks(timeout_sec)
+        except (ShutdownException, TimeoutException, rclpy_implementation.InvalidHandle):
+            return
+        future = self._pool.submit(_run, task)
+        self._running = {other for other in self._running if not other.done()} | {future}
+        while not (task.executing() or future.done()):
+            time.sleep(START_POLL)
+
+    def finish(self, timeout: float) -> None:
+        """Wait for the callbacks that have begun, at most so many seconds."""
+        wait(self._running, timeout)
+
+
+def _run(task: Any) -> None:
+    task()
+    if task.done() and (error := task.exception()) is not None:
+        text = ''.join(traceback.format_exception(error))
+        get_logger('stavpr_executor').error(f'a callback failed: {text}')
+
+
+def repeat_responses(service: Service) -> None:
+    """
+    Make a service repeat a response until its client is matched.
+
+    Waits for ros2/rmw_fastrtps#418: a request may arrive before the middleware has discovered the
+    client's reader, at the start or on a busy machine. rmw_fastrtps then drops the response after
+    0.1 s, and the client waits forever; a transition requested by a life-cycle manager is made but
+    counts as failed. A longer ``max_blocking_time`` in the profile (ros2/rmw_fastrtps#704) is no
+    substitute: rclpy holds the interpreter lock meanwhile (measured: no other thread ran for the
+    whole second of the setting).
+    """
+    send = service.send_response
+
+    def send_repeatedly(response: Any, header: Any) -> None:
+        end = time.monotonic() + RESPONSE_TIMEOUT
+        while time.monotonic() < end:
+            with _warning_filters, warnings.catch_warnings():
+                warnings.filterwarnings('error', RESPONSE_LOST, RuntimeWarning)
+                try:
+                    return send(response, header)
+                except (
+                    RuntimeWarning,
+                    SystemError,
+                ) as error:  # the latter from C++, caused by the former
+                    if RESPONSE_LOST not in str(error.__cause__ or error):
+                        raise
+            time.sleep(RESPONSE_PAUSE)
+        return send(response, header)  # rclpy warns if it fails again
+
+    service.send_response = send_repeatedly
+
+
+class ManagedNode(LifecycleNodeMixin, Node):
+    """
+    Lifecycle node that rejects invalid transitions instead of ending the process.
+
+    Waits for ros2/rclpy#1319 (see #1209; merged for later distributions): a transition that the
+    current state does not have raises out of the service and out of ``trigger_...``.
+
+    Its services are reentrant, so that the state can be read during a transition; hence the lock
+    against two transitions at once. ``LifecycleNode`` has no option for their callback group.
+
+    :param name: of the node.
+    """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        Node.__init__(self, name, **options)
+        LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
+        self._in_transition = threading.Lock()
+        self.ending = threading.Event()  # set when the process ends: waits are given up
+        self.left_behind = False  # work was still running when the node was destroyed
+        service = self._service_change_state
+        self._upstream_change_state = service.callback
+        service.callback = self._change_or_reject
+        for service in self.services:
+            repeat_responses(service)
+
+    @property
+    def state(self) -> str:
+        """Label of the life-cycle state."""
+        return str(self._state_machine.current_state[1])
+
+    def advance(self, trigger: Callable[[], TransitionCallbackReturn]) -> bool:
+        """
+        Make a transition, such as ``trigger_configure``; return whether it succeeded.
+
+        An invalid one, or one during another, is logged and not made.
+        """
+        return self._guarded(
+            trigger.__name__, lambda: trigger() == TransitionCallbackReturn.SUCCESS
+        )
+
+    def destroy_node(self) -> None:
+        """
+        Destroy the node and the services of its life cycle.
+
+        No upstream issue was found: rclpy leaves these services to the garbage collector, and
+        until then other nodes discover them and send requests that nobody answers.
+        """
+        if not self.left_behind:  # otherwise a transition may still be running
+            self._state_machine.destroy_when_not_in_use()
+        super().destroy_node()
+
+    def _change_or_reject(self, request: Any, response: Any) -> Any:
+        requested = request.transition.label or request.transition.id
+        response.success = self._guarded(
+            requested, lambda: self._upstream_change_state(request, response).success
+        )
+        return response
+
+    def _guarded(self, requested: str | int, change: Callable[[], bool]) -> bool:
+        if not self._in_transition.acquire(blocking=False):
+            self.get_logger().warning(
+                f'transition {requested!r} rejected: another is under way ({self.state})'
+            )
+            return False
+        try:
+            return change()
+        except rclpy_implementation.RCLError as error:
+            self.get_logger().error(
+                f'no transition {requested!r} from state {self.state}: {error}'
+            )
+            return False
+        finally:
+            self._in_transition.release()

@@ -1,0 +1,274 @@
+"""
+Workarounds for rclpy, and the failures of upstream without them.
+
+A test of upstream that fails means that its workaround can go.
+"""
+
+import threading
+import warnings
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import pytest
+import rclpy
+from processes import DOMAIN
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import Trigger
+
+from stavpr_ros.ros import rclpy_workarounds
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode, PromptExecutor, repeat_responses
+
+SPINS = 200  # of at most 50 ms each: until an event counts as missing
+LOST = 'failed to send response (timeout): client will not receive response'
+
+
+@pytest.fixture
+def context():
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    yield context
+    rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture
+def node(context):
+    node = rclpy.create_node('waiting', context=context)
+    yield node
+    node.destroy_node()
+
+
+def spin_until(executor, done):
+    for _ in range(SPINS):
+        executor.spin_once(timeout_sec=0.05)
+        if done():
+            return
+    raise AssertionError(f'not done after {SPINS} spins')
+
+
+# the executor
+
+
+@pytest.fixture
+def submitted(monkeypatch):
+    """Collect what executors submit to pools whose threads never begin."""
+    tasks = []
+
+    def submit(pool, function, *arguments):
+        tasks.append(arguments[0] if arguments else function)
+        return Future()
+
+    monkeypatch.setattr(ThreadPoolExecutor, 'submit', submit)
+    return tasks
+
+
+def test_multi_threaded_executor_of_upstream_submits_a_waiting_callback_again(
+    node, context, submitted
+):
+    executor = MultiThreadedExecutor(2, context=context)
+    executor.add_node(node)
+    node.create_timer(0.0, lambda: None)
+    for _ in range(20):
+        executor.spin_once(timeout_sec=0.05)
+    assert len(submitted) > len({id(task) for task in submitted})
+    executor.shutdown()
+
+
+def test_prompt_executor_of_a_waiting_callback_submits_it_once(node, context, monkeypatch):
+    ran, submissions, submit = [], [], ThreadPoolExecutor.submit
+
+    def counted(pool, function, *arguments):
+        submissions.append(arguments)
+        return submit(pool, function, *arguments)
+
+    monkeypatch.setattr(ThreadPoolExecutor, 'submit', counted)
+    executor = PromptExecutor(2, context=context)
+    executor.add_node(node)
+    node.create_timer(0.0, lambda: ran.append(1))
+    for _ in range(20):
+        executor.spin_once(timeout_sec=0.05)
+    executor.finish(10.0)
+    assert len(submissions) == len(ran) > 0
+    executor.shutdown()
+
+
+def test_prompt_executor_with_a_blocked_callback_runs_others(node, context):
+    blocked, ran = threading.Event(), threading.Event()
+    executor = PromptExecutor(2, context=context)
+    executor.add_node(node)
+    group = ReentrantCallbackGroup()
+    once = node.create_timer(0.0, lambda: (once.cancel(), blocked.wait(60)), callback_group=group)
+    node.create_timer(0.0, ran.set, callback_group=group)
+    try:
+        spin_until(executor, ran.is_set)
+    finally:
+        blocked.set()
+    executor.finish(10.0)
+    executor.shutdown()
+
+
+def test_prompt_executor_after_a_failing_callback_goes_on(node, context, capfd):
+    executor = PromptExecutor(1, context=context)
+    executor.add_node(node)
+
+    def fail():
+        raise ValueError('defect')
+
+    node.create_timer(0.0, fail)
+    for _ in range(3):
+        executor.spin_once(timeout_sec=0.05)
+    executor.finish(10.0)
+    executor.shutdown()
+    assert 'ValueError: defect' in capfd.readouterr().err
+
+
+def test_prompt_executor_meeting_a_destroyed_entity_goes_on(context, monkeypatch):
+    executor = PromptExecutor(1, context=context)
+
+    def raise_invalid_handle(*arguments):
+        raise rclpy_implementation.InvalidHandle('destroyed')
+
+    monkeypatch.setattr(executor, 'wait_for_ready_callbacks', raise_invalid_handle)
+    executor.spin_once(0.1)
+    executor.shutdown()
+
+
+# responses to clients that are not matched yet
+
+
+@pytest.fixture
+def lost_response(context, node, monkeypatch):
+    """
+    Return a function that serves one request, whose response cannot be sent; it returns attempts.
+
+    The request of a transient local client is received, but its reader never matches the volatile
+    writer of the service: as a reader that is not discovered yet.
+    """
+    other = rclpy.create_node('other', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+
+    def serve(prepare=lambda service: None):
+        attempts, handled = [], []
+
+        def handle(request, response):
+            handled.append(request)
+            return response
+
+        service = node.create_service(Trigger, '/lost', handle)
+        send = service.send_response
+
+        def counted(response, header):
+            attempts.append(header)
+            return send(response, header)
+
+        service.send_response = counted
+        prepare(service)
+        qos = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        client = other.create_client(Trigger, '/lost', qos_profile=qos)
+        client.call_async(Trigger.Request())
+        with pytest.warns(RuntimeWarning, match='client will not receive'):
+            spin_until(executor, lambda: bool(handled))
+        return attempts
+
+    yield serve
+    executor.shutdown()
+    other.destroy_node()
+
+
+def test_service_of_upstream_with_an_unmatched_client_drops_the_response(lost_response):
+    assert len(lost_response()) == 1
+
+
+def test_service_with_an_unmatched_client_repeats_the_response(lost_response, monkeypatch):
+    monkeypatch.setattr(rclpy_workarounds, 'RESPONSE_TIMEOUT', 0.5)
+    assert len(lost_response(repeat_responses)) > 2
+
+
+class FakeService:
+    """A service that fails to send its first responses."""
+
+    def __init__(self, failures, fail):
+        self.failures, self.fail, self.sent = failures, fail, []
+
+    def send_response(self, response, header):
+        self.sent.append((response, header))
+        if len(self.sent) <= self.failures:
+            self.fail()
+
+
+def warn():
+    warnings.warn(LOST, RuntimeWarning, stacklevel=1)
+
+
+def warn_within_c():
+    """Raise as Python does for a warning, made an error, in a C function that returns a result."""
+    try:
+        warn()
+    except RuntimeWarning as error:
+        raise SystemError('returned a result with an exception set') from error
+
+
+@pytest.mark.parametrize('fail', [warn, warn_within_c])
+@pytest.mark.parametrize('failures', [0, 1, 5])
+def test_service_whose_client_is_matched_late_sends_the_response(
+    fail, failures, recwarn, monkeypatch
+):
+    monkeypatch.setattr(rclpy_workarounds, 'RESPONSE_PAUSE', 0.001)
+    service = FakeService(failures, fail)
+    repeat_responses(service)
+    service.send_response('yes', 7)
+    assert service.sent == [('yes', 7)] * (failures + 1)
+    assert not recwarn.list
+
+
+def test_service_with_another_error_raises_it_at_once():
+    def fail():
+        raise SystemError('something else')
+
+    service = FakeService(1, fail)
+    repeat_responses(service)
+    with pytest.raises(SystemError, match='something else'):
+        service.send_response('yes', 7)
+    assert len(service.sent) == 1
+
+
+def test_services_of_a_managed_node_repeat_responses(context):
+    node = ManagedNode('managed', context=context)
+    names = {service.srv_name.rpartition('/')[2] for service in node.services}
+    assert {'change_state', 'get_state', 'set_parameters'} <= names
+    for service in node.services:
+        assert service.send_response.__name__ == 'send_repeatedly', service.srv_name
+    node.destroy_node()
+
+
+# the life cycle
+
+
+def test_lifecycle_node_of_upstream_raises_at_an_invalid_transition(context):
+    node = LifecycleNode('upstream', context=context)
+    with pytest.raises(rclpy_implementation.RCLError, match='not registered'):
+        node.trigger_activate()
+    node.destroy_node()
+
+
+def test_managed_node_at_an_invalid_transition_stays_in_its_state(context):
+    node = ManagedNode('managed', context=context)
+    assert not node.advance(node.trigger_activate)
+    assert node.state == 'unconfigured'
+    assert node.advance(node.trigger_configure)
+    assert node.state == 'inactive'
+    node.destroy_node()
+
+
+@pytest.mark.parametrize(('kind', 'left'), [(LifecycleNode, True), (ManagedNode, False)])
+def test_services_of_a_destroyed_node_are_left_by_upstream_only(context, node, kind, left):
+    managed = kind('managed', context=context)
+    names = dict(node.get_service_names_and_types())  # of the same process: known at once
+    assert '/managed/get_state' in names
+    managed.destroy_node()
+    names = dict(node.get_service_names_and_types())
+    assert ('/managed/get_state' in names) == left
+    assert '/managed/get_parameters' not in names

@@ -1,0 +1,371 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Tests of the set-up behind the Makefile; none of them needs a network."""
+
+import ast
+import json
+import os
+from pathlib import Path
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+
+import pytest
+import setup_venv
+
+ROOT = Path(__file__).resolve().parent.parent
+GROUPS = (*setup_venv.REQUIRED, *setup_venv.EXTRAS)
+BUILT_ON = '/opt/python/cp312-cp312'
+
+
+@pytest.fixture
+def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Make a checkout in which nothing is installed and every requirement is ``fake``."""
+    for name in ('requirements', 'stavpr_msgs', 'stavpr_ros'):
+        (tmp_path / name).mkdir()
+    for name in GROUPS:
+        (tmp_path / 'requirements' / f'{name}.txt').write_text('fake==1\n')
+    (tmp_path / 'requirements' / 'constraints.txt').touch()
+    monkeypatch.setattr(setup_venv, 'ROOT', tmp_path)
+    monkeypatch.setattr(setup_venv, 'machine_problems', list)
+    return tmp_path
+
+
+class Recorder:
+    """
+    Replaces ``run_logged``: records the commands instead of running them.
+
+    :ivar failure: raised by the command of the name ``fails``.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.commands: dict[str, str] = {}
+        self.fails = ''
+        self.failure: BaseException = setup_venv.SetupError('failed on request')
+
+    def __call__(self, name: str, title: str, command: list) -> None:
+        self.commands[name] = ' '.join(map(str, command))
+        if name == self.fails:
+            raise self.failure
+        if name == 'venv':
+            (self.root / '.venv').mkdir(exist_ok=True)
+            (self.root / '.venv' / 'pyvenv.cfg').write_text(f'home = {sys.base_prefix}')
+        if name in setup_venv.SOURCES:
+            (self.root / 'install' / name).mkdir(parents=True)  # fails where an old one is left
+
+    def run(self, *arguments: str) -> list[str]:
+        """Return the names of the commands that the set-up runs for its arguments."""
+        self.commands.clear()
+        setup_venv.main(list(arguments))
+        return list(self.commands)
+
+
+@pytest.fixture
+def recorder(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    recorder = Recorder(checkout)
+    monkeypatch.setattr(setup_venv, 'run_logged', recorder)
+    return recorder
+
+
+# Rejections
+
+
+@pytest.mark.parametrize(
+    ('version', 'implementation', 'status'),
+    [
+        *[('3.11', 'CPython', 0), ('3.12', 'CPython', 0), ('3.13', 'CPython', 0)],
+        *[('3.10', 'CPython', 1), ('3.14', 'CPython', 1), ('3.11', 'PyPy', 1)],
+    ],
+)
+def test_python_unsupported_is_rejected_by_name(
+    recorder, monkeypatch, capsys, version, implementation, status
+):
+    monkeypatch.setattr(setup_venv, 'PYTHON_VERSION', version)
+    monkeypatch.setattr(platform, 'python_implementation', lambda: implementation)
+    assert setup_venv.main(['build']) == status
+    assert bool(recorder.commands) == (status == 0)
+    text = capsys.readouterr().err
+    for word in (f'{implementation} {version} ({sys.executable})', '3.11, 3.12, 3.13', 'PYTHON='):
+        assert (word in text) == (status == 1)
+
+
+def test_python_old_parses_the_program():
+    source = (ROOT / 'tools' / 'setup_venv.py').read_text(encoding='utf-8')
+    ast.parse(source, feature_version=(3, 6))
+    assert '__future__' not in source
+
+
+def test_machine_without_tools_lists_all_of_them(tmp_path, monkeypatch):
+    for program in ('c++', 'mycc'):
+        (tmp_path / program).touch(mode=0o755)
+    monkeypatch.setenv('PATH', str(tmp_path))
+    monkeypatch.setenv('CC', 'mycc -m64')
+    monkeypatch.setenv('CXX', 'no-such-compiler')
+    monkeypatch.setattr(platform, 'machine', lambda: 'aarch64')
+    monkeypatch.setattr(setup_venv.importlib.util, 'find_spec', lambda _: None)
+    text = '\n'.join(setup_venv.machine_problems())
+    for word in ('Linux aarch64', 'no-such-compiler is not', 'cmake is not', 'ensurepip'):
+        assert word in text
+    assert 'mycc' not in text
+
+
+def test_machine_problems_stop_the_set_up(recorder, monkeypatch, capsys):
+    monkeypatch.setattr(setup_venv, 'machine_problems', lambda: ['no cmake', 'no compiler'])
+    assert setup_venv.main(['build']) == 1
+    assert '  * no cmake\n  * no compiler' in capsys.readouterr().err
+    assert not recorder.commands
+
+
+# Inputs and stamps
+
+
+def test_digest_depends_on_names_and_contents(checkout):
+    folder = checkout / 'stavpr_ros'
+    (folder / '__pycache__').mkdir()
+    (folder / 'x.py').write_text('1')
+    before = setup_venv.digest([folder, checkout / 'missing'])
+    (folder / '__pycache__' / 'x.pyc').touch()
+    assert setup_venv.digest([folder]) == before
+    (folder / 'x.py').rename(folder / 'y.py')
+    renamed = setup_venv.digest([folder])
+    (folder / 'y.py').write_text('2')
+    assert len({before, renamed, setup_venv.digest([folder])}) == 3
+
+
+def test_extras_are_added_and_kept(recorder):
+    recorder.run('build', '--with', 'onnx')
+    assert recorder.run('build', '--with', 'dev') == ['pip']
+    installed = re.findall(r'(\w+)\.txt', recorder.commands['pip'])
+    assert installed == [*setup_venv.REQUIRED, 'onnx', 'dev', 'constraints']
+    assert recorder.run('build', '--with', 'dev', 'onnx') == recorder.run('build') == []
+
+
+def test_changed_requirement_is_installed_in_place(recorder, checkout):
+    recorder.run('build')
+    (checkout / 'requirements' / 'runtime.txt').write_text('fake==2\n')
+    assert recorder.run('build') == ['pip']
+    for name in ('ros', 'constraints'):
+        (checkout / 'requirements' / f'{name}.txt').write_text('fake==2\n')
+        assert recorder.run('build') == ['pip', 'stavpr_msgs', 'stavpr_ros']
+    (checkout / 'requirements' / 'onnx.txt').write_text('fake==2\n')
+    assert recorder.run('build') == []
+
+
+def test_changed_source_builds_its_package_from_nothing(recorder, checkout):
+    recorder.run('build')
+    (checkout / 'stavpr_ros' / 'x.py').touch()
+    stale = [checkout / folder / 'stavpr_ros' / 'stale' for folder in ('build', 'install')]
+    for file in stale:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    assert recorder.run('build') == ['stavpr_ros']
+    assert not any(file.exists() for file in stale)
+
+
+def test_torch_index_is_for_torch_alone_and_is_kept(recorder):
+    recorder.run('build')
+    steps = ['venv', 'torch', 'pip']
+    assert recorder.run('build', '--torch-index', 'file:///cpu') == steps
+    command = recorder.commands['torch']
+    assert '--index-url file:///cpu' in command
+    assert re.findall(r'(\w+)\.txt', command) == ['torch']
+    assert '--index-url' not in recorder.commands['pip']
+    assert recorder.run('build') == []
+
+
+@pytest.mark.parametrize('changed', ['python', 'prefix', 'folder'])
+def test_changed_interpreter_or_folder_starts_anew(recorder, checkout, monkeypatch, changed):
+    recorder.run('setup')
+    if changed == 'python':
+        other = next(name for name in setup_venv.SUPPORTED if name != setup_venv.PYTHON_VERSION)
+        monkeypatch.setattr(setup_venv, 'PYTHON_VERSION', other)
+    elif changed == 'prefix':
+        monkeypatch.setattr(sys, 'base_prefix', '/other')
+    else:
+        stamp = checkout / '.venv' / 'setup.json'
+        stamp.write_text(json.dumps({**json.loads(stamp.read_text()), 'folder': '/other'}))
+    assert recorder.run('setup') == ['venv', 'pip']
+    assert '--clear' in recorder.commands['venv']
+
+
+@pytest.mark.parametrize('step', ['venv', 'pip'])
+def test_interrupted_installation_starts_anew(recorder, checkout, step):
+    recorder.run('setup')
+    stamp = checkout / '.venv' / 'setup.json'
+    stamp.write_text(stamp.read_text()[:9])
+    recorder.fails, recorder.failure = step, KeyboardInterrupt()
+    assert setup_venv.main(['setup']) == 130
+    recorder.fails = ''
+    assert recorder.run('setup') == ['venv', 'pip']
+    recorder.fails = 'pip'
+    assert recorder.run('setup', '--with', 'dev') == ['pip']
+    recorder.fails = ''
+    assert recorder.run('setup') == ['venv', 'pip']
+
+
+def test_interrupted_build_continues_and_a_finished_one_runs_nothing(recorder):
+    recorder.fails = 'stavpr_msgs'
+    assert recorder.run('build') == ['venv', 'pip', 'stavpr_msgs']
+    recorder.fails = ''
+    assert recorder.run('build') == ['stavpr_msgs', 'stavpr_ros']
+    assert recorder.run('build') == []
+
+
+def test_changed_interpreter_builds_anew_even_after_a_failure(recorder, monkeypatch):
+    recorder.run('build')
+    recorder.fails = 'pip'
+    with monkeypatch.context() as other:
+        other.setattr(sys, 'base_prefix', '/other')
+        assert recorder.run('build') == ['venv', 'pip']
+    recorder.fails = ''
+    assert recorder.run('build') == ['venv', 'pip']
+    monkeypatch.setattr(sys, 'base_prefix', '/other')
+    assert recorder.run('build') == ['venv', 'pip', 'stavpr_msgs', 'stavpr_ros']
+
+
+def test_failed_extra_leaves_the_environment_in_use(recorder):
+    recorder.run('build')
+    recorder.fails = 'pip'
+    assert setup_venv.main(['build', '--with', 'evaluation']) == 1
+    recorder.fails = ''
+    assert recorder.run('build') == []
+
+
+# Commands and their environment
+
+
+def test_failed_command_shows_the_end_of_its_log(checkout):
+    script = 'for i in $(seq 100); do echo line $i; done; echo cause >&2; exit 3'
+    with pytest.raises(setup_venv.SetupError) as caught:
+        setup_venv.run_logged('step', 'Trying', ['sh', '-c', script])
+    lines = str(caught.value).splitlines()
+    assert 'status 3' in lines[0]
+    assert str(checkout / 'log' / 'setup' / 'step.log') in lines[0]
+    assert lines[-3:-1] == ['  | line 100', '  | cause']
+    assert '  | line 1' not in lines
+
+
+def test_environment_has_no_other_ros(checkout, monkeypatch):
+    variables = {
+        'PATH': '/opt/ros/jazzy/bin:/usr/bin:/ws/install/a/bin:/opt/rosalind/bin',
+        'PYTHONPATH': '/opt/ros/jazzy/lib',
+        'AMENT_PREFIX_PATH': '/ws/install/a:/opt/ros/jazzy',
+        'COLCON_PREFIX_PATH': '/ws/install',
+        'ROS_DISTRO': 'humble',
+        'ROS_DOMAIN_ID': '7',
+        'MAKEFLAGS': 'j',
+        'STAVPR_DATA': '/data',
+        'LD_LIBRARY_PATH': '/opt/ros/jazzy/lib:/v/lib/python3.11/site-packages/ros_rcl.libs',
+        '_ROS_WHEELS_BOOTSTRAP_COMPLETE': '1',
+    }
+    monkeypatch.setattr(os, 'environ', variables)
+    venv = str(checkout / '.venv')
+    assert setup_venv.clean_environment() == {
+        'PATH': f'{venv}/bin:/usr/bin:/opt/rosalind/bin',
+        'VIRTUAL_ENV': venv,
+        'AMENT_PREFIX_PATH': venv,
+        'CMAKE_PREFIX_PATH': venv,
+        'COLCON_HOME': f'{venv}/colcon',
+        'ROS_DOMAIN_ID': '7',
+        'STAVPR_DATA': '/data',
+        'PIP_USER': '0',
+    }
+
+
+FAKE_COLCON = """
+import pathlib, sys
+package = sys.argv[sys.argv.index('--packages-select') + 1]
+pathlib.Path('install', package).mkdir(parents=True)
+pathlib.Path('install', package, 'arguments').write_text(' '.join(sys.argv))
+pathlib.Path('install/local_setup.bash').write_text('export SOURCED=yes')
+"""
+
+
+def write_fake_wheel(folder: Path) -> None:
+    """Write a wheel with a module ``colcon`` and a CMake file of the build machine."""
+    cmake = f'"{BUILT_ON}/include/python3.12;{BUILT_ON}/lib/python3.12/site-packages/numpy/x"'
+    info = 'fake-1.dist-info'
+    with zipfile.ZipFile(folder / 'fake-1-py3-none-any.whl', 'w') as wheel:
+        wheel.writestr('colcon/__main__.py', FAKE_COLCON)
+        wheel.writestr('fake-1.data/data/share/fake/cmake/fakeConfig.cmake', cmake)
+        wheel.writestr(f'{info}/METADATA', 'Metadata-Version: 2.1\nName: fake\nVersion: 1\n')
+        wheel.writestr(f'{info}/WHEEL', 'Wheel-Version: 1.0\nTag: py3-none-any\n')
+        wheel.writestr(f'{info}/RECORD', '')
+
+
+def test_build_offline_with_a_real_environment(checkout, monkeypatch, capsys):
+    pytest.importorskip('ensurepip', reason='this Python cannot create virtual environments')
+    write_fake_wheel(checkout)
+    monkeypatch.setenv('PIP_CONFIG_FILE', os.devnull)
+    monkeypatch.setenv('PIP_NO_INDEX', '1')
+    monkeypatch.setenv('PIP_FIND_LINKS', str(checkout))
+    assert setup_venv.main(['build']) == 0
+    venv = checkout / '.venv'
+
+    include = setup_venv.sysconfig.get_paths()['include']
+    packages = venv / 'lib' / f'python{setup_venv.PYTHON_VERSION}' / 'site-packages'
+    cmake = venv / 'share' / 'fake' / 'cmake' / 'fakeConfig.cmake'
+    assert cmake.read_text() == f'"{include};{packages}/numpy/x"'
+    for package in ('stavpr_msgs', 'stavpr_ros'):
+        arguments = (checkout / 'install' / package / 'arguments').read_text()
+        assert f'--base-paths . stavpr_msgs --packages-select {package} ' in arguments
+
+    capsys.readouterr()
+    assert setup_venv.main(['build']) == 0
+    assert capsys.readouterr().out == ''
+
+    (checkout / 'requirements' / 'dev.txt').write_text('missing==1\n')
+    assert setup_venv.main(['build', '--with', 'dev']) == 1
+    assert '  | ERROR: No matching distribution found for missing==1' in capsys.readouterr().err
+
+    (checkout / 'tools').mkdir()
+    program = shutil.copy(ROOT / 'tools' / 'setup_venv.py', checkout / 'tools')
+    script = 'import os, sys; print(sys.prefix, os.getenv("SOURCED"), os.getenv("PYTHONPATH"))'
+    printed = subprocess.run(
+        [sys.executable, '-E', program, 'run', 'python3', '-c', script],
+        env={**os.environ, 'PYTHONPATH': '/opt/ros/jazzy/lib'},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert printed.stdout.split() == [str(venv), 'yes', 'None']
+
+
+# The files of the repository
+
+
+def test_requirements_are_pinned_exactly():
+    for name in (*GROUPS, 'constraints'):
+        text = (ROOT / 'requirements' / f'{name}.txt').read_text(encoding='utf-8')
+        pins = re.sub('#.*', '', text).split()
+        assert pins
+        assert [pin for pin in pins if not re.fullmatch(r'[\w.\[\]-]+==[\w.]+', pin)] == []
+
+
+def test_sources_of_a_build_exist():
+    sources = [name for names in setup_venv.SOURCES.values() for name in names]
+    assert [name for name in sources if not (ROOT / name).exists()] == []
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'expected'),
+    [
+        (['demo', 'LOOP=synthetic'], r'/demo +--loop *$'),
+        (['demo', 'LOOP=walk'], r'/demo +--loop "\$LOOP" *$'),
+        (['demo', 'MAP=a', 'QUERY=b', 'ARGS=-v'], r'/demo --map "\$MAP" --query "\$QUERY" +-v$'),
+        (['evaluate', 'EXTRAS=onnx', 'MAP=a', 'QUERY=b'], r'--with onnx evaluation\n'),
+        (['setup', 'TORCH_INDEX=file:///cpu'], r"--torch-index 'file:///cpu' --with *$"),
+        (['test', 'ARGS=-x'], r'sphinx-build .*-W(.|\n)* pytest test -m .not long. -x$'),
+        (['test-long'], r' pytest test -m long *$'),
+        (['setup', 'PYTHON=python3.12'], r'^python3.12 -E tools/setup_venv.py setup '),
+    ],
+)
+def test_make_target_runs_its_program(arguments, expected):
+    command = ['make', '--dry-run', '--no-print-directory', '-C', str(ROOT), *arguments]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True)
+    commands = re.sub(r' *\\\n\s*', ' ', printed.stdout)
+    assert re.search(expected, commands, re.MULTILINE), commands
