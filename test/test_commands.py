@@ -269,13 +269,13 @@ def test_match_record_names_every_status(name):
     ('options', 'word'),
     [
         (['--map', 'x'], 'go together'),
-        (['--ground-truth', 'identity'], '--ground-truth'),
+        (['--truth', 'identity'], '--truth'),
         (['--threshold', '-1'], '--threshold'),
         (['--tolerance', '-4'], '--tolerance'),
-        (['--map', 'x', '--query', 'y', '--ground-truth', 'file.csv'], 'expected identity'),
+        (['--map', 'x', '--query', 'y', '--truth', 'file.csv'], 'expected identity'),
         (['--loop', '--map', 'x', '--query', 'y'], 'leave --map'),
-        (['--loop', 'synthetic', '--ground-truth', 'file.csv'], 'is known'),
-        (['--loop', 'x', '--ground-truth', 'identity'], 'takes a file'),
+        (['--loop', 'synthetic', '--truth', 'file.csv'], 'is known'),
+        (['--loop', 'x', '--truth', 'identity'], 'takes a file'),
         (['--loop', '--exclude-places', '0'], '--exclude-places'),
         (['--loop', '--sequence-length', '1'], '--sequence-length'),
         (['--loop', '--mode', 'paper'], '--threshold'),
@@ -348,7 +348,7 @@ def test_demo_of_loop_closure_reports_closures(run, tmp_path):
     truth = tmp_path / 'truth.csv'
     truth.write_text('query,place\n' + ''.join(f'{37 + i},{i}\n' for i in range(36)))
     output = tmp_path / 'output'
-    options = ['--ground-truth', truth, '--exclude-places', 30, '--sequence-length', 8]
+    options = ['--truth', truth, '--exclude-places', 30, '--sequence-length', 8]
     options += ['--geometric-check', 'none', '--tolerance', 0, '--output', output]
     result = run_process('demo', '--loop', traverse, *options)
     assert result.returncode == 0, result.stdout + result.stderr

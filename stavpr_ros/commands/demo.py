@@ -31,10 +31,10 @@ loop_closure, which compares it with its own past; 'synthetic' is the synthetic 
 EPILOG = """
 examples:
   demo
-  demo --map monday/ --query tuesday/ --ground-truth identity --tolerance 3
+  demo --map monday/ --query tuesday/ --truth identity --tolerance 3
   demo --map monday.bag --query tuesday.bag --topic /camera/image_raw --threshold 0.2
   demo --loop synthetic
-  demo --loop round/ --ground-truth closures.png --exclude-places 100
+  demo --loop round/ --truth closures.png --exclude-places 100
 
 exit codes: 0 done, 1 something failed (the reason is printed), 2 usage, 130 interrupted
 """
@@ -59,7 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add('--topic', help='image topic of the bags, if they have several')
     add(
-        '--ground-truth', metavar='identity|FILE',
+        '--truth', metavar='identity|FILE',
         help='identity: image i of the query shows place i of the map; with --loop a FILE: pairs '
         'of images (.csv), or a square array (.npy) or black and white image of loop closures',
     )  # fmt: skip
@@ -93,13 +93,13 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         value = getattr(arguments, name)
         if value is not None and value < least:
             parser.error(f'--{name.replace("_", "-")} {value} must be at least {least}')
-    truth = arguments.ground_truth
+    truth = arguments.truth
     if arguments.loop is not None:
         if arguments.map or arguments.query:
             parser.error('--loop is one traverse: leave --map and --query out')
         if truth == 'identity' or (truth and arguments.loop == SYNTHETIC):
             parser.error(
-                '--loop FOLDER takes a file as --ground-truth; that of the synthetic street is '
+                '--loop FOLDER takes a file as --truth; that of the synthetic street is '
                 'known'
             )
         if arguments.mode == 'paper' and arguments.threshold is None:
@@ -110,10 +110,10 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
     if (arguments.map is None) != (arguments.query is None):
         parser.error('--map and --query go together')
     if truth and arguments.map is None:
-        parser.error('--ground-truth goes with --map and --query')
+        parser.error('--truth goes with --map and --query')
     if truth not in (None, 'identity'):
         parser.error(
-            f'--ground-truth {truth}: expected identity; files are for --loop, and for evaluate'
+            f'--truth {truth}: expected identity; files are for --loop, and for evaluate'
         )
 
 
@@ -154,7 +154,7 @@ def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair
         _print('1. Two traverses of a synthetic street')
         return synthetic_pair(folder, arguments.street_seed)
     _print(f'1. Your traverses: {arguments.map} is the map, {arguments.query} the query')
-    identity = arguments.ground_truth == 'identity'
+    identity = arguments.truth == 'identity'
     length = arguments.sequence_length
     return own_pair(arguments.map, arguments.query, arguments.topic, identity, length)
 
@@ -216,7 +216,7 @@ def _loop_traverse(arguments: argparse.Namespace, folder: Path, exclude: int) ->
                'a detour')  # fmt: skip
         return synthetic_loop(folder, arguments.street_seed, exclude, tolerance)
     _print(f'1. Your traverse: {arguments.loop}')
-    return own_loop(arguments.loop, arguments.topic, arguments.ground_truth, exclude, tolerance)
+    return own_loop(arguments.loop, arguments.topic, arguments.truth, exclude, tolerance)
 
 
 def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:

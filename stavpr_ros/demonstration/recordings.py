@@ -148,7 +148,7 @@ def own_pair(
         raise SettingsError(f'{query} has {images} images: the window needs {sequence_length}')
     if identity and images > places:
         raise SettingsError(
-            f'--ground-truth identity: {images} query images on a map of {places} places'
+            f'--truth identity: {images} query images on a map of {places} places'
         )
     title = f'{Path(query).name} recognized on the map of {Path(reference).name}'
     return TraversePair(first, second, np.arange(images) if identity else None, title)
