@@ -1,4 +1,4 @@
-"""A node that watches one camera of a test: how it is started, and images with the answers to them."""
+"""A node and one camera: how the node is started, and images with their matches."""
 
 import time
 from pathlib import Path
@@ -21,7 +21,7 @@ SECOND = 10**9
 
 def start_node(folder: Path, *options: str) -> Process:
     """
-    Start a node with more options of its command line; all are called the same, so one at a time.
+    Start a node with further command-line options; one at a time, since all have one name.
 
     :param folder: holds ``route.stavpr``, the map; the log goes there.
     """
@@ -37,7 +37,7 @@ def nanoseconds(stamp: Time) -> int:
 
 class Camera:
     """
-    Publishes images, each later than the one before, and returns the answer to each.
+    Publishes images with increasing stamps, and returns the match of each.
 
     :param kind: type of the publisher's messages.
     """
@@ -48,7 +48,7 @@ class Camera:
         self.diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
 
     def connect(self) -> None:
-        """Publish empty images until they are answered, as the bench does for its own publisher."""
+        """Publish empty images until a match is received, as the bench does."""
         self.bench.until(lambda: self.publisher.get_subscription_count() > 0, 'the node')
         before, sent = len(self.bench.answers), 0
         while len(self.bench.answers) == before:
@@ -56,27 +56,27 @@ class Camera:
             assert sent < 100
             self.publisher.publish(self.kind(header=Header(stamp=Time(nanosec=sent))))
             self.bench.executor.spin_once(timeout_sec=0.5)
-        self.bench.until(lambda: self.bench.answers[-1].header.stamp.nanosec == sent, 'the last answer')
+        self.bench.until(lambda: self.bench.answers[-1].header.stamp.nanosec == sent, 'the last match')
 
     def show(self, image: np.ndarray | Image | CompressedImage, later: int = SECOND) -> PlaceMatch:
-        """Publish an image, or a message, stamped so much later than the last one [ns]."""
+        """Publish an image, or a message, stamped later than the last one by so many ns."""
         self.stamp += later
         message = image_message(image, 0) if isinstance(image, np.ndarray) else image
         message.header = Header(frame_id='camera')
         message.header.stamp = Time(sec=self.stamp // SECOND, nanosec=self.stamp % SECOND)
         count = len(self.bench.answers)
         self.publisher.publish(message)
-        self.bench.until(lambda: len(self.bench.answers) > count, 'an answer')
+        self.bench.until(lambda: len(self.bench.answers) > count, 'a match')
         assert len(self.bench.answers) == count + 1
         assert self.bench.answers[-1].header == message.header
         return self.bench.answers[-1]
 
     def statuses(self, images: list, later: int = SECOND) -> list[int]:
-        """Show several."""
+        """Return the status of each of several images."""
         return [self.show(image, later).status for image in images]
 
     def counts(self, part: str) -> dict[str, str]:
-        """Return the values of the diagnostics of a part as they are now, by the clock of the machine."""
+        """Return the values of the diagnostics of a part, newer than this call."""
         now, arrays = time.time_ns(), self.diagnostics
         self.bench.until(lambda: bool(arrays) and nanoseconds(arrays[-1].header.stamp) > now, 'diagnostics')
         found = [status for status in arrays[-1].status if status.name.endswith(part)]

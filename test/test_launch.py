@@ -1,8 +1,8 @@
 """
-The launch files: what they offer, and what they start.
+The launch files: their arguments, and the node that they start.
 
-``launch`` is no package that pip can install, so a stand-in that records takes its place; where it is
-installed, it runs one of the files as well.
+``launch`` cannot be installed by pip, so a recording stand-in replaces it; where it is installed, it
+runs one of the files as well.
 """
 
 import ast
@@ -19,7 +19,7 @@ from ament_index_python.packages import get_package_share_directory
 from conftest import route_images
 from processes import DOMAIN, executable
 
-from stavpr_ros.ros.parameters import BY_NAME
+from stavpr_ros.parameters import BY_NAME
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
@@ -28,7 +28,7 @@ OPERATIONS = {'stavpr': None, 'replay': None, 'mapping': 'mapping', 'loop_closur
 
 
 class Recorded:
-    """An action or substitution that knows what it was made with."""
+    """An action or substitution that keeps its arguments."""
 
     def __init__(self, *positional, **named):
         self.positional = positional
@@ -93,7 +93,7 @@ def describe(path):
 
 @pytest.fixture
 def load(monkeypatch):
-    """Return what a launch file describes, by the stand-in."""
+    """Return the description of a launch file, by the stand-in."""
     for name, content in STAND_INS.items():
         module = ModuleType(name)
         module.__dict__.update(content)
@@ -130,43 +130,40 @@ def test_every_launch_file_is_installed():
         assert (folder / path.name).read_text() == path.read_text()
 
 
-def test_the_helper_is_light():
-    """It is imported by the Python of ``ros2 launch``, which may have neither torch nor numba."""
+def test_launching_imports_nothing_heavy():
+    """The Python of ``ros2 launch`` may have neither torch nor numba."""
     tree = ast.parse((ROOT / 'stavpr_ros' / 'ros' / 'launching.py').read_text())
     modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
-    modules |= {alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names}
-    assert {name.partition('.')[0] for name in modules} == {'collections', 'typing', 'launch', 'launch_ros'}
+    modules |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
+    own = {name for name in modules if name.startswith('stavpr_ros')}
+    assert own == {'stavpr_ros.parameters'}  # see test_parameters
+    assert {name.partition('.')[0] for name in modules - own} == {'typing', 'launch', 'launch_ros'}
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_every_argument_is_described(load, name):
-    arguments = load(name).arguments
-    assert {'image', 'odom', 'namespace', 'params_file', 'use_sim_time', 'map_path'} <= set(arguments)
-    for argument in arguments.values():
+def test_every_parameter_is_an_argument(load, name):
+    """Everything is given at once: names and types are those of the table."""
+    launch = load(name)
+    fixed = {'operation'} if OPERATIONS[name] else set()
+    common = {'image', 'odom', 'namespace', 'params_file', 'use_sim_time'}
+    own = {'bag', 'topic', 'rate', 'lossless', 'shutdown'} if name == 'replay' else set()
+    assert set(launch.arguments) == (set(BY_NAME) - fixed) | common | own
+    for argument in launch.arguments.values():
         assert len(argument.description) > 10
         assert hasattr(argument, 'default_value') or argument.name == 'bag'
-
-
-@pytest.mark.parametrize('name', NAMES)
-def test_every_parameter_is_in_the_table(load, name):
-    """Everything is given at once: names and types are those of the node's table."""
-    launch = load(name)
-    given = dict.fromkeys(launch.arguments, 'true')
-    parameters = launch.start(**given)[0].parameters[1]
-    own = {'image', 'odom', 'namespace', 'params_file', 'bag', 'topic', 'rate', 'lossless', 'shutdown'}
-    assert set(launch.arguments) - own <= set(parameters)
+    parameters = launch.start(**dict.fromkeys(launch.arguments, 'true'))[0].parameters[1]
+    assert set(parameters) == set(BY_NAME) | {'use_sim_time'}
+    assert parameters.pop('use_sim_time').value_type is bool
     for parameter, value in parameters.items():
-        if parameter == 'use_sim_time':
-            assert value.value_type is bool
-        elif isinstance(value, ParameterValue):
+        if parameter in fixed:
+            assert value == OPERATIONS[name]
+        else:
             assert value.value_type is type(BY_NAME[parameter].default)
             assert words(value.positional[0]) == f'${{{parameter}}}'
-        else:
-            assert value in BY_NAME[parameter].choices
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_what_is_not_given_is_left_to_the_parameter_file(load, name):
+def test_empty_arguments_are_left_to_the_parameter_file(load, name):
     node = load(name).start()[0]
     fixed = {} if OPERATIONS[name] is None else {'operation': OPERATIONS[name]}
     assert words(node.parameters[0]) == '${params_file}'
@@ -178,20 +175,13 @@ def test_what_is_not_given_is_left_to_the_parameter_file(load, name):
     assert topics == expected
 
 
-@pytest.mark.parametrize('operation', ['mapping', 'loop_closure'])
-def test_the_operation_of_the_file_stays(load, operation):
-    launch = load(operation)
-    assert 'operation' not in launch.arguments
-    assert launch.start(map_path='x')[0].parameters[1]['operation'] == operation
-
-
-def test_mapping_says_how_to_save(load):
+def test_mapping_logs_how_to_save(load):
     logs = [words(e.msg) for e in load('mapping').entities if type(e).__name__ == 'LogInfo']
     assert len(logs) == 1
     assert '${namespace}/stavpr/save_map stavpr_msgs/srv/SaveMap' in logs[0]
 
 
-def test_replay(load):
+def test_replay_gets_its_options(load):
     launch = load('replay')
     _, replay = launch.start(bag='drive')
     assert [words(word) for word in replay.arguments] == ['${bag}']
@@ -219,8 +209,8 @@ sys.exit(service.run())
 """
 
 
-def test_with_launch_itself(tmp_path):
-    """A folder is replayed into the node, in a namespace; the launch ends with the replay."""
+def test_launch_replays_a_folder_in_a_namespace(tmp_path):
+    """By launch itself; it ends with the replay."""
     pytest.importorskip('launch_ros', reason='launch is not installed')
     for i, image in enumerate(route_images(24)):
         cv2.imwrite(str(tmp_path / f'{i}.png'), image)
@@ -230,8 +220,8 @@ def test_with_launch_itself(tmp_path):
     done = subprocess.run(
         [*command, *given], env=environment, capture_output=True, text=True, timeout=120, check=False
     )
-    said = done.stdout + done.stderr
-    assert done.returncode == 0, said
-    assert '24 images published on /camera' in said
-    assert 'robot.stavpr]: 24 images received, 24 answered' in said
-    assert 'Traceback' not in said
+    output = done.stdout + done.stderr
+    assert done.returncode == 0, output
+    assert '24 images published on /camera' in output
+    assert 'robot.stavpr]: 24 images received, 24 processed' in output
+    assert 'Traceback' not in output

@@ -1,4 +1,4 @@
-"""The node's life cycle from outside: every state, every way between them, and what may come at any time."""
+"""The life cycle of the node from outside: states, transitions, and requests at any time."""
 
 import dataclasses
 import os
@@ -23,7 +23,13 @@ from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import PlaceMap, save_map
 
 LENGTH = 5
-PARAMETERS = {'sequence_length': LENGTH, 'xi': 0, 'threshold': 0.2, 'max_rate': 0.0, 'verbosity': 'info'}
+PARAMETERS = {
+    'sequence_length': LENGTH,
+    'xi': 0,
+    'threshold': 0.2,
+    'max_rate': 0.0,
+    'verbosity': 'info',
+}
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BACK = {'unconfigured': (), 'inactive': ('cleanup',), 'active': ('deactivate', 'cleanup')}
 MEGABYTE = 1 << 20
@@ -43,7 +49,11 @@ def folder(tmp_path_factory):
 
 def part_of(whole: PlaceMap, places: slice) -> PlaceMap:
     return PlaceMap(
-        whole.features[places], whole.projection, whole.stamps[places], whole.ids[places], whole.poses[places]
+        whole.features[places],
+        whole.projection,
+        whole.stamps[places],
+        whole.ids[places],
+        whole.poses[places],
     )
 
 
@@ -62,7 +72,7 @@ def late_map_file(small_map, folder):
 
 @pytest.fixture(scope='module')
 def managed(bench, folder):
-    """One node for the module; a manager, which is the test, takes it through its states."""
+    """One node for the module; the tests manage its life cycle."""
     process = node_process(
         folder / 'node.log',
         **PARAMETERS | TAKEN_RELIABLY,
@@ -78,10 +88,13 @@ def managed(bench, folder):
 
 @pytest.fixture
 def node(bench, managed):
-    """The node, unconfigured, with the parameters that it had at first."""
+    """The node, unconfigured, with its initial parameters."""
     for label in BACK[bench.state()]:
         assert bench.transition(label)
-    values = [Parameter(n, value=v).to_parameter_msg() for n, v in (PARAMETERS | {'map_path': ''}).items()]
+    values = [
+        Parameter(n, value=v).to_parameter_msg()
+        for n, v in (PARAMETERS | {'map_path': ''}).items()
+    ]
     results = bench.call(SetParameters, 'set_parameters', parameters=values).results
     assert all(result.successful for result in results)
     bench.wait_for_nobody()
@@ -89,16 +102,16 @@ def node(bench, managed):
 
 
 @pytest.fixture
-def hear(bench):
-    """Return ``hear(type, topic, qos)``: a list that fills until the test ends."""
+def receive(bench):
+    """Return ``receive(type, topic, qos)``: a list that fills until the test ends."""
     subscriptions = []
 
-    def hear(kind, topic, qos=50):
-        heard = []
-        subscriptions.append(bench.node.create_subscription(kind, topic, heard.append, qos))
-        return heard
+    def receive(kind, topic, qos=50):
+        messages = []
+        subscriptions.append(bench.node.create_subscription(kind, topic, messages.append, qos))
+        return messages
 
-    yield hear
+    yield receive
     for subscription in subscriptions:
         bench.node.destroy_subscription(subscription)
 
@@ -115,8 +128,8 @@ def statuses(bench, images, stamp=1):
     return [bench.ask(image_message(image, stamp + i)).status for i, image in enumerate(images)]
 
 
-def refusals(bench):
-    """What each service says; none may do what it is asked."""
+def rejections(bench):
+    """Return the message of each service; all must fail."""
     requests = {
         'reset': (Trigger, {}),
         'load_map': (LoadMap, {'path': 'any.stavpr'}),
@@ -129,11 +142,16 @@ def refusals(bench):
     return [answer.message for answer in answers]
 
 
-def test_through_all_states(bench, node, hear, map_file, route):
-    infos, warming = hear(MapInfo, '/stavpr/map_info', LATCHED), [PlaceMatch.WARMING_UP] * (LENGTH - 1)
+def test_node_through_all_states_behaves_as_each_state(bench, node, receive, map_file, route):
+    infos, warming = (
+        receive(MapInfo, '/stavpr/map_info', LATCHED),
+        [PlaceMatch.WARMING_UP] * (LENGTH - 1),
+    )
     assert bench.state() == 'unconfigured'
-    assert all('is unconfigured: configure it first' in message for message in refusals(bench))
-    assert bench.until_diagnosed('processing', DiagnosticStatus.OK, 'unconfigured: no image is processed')
+    assert all('is unconfigured: configure it first' in message for message in rejections(bench))
+    assert bench.until_diagnosed(
+        'processing', DiagnosticStatus.OK, 'unconfigured: no image is processed'
+    )
 
     configure(bench, map_file)
     assert bench.state() == 'inactive'
@@ -143,7 +161,7 @@ def test_through_all_states(bench, node, hear, map_file, route):
     assert 'in the window' in bench.call(Relocalize, 'relocalize').message
     bench.until_diagnosed('processing', DiagnosticStatus.OK, 'inactive: no image is processed')
 
-    for first in (10, 20):  # the second time like the first: with an empty window, and nothing of before
+    for first in (10, 20):  # both times with an empty window
         assert bench.transition('activate')
         assert bench.state() == 'active'
         bench.wait_for_node()
@@ -157,36 +175,36 @@ def test_through_all_states(bench, node, hear, map_file, route):
         bench.wait_for_nobody()
         before = len(bench.answers)
         bench.publisher.publish(image_message(route[0], 50))
-        assert bench.call(Relocalize, 'relocalize').success  # it still has the window, and time has passed
+        assert bench.call(Relocalize, 'relocalize').success  # the window is kept
         assert len(bench.answers) == before
 
     assert bench.transition('cleanup')
     assert bench.state() == 'unconfigured'
-    bench.until(lambda: infos[-1].state == 'none', 'that there is no map')
+    bench.until(lambda: infos[-1].state == 'none', 'the state without a map')
     assert infos[-1].places == 0
-    assert all('is unconfigured' in message for message in refusals(bench))
+    assert all('is unconfigured' in message for message in rejections(bench))
 
 
-def test_transitions_are_announced(bench, node, hear, map_file):
-    heard = hear(TransitionEvent, '/stavpr/transition_event')
+def test_node_in_transitions_publishes_events(bench, node, receive, map_file):
+    messages = receive(TransitionEvent, '/stavpr/transition_event')
 
     def events():
-        return [(event.start_state.label, event.goal_state.label) for event in heard]
+        return [(event.start_state.label, event.goal_state.label) for event in messages]
 
-    def told():  # try until we are heard: that the topic is there does not mean that it is connected
+    def received():  # a discovered topic is not necessarily matched
         bench.transition('configure')
         bench.transition('cleanup')
-        return bool(heard)
+        return bool(messages)
 
-    bench.until(told, 'the first event')
+    bench.until(received, 'the first event')
     bench.until(lambda: events()[-1] == ('cleaningup', 'unconfigured'), 'the last event')
-    heard.clear()
+    messages.clear()
     configure(bench, map_file)
     for label in ('activate', 'deactivate', 'cleanup'):
         assert bench.transition(label)
     assert bench.set_parameter('map_path', '/nowhere/route.stavpr')[0]
     assert not bench.transition('configure')
-    bench.until(lambda: len(heard) == 11, 'eleven events')
+    bench.until(lambda: len(messages) == 11, 'eleven events')
     assert events() == [
         ('unconfigured', 'configuring'),
         ('configuring', 'inactive'),
@@ -202,21 +220,23 @@ def test_transitions_are_announced(bench, node, hear, map_file):
     ]
 
 
-def test_impossible_transitions_are_refused(bench, node, map_file):
+def test_node_at_invalid_transitions_rejects_them(bench, node, map_file):
     steps = (None, 'configure', 'activate')
-    refused = (
+    invalid = (
         ('activate', 'deactivate', 'cleanup', 'teleport'),
         ('configure', 'deactivate', 'teleport'),
         ('configure', 'activate', 'cleanup', 'teleport'),
     )
     assert bench.set_parameter('map_path', map_file)[0]
-    for step, labels, state in zip(steps, refused, BACK, strict=True):
+    for step, labels, state in zip(steps, invalid, BACK, strict=True):
         assert step is None or bench.transition(step)
         for label in labels:
             assert not bench.transition(label), (state, label)
             assert bench.state() == state
         for number in (0, 77, Transition.TRANSITION_ON_CONFIGURE_SUCCESS):
-            assert not bench.call(ChangeState, 'change_state', transition=Transition(id=number)).success
+            assert not bench.call(
+                ChangeState, 'change_state', transition=Transition(id=number)
+            ).success
         assert bench.state() == state
         assert f'from state {state}' in node.output()
     assert bench.call(
@@ -225,12 +245,15 @@ def test_impossible_transitions_are_refused(bench, node, map_file):
     assert 'Traceback' not in node.output()
 
 
-def test_other_parameters_for_the_next_configuration(bench, node, map_file, late_map_file, route):
-    """What needs a new configuration is refused, with the reason, until there is none."""
+def test_node_with_fixed_parameters_takes_them_when_unconfigured(
+    bench, node, map_file, late_map_file, route
+):
     configure(bench, map_file)
     done, reason = bench.set_parameter('sequence_length', 3)
     assert not done
-    assert 'sequence_length can be set only while the node is unconfigured, it is inactive' in reason
+    assert (
+        'sequence_length can be set only while the node is unconfigured, it is inactive' in reason
+    )
     assert bench.transition('activate')
     done, reason = bench.set_parameter('sequence_length', 3)
     assert not done
@@ -245,27 +268,30 @@ def test_other_parameters_for_the_next_configuration(bench, node, map_file, late
 
 
 def with_missing_model(whole: PlaceMap) -> PlaceMap:
-    """A map that asks for a network whose file is nowhere."""
+    """Return a map whose network has no file."""
     network = settings_class('torchscript')(model='/nowhere/network.pt')
     settings = dataclasses.replace(whole.settings, kind='torchscript', backbone=network)
-    return dataclasses.replace(whole, features=dataclasses.replace(whole.features, settings=settings))
+    return dataclasses.replace(
+        whole, features=dataclasses.replace(whole.features, settings=settings)
+    )
 
 
-@pytest.mark.parametrize('trouble', ['damaged', 'missing', 'model', 'xi'])
-def test_a_configuration_that_fails(bench, node, map_file, small_map, route, tmp_path, trouble):
-    """The reason is told; the node is unconfigured again, and the next configuration can do."""
-    path = tmp_path / f'{trouble}.stavpr'
+@pytest.mark.parametrize('fault', ['damaged', 'missing', 'model', 'xi'])
+def test_node_after_a_failed_configuration_can_be_configured(
+    bench, node, map_file, small_map, route, tmp_path, fault
+):
+    path = tmp_path / f'{fault}.stavpr'
     words = {
         'damaged': 'damaged or truncated',
         'missing': 'does not exist',
         'model': "'/nowhere/network.pt' cannot be read",
         'xi': 'xi = 8',
-    }[trouble]
-    if trouble == 'damaged':
+    }[fault]
+    if fault == 'damaged':
         path.write_bytes(Path(map_file).read_bytes()[:5000])
-    elif trouble == 'model':
+    elif fault == 'model':
         save_map(with_missing_model(small_map), path)
-    elif trouble == 'xi':
+    elif fault == 'xi':
         assert bench.set_parameter('xi', 8) == (True, '')  # W, 7, is known with the map only
         path = map_file
     assert bench.set_parameter('map_path', str(path)) == (True, '')
@@ -274,8 +300,10 @@ def test_a_configuration_that_fails(bench, node, map_file, small_map, route, tmp
     assert bench.state() == 'unconfigured'
     assert 'cannot configure' in node.output()[log:]
     assert words in node.output()[log:]
-    assert 'cannot configure' in bench.until_diagnosed('map', DiagnosticStatus.ERROR, words).message
-    assert all('cannot configure' in message and words in message for message in refusals(bench))
+    assert (
+        'cannot configure' in bench.until_diagnosed('map', DiagnosticStatus.ERROR, words).message
+    )
+    assert all('cannot configure' in message and words in message for message in rejections(bench))
     assert not bench.transition('activate')
     assert bench.set_parameter('xi', 0)[0]
     configure(bench, map_file, activate=True)
@@ -285,13 +313,13 @@ def test_a_configuration_that_fails(bench, node, map_file, small_map, route, tmp
 
 
 def resident(process: Process) -> int:
-    """Bytes of memory that a process has."""
+    """Return the resident memory of a process [bytes]."""
     pages = Path(f'/proc/{process.popen.pid}/statm').read_text().split()[1]
     return int(pages) * os.sysconf('SC_PAGE_SIZE')
 
 
-def test_memory_of_a_map_is_freed(bench, node, map_file, small_map, folder):
-    """A map of 80 MB comes and goes: by clean-up, after an error, and when another one takes its place."""
+def test_node_without_its_map_frees_the_memory(bench, node, map_file, small_map, folder):
+    """A map of 80 MB is freed by cleanup, after an error, and by another map."""
     features = small_map.features
     strips, weights = (x.repeat_interleave(800, 1) for x in (features.strips, features.weights))
     n = strips.shape[1]
@@ -318,7 +346,7 @@ def test_memory_of_a_map_is_freed(bench, node, map_file, small_map, folder):
     assert full - resident(node) > 70 * MEGABYTE
 
 
-def test_who_comes_late_hears_of_the_map_and_the_health(bench, node, map_file):
+def test_node_with_a_late_subscriber_publishes_map_and_diagnostics(bench, node, map_file):
     configure(bench, map_file)
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=DOMAIN)
@@ -329,18 +357,18 @@ def test_who_comes_late_hears_of_the_map_and_the_health(bench, node, map_file):
     late.create_subscription(MapInfo, '/stavpr/map_info', infos.append, LATCHED)
     late.create_subscription(DiagnosticArray, '/diagnostics', reports.append, 10)
 
-    def heard():
+    def received():
         executor.spin_once(timeout_sec=0.05)
         return infos and len(reports) >= 3
 
-    bench.until(heard, 'the latched map')
+    bench.until(received, 'the latched map')
     assert [(info.state, info.places) for info in infos] == [('loaded', 60)]
     executor.shutdown()
     late.destroy_node()
     rclpy.shutdown(context=context)
 
 
-def test_another_publisher_goes_on_where_the_first_stopped(bench, node, map_file, route):
+def test_node_with_another_publisher_keeps_the_window(bench, node, map_file, route):
     configure(bench, map_file, activate=True)
     statuses(bench, route[:3])
     bench.node.destroy_publisher(bench.publisher)

@@ -1,4 +1,4 @@
-"""What the node hears, from outside: transports, encodings, broken images, keyframes, odometry, QoS."""
+"""Subscriptions of the node: transports, encodings, invalid images, keyframes, odometry, QoS."""
 
 import array
 
@@ -16,7 +16,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
 from stavpr_msgs.msg import PlaceMatch
-from stavpr_ros.ros.parameters import BY_NAME
+from stavpr_ros.parameters import BY_NAME
 
 WARN, ERROR = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 WARMING_UP, MATCH = PlaceMatch.WARMING_UP, PlaceMatch.MATCH
@@ -47,8 +47,8 @@ def encoded(image, encoding):
     return message
 
 
-def broken_images(image):
-    """One of each kind of broken image, by the kind."""
+def invalid_images(image):
+    """One invalid image for each cause."""
     kinds = {kind: image_message(image, 0) for kind in ('cut off', 'encoding', 'depth', 'size', 'step')}
     kinds['cut off'].height = kinds['cut off'].step = 2**32 - 1
     kinds['encoding'].encoding = 'teleport8'
@@ -68,44 +68,44 @@ def process(bench, start):
 
 
 class TestImages:
-    """One node with the defaults; what a test sets, it sets back."""
+    """One node with the defaults; a test restores the parameters that it sets."""
 
     @pytest.mark.parametrize('encoding', [*CHANNELS, *BAYER, *YUV])
-    def test_every_raw_encoding_is_recognized(self, stream, route, encoding):
+    def test_node_recognizes_raw_encoding(self, stream, route, encoding):
         """Without a reset: after five images there are only these in the window."""
         for image in route[30:35]:
-            answer = stream.show(encoded(image, encoding))
-        assert (answer.status, answer.newest_index) == (MATCH, 34)
+            match = stream.show(encoded(image, encoding))
+        assert (match.status, match.newest_index) == (MATCH, 34)
 
-    def test_broken_images_are_counted_and_explained_once_a_kind(self, bench, process, camera, route):
+    def test_invalid_images_are_counted_and_explained_once_a_kind(self, bench, process, camera, route):
         before = camera.counts('input')
         good = iter(range(20))
         for _ in range(2):
-            for kind, message in broken_images(route[0]).items():
-                answer = camera.show(message)
-                assert answer.status == INVALID, kind
-                assert answer.reason, kind
-                assert answer.place_index == answer.newest_index == -1
+            for kind, message in invalid_images(route[0]).items():
+                match = camera.show(message)
+                assert match.status == INVALID, kind
+                assert match.reason, kind
+                assert match.place_index == match.newest_index == -1
                 i = next(good)
-                answer = camera.show(route[i])
-                assert answer.status == (WARMING_UP if i < LENGTH - 1 else MATCH)
-        assert answer.newest_index == 9
+                match = camera.show(route[i])
+                assert match.status == (WARMING_UP if i < LENGTH - 1 else MATCH)
+        assert match.newest_index == 9
         after = camera.counts('input')
-        for kind in broken_images(route[0]):
+        for kind in invalid_images(route[0]):
             key = f'dropped_invalid_{kind.replace(" ", "_")}'
             assert int(after[key]) == int(before.get(key, 0)) + 2, kind
-            assert process.output().count(f'said once; /diagnostics counts "invalid: {kind}"') == 1, kind
+            assert process.output().count(f'logged once; /diagnostics counts "invalid: {kind}"') == 1, kind
         bench.until_diagnosed('input', WARN, 'cut off 2')
         assert 'Traceback' not in process.output()
 
-    def test_a_robot_that_stands_still_does_not_fill_the_window(self, bench, camera, route):
+    def test_images_at_rest_do_not_fill_the_window(self, bench, camera, route):
         rng, change = np.random.default_rng(0), BY_NAME['keyframe_change'].default
         assert camera.show(route[20]).status == WARMING_UP
         for _ in range(100):
             noisy = np.clip(route[20] + rng.normal(0, 3, route[20].shape), 0, 255).astype(np.uint8)
-            answer = camera.show(noisy, SECOND // 10)
-            assert answer.status == SKIPPED
-            assert f'less than {change:g}' in answer.reason
+            match = camera.show(noisy, SECOND // 10)
+            assert match.status == SKIPPED
+            assert f'less than {change:g}' in match.reason
         assert camera.counts('recognition')['window'] == '1'
         assert int(camera.counts('processing')['dropped_not_a_keyframe']) >= 100
         assert camera.statuses(route[21:25]) == 3 * [WARMING_UP] + [MATCH]
@@ -116,18 +116,18 @@ class TestImages:
         assert camera.counts('recognition')['window'] == '4'
         camera.set(keyframe_change=change)
 
-    def test_keyframes_by_odometry(self, bench, camera, route):
+    def test_keyframe_distance_and_angle_use_odometry(self, bench, camera, route):
         camera.set(keyframe_distance=1.0)
-        answer = camera.show(route[0])
-        assert answer.status == SKIPPED
-        assert 'no odometry' in answer.reason
+        match = camera.show(route[0])
+        assert match.status == SKIPPED
+        assert 'no odometry' in match.reason
         assert 'never' in bench.until_diagnosed('input', WARN, 'odometry').message
         assert int(camera.counts('input')['dropped_no_odometry']) >= 1
         wheels = bench.node.create_publisher(Odometry, '/wheels/odometry', 10)
         bench.until(lambda: wheels.get_subscription_count() > 0, 'the subscriber of odometry')
 
         def moved(meters, degrees=0.0):
-            """Show the next image of the route as taken there; poses hold for half a second only."""
+            """Publish the next image of the route with that pose, which is valid for half a second."""
             camera.stamp += SECOND
             odometry, half = Odometry(), np.radians(degrees) / 2
             odometry.header.stamp = Time(sec=camera.stamp // SECOND, nanosec=camera.stamp % SECOND)
@@ -135,7 +135,7 @@ class TestImages:
             odometry.pose.pose.orientation.z, odometry.pose.pose.orientation.w = np.sin(half), np.cos(half)
             image = next(images)
 
-            def known():  # not at once where the image is faster, or the connection is not there yet
+            def known():  # the image may be faster, or the publisher not be matched yet
                 wheels.publish(odometry)
                 return 'no odometry' not in camera.show(image, 0).reason
 
@@ -149,8 +149,8 @@ class TestImages:
         assert moved(6.1, degrees=170).status == SKIPPED
         camera.set(keyframe_angle=30.0)
         assert moved(6.1, degrees=40).status == WARMING_UP
-        answer = moved(6.1, degrees=50)
-        assert answer.reason == 'moved 0.000 m of 1 m and turned 10.00 of 30 degrees since the last keyframe'
+        match = moved(6.1, degrees=50)
+        assert match.reason == 'moved 0.000 m of 1 m and turned 10.00 of 30 degrees since the last keyframe'
         assert camera.counts('recognition')['window'] == '3'
         assert 'no odometry' in camera.show(next(images), 3600 * SECOND).reason  # another clock
 
@@ -167,22 +167,22 @@ class TestImages:
         assert camera.counts('input')['odometry'] == 'not needed'
         bench.node.destroy_publisher(wheels)
 
-    def test_a_subscriber_that_asks_too_much_is_told(self, bench, process):
-        asks = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        bench.listen(PlaceMatch, '/stavpr/match', asks)
-        said = 'a subscriber of ~/match hears nothing: it asks for another durability'
-        bench.until(lambda: said in process.output(), 'the warning')
+    def test_incompatible_subscriber_is_logged(self, bench, process):
+        requested = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        bench.listen(PlaceMatch, '/stavpr/match', requested)
+        line = 'a subscriber of ~/match receives nothing: it requests another durability'
+        bench.until(lambda: line in process.output(), 'the warning')
 
-    def test_a_flood_of_big_images(self, bench, camera, route):
-        """What the middleware loses it may tell; what came is answered, whatever was lost."""
-        before, answered = camera.counts('input'), len(bench.answers)
+    def test_a_burst_of_large_images(self, bench, camera, route):
+        """The middleware may report losses; every image that arrived gets one match."""
+        before, count = camera.counts('input'), len(bench.answers)
         big = image_message(np.kron(route[0], np.ones((10, 10, 1), np.uint8)), camera.stamp)
         for _ in range(60):
             bench.publisher.publish(big)
         bench.ask_until_answered(image_message(route[1], camera.stamp + 1))
         after = camera.counts('input')
         received = int(after['received']) - int(before['received'])
-        bench.until(lambda: len(bench.answers) - answered == received, 'an answer to every image')
+        bench.until(lambda: len(bench.answers) - count == received, 'a match for every image')
         lost = int(after.get('dropped_lost_in_transport', 0)) - int(
             before.get('dropped_lost_in_transport', 0)
         )
@@ -198,7 +198,7 @@ def compressed_process(start):
 
 @pytest.fixture(scope='class')
 def packed(bench, compressed_process):
-    """Before there is one, or only one of raw images, and while it is silent, the node says so."""
+    """The diagnostics without a publisher, with one of raw images, and with a silent one."""
     topic = '/front/image/compressed'  # below what `image` is remapped to
     message = bench.until_diagnosed('input', WARN, 'no publisher').message
     assert topic in message
@@ -216,22 +216,22 @@ def packed(bench, compressed_process):
 
 class TestCompressed:
     @pytest.mark.parametrize('suffix', ['.png', '.jpeg'])
-    def test_pictures(self, packed, route, suffix):
+    def test_compressed_images_are_recognized(self, packed, route, suffix):
         packed.reset()
         statuses = packed.statuses(compressed_message(image, 0, suffix) for image in route[40:46])
         assert statuses == 4 * [WARMING_UP] + 2 * [MATCH]
         assert packed.bench.answers[-1].newest_index == 45
 
-    def test_what_is_no_picture(self, bench, packed, route):
+    def test_invalid_compressed_images_are_counted(self, bench, packed, route):
         packed.reset()
         depth, short, text = (compressed_message(route[0], 0) for _ in range(3))
         depth.format = '16UC1; compressedDepth png'
         short.data = short.data[: len(short.data) // 2]
-        text.data = array.array('B', b'no picture at all')
+        text.data = array.array('B', b'not an image at all')
         for message, word in ((depth, 'compressedDepth'), (short, 'png'), (text, 'rgb8')):
-            answer = packed.show(message)
-            assert answer.status == INVALID
-            assert word in answer.reason
+            match = packed.show(message)
+            assert match.status == INVALID
+            assert word in match.reason
         assert packed.show(compressed_message(route[0], 0)).status == WARMING_UP
         bench.until_diagnosed('input', WARN, 'depth 1')
 
@@ -248,11 +248,11 @@ def reliable_process(start):
 
 @pytest.fixture(scope='class')
 def reliable(bench, reliable_process):
-    """Reliable; the bench's own is not, which the node does not hear, and says so."""
+    """A reliable camera; the publisher of the bench is not, which the node reports."""
     message = bench.until_diagnosed('input', ERROR, 'refused for QoS').message
     remedy = 'set qos_overrides./image.subscription.reliability to best_effort, or make the publisher'
     assert remedy in message
-    assert f'images are not heard: a publisher of /image offers another reliability: {remedy}' in (
+    assert f'images are not received: a publisher of /image offers another reliability: {remedy}' in (
         reliable_process.output()
     )
     camera = Camera(bench, bench.node.create_publisher(Image, 'image', QoSProfile(depth=10)))
@@ -262,18 +262,18 @@ def reliable(bench, reliable_process):
 
 
 class TestQualityOfService:
-    def test_a_second_publisher_that_fits_is_heard(self, bench, reliable, route):
+    def test_incompatible_publisher_beside_a_compatible_one_is_reported(self, bench, reliable, route):
         for image in route[:LENGTH]:
-            bench.publisher.publish(image_message(route[50], 1))  # not heard: there is one answer only
-            answer = reliable.show(image)
-        assert (answer.status, answer.newest_index) == (MATCH, LENGTH - 1)
+            bench.publisher.publish(image_message(route[50], 1))  # not received: there is one match only
+            match = reliable.show(image)
+        assert (match.status, match.newest_index) == (MATCH, LENGTH - 1)
 
-        def told():
+        def reported():
             reliable.show(route[LENGTH])
             status = bench.diagnostics['input']
             return status.level == WARN and '1 publisher refused for QoS, while images of' in status.message
 
-        bench.until(told, 'a warning')
+        bench.until(reported, 'a warning')
         counts = reliable.counts('input')
         assert (counts['publishers'], counts['publishers_refused']) == ('2', '1')
         bench.node.destroy_publisher(bench.publisher)
@@ -283,7 +283,7 @@ class TestQualityOfService:
         depth = bench.call(GetParameters, 'get_parameters', names=['qos_overrides./image.subscription.depth'])
         assert depth.values[0].integer_value == 7
 
-    def test_overrides_are_of_one_topic_and_outlive_a_pause(self, bench, reliable, route):
+    def test_qos_overrides_apply_to_one_topic_and_after_a_pause(self, bench, reliable, route):
         def offered(topic):
             return [s.qos_profile.reliability for s in bench.node.get_subscriptions_info_by_topic(topic)]
 
@@ -297,7 +297,7 @@ class TestQualityOfService:
         assert offered('/odom') == [ReliabilityPolicy.BEST_EFFORT]
 
 
-def test_durability_can_be_overridden(bench, start):
+def test_durability_override_excludes_volatile_publishers(bench, start):
     process = start('-p', 'qos_overrides./image.subscription.durability:=transient_local')
     try:
         bench.until_diagnosed('input', ERROR, 'qos_overrides./image.subscription.durability to volatile, or')
@@ -309,7 +309,7 @@ def test_durability_can_be_overridden(bench, start):
         process.end()
 
 
-def test_overrides_that_do_not_do(bench, start):
+def test_invalid_qos_override_is_an_error(bench, start):
     process = start('-p', 'qos_overrides./image.subscription.reliability:=certain')
     try:
         bench.until_diagnosed('map', ERROR, 'correct qos_overrides./image.subscription')
@@ -318,9 +318,3 @@ def test_overrides_that_do_not_do(bench, start):
         assert 'Traceback' not in process.output()
     finally:
         process.end()
-
-
-def test_compressed_depth_is_no_transport(start):
-    process = start('-p', 'image_transport:=compressedDepth')
-    assert process.wait() == 1
-    assert "image_transport = 'compressedDepth' is unknown: take one of raw, compressed" in process.output()

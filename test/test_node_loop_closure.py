@@ -1,4 +1,4 @@
-"""Operation loop_closure from the outside: the hallway of the data folder, a made-up loop with odometry."""
+"""Operation loop_closure: a hallway of the data folder, and a synthetic loop with odometry."""
 
 from dataclasses import dataclass
 
@@ -13,11 +13,10 @@ from stavpr_msgs.msg import LoopClosure, PlaceMatch
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import counts_at, image_matches
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import load_map
-from stavpr_ros.pipeline import PipelineSettings
-from stavpr_ros.recognition import Status
+from stavpr_ros.recognition import RecognizerSettings
+from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.sources import open_source
 
 SECOND = 10**9
@@ -25,10 +24,10 @@ LAP, LENGTH = 40, 5
 
 
 @dataclass
-class Drive:
-    """What came of a drive: answers, loop closures by their last image, and what the core says."""
+class Results:
+    """Matches, loop closures by their last image, and the matches of the library."""
 
-    answers: list
+    matches: list
     closures: dict
     core: list
 
@@ -49,7 +48,8 @@ def start(bench, tmp_path_factory):
     def start(**parameters):
         end()
         values = {'operation': 'loop_closure', 'threads': 1, 'keyframe_change': 0.0} | parameters
-        started.append(node_process(tmp_path_factory.mktemp('node') / 'node.log', **values | TAKEN_RELIABLY))
+        log = tmp_path_factory.mktemp('node') / 'node.log'
+        started.append(node_process(log, **values | TAKEN_RELIABLY))
         bench.wait_for_node()
         bench.closures.clear()
 
@@ -65,91 +65,82 @@ def start(bench, tmp_path_factory):
 
 
 def pose(x):
-    """Where odometry believes to be: the second lap is a little off the first."""
     message = Odometry()
     message.pose.pose.position.x = float(x)
     message.pose.pose.orientation.z, message.pose.pose.orientation.w = 0.6, 0.8
     return message
 
 
-def drive(bench, images, settings, x_of=None):
+def process(bench, images, settings, exclude, x_of=None):
     """
-    Show image i at i + 1 seconds, with odometry, if there is any, at x_of(i), None = none for that image.
+    Publish image i at i + 1 seconds, with odometry, if any, at x_of(i); None = none for that image.
 
-    With the rule of motion, an image whose pose has not arrived yet is skipped: both are sent once more.
+    With the rule of motion, an image without a pose yet is skipped: both are published once more.
     """
     extractor = FeatureExtractor()
-    closer = settings.loop_closer(extractor, settings.applied_threshold('loop_closure'))
-    answers, core = [], []
+    closer = LoopCloser(settings, exclude, extractor.settings)
+    matches, core = [], []
     for i, image in enumerate(images):
         message = image_message(image, (i + 1) * SECOND)
         x = None if x_of is None else x_of(i)
         if x_of is not None:
             assert bench.set_parameter('keyframe_distance', 0.0 if x is None else 0.001)[0]
-        answer = None
-        while answer is None or 'no odometry' in answer.reason:
+        match = None
+        while match is None or 'no odometry' in match.reason:
             if x is not None:
                 odometry = pose(x)
                 odometry.header.stamp = message.header.stamp
                 bench.odometry.publish(odometry)
-            answer = bench.ask(message)
-        answers.append(answer)
+            match = bench.ask(message)
+        matches.append(match)
         core.append(closer.update(extractor.extract([image]), (i + 1) * SECOND))
-    matches = sum(answer.status == PlaceMatch.MATCH for answer in answers)
-    bench.until(lambda: len(bench.closures) >= matches, 'a loop closure for each match')
-    assert len(bench.closures) == matches
-    return Drive(answers, {closure.header.stamp.sec - 1: closure for closure in bench.closures}, core)
+    count = sum(match.status == PlaceMatch.MATCH for match in matches)
+    bench.until(lambda: len(bench.closures) >= count, 'a loop closure for each match')
+    assert len(bench.closures) == count
+    closures = {closure.header.stamp.sec - 1: closure for closure in bench.closures}
+    return Results(matches, closures, core)
 
 
-def check_against_core(driven, length):
-    """Match for match: statuses, places, distances, paths; and what a loop closure makes of them."""
-    for i, (answer, core) in enumerate(zip(driven.answers, driven.core, strict=True)):
-        assert answer.status == {'warming up': 0, 'no match': 1, 'match': 2}[core.status.value]
-        assert (answer.place_index, answer.newest_index) == (core.place_index, core.newest_index)
-        assert (i in driven.closures) == (core.status is Status.MATCH)
-        if core.sequence is None:
+def same_as_core(results, length):
+    """Match for match: status, places, distance; and the loop closure of each match."""
+    for i, (match, core) in enumerate(zip(results.matches, results.core, strict=True)):
+        assert match.status == core.status
+        assert (match.place_index, match.newest_index) == (core.place_index, core.newest_index)
+        assert (i in results.closures) == core.accepted
+        if core.sequence is not None:
+            assert match.distance == pytest.approx(core.sequence.distance, abs=1e-4)
+        if i not in results.closures:
             continue
-        assert answer.distance == pytest.approx(core.sequence.distance, abs=1e-4)
-        if i not in driven.closures:
-            continue
-        closure, first = driven.closures[i], i - length + 1
-        assert closure.header == answer.header
-        assert (closure.distance, closure.threshold) == (answer.distance, answer.threshold)
-        assert (closure.query_index, closure.place_index) == (first + (length - 1) // 2, core.place_index)
-        assert (closure.query_stamp.sec, closure.place_stamp.sec) == (closure.query_index + 1, core.place_index + 1)
-        assert closure.query_stamp == answer.window_middle
+        closure, first = results.closures[i], i - length + 1
+        assert closure.header == match.header
+        assert (closure.distance, closure.threshold) == (match.distance, match.threshold)
+        query, place = closure.query_index, closure.place_index
+        assert (query, place) == (first + (length - 1) // 2, core.place_index)
+        assert (closure.query_stamp.sec, closure.place_stamp.sec) == (query + 1, place + 1)
+        assert closure.query_stamp == match.window_middle
         assert closure.inliers == -1
         pairs = [(pair.query_index, pair.place_index) for pair in closure.pairs]
         assert pairs == [(first + q, m) for q, m in core.path.tolist()]
-        assert (pairs[0][0], pairs[-1][0]) == (first, i)
-        stamps = [(pair.query_stamp.sec - 1, pair.place_stamp.sec - 1) for pair in closure.pairs]
+        stamps = [(p.query_stamp.sec - 1, p.place_stamp.sec - 1) for p in closure.pairs]
         assert stamps == pairs
 
 
-def test_the_hallway_is_closed(bench, start, data_folder):
-    """As the core closes it in test_robust, and every loop closure is right."""
-    images = [frame.image for frame in open_source(data_folder / 'rtabmap_hallway_loop' / 'samples')]
-    truth_file = data_folder / 'rtabmap_hallway_loop' / 'samples_GT.bmp'
-    truth = GroundTruth.from_file(truth_file, 84, 84, 0).loop_closures(19)
+def test_hallway_loop_closures_are_correct(bench, start, data_folder):
+    """Those of the library, and every one agrees with the ground truth."""
+    folder = data_folder / 'rtabmap_hallway_loop'
+    images = [frame.image for frame in open_source(folder / 'samples')]
+    truth = GroundTruth.from_file(folder / 'samples_GT.bmp', 84, 84, 0).loop_closures(19)
     start(exclude_places=20)
-    driven = drive(bench, images, PipelineSettings(exclude_places=20))
-    check_against_core(driven, 20)
+    results = process(bench, images, RecognizerSettings(0.8, mode='robust'), 20)
+    same_as_core(results, 20)
     places = np.full(84, -1)
-    for closure in driven.closures.values():
+    for closure in results.closures.values():
         places[closure.query_index] = closure.place_index
-    told = np.flatnonzero(places >= 0)
-    correct = truth.accepts(places)
-    offline = image_matches(driven.core, 20)
-    score = counts_at(1.0, offline.distances, truth.accepts(offline.places), truth.has_match)
-    print(f'hallway: {len(told)} loop closures, {correct[told].mean():.3f} right, '
-          f'{correct.sum()} of {truth.has_match.sum()} places; core with its ends '
-          f'precision {score.precision:.3f}, recall {score.recall:.3f}')  # fmt: skip
-    assert len(told) == len(driven.closures) >= 20
-    assert correct[told].all()
-    assert score.precision == 1
-    # frames after the last window's middle have no loop closure of their own, but a pair in the last one
-    last = driven.closures[max(driven.closures)]
-    for pair in last.pairs:
+    indices = np.flatnonzero(places >= 0)
+    assert len(indices) == len(results.closures) >= 20
+    assert truth.accepts(places)[indices].all()
+    # images after the middle of the last window are in its pairs only
+    for pair in results.closures[max(results.closures)].pairs:
         if places[pair.query_index] < 0:
             places[pair.query_index] = pair.place_index
     assert truth.accepts(places)[truth.has_match].mean() >= 0.8
@@ -157,39 +148,44 @@ def test_the_hallway_is_closed(bench, start, data_folder):
 
 @pytest.fixture(scope='module')
 def loop(bench, start):
-    """A made-up loop, driven twice and a half; odometry drifts, and is silent for places 10 to 14."""
-    start(sequence_length=LENGTH, exclude_places=10, nms_radius=5, candidates=2, geometric_check='none')
-    settings = PipelineSettings(sequence=SequenceSettings(LENGTH), exclude_places=10, nms_radius=5)
+    """A synthetic loop, two laps and a half; odometry drifts, without poses for places 10 to 14."""
+    start(sequence_length=LENGTH, exclude_places=10, nms_radius=5, candidates=2)
+    sequence = SequenceSettings(LENGTH)
+    settings = RecognizerSettings(0.8, sequence=sequence, nms_radius=5, mode='robust')
     images = (route_images(LAP) * 3)[: 2 * LAP + LAP // 2]
-    return drive(bench, images, settings, lambda i: None if 10 <= i < 15 else i % LAP + 0.1 * (i // LAP))
+
+    def x_of(i):
+        return None if 10 <= i < 15 else i % LAP + 0.1 * (i // LAP)
+
+    return process(bench, images, settings, 10, x_of)
 
 
-def test_a_made_up_loop_is_closed_as_the_core_closes_it(loop):
-    check_against_core(loop, LENGTH)
+def test_loop_closures_connect_the_laps(loop):
+    same_as_core(loop, LENGTH)
     for i in range(LAP + LENGTH, 2 * LAP):
         closure = loop.closures[i]
         assert closure.query_index - closure.place_index == LAP
         assert closure.pairs[-1].place_index == i - LAP
 
 
-def test_odometry_gives_both_poses(loop):
-    """What odometry believed at either time; none where it was silent at one of them."""
+def test_loop_closures_have_both_poses_or_none(loop):
+    """The odometry at either time; none where it is missing at one of them."""
     known = 0
     for closure in loop.closures.values():
         places = closure.query_index, closure.place_index
-        silent = any(10 <= place < 15 for place in places)
-        assert closure.has_poses != silent
-        if silent:
-            assert closure.query_pose.position.x == closure.place_pose.position.x == 0
-            continue
-        known += 1
-        for place, believed in zip(places, (closure.query_pose, closure.place_pose), strict=True):
-            assert believed.position.x == pytest.approx(place % LAP + 0.1 * (place // LAP), abs=1e-9)
-            assert (believed.orientation.z, believed.orientation.w) == pytest.approx((0.6, 0.8))
+        poses = closure.query_pose, closure.place_pose
+        missing = any(10 <= place < 15 for place in places)
+        assert closure.has_poses != missing
+        for place, found in zip(places, poses, strict=True):
+            x = 0 if missing else place % LAP + 0.1 * (place // LAP)
+            assert found.position.x == pytest.approx(x, abs=1e-9)
+            if not missing:
+                assert (found.orientation.z, found.orientation.w) == pytest.approx((0.6, 0.8))
+        known += not missing
     assert known >= 40
 
 
-def test_the_route_can_be_saved(bench, loop, tmp_path):
+def test_the_recorded_route_is_saved(bench, loop, tmp_path):
     path = tmp_path / 'route.stavpr'
     response = bench.call(SaveMap, 'save_map', path=str(path))
     assert (response.success, response.places) == (True, 2 * LAP + LAP // 2)

@@ -1,4 +1,4 @@
-"""The node's services and what it publishes beside ~/match, from the outside: good requests and bad ones."""
+"""Services of the node, and its topics besides ~/match: valid and invalid requests."""
 
 import os
 from contextlib import contextmanager
@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
-from stavpr_msgs.msg import Candidates, MapInfo, PlaceMatch
+from stavpr_msgs.msg import MapInfo, PlaceCandidates, PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.mapping import load_map, save_map
 
@@ -28,7 +28,7 @@ SHORT = {'sequence_length': LENGTH, 'nms_radius': 5, 'candidates': 3, 'threads':
 
 
 class Robot(Bench):
-    """A bench whose images are not lost, and which drives along the route; every image has a new stamp."""
+    """A bench with reliable images, each with a new stamp, and odometry along the route."""
 
     def __init__(self):
         super().__init__(RELIABLE)
@@ -44,28 +44,28 @@ class Robot(Bench):
         return [self.ask(self.stamped(image)) for image in images]
 
     def drive_with_odometry(self, images, first=0):
-        """Image i is taken at x = i. The node skips what it has no pose of yet: then both come once more."""
-        answers = []
+        """Image i is taken at x = i; repeated while the node has no pose of that time yet."""
+        matches = []
         for x, image in enumerate(images, first):
             self.clock += 1
             place = Odometry()
             place.header.stamp.sec = self.clock
             place.pose.pose.position.x, place.pose.pose.orientation.w = float(x), 1.0
-            answer = None
-            while answer is None or 'no odometry' in answer.reason:
+            match = None
+            while match is None or 'no odometry' in match.reason:
                 self.odometry.publish(place)
-                answer = self.ask(image_message(image, self.clock * SECOND))
-            answers.append(answer)
-        return answers
+                match = self.ask(image_message(image, self.clock * SECOND))
+            matches.append(match)
+        return matches
 
-    def until_told(self, **fields):
-        """Wait until the last ~/map_info says so, and return it."""
+    def until_map(self, **fields):
+        """Wait until the last ~/map_info has these fields, and return it."""
 
-        def told():
+        def published():
             last = self.infos[-1] if self.infos else None
             return last is not None and all(getattr(last, name) == fields[name] for name in fields)
 
-        self.until(told, f'map_info with {fields}')
+        self.until(published, f'map_info with {fields}')
         return self.infos[-1]
 
     def does(self, kind, name, **fields):
@@ -80,7 +80,7 @@ class Robot(Bench):
 
     @contextmanager
     def while_loading(self, path):
-        """Have the node load a pipe, which nobody writes into until the block ends: it is no map then."""
+        """Load a pipe: reading it takes until the end of the block, and then it is no map."""
         os.mkfifo(path)
         futures = []
 
@@ -90,12 +90,12 @@ class Robot(Bench):
         with self.request(futures, LoadMap, 'load_map', loading, path=str(path)):
             yield path
             os.close(os.open(path, os.O_WRONLY))  # waits for the reader
-            self.until(futures[0].done, 'the answer of load_map')
+            self.until(futures[0].done, 'the match of load_map')
         assert not futures[0].result().success
         assert path.name in futures[0].result().message
 
     def begin(self, operation, path):
-        """Bring a node that other tests have used into an operation with a map and an empty window."""
+        """Bring a used node into an operation with a map and an empty window."""
         self.does(SetOperation, 'set_operation', operation='localization')
         self.does(LoadMap, 'load_map', path=str(path))
         self.does(SetOperation, 'set_operation', operation=operation)
@@ -121,8 +121,8 @@ def map_file(small_map, folder):
 
 
 @pytest.fixture(scope='module')
-def _nodes(robot, folder):
-    """One node at a time, kept until another one is asked for; none of them may have stumbled."""
+def nodes(robot, folder):
+    """One node at a time, kept until another one is needed; none may have logged a traceback."""
     kept = {}
 
     def node(name, **parameters):
@@ -145,75 +145,77 @@ def _nodes(robot, folder):
 
 
 @pytest.fixture
-def bare(_nodes):
-    """A node without a map."""
-    return _nodes('bare')
+def bare(nodes):
+    """A node without a map; tests leave it so."""
+    return nodes('bare')
 
 
 @pytest.fixture
-def mapped(_nodes, robot, map_file):
+def mapped(nodes, robot, map_file):
     """A node that localizes on the route, with an empty window."""
     # ~/map_info must not wait for the diagnostics
-    process = _nodes('mapped', map_path=map_file, diagnostics_period=60.0)
+    process = nodes('mapped', map_path=map_file, diagnostics_period=60.0)
     robot.begin('localization', map_file)
     return process
 
 
-# ------------------------------------------------ a node without a map: the first tests of this file
+# ------------------------------------------------ a node without a map
 
 
-def test_without_a_map_everything_says_what_is_missing(bare, robot, route, tmp_path):
-    info = robot.until_told(state='none')
+def test_services_without_a_map_return_the_reason(bare, robot, route, tmp_path):
+    info = robot.until_map(state='none')
     assert (info.operation, info.path, info.places) == ('localization', '', 0)
-    assert 'map_path' in robot.drive(route[:1])[0].reason
-    assert 'map_path' in robot.refuses(Relocalize, 'relocalize')
-    assert 'map_path' in robot.refuses(SaveMap, 'save_map', path=str(tmp_path / 'nothing.stavpr'))
-    assert 'name a file' in robot.refuses(SaveMap, 'save_map')
-    assert 'names no file' in robot.refuses(LoadMap, 'load_map')
-    assert 'does not exist' in robot.refuses(LoadMap, 'load_map', path='/nowhere/a.stavpr')
-    assert 'teleport' in robot.refuses(SetOperation, 'set_operation', operation='teleport')
+    assert 'no map' in robot.drive(route[:1])[0].reason
+    for kind, name, fields, words in (
+        (Relocalize, 'relocalize', {}, 'no map'),
+        (SaveMap, 'save_map', {'path': str(tmp_path / 'nothing.stavpr')}, 'no map'),
+        (SaveMap, 'save_map', {}, 'set a path'),
+        (LoadMap, 'load_map', {}, 'is no file'),
+        (LoadMap, 'load_map', {'path': '/nowhere/a.stavpr'}, 'does not exist'),
+        (SetOperation, 'set_operation', {'operation': 'teleport'}, 'teleport'),
+    ):
+        assert words in robot.refuses(kind, name, **fields)
+        assert f'{name} failed: ' in bare.output()
     assert robot.does(Trigger, 'reset').message
     assert list(tmp_path.iterdir()) == []
 
 
-def test_images_that_come_while_the_first_map_is_loaded_are_answered(bare, robot, route, tmp_path):
+def test_images_while_the_first_map_is_loaded_are_not_ready(bare, robot, route, tmp_path):
     with robot.while_loading(tmp_path / 'slow.stavpr') as slow:
-        answers = robot.drive(route[:5])
-        assert {answer.status for answer in answers} == {PlaceMatch.NOT_READY}
-        assert {answer.reason for answer in answers} == {f'map {slow} is being loaded'}
+        matches = robot.drive(route[:5])
+        assert {match.status for match in matches} == {PlaceMatch.NOT_READY}
+        assert {match.reason for match in matches} == {f'map {slow} is being loaded'}
         robot.until_diagnosed('map', DiagnosticStatus.OK, 'loading')
-    robot.until_told(state='none')
+    robot.until_map(state='none')
     robot.until_diagnosed('map', DiagnosticStatus.ERROR, 'cannot load')
-    assert 'map_path' in robot.drive(route[:1])[0].reason
+    assert 'no map' in robot.drive(route[:1])[0].reason
 
 
-def test_from_mapping_with_odometry_to_poses(bare, robot, route, folder):
-    """Mapping from nothing, saved, loaded by a service, recognized; and live from mapping to localization."""
-    path = folder / 'grown.stavpr'
+def test_a_map_recorded_with_odometry_is_saved_and_gives_poses(nodes, robot, route, folder):
+    """From nothing; recognized at once, and after it was loaded from its file."""
+    nodes('recording')
+    path = folder / 'recorded.stavpr'
     robot.does(SetOperation, 'set_operation', operation='mapping')
     assert robot.set_parameter('keyframe_distance', 0.5)[0]
-    assert 'mapping recognizes nothing' in robot.refuses(Relocalize, 'relocalize')
+    assert 'recognizes no places' in robot.refuses(Relocalize, 'relocalize')
     assert 'no places' in robot.refuses(SaveMap, 'save_map', path=str(path))
-    answers = robot.drive_with_odometry(route[:40])
-    assert {(answer.status, answer.reason, answer.place_index) for answer in answers} == {
+    matches = robot.drive_with_odometry(route[:40])
+    assert {(match.status, match.reason, match.place_index) for match in matches} == {
         (PlaceMatch.MAPPED, '', -1)
     }
-    assert [answer.newest_index for answer in answers] == list(range(40))
-    info = robot.until_told(state='growing', places=40)
-    assert (info.operation, info.features, info.has_poses, info.has_thumbnails) == (
-        'mapping',
-        'gradient',
-        True,
-        True,
-    )
+    assert [match.newest_index for match in matches] == list(range(40))
+    info = robot.until_map(state='growing', places=40)
+    assert (info.operation, info.features) == ('mapping', 'gradient')
+    assert info.has_poses
+    assert info.has_thumbnails
     assert robot.does(SaveMap, 'save_map', path=str(path)).places == 40
-    assert 'is there already' in robot.refuses(SaveMap, 'save_map', path=str(path))
-    assert 'make it first' in robot.refuses(SaveMap, 'save_map', path=str(folder / 'no' / 'a.stavpr'))
-    assert robot.does(SaveMap, 'save_map', path=str(path), overwrite=True).places == 40
-    assert robot.until_told(path=str(path)).places == 40
+    assert 'exists already' in robot.refuses(SaveMap, 'save_map', path=str(path))
+    assert 'make it first' in robot.refuses(SaveMap, 'save_map', path=str(folder / 'no' / 'a'))
+    assert robot.does(SaveMap, 'save_map', overwrite=True).places == 40  # to its own file
+    assert robot.until_map(path=str(path)).places == 40
     saved = load_map(path)
     np.testing.assert_allclose(saved.poses, [[x, 0, 0, 0, 0, 0, 1] for x in range(40)], atol=1e-9)
-    first = answers[0].header.stamp.sec
+    first = matches[0].header.stamp.sec
     assert [stamp // SECOND for stamp in saved.stamps] == [first + x for x in range(40)]
 
     poses = robot.listen(PoseWithCovarianceStamped, '/stavpr/pose')
@@ -225,38 +227,40 @@ def test_from_mapping_with_odometry_to_poses(bare, robot, route, folder):
             robot.does(SetOperation, 'set_operation', operation='localization')
         robot.until(lambda: robot.node.count_publishers('/stavpr/pose') == 1, 'the poses')
         poses.clear()
-        answers = robot.drive(route[10:20])
-        assert [answer.status for answer in answers] == [PlaceMatch.WARMING_UP] * 4 + [PlaceMatch.MATCH] * 6
-        assert [answer.newest_index for answer in answers[4:]] == list(range(14, 20))
+        matches = robot.drive(route[10:20])
+        statuses = [match.status for match in matches]
+        assert statuses == [PlaceMatch.WARMING_UP] * 4 + [PlaceMatch.MATCH] * 6
+        assert [match.newest_index for match in matches[4:]] == list(range(14, 20))
         robot.until(lambda: len(poses) == 6, 'a pose for each match')
-        for pose, answer in zip(poses, answers[4:], strict=True):
-            assert (pose.header.stamp, pose.header.frame_id) == (answer.header.stamp, 'map')
-            assert (pose.pose.pose.position.x, pose.pose.pose.orientation.w) == (answer.newest_index, 1)
-            assert pose.pose.covariance[0] == pytest.approx(2.0)  # of two places before and two after it
-    robot.until_told(state='loaded', path=str(path), operation='localization')
-
-
-def test_a_map_that_is_full_says_so(bare, robot, route, folder):
-    robot.does(SetOperation, 'set_operation', operation='mapping')
-    places = robot.until_told(operation='mapping').places
-    answers = robot.drive((route * 2)[: 100 - places + 2])
-    assert [answer.status for answer in answers[-3:]] == [PlaceMatch.MAPPED] + [PlaceMatch.NOT_READY] * 2
-    assert 'max_places = 100' in answers[-1].reason
-    robot.until_told(state='full', places=100)
-    robot.until_diagnosed('map', DiagnosticStatus.WARN, 'full')
-    path = str(folder / 'full.stavpr')
-    assert 'not saved' in robot.refuses(LoadMap, 'load_map', path=str(folder / 'grown.stavpr'))
-    assert robot.does(SaveMap, 'save_map', path=path).places == 100
-    assert robot.does(LoadMap, 'load_map', path=str(folder / 'grown.stavpr')).map.places == 40
-    robot.until_told(state='growing', places=40)
-    assert robot.drive(route[:1])[0].newest_index == 40
+        for pose, match in zip(poses, matches[4:], strict=True):
+            assert (pose.header.stamp, pose.header.frame_id) == (match.header.stamp, 'map')
+            position, orientation = pose.pose.pose.position, pose.pose.pose.orientation
+            assert (position.x, orientation.w) == (match.newest_index, 1)
+            assert pose.pose.covariance[0] == pytest.approx(2.0)  # two places before, two after
+    robot.until_map(state='loaded', path=str(path), operation='localization')
 
 
 # ------------------------------------------------ a node with a map
 
 
-def test_a_map_is_swapped_under_a_stream(mapped, robot, small_map, route, folder):
-    """At 20 Hz: every image has one answer, of the old map; then the window fills; then of the new one."""
+def test_a_full_map_stops_mapping(mapped, robot, route, map_file, folder):
+    robot.begin('mapping', map_file)
+    matches = robot.drive((route * 2)[:42])
+    statuses = [match.status for match in matches[-3:]]
+    assert statuses == [PlaceMatch.MAPPED] + [PlaceMatch.NOT_READY] * 2
+    assert 'max_places = 100' in matches[-1].reason
+    robot.drive(route[:1])
+    assert 'not saved' in robot.refuses(LoadMap, 'load_map', path=str(map_file))
+    full = str(folder / 'full.stavpr')
+    assert robot.does(SaveMap, 'save_map', path=full, overwrite=True).places == 100
+    robot.until_map(state='full', places=100, path=full)
+    assert robot.does(LoadMap, 'load_map', path=str(map_file)).map.places == 60
+    robot.until_map(state='growing', places=60)
+    assert robot.drive(route[:1])[0].newest_index == 60
+
+
+def test_load_map_during_a_stream_processes_every_image(mapped, robot, small_map, route, folder):
+    """At 20 Hz: matches with the old map, then a window that fills, then matches with the new map."""
     n = 5060
     rng = torch.Generator().manual_seed(0)
     strips = torch.randn((7, n, 64), generator=rng)
@@ -267,7 +271,7 @@ def test_a_map_is_swapped_under_a_stream(mapped, robot, small_map, route, folder
     large = replace(small_map, features=features, stamps=np.arange(1, n + 1), poses=None, thumbnails=(),
                     ids=tuple(f'new {i - 5000}' for i in range(n)))  # fmt: skip
     save_map(large, folder / 'large.stavpr')
-    robot.until_told(state='loaded', places=60)
+    robot.until_map(state='loaded', places=60)
     robot.drive(route[20:28])
     before, infos = len(robot.answers), len(robot.infos)
     sent = []
@@ -283,50 +287,49 @@ def test_a_map_is_swapped_under_a_stream(mapped, robot, small_map, route, folder
     during = len(sent)
     robot.until(lambda: len(sent) >= during + 2 * LENGTH, 'more of the stream')
     robot.node.destroy_timer(timer)
-    robot.until(lambda: len(robot.answers) >= before + len(sent), 'all answers')
-    answers = robot.answers[before:]
-    assert [answer.header for answer in answers] == [image.header for image in sent]
-    warming = [i for i, answer in enumerate(answers) if answer.status == PlaceMatch.WARMING_UP]
+    robot.until(lambda: len(robot.answers) >= before + len(sent), 'all matches')
+    matches = robot.answers[before:]
+    assert [match.header for match in matches] == [image.header for image in sent]
+    warming = [i for i, match in enumerate(matches) if match.status == PlaceMatch.WARMING_UP]
     assert warming == list(range(warming[0], warming[0] + LENGTH - 1))
     assert 4 <= warming[0] <= during
-    old, new = answers[: warming[0]], answers[warming[-1] + 1 :]
-    assert {answer.newest_id.split()[0] for answer in old if answer.status == PlaceMatch.MATCH} == {'place'}
-    assert {answer.newest_id.split()[0] for answer in new if answer.status == PlaceMatch.MATCH} == {'new'}
-    assert max(answer.sequence_last for answer in old) < 60
-    robot.until_told(state='loaded', places=n, has_poses=False, has_ids=True)
-    told = [(info.state, info.places) for info in robot.infos[infos:]]
-    assert told == [('loading', 60), ('loaded', n)]
+    old, new = matches[: warming[0]], matches[warming[-1] + 1 :]
+    assert {match.newest_id.split()[0] for match in old if match.status == PlaceMatch.MATCH} == {'place'}
+    assert {match.newest_id.split()[0] for match in new if match.status == PlaceMatch.MATCH} == {'new'}
+    assert max(match.sequence_last for match in old) < 60
+    robot.until_map(state='loaded', places=n, has_poses=False, has_ids=True)
+    shown = [(info.state, info.places) for info in robot.infos[infos:]]
+    assert shown == [('loading', 60), ('loaded', n)]
 
 
-def test_a_damaged_map_leaves_the_old_one_in_use(mapped, robot, route, tmp_path):
-    """While it is read, the window goes on, and after it as well."""
-    answers = robot.drive(route[:6])
+def test_load_map_of_a_damaged_file_keeps_the_map_and_the_window(mapped, robot, route, tmp_path):
+    matches = robot.drive(route[:6])
     infos = len(robot.infos)
     with robot.while_loading(tmp_path / 'slow.stavpr'):
-        robot.until_told(state='loading', places=60)
-        answers += robot.drive(route[6:12])
-    answers += robot.drive(route[12:14])  # told at once, not with the next diagnostics
+        robot.until_map(state='loading', places=60)
+        matches += robot.drive(route[6:12])
+    matches += robot.drive(route[12:14])
     assert [info.state for info in robot.infos[infos:]] == ['loading', 'loaded']
     damaged = tmp_path / 'damaged.stavpr'
     damaged.write_bytes(b'PK' + bytes(1000))
     assert 'damaged.stavpr' in robot.refuses(LoadMap, 'load_map', path=str(damaged))
-    answers += robot.drive(route[14:15])
-    assert [answer.newest_index for answer in answers[4:]] == list(range(4, 15))
+    matches += robot.drive(route[14:15])
+    assert [match.newest_index for match in matches[4:]] == list(range(4, 15))
     assert robot.does(Trigger, 'reset').message
     assert robot.drive(route[:1])[0].status == PlaceMatch.WARMING_UP
 
 
-def test_relocalize(mapped, robot, route):
-    """Not before the window is full; then the answer that was given, and candidates as many as asked for."""
+def test_relocalize_returns_the_last_match_and_candidates(mapped, robot, route):
+    """Not before the window is full."""
     for i in range(LENGTH):
         assert f'{i} of 5 images' in robot.refuses(Relocalize, 'relocalize')
-        answer = robot.drive(route[30 + i : 31 + i])[0]
+        match = robot.drive(route[30 + i : 31 + i])[0]
     for count, expected in ((0, 3), (1, 1), (6, 6)):
         response = robot.does(Relocalize, 'relocalize', count=count)
-        assert response.match == answer
+        assert response.match == match
         assert len(response.candidates) == expected
         best = response.candidates[0]
-        assert (best.place_index, best.distance) == (answer.place_index, answer.distance)
+        assert (best.place_index, best.distance) == (match.place_index, match.distance)
         for candidate in response.candidates:
             assert candidate.place_id == f'place {candidate.place_index}'
             assert candidate.place_stamp.sec == candidate.place_index + 1
@@ -336,27 +339,27 @@ def test_relocalize(mapped, robot, route):
         assert distances == sorted(distances)
     strange = robot.drive([np.random.default_rng(1).integers(0, 256, (96, 128, 3), np.uint8)] * LENGTH)[-1]
     assert strange.status == PlaceMatch.NO_MATCH
-    response = robot.does(Relocalize, 'relocalize')  # an answer, though no match
+    response = robot.does(Relocalize, 'relocalize')  # though there is no match
     assert (response.match, response.message) == (strange, strange.reason)
 
 
-def test_candidates_are_told_with_every_window(mapped, robot, route):
-    heard = robot.listen(Candidates, '/stavpr/candidates')
+def test_candidates_are_published_for_every_window(mapped, robot, route):
+    received = robot.listen(PlaceCandidates, '/stavpr/candidates')
     robot.until(lambda: robot.node.count_publishers('/stavpr/candidates') == 1, 'the candidates')
-    answers = robot.drive(route[10:18])
-    robot.until(lambda: len(heard) == 4, 'candidates of four windows')
-    for told, answer in zip(heard, answers[4:], strict=True):
-        assert (told.header, told.threshold) == (answer.header, answer.threshold)
-        assert len(told.candidates) == 3
-        assert told.candidates[0].place_index == answer.sequence_middle
-        assert told.candidates[0].distance == answer.distance
-        assert told.candidates[1].place_index == answer.second_best_index
+    matches = robot.drive(route[10:18])
+    robot.until(lambda: len(received) == 4, 'candidates of four windows')
+    for shown, match in zip(received, matches[4:], strict=True):
+        assert (shown.header, shown.threshold) == (match.header, match.threshold)
+        assert len(shown.candidates) == 3
+        assert shown.candidates[0].place_index == match.sequence_middle
+        assert shown.candidates[0].distance == match.distance
+        assert shown.candidates[1].place_index == match.second_best_index
     assert robot.set_parameter('candidates', 0)[0]
     robot.drive(route[18:20])
     assert robot.set_parameter('candidates', 2)[0]
     robot.drive(route[20:21])
-    robot.until(lambda: len(heard) == 5, 'candidates of one more window')
-    assert len(heard[-1].candidates) == 2
+    robot.until(lambda: len(received) == 5, 'candidates of one more window')
+    assert len(received[-1].candidates) == 2
     assert robot.set_parameter('candidates', 3)[0]
 
 
@@ -364,19 +367,18 @@ def test_a_match_image_shows_the_query_and_its_place(mapped, robot, route, small
     drawn = robot.listen(Image, '/stavpr/match_image')
     robot.drive(route[:4])
 
-    def hears():
-        """A subscriber that is matched hears the next picture."""
+    def received():
         robot.drive(route[4:5])
         return bool(drawn)
 
-    robot.until(hears, 'a picture')
-    answer = robot.drive(route[5:10])[-1]
-    robot.until(lambda: drawn[-1].header == answer.header, 'the last picture')
-    assert answer.newest_index == 9
-    told = drawn[-1]
-    assert (told.header, told.encoding, told.is_bigendian) == (answer.header, 'rgb8', 0)
-    assert (told.height, told.width, told.step) == (96 + 18, 2 * 128 + 2, 3 * told.width)
-    picture = np.frombuffer(told.data, np.uint8).reshape(told.height, told.width, 3)
-    np.testing.assert_array_equal(picture[:96, :128], route[9])
-    np.testing.assert_array_equal(picture[:96, 130:], cv2.resize(small_map.thumbnail(9), (128, 96)))
-    assert np.ptp(picture[96:, 20:].astype(int)) > 100  # words
+    robot.until(received, 'an image')
+    match = robot.drive(route[5:10])[-1]
+    robot.until(lambda: drawn[-1].header == match.header, 'the last image')
+    assert match.newest_index == 9
+    shown = drawn[-1]
+    assert (shown.header, shown.encoding, shown.is_bigendian) == (match.header, 'rgb8', 0)
+    assert (shown.height, shown.width, shown.step) == (96 + 18, 2 * 128 + 2, 3 * shown.width)
+    image = np.frombuffer(shown.data, np.uint8).reshape(shown.height, shown.width, 3)
+    np.testing.assert_array_equal(image[:96, :128], route[9])
+    np.testing.assert_array_equal(image[:96, 130:], cv2.resize(small_map.thumbnail(9), (128, 96)))
+    assert np.ptp(image[96:, 20:].astype(int)) > 100  # words

@@ -124,15 +124,20 @@ def _replay(
                 count()
             seconds = time.monotonic() - began
             replayer.finish()
+            return _summary(replayer, seconds)
         finally:
             replayer.close()
-    results = ''
-    if settings.lossless:
-        results = f', {replayer.resent} sent again, {replayer.dropped} dropped'
-    return (
+
+
+def _summary(replayer: Replayer, seconds: float) -> str:
+    rate = replayer.published / max(seconds, 1e-9)
+    summary = (
         f'{replayer.published} images published on {replayer.publisher.topic_name} '
-        f'in {seconds:.1f} s ({replayer.published / max(seconds, 1e-9):.1f} per second){results}'
+        f'in {seconds:.1f} s ({rate:.1f} per second)'
     )
+    if replayer.settings.lossless:
+        summary += f', {replayer.resent} sent again, {replayer.dropped} dropped'
+    return summary
 
 
 def _parser() -> argparse.ArgumentParser:

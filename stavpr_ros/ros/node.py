@@ -68,7 +68,7 @@ class PlaceRecognitionNode(ManagedNode):
         self._map_info_lock = (
             threading.RLock()
         )  # messages are published in the order of the changes
-        self._services = Services(self)
+        self._served = Services(self)
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         backwards = JumpThreshold(
