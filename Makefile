@@ -43,7 +43,7 @@ build: ## setup, then build stavpr_msgs and stavpr_ros with colcon
 
 demo: build ## run the node on the synthetic street, or on your images (MAP= QUERY= LOOP= ARGS=)
 	@$(RUN) $(EXECUTABLES)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
-		$(if $(LOOP),--loop $(if $(filter-out synthetic,$(LOOP)),"$$LOOP")) $(ARGS)
+		$(if $(LOOP),--loop "$$LOOP") $(ARGS)
 
 evaluate: override EXTRAS += evaluation
 evaluate: build ## evaluate the recognition of QUERY= on MAP=: metrics, plots, a report (ARGS=)

@@ -55,7 +55,7 @@ SHAPES = {VGG16: networks.vgg16_shapes, DenseNet161: networks.densenet161_shapes
 
 
 @pytest.mark.parametrize('network', [VGG16, DenseNet161])
-def test_every_parameter_has_its_published_name_and_shape(network):
+def test_network_has_published_parameters(network):
     with torch.device('meta'):
         built = network()
     ours = {name: tuple(value.shape) for name, value in built.state_dict().items() if value.ndim}
@@ -65,7 +65,7 @@ def test_every_parameter_has_its_published_name_and_shape(network):
     assert sum(value.numel() for value in built.parameters()) == count
 
 
-def test_nothing_after_the_layer_is_kept():
+def test_up_to_layer_drops_later_parameters():
     """VGG16: the first ten convolutions. DenseNet161: layer 10 of the last block only normalizes."""
     with torch.device('meta'):
         vgg, dense = VGG16Pool4.up_to_layer(VGG16()), DenseNet161Places365.up_to_layer(DenseNet161())
@@ -112,7 +112,7 @@ def pictures(*sizes: tuple[int, int]) -> list[np.ndarray]:
     ]
 
 
-def test_densenet161_as_a_second_implementation_has_it(densenet_file, densenet_parameters):
+def test_densenet161_equals_second_implementation(densenet_file, densenet_parameters):
     """The whole way at full size, from the published kind of file to 7 x 7 x 1488, in a batch of two."""
     images = pictures((120, 160), (300, 200))
     settings = settings_class('densenet161_places365')(model=str(densenet_file))
@@ -122,7 +122,7 @@ def test_densenet161_as_a_second_implementation_has_it(densenet_file, densenet_p
     assert_same(ours, networks.densenet161_layer10(doubles, standardized(images, 224)))
 
 
-def test_vgg16_as_a_second_implementation_has_it(vgg_file, vgg_parameters):
+def test_vgg16_equals_second_implementation(vgg_file, vgg_parameters):
     """At 96 pixels, where nothing but the size of the maps differs from 224."""
     images = pictures((120, 160), (96, 96), (50, 70))
     settings = settings_class('vgg16')(model=str(vgg_file), size=96)
@@ -150,7 +150,7 @@ def test_more_images_than_go_through_at_once(vgg_file, monkeypatch):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='no CUDA device')
 @pytest.mark.parametrize('kind', ['vgg16', 'densenet161_places365'])
-def test_half_precision_on_a_gpu(kind, vgg_file, densenet_file):
+def test_network_in_half_precision_on_gpu_is_close(kind, vgg_file, densenet_file):
     path = vgg_file if kind == 'vgg16' else densenet_file
     images = pictures((120, 160), (300, 200))
     whole = backbone_class(kind)(settings_class(kind)(model=str(path)), 'cpu').feature_maps(images)
@@ -168,7 +168,7 @@ def test_half_is_no_part_of_the_identity_and_no_change_on_a_cpu(vgg_file):
     assert backbone.settings == backbone_class('vgg16')(settings_class('vgg16')(model=str(vgg_file), size=32)).settings
 
 
-def test_a_map_knows_the_weights_wherever_they_are(vgg_file, tmp_path):
+def test_extractor_with_moved_weights_has_same_settings(vgg_file, tmp_path):
     settings = FeatureExtractor('vgg16', settings_class('vgg16')(model=str(vgg_file), size=112)).settings
     settings = FeatureSettings.from_json(settings.to_json().replace(str(vgg_file), '/gone/vgg16.pth'))
     with pytest.raises(UnavailableError, match=r'/gone/vgg16\.pth.*cannot be read'):
@@ -178,7 +178,7 @@ def test_a_map_knows_the_weights_wherever_they_are(vgg_file, tmp_path):
     assert FeatureExtractor.from_settings(settings, None, model=str(moved)).settings == settings
 
 
-def test_other_networks_weights_are_refused(densenet_parameters):
+def test_load_parameters_of_other_network_is_rejected(densenet_parameters):
     """ImageNet's DenseNet161 has the same features' shapes, but they are other features."""
 
     def load(**changes):
@@ -207,13 +207,13 @@ def test_other_networks_weights_are_refused(densenet_parameters):
 @pytest.mark.parametrize(
     'bad', [{'size': 31}, {'resize': 'cubic'}, {'sha256': '397923af'}, {'sha256': 'Z' * 64}]
 )
-def test_settings_out_of_range(bad):
+def test_published_settings_out_of_range_are_rejected(bad):
     for kind in ('vgg16', 'densenet161_places365'):
         with pytest.raises(SettingsError):
             settings_class(kind)(**bad)
 
 
-def test_options_of_the_command_line(vgg_file):
+def test_feature_options_make_extractor(vgg_file):
     parser = argparse.ArgumentParser()
     add_feature_options(parser)
     words = ['--features', 'vgg16', '--vgg16-model', str(vgg_file), '--vgg16-size', '112', '--device', 'cpu']

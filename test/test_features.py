@@ -11,7 +11,7 @@ from stavpr_ros.features.registry import backbone_class, settings_class
 
 
 @pytest.mark.parametrize('kind', list(KINDS))
-def test_every_row_of_the_table_is_complete(kind):
+def test_kinds_have_settings_and_class(kind):
     """What the command line and the map need from a kind: a frozen dataclass with a sentence a field."""
     import dataclasses
 
@@ -21,7 +21,7 @@ def test_every_row_of_the_table_is_complete(kind):
     assert all(row.metadata['help'] for row in dataclasses.fields(settings))
 
 
-def test_unknown_kind():
+def test_extractor_of_unknown_kind_is_rejected():
     with pytest.raises(SettingsError, match=r'teleport.*gradient'):
         FeatureExtractor('teleport')
 
@@ -34,26 +34,26 @@ def edge(angle: float, size: int = 224) -> np.ndarray:
 
 
 @pytest.mark.parametrize('direction', range(8))
-def test_an_edge_falls_into_its_orientation(direction):
+def test_gradient_of_edge_has_its_orientation(direction):
     angle = direction * np.pi / 4
     maps = Gradient(GradientSettings()).feature_maps([edge(angle)])
     assert maps.shape == (1, 8, 14, 14)
     assert int(maps.sum(dim=(0, 2, 3)).argmax()) == direction
 
 
-def test_unsigned_gradients_do_not_tell_polarity():
+def test_gradient_unsigned_ignores_polarity():
     maps = Gradient(GradientSettings(signed=False)).feature_maps([edge(0.5), 255 - edge(0.5)])
     torch.testing.assert_close(maps[0].sum(dim=(1, 2)), maps[1].sum(dim=(1, 2)), rtol=1e-3, atol=1e-3)
 
 
-def test_an_edge_stays_in_its_strip():
+def test_extractor_edge_stays_in_its_strip():
     image = np.zeros((224, 224, 3), np.uint8)
     image[:, 3 * 32 + 16 :] = 255  # the edge is in the middle of strip 4 of 7
     features = FeatureExtractor().extract([image])
     assert int(features.weights[:, 0].argmax()) == 3
 
 
-def test_contrast_hardly_matters(route):
+def test_extractor_is_robust_to_contrast(route):
     """Half the contrast, other brightness: nearly the same direction in feature space."""
     dim = [(image.astype(float) * 0.5 + 30).astype(np.uint8) for image in route[:4]]
     extractor = FeatureExtractor()
@@ -61,7 +61,7 @@ def test_contrast_hardly_matters(route):
     assert float((a.strips * b.strips).sum(dim=2).min()) > 0.97
 
 
-def test_a_batch_is_its_images_one_by_one(route):
+def test_extractor_batch_equals_single_images(route):
     extractor = FeatureExtractor()
     mixed = [route[0], np.ascontiguousarray(route[1][:50]), route[2].repeat(3, axis=0)]  # sizes differ
     together = extractor.extract(mixed)
@@ -69,19 +69,19 @@ def test_a_batch_is_its_images_one_by_one(route):
         torch.testing.assert_close(extractor.extract([image]).strips[:, 0], together.strips[:, i])
 
 
-def test_a_black_image_has_zero_features():
+def test_extractor_of_black_image_returns_zeros():
     features = FeatureExtractor().extract([np.zeros((10, 10, 3), np.uint8)])
     assert not features.strips.any()
     assert not features.weights.any()
 
 
 @pytest.mark.parametrize('bad', [{'cell': 1}, {'cell': 15}, {'size': 16}, {'orientations': 1}])
-def test_gradient_settings_out_of_range(bad):
+def test_gradient_settings_out_of_range_are_rejected(bad):
     with pytest.raises(SettingsError):
         GradientSettings(**bad)
 
 
-def test_settings_survive_json():
+def test_feature_settings_survive_json():
     for settings in (FeatureExtractor().settings, FeatureExtractor(strips=5, projection=32, seed=3).settings):
         assert FeatureSettings.from_json(settings.to_json()) == settings
     with pytest.raises(SettingsError, match='cannot be read'):
@@ -120,7 +120,7 @@ def onnx_settings(path, **changes):
     return settings_class('onnx')(model=str(path), **options)
 
 
-def test_onnx_inner_layer(tiny_onnx):
+def test_onnx_inner_layer_by_hand(tiny_onnx):
     """Pixel value 10 r + g + ... summed over a block of four equal pixels: worked by hand; batch of two."""
     image = np.zeros((16, 16, 3), np.uint8)
     image[:, :, 0], image[:, :, 1], image[:, :, 2] = 1, 2, 3
@@ -131,14 +131,14 @@ def test_onnx_inner_layer(tiny_onnx):
     assert (maps[1] == 8 * (1 + 2 + 3)).all()
 
 
-def test_onnx_mean_std_and_channel_order(tiny_onnx):
+def test_onnx_normalization_by_hand(tiny_onnx):
     image = np.zeros((16, 16, 3), np.uint8)
     image[:, :, 0] = 100  # red
     settings = onnx_settings(tiny_onnx, channels='bgr', mean=(0, 0, 20), std=(1, 1, 2))
     assert (backbone_class('onnx')(settings).feature_maps([image]) == 4 * (100 - 20) / 2).all()
 
 
-def test_onnx_errors_say_what_to_do(tiny_onnx, tmp_path):
+def test_onnx_errors_name_file_and_layer(tiny_onnx, tmp_path):
     with pytest.raises(UnavailableError, match='cannot be read'):
         FeatureExtractor('onnx', onnx_settings(tmp_path / 'missing.onnx'))
     (tmp_path / 'broken.onnx').write_bytes(b'no model')
@@ -152,7 +152,7 @@ def test_onnx_errors_say_what_to_do(tiny_onnx, tmp_path):
         FeatureExtractor('onnx', onnx_settings(tiny_onnx, sha256='0' * 64))
 
 
-def test_a_map_remembers_the_network_not_its_place(tiny_onnx, tmp_path):
+def test_onnx_model_may_move_but_not_change(tiny_onnx, tmp_path):
     """The same file elsewhere gives the same features; another file under the same name is refused."""
     settings = FeatureExtractor('onnx', onnx_settings(tiny_onnx)).settings
     moved = tmp_path / 'moved.onnx'
@@ -163,7 +163,7 @@ def test_a_map_remembers_the_network_not_its_place(tiny_onnx, tmp_path):
         FeatureExtractor.from_settings(settings, None, model=str(moved))
 
 
-def test_squeezenet(squeezenet_settings):
+def test_onnx_squeezenet_has_expected_shape(squeezenet_settings):
     """The real network's inner layer: 13 x 13 x 384, cropped to seven strips of one column."""
     extractor = FeatureExtractor('onnx', squeezenet_settings)
     rng = np.random.default_rng(0)

@@ -32,7 +32,7 @@ def bags(data_folder, tmp_path_factory):
     ('kind', 'mode', 'known_f1'),
     [('gradient', 'paper', 0.75), ('onnx', 'paper', 0.92), ('gradient', 'robust', 0.99)],
 )
-def test_the_node_is_the_core(bags, request, tmp_path, kind, mode, known_f1, record_property):
+def test_node_on_gardens_point_equals_library(bags, request, tmp_path, kind, mode, known_f1, record_property):
     """In the defaults of both modes; the F1 that is asserted is the one measured, a little below."""
     threshold = ACCEPT_ALL if mode == 'paper' else 1.0
     settings = request.getfixturevalue('squeezenet_settings') if kind == 'onnx' else None

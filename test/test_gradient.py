@@ -81,13 +81,13 @@ pictures = {'seed': st.integers(0, 2**32 - 1), 'contrast': st.sampled_from([0, 1
 
 
 @given(settings=gradient_settings(), **pictures)
-def test_the_kernel_is_the_definition(settings, seed, contrast):
+def test_gradient_kernel_equals_definition(settings, seed, contrast):
     gray = picture(seed, contrast, (settings.size, settings.size))
     assert_same_features(kernel_maps(gray, settings), reference_maps(gray, settings))
 
 
 @given(settings=gradient_settings(), **pictures)
-def test_torch_operators_are_the_definition(settings, seed, contrast):
+def test_gradient_by_torch_equals_definition(settings, seed, contrast):
     """What runs on a GPU, here on a CPU."""
     gray = picture(seed, contrast, (settings.size, settings.size))
     maps = feature_maps_by_torch(torch.from_numpy(gray[None]), settings)[0]
@@ -95,7 +95,7 @@ def test_torch_operators_are_the_definition(settings, seed, contrast):
 
 
 @given(settings=gradient_settings(), height=st.integers(1, 150), width=st.integers(1, 150), **pictures)
-def test_features_of_images_of_any_size(settings, height, width, seed, contrast):
+def test_gradient_of_any_image_size_equals_definition(settings, height, width, seed, contrast):
     """Color, resizing, kernel: what OpenCV and the definition make of the same image."""
     image = np.dstack([picture(seed + channel, contrast, (height, width)) for channel in range(3)])
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -107,7 +107,7 @@ def test_features_of_images_of_any_size(settings, height, width, seed, contrast)
 
 @pytest.mark.parametrize('signed', [True, False])
 @pytest.mark.parametrize('bins', [2, 8, 9])
-def test_every_gradient_there_is(bins, signed):
+def test_to_polar_of_every_gradient_is_exact(bins, signed):
     """All 511 x 511 differences of gray levels: the angle to a millionth of a turn, the length exactly."""
     dx = np.arange(-255, 256)
     here = np.zeros(3 * dx.size, np.uint8)  # pixels 0 and 2 of each three make one difference
@@ -125,12 +125,12 @@ def test_every_gradient_there_is(bins, signed):
         np.testing.assert_array_equal(magnitude[::3], np.hypot(dx, dy).astype(np.float32))
 
 
-def test_odd_cells_leave_no_half_cell():
+def test_gradient_with_odd_cell_drops_half_cells():
     maps = Gradient(GradientSettings(size=21, cell=7)).feature_maps([np.zeros((30, 30, 3), np.uint8)])
     assert maps.shape == (1, 8, 2, 2)
 
 
-def test_area_worked_by_hand():
+def test_resize_square_area_by_hand():
     """Three pixels to two: the first takes the first and half of the second."""
     gray = np.array([[0, 90, 180], [45, 90, 135], [225, 0, 9]], np.uint8)
     expected = [[(4 * 0 + 2 * 90 + 2 * 45 + 90) / 9, (4 * 180 + 2 * 90 + 2 * 135 + 90) / 9]]
@@ -148,7 +148,7 @@ def two_threads():
 
 @pytest.mark.usefixtures('two_threads')
 @pytest.mark.parametrize('n', [0, 1, PER_THREAD, 2 * PER_THREAD, 2 * PER_THREAD + 3])
-def test_threads_share_a_batch(route, n):
+def test_gradient_on_threads_equals_single_images(route, n):
     gradient = Gradient(GradientSettings())
     together = gradient.feature_maps(route[:n])
     assert together.shape == (n, 8, 14, 14)
@@ -158,7 +158,7 @@ def test_threads_share_a_batch(route, n):
 
 @pytest.mark.usefixtures('two_threads')
 @pytest.mark.parametrize(('count', 'threads'), [(PER_THREAD, 1), (2 * PER_THREAD, 2), (9 * PER_THREAD, 2)])
-def test_a_large_batch_goes_to_several_threads(count, threads):
+def test_on_threads_with_large_batch_uses_several(count, threads):
     """They meet at every image, which one thread alone could not."""
     meeting, seen = threading.Barrier(threads), set()
 
@@ -173,14 +173,14 @@ def test_a_large_batch_goes_to_several_threads(count, threads):
 
 @pytest.mark.usefixtures('two_threads')
 @pytest.mark.parametrize('bad', range(4))
-def test_an_error_in_a_thread_is_not_lost(route, bad):
+def test_gradient_error_in_thread_is_raised(route, bad):
     images = [*route[: 2 * PER_THREAD]]
     images[bad] = np.empty((0, 5, 3), np.uint8)
     with pytest.raises(cv2.error):
         Gradient(GradientSettings()).feature_maps(images)
 
 
-def test_other_devices_than_cpu_take_torch_operators(route):
+def test_gradient_on_other_device_uses_torch(route):
     """On torch's device without numbers, since there may be no other; then the same way on the CPU."""
     settings = GradientSettings(cell=7, orientations=5)
     maps = Gradient(settings, 'meta').feature_maps(route[:3])
@@ -191,6 +191,6 @@ def test_other_devices_than_cpu_take_torch_operators(route):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='no GPU')
-def test_gpu_and_cpu_agree(route):
+def test_gradient_on_gpu_equals_cpu(route):
     on_gpu, on_cpu = FeatureExtractor(device='cuda').extract(route).to('cpu'), FeatureExtractor().extract(route)
     torch.testing.assert_close(on_gpu.strips, on_cpu.strips, rtol=0, atol=1e-5)

@@ -59,7 +59,7 @@ def assert_holds(made, numbers):
 
 
 @pytest.mark.parametrize('count', [1, 4, 5, 9, 10])
-def test_what_was_added_comes_out(count):
+def test_growing_map_holds_added_places(count):
     made = grown(count, limit=10)
     assert_holds(made, range(count))
     assert made.full is (count == 10)
@@ -67,7 +67,7 @@ def test_what_was_added_comes_out(count):
     assert made.first == 0
 
 
-def test_room_doubles_up_to_the_limit():
+def test_growing_map_memory_doubles_up_to_limit():
     made, rooms = GrowingMap(DESCRIBER.settings, None, 18), []
     for i in range(18):
         rooms.append(made.memory)
@@ -81,14 +81,14 @@ def test_room_doubles_up_to_the_limit():
     assert_holds(made, range(18))
 
 
-def test_the_view_is_no_copy():
+def test_growing_map_features_are_views():
     made = grown(6)
     first, second = made.features, made.features
     assert first.strips.data_ptr() == second.strips.data_ptr()
     assert made.poses.base is not None
 
 
-def test_a_snapshot_does_not_change():
+def test_snapshot_is_independent_of_map():
     made = grown(3)
     snapshot = made.snapshot()
     assert_holds(snapshot, range(3))
@@ -100,7 +100,7 @@ def test_a_snapshot_does_not_change():
     assert_holds(snapshot, range(3))
 
 
-def test_snapshot_of_nothing_and_without_extras():
+def test_snapshot_without_places_or_extras_is_empty():
     made = GrowingMap(DESCRIBER.settings, None, 3)
     assert len(made.snapshot()) == 0
     assert len(made.features) == 0
@@ -112,7 +112,7 @@ def test_snapshot_of_nothing_and_without_extras():
     assert snapshot.thumbnail(0) is None
 
 
-def test_snapshot_to_file_and_back(tmp_path):
+def test_snapshot_saved_and_loaded_continues(tmp_path):
     """Poses of some places, pictures of some places."""
     save_map(grown(7).snapshot(), tmp_path / 'map')
     loaded = load_map(tmp_path / 'map')
@@ -125,7 +125,7 @@ def test_snapshot_to_file_and_back(tmp_path):
     assert_holds(loaded, range(7))
 
 
-def test_continue_a_map(small_map, route):
+def test_from_map_continues_map(small_map, route):
     made = GrowingMap.from_map(small_map, 61)
     extractor = small_map.extractor()
     assert made.add(extractor.extract([route[0]]), 5, 'again') == 60
@@ -142,7 +142,7 @@ def test_continue_a_map(small_map, route):
         GrowingMap.from_map(small_map, 59)
 
 
-def test_continue_a_map_without_extras(small_map):
+def test_from_map_without_extras_continues(small_map):
     plain = dataclasses.replace(small_map, poses=None, thumbnails=())
     made = GrowingMap.from_map(plain, 100)
     assert np.isnan(made.poses).all()
@@ -151,7 +151,7 @@ def test_continue_a_map_without_extras(small_map):
     assert made.thumbnails == [*[b''] * 60, b'x']
 
 
-def test_forgetting():
+def test_forget_removes_oldest_places():
     made = grown(10, limit=10)
     made.forget(4)
     assert made.first == 4
@@ -169,7 +169,7 @@ def test_forgetting():
 
 
 @given(st.lists(st.one_of(st.none(), st.integers(0, 6)), max_size=60))
-def test_against_a_list(steps):
+def test_growing_map_equals_plain_list(steps):
     """None adds a place, a number forgets so many."""
     made, plain, added = GrowingMap(DESCRIBER.settings, None, 9), [], 0
     for step in steps:
@@ -200,7 +200,7 @@ def test_against_a_list(steps):
         ((features(1), 2**64), OverflowError, 'int'),
     ],
 )
-def test_an_error_leaves_all_as_it_was(count, arguments, error, words):
+def test_add_with_error_changes_nothing(count, arguments, error, words):
     made = grown(count)
     with pytest.raises(error, match=words):
         made.add(*arguments)
@@ -210,14 +210,14 @@ def test_an_error_leaves_all_as_it_was(count, arguments, error, words):
     assert_holds(made, range(count + 1))
 
 
-def test_other_dimensions():
+def test_add_of_other_dimension_is_rejected():
     made = grown(2)
     with pytest.raises(InputError, match='6 dimensions came: the map has 5'):
         made.add(features(2, d=6))
     assert_holds(made, range(2))
 
 
-def test_wrong_beginnings(small_map):
+def test_growing_map_with_wrong_settings_is_rejected(small_map):
     with pytest.raises(SettingsError, match='limit = 0'):
         GrowingMap(DESCRIBER.settings, None, 0)
     for settings, projection in ((small_map.settings, None), (DESCRIBER.settings, small_map.projection)):

@@ -36,69 +36,69 @@ def selector(stamp=10 * SECOND, where=None, image=PICTURE, **rules):
 
 @pytest.mark.parametrize('name', [field.name for field in dataclasses.fields(KeyframeSettings)])
 @pytest.mark.parametrize('value', [-1e-9, math.nan, math.inf, -math.inf])
-def test_wrong_settings(name, value):
+def test_keyframe_settings_not_finite_or_negative_are_rejected(name, value):
     with pytest.raises(SettingsError, match=name):
         KeyframeSettings(**{name: value})
 
 
-def test_settings_out_of_reach():
-    for wrong in ({'degrees': 180.1}, {'change': 2.1}):
+def test_keyframe_settings_out_of_range_are_rejected():
+    for wrong in ({'angle': 180.1}, {'change': 2.1}):
         with pytest.raises(SettingsError, match='no'):
             KeyframeSettings(**wrong)
-    KeyframeSettings(degrees=180, change=2)
+    KeyframeSettings(angle=180, change=2)
 
 
-def test_any():
+def test_keyframe_settings_any_and_needs_poses():
     assert not KeyframeSettings().any
-    for name in ('seconds', 'meters', 'degrees', 'change'):
+    for name in ('interval', 'distance', 'angle', 'change'):
         assert KeyframeSettings(**{name: 0.1}).any
-    assert KeyframeSettings(degrees=1).needs_poses
-    assert KeyframeSettings(meters=1).needs_poses
-    assert not KeyframeSettings(seconds=1, change=1).needs_poses
+    assert KeyframeSettings(angle=1).needs_poses
+    assert KeyframeSettings(distance=1).needs_poses
+    assert not KeyframeSettings(interval=1, change=1).needs_poses
 
 
-def test_without_rules_every_image_is_one():
+def test_selector_without_rules_accepts_all():
     made = selector()
     assert made.too_soon(10 * SECOND, None) == ''
     assert made.too_alike(PICTURE) == ''
 
 
-def test_time():
-    made = selector(seconds=0.1)
+def test_selector_interval_by_hand():
+    made = selector(interval=0.1)
     reason = made.too_soon(10 * SECOND + 99_999_999, None)
     assert '0.100 s after the last keyframe: less than 0.1 s' in reason
     assert made.too_soon(10 * SECOND, None)
     assert made.too_soon(10 * SECOND - 99_999_999, None)  # overtaken on the way
     for fine in (10 * SECOND + 100_000_000, 10 * SECOND - 100_000_000, 0):  # late, jumped back, unknown
         assert made.too_soon(fine, None) == ''
-    assert selector(stamp=0, seconds=0.1).too_soon(5, None) == ''
+    assert selector(stamp=0, interval=0.1).too_soon(5, None) == ''
 
 
-def test_motion_is_one_rule():
-    made = selector(where=pose(), meters=1, degrees=10)
+def test_selector_distance_or_angle_suffices():
+    made = selector(where=pose(), distance=1, angle=10)
     reason = made.too_soon(0, pose(0.999, -9.99))
     assert reason == 'moved 0.999 m of 1 m and turned 9.99 of 10 degrees since the last keyframe'
     assert made.too_soon(0, pose(1)) == ''
     assert made.too_soon(0, pose(0, -10.001)) == ''
-    assert 'degrees' not in selector(where=pose(), meters=1).too_soon(0, pose(0, 90))
-    assert 'm of' not in selector(where=pose(), degrees=10).too_soon(0, pose(5, 9))
+    assert 'degrees' not in selector(where=pose(), distance=1).too_soon(0, pose(0, 90))
+    assert 'm of' not in selector(where=pose(), angle=10).too_soon(0, pose(5, 9))
 
 
-def test_motion_without_odometry():
-    for made in (KeyframeSelector(KeyframeSettings(degrees=5)), selector(where=pose(), meters=1)):
+def test_selector_motion_without_pose_rejects():
+    for made in (KeyframeSelector(KeyframeSettings(angle=5)), selector(where=pose(), distance=1)):
         assert 'no odometry' in made.too_soon(20 * SECOND, None)
     # the rule came on after the last keyframe, of which no pose is known
-    assert selector(meters=1).too_soon(20 * SECOND, pose()) == ''
+    assert selector(distance=1).too_soon(20 * SECOND, pose()) == ''
 
 
-def test_all_rules_must_agree():
-    made = selector(where=pose(), seconds=1, meters=1)
+def test_selector_requires_all_rules():
+    made = selector(where=pose(), interval=1, distance=1)
     assert 's after' in made.too_soon(10_500_000_000, pose(5))
     assert 'moved' in made.too_soon(12 * SECOND, pose(0.5))
     assert made.too_soon(12 * SECOND, pose(5)) == ''
 
 
-def test_change_of_the_picture(route):
+def test_selector_change_by_hand(route):
     made = selector(image=route[0], change=0.1)
     assert 'differs by 0.0000 from the last keyframe: less than 0.1' in made.too_alike(route[0])
     assert made.too_alike(route[9]) == ''
@@ -107,8 +107,8 @@ def test_change_of_the_picture(route):
     assert made.too_alike(route[0]) == ''
 
 
-def test_asking_changes_nothing(route):
-    made = selector(where=pose(), image=route[0], seconds=1, meters=1, change=0.1)
+def test_selector_queries_change_nothing(route):
+    made = selector(where=pose(), image=route[0], interval=1, distance=1, change=0.1)
     for _ in range(2):
         assert made.too_soon(20 * SECOND, pose(9)) == ''
         assert made.too_alike(route[9]) == ''
@@ -116,31 +116,31 @@ def test_asking_changes_nothing(route):
         assert made.too_alike(route[0])
 
 
-def test_settings_change_while_it_runs(route):
+def test_selector_with_new_settings_keeps_keyframe(route):
     """The last keyframe is kept, also what no rule asked for when it came."""
     made = selector(where=pose(), image=route[0])
-    for rules in ({'seconds': 1}, {'meters': 1}):
+    for rules in ({'interval': 1}, {'distance': 1}):
         made.settings = KeyframeSettings(**rules)
         assert made.too_soon(10 * SECOND, pose())
     made.settings = KeyframeSettings(change=0.1)
     assert made.too_alike(route[0])
     made.reset()
     assert made.too_alike(route[0]) == ''
-    made.settings = KeyframeSettings(seconds=1, meters=1)
+    made.settings = KeyframeSettings(interval=1, distance=1)
     assert made.too_soon(10 * SECOND, pose()) == ''
 
 
-def test_a_pose_that_is_none():
-    made = selector(where=pose(), meters=1)
+def test_selector_with_invalid_pose_changes_nothing():
+    made = selector(where=pose(), distance=1)
     for call in (lambda wrong: made.too_soon(1, wrong), lambda wrong: made.accept(1, wrong, PICTURE)):
         with pytest.raises(InputError):
             call(np.full(7, np.nan))
     assert made.too_soon(1, pose(0.5))
 
 
-def test_a_keyframe_is_kept_though_its_arrays_are_reused(route):
+def test_selector_copies_its_input(route):
     where, image = pose(), route[0].copy()
-    made = selector(where=where, image=image, meters=1, change=0.1)
+    made = selector(where=where, image=image, distance=1, change=0.1)
     where[0], image[:] = 50, route[9]
     assert made.too_soon(0, pose(0.5))
     assert made.too_alike(route[0])
@@ -158,7 +158,7 @@ STEPS = st.tuples(st.integers(0, 4), st.integers(-3, 9), st.integers(-9, 9), st.
         st.sampled_from([0.0, 0.3]),
     ),
 )
-def test_kept_images_are_those_of_a_plain_loop(steps, rules):
+def test_selector_equals_plain_loop(steps, rules):
     """Stamps (0 = unknown, some earlier), poses (some unknown) and pictures, with any rules."""
     seconds, meters, degrees, change = rules
     pictures = [np.random.default_rng(i).integers(0, 256, (24, 32, 3), np.uint8) for i in range(5)]
@@ -195,14 +195,14 @@ def test_kept_images_are_those_of_a_plain_loop(steps, rules):
 # ------------------------------------------------------------------------------------------ pictures
 
 
-def test_small_gray():
+def test_small_gray_of_red_image():
     image = np.full((480, 640, 3), (255, 0, 0), np.uint8)
     small = small_gray(image)
     assert (small.shape, small.dtype) == ((24, 32), np.float32)
     np.testing.assert_allclose(small, 76, atol=1)  # 0.299 of red
 
 
-def test_change_by_hand():
+def test_image_change_by_hand():
     ramp = np.tile(np.arange(32, dtype=np.float32), (24, 1))
     flat = np.full((24, 32), 80, np.float32)
     tall = np.tile(np.arange(24, dtype=np.float32)[:, None], (1, 32))
@@ -215,7 +215,7 @@ def test_change_by_hand():
     assert image_change(flat, ramp) == image_change(ramp, flat) == 1
 
 
-def test_darkness_is_flat():
+def test_image_change_of_dark_noise_is_zero():
     """What a covered camera sends is noise, and noise has changed every time."""
     rng = np.random.default_rng(0)
     dark = [small_gray(rng.integers(0, 20, (480, 640, 3), np.uint8)) for _ in range(2)]
@@ -226,7 +226,7 @@ def test_darkness_is_flat():
     'drive',
     ['gardens_point/day_right', 'corridor/ref', 'corridor/query', 'rtabmap_hallway_loop/samples'],
 )
-def test_a_moving_camera_is_told_from_a_standing_one(data_folder, drive):
+def test_image_change_separates_moving_from_standing_camera(data_folder, drive):
     frames = list(open_source(data_folder / drive))
     small = [small_gray(frame.image) for frame in frames]
     moving = min(image_change(a, b) for a, b in pairwise(small))
@@ -263,7 +263,7 @@ def drive(images, shown):
     return [Frame(image, (i + 1) * SECOND, f'{i}') for i, image in enumerate(images)]
 
 
-def test_keyframes_in_time_and_picture(route):
+def test_build_map_with_change_or_interval_selects_keyframes(route):
     """Standing three seconds at every view: one place for each."""
     frames = drive(route[:20], shown=3)
     settings = KeyframeSettings(change=0.1)
@@ -274,13 +274,13 @@ def test_keyframes_in_time_and_picture(route):
     alone = build_map(frames[57:58], FeatureExtractor(), progress=False)
     np.testing.assert_allclose(built.features.strips[:, 19], alone.features.strips[:, 0], atol=1e-6)
     assert built.thumbnails[19] == alone.thumbnails[0]
-    slow = build_map(frames, FeatureExtractor(), progress=False, keyframes=KeyframeSettings(seconds=7))
+    slow = build_map(frames, FeatureExtractor(), progress=False, keyframes=KeyframeSettings(interval=7))
     assert slow.ids == tuple(str(i) for i in range(0, 60, 7))
 
 
-def test_the_selector_decides(route):
+def test_build_map_selects_as_selector(route):
     """The same places as the selector's own answers, over the border of a batch."""
-    frames, settings = drive(route[:50], shown=2), KeyframeSettings(seconds=3, change=0.1)
+    frames, settings = drive(route[:50], shown=2), KeyframeSettings(interval=3, change=0.1)
     selector, expected = KeyframeSelector(settings), []
     for frame in frames:
         if not selector.too_soon(frame.stamp, None) and not selector.too_alike(frame.image):

@@ -48,7 +48,7 @@ def saved(small_map, tmp_path):
     return path
 
 
-def test_round_trip(small_map, saved, route):
+def test_save_map_then_load_map_is_identical(small_map, saved, route):
     loaded = load_map(saved)
     assert_same(small_map, loaded)
     assert loaded.projection.identity == small_map.projection.identity
@@ -57,7 +57,7 @@ def test_round_trip(small_map, saved, route):
     np.testing.assert_allclose(query.strips[:, 0], small_map.features.strips[:, 5], atol=1e-6)
 
 
-def test_map_without_extras(route, tmp_path):
+def test_save_map_without_extras_loads(route, tmp_path):
     plain = build_map([Frame(route[0], 0, '')], FeatureExtractor(), thumbnails=False, progress=False)
     save_map(plain, tmp_path / 'plain.stavpr')
     loaded = load_map(tmp_path / 'plain.stavpr')
@@ -67,7 +67,7 @@ def test_map_without_extras(route, tmp_path):
     assert not loaded.has_ids
 
 
-def test_projected_otherwise_is_refused(small_map, route):
+def test_recognizer_with_other_features_rejects_them(small_map, route):
     from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
     recognizer = PlaceRecognizer(small_map, RecognizerSettings(threshold=1.0))
@@ -79,7 +79,7 @@ def test_projected_otherwise_is_refused(small_map, route):
     assert recognizer.window_fill == 0
 
 
-def test_empty_source_is_refused():
+def test_build_map_of_no_images_fails():
     with pytest.raises(InputError, match='no images'):
         build_map([], FeatureExtractor(), progress=False)
 
@@ -93,7 +93,7 @@ def partly_posed(small_map):
     return dataclasses.replace(small_map, poses=poses)
 
 
-def test_poses_of_some_places(small_map, tmp_path):
+def test_save_map_with_some_poses_loads(small_map, tmp_path):
     save_map(partly_posed(small_map), tmp_path / 'map')
     loaded = load_map(tmp_path / 'map')
     assert_same(partly_posed(small_map), loaded)
@@ -103,7 +103,7 @@ def test_poses_of_some_places(small_map, tmp_path):
     assert loaded.pose(8).tolist() == [8, 0, 0, 0, 0, 0, 1]
 
 
-def test_no_poses(small_map):
+def test_place_map_without_poses_returns_none(small_map):
     for poses in (None, np.full((60, 7), np.nan)):
         without = dataclasses.replace(small_map, poses=poses)
         assert not without.has_poses
@@ -111,7 +111,7 @@ def test_no_poses(small_map):
     assert small_map.has_poses
 
 
-def test_a_pose_is_known_whole_or_not_at_all(small_map):
+def test_place_map_with_partial_pose_is_rejected(small_map):
     for value in (np.nan, np.inf):
         poses = small_map.poses.copy()
         poses[3, 4] = value
@@ -121,7 +121,7 @@ def test_a_pose_is_known_whole_or_not_at_all(small_map):
         dataclasses.replace(small_map, poses=np.where(np.arange(60)[:, None] == 3, np.inf, small_map.poses))
 
 
-def test_a_place_without_its_picture(small_map):
+def test_place_map_without_one_thumbnail_returns_none(small_map):
     some = dataclasses.replace(small_map, thumbnails=(b'', *small_map.thumbnails[1:]))
     assert some.thumbnail(0) is None
     assert some.thumbnail(1) is not None
@@ -142,16 +142,16 @@ def straight(count):
 
 
 @pytest.mark.parametrize('known', ['array', 'trajectory'])
-def test_keyframes_in_space(route, known):
+def test_build_map_with_distance_selects_keyframes(route, known):
     frames, poses = drive(route[:20]), straight(20)
     poses[4] = np.nan
     if known == 'trajectory':
-        trajectory = Trajectory(gap=1.5)
+        trajectory = Trajectory(max_gap=1.5)
         for frame, pose in zip(frames, poses, strict=True):
             if not np.isnan(pose[0]):
                 trajectory.add(frame.stamp, pose)
         poses = trajectory
-    built = build_map(frames, FeatureExtractor(), poses, progress=False, keyframes=KeyframeSettings(meters=2))
+    built = build_map(frames, FeatureExtractor(), poses, progress=False, keyframes=KeyframeSettings(distance=2))
     assert built.ids == ('0', '2', *map(str, range(5, 20, 2)))  # of 4 nothing is known
     assert built.poses[:, 0].tolist() == [0, 2, *range(5, 20, 2)]
     every = build_map(frames, FeatureExtractor(), poses, progress=False)
@@ -160,7 +160,7 @@ def test_keyframes_in_space(route, known):
     assert every.pose(5)[0] == 5
 
 
-def test_poses_that_do_not_fit(route):
+def test_build_map_with_wrong_poses_fails(route):
     frames, extractor = drive(route[:20]), FeatureExtractor()
     for count in (19, 21):
         with pytest.raises(InputError, match=f'{count} poses for 20 images'):
@@ -175,14 +175,14 @@ def test_poses_that_do_not_fit(route):
     built = build_map(frames, extractor, straight(20) * 2, progress=False)
     assert built.pose(3).tolist() == [6, 0, 0, 0, 0, 0, 1]
     with pytest.raises(SettingsError, match='without poses'):
-        build_map(frames, extractor, progress=False, keyframes=KeyframeSettings(degrees=1))
+        build_map(frames, extractor, progress=False, keyframes=KeyframeSettings(angle=1))
     nowhere = Trajectory()
     with pytest.raises(InputError, match=r'none of 20 images became a place.*no odometry'):
-        build_map(frames, extractor, nowhere, progress=False, keyframes=KeyframeSettings(meters=1))
+        build_map(frames, extractor, nowhere, progress=False, keyframes=KeyframeSettings(distance=1))
     assert build_map(frames, extractor, nowhere, progress=False).poses is None
 
 
-def test_width_of_the_thumbnails(route):
+def test_build_map_scales_thumbnails(route):
     image = cv2.resize(route[0], (640, 480))
     built = build_map(drive([image]), FeatureExtractor(), progress=False, thumbnail_width=320)
     assert built.thumbnail(0).shape == (240, 320, 3)
@@ -210,7 +210,7 @@ class Watched:
             self.closed.append(threading.get_ident())
 
 
-def test_images_are_decoded_by_one_thread_that_also_closes_the_source(route):
+def test_build_map_reads_and_closes_source_on_one_thread(route):
     """What a bag needs; also when the images, or their features, fail."""
     whole = Watched(drive(route))
     assert len(build_map(whole, FeatureExtractor(), progress=False)) == 60
@@ -232,7 +232,7 @@ def test_images_are_decoded_by_one_thread_that_also_closes_the_source(route):
 # ------------------------------------------------------------------------------------------ files
 
 
-def test_failed_save_leaves_the_old_file(small_map, saved, monkeypatch):
+def test_save_map_that_fails_keeps_old_file(small_map, saved, monkeypatch):
     before = saved.read_bytes()
 
     def full_disk(*_):
@@ -286,13 +286,13 @@ def rewritten(saved, change, members=None):
             archive.writestr(name, value)
 
 
-def test_newer_version(saved):
+def test_load_map_of_newer_version_fails(saved):
     rewritten(saved, lambda manifest: manifest.update(version=99))
     with pytest.raises(MapFileError, match='version 99'):
         load_map(saved)
 
 
-def test_unknown_kind_of_features(saved):
+def test_load_map_with_unknown_features_fails(saved):
     def change(manifest):
         manifest['settings'] = manifest['settings'].replace('"gradient"', '"teleport"')
 
@@ -301,7 +301,7 @@ def test_unknown_kind_of_features(saved):
         load_map(saved)
 
 
-def test_pickle_is_never_executed(saved, tmp_path):
+def test_load_map_executes_no_pickle(saved, tmp_path):
     class Bomb:
         def __reduce__(self):
             return (os.mkdir, (str(tmp_path / 'exploded'),))
@@ -321,7 +321,7 @@ def test_pickle_is_never_executed(saved, tmp_path):
     assert not (tmp_path / 'exploded').exists()
 
 
-def test_compressed_members_are_refused(saved):
+def test_load_map_with_compressed_members_fails(saved):
     with zipfile.ZipFile(saved) as archive:
         content = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(saved, 'w', zipfile.ZIP_DEFLATED) as archive:
@@ -333,7 +333,7 @@ def test_compressed_members_are_refused(saved):
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_damage_is_noticed(saved, small_map, data):
+def test_load_map_with_damage_fails_or_is_identical(saved, small_map, data):
     """Any byte changed, any tail cut off: the same map or a clear error, nothing else."""
     whole = saved.read_bytes()
     damaged = saved.parent / 'damaged'

@@ -95,11 +95,11 @@ def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
     assert matches[1].cause == 'not a keyframe'
     assert 'differs by 0.0000' in matches[1].reason
     assert matches[-1].window_stamps == tuple(stamp * SECOND for stamp in (1, 4, 5, 6, 7))
-    pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(seconds=2.0)))
+    pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(interval=2.0)))
     matches = process(pipeline, route[5:7], first=7)
     assert statuses(matches) == [Status.SKIPPED, Status.MATCH]
     assert 'less than 2 s' in matches[0].reason
-    pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(meters=3.0)))
+    pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(distance=3.0)))
     matches = process(pipeline, route[7:9], first=9)
     assert matches[0].cause == matches[1].cause == 'no odometry'
     # the last keyframe has no pose, so that the next image is one; then it is every third meter

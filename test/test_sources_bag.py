@@ -53,7 +53,7 @@ def write_mixed(path, ros1=False, bad=()):
 
 
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
-def test_round_trip(tmp_path, storage):
+def test_write_bag_then_open_source_is_identical(tmp_path, storage):
     path = tmp_path / 'bag'
     assert write_bag(path, '/camera/image', records(), storage) == 5
     assert image_topics(path) == {'/camera/image': (RAW, 5)}
@@ -70,7 +70,7 @@ def test_round_trip(tmp_path, storage):
             assert (frame.stamp, frame.identifier) == (original.stamp_ns, f'/camera/image#{i}')
 
 
-def test_without_header_stamps_frames_take_the_time_of_recording(tmp_path):
+def test_bag_without_header_stamps_uses_recording_time(tmp_path):
     write_bag(tmp_path / 'bag', '/image', records(stamped=False))
     source = open_source(tmp_path / 'bag', 'image')
     assert [frame.stamp for frame in source] == [record.time_ns for record in records()]
@@ -78,7 +78,7 @@ def test_without_header_stamps_frames_take_the_time_of_recording(tmp_path):
 
 
 @pytest.mark.parametrize('ros1', [False, True])
-def test_raw_and_compressed(tmp_path, ros1):
+def test_bag_raw_and_compressed_images_are_equal(tmp_path, ros1):
     path = write_mixed(tmp_path / 'mixed.bag', ros1)
     assert image_topics(path) == {'/raw': (RAW, 5), '/silent': (RAW, 0), '/small': (COMPRESSED, 5)}
     for topic in ('/raw', '/small'):
@@ -89,7 +89,7 @@ def test_raw_and_compressed(tmp_path, ros1):
             assert (record.time_ns, record.encoding, record.frame_id) == (original.time_ns, 'rgb8', 'camera')
 
 
-def test_topics_to_choose_from_are_listed(tmp_path):
+def test_bag_with_ambiguous_or_wrong_topic_lists_topics(tmp_path):
     path = write_mixed(tmp_path / 'bag')
     with pytest.raises(
         SourceError, match=r'2 image topics.*/raw \(sensor_msgs/msg/Image, 5 messages\), /small'
@@ -103,7 +103,7 @@ def test_topics_to_choose_from_are_listed(tmp_path):
         open_source(path, '/silent')
 
 
-def test_a_bag_without_images_lists_its_topics(tmp_path):
+def test_bag_without_images_lists_topics(tmp_path):
     store = get_typestore(Stores.ROS2_JAZZY)
     with Ros2Writer(tmp_path / 'bag', version=9) as writer:
         writer.add_connection('/text', 'std_msgs/msg/String', typestore=store)
@@ -112,7 +112,7 @@ def test_a_bag_without_images_lists_its_topics(tmp_path):
 
 
 @pytest.mark.parametrize('ros1', [False, True])
-def test_a_damaged_image_is_named_or_skipped(tmp_path, ros1):
+def test_bag_with_damaged_image_fails_or_skips(tmp_path, ros1):
     path = write_mixed(tmp_path / 'mixed.bag', ros1, bad={1, 3})
     with pytest.raises(ImageError, match=r'/small#1: .*damaged'):
         list(open_source(path, '/small'))
@@ -124,7 +124,7 @@ def test_a_damaged_image_is_named_or_skipped(tmp_path, ros1):
 
 
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
-def test_a_recording_that_was_killed_has_no_metadata(tmp_path, storage):
+def test_bag_without_metadata_is_read(tmp_path, storage):
     write_bag(tmp_path / 'bag', '/image', records(), storage)
     (tmp_path / 'bag' / 'metadata.yaml').unlink()
     assert len(list(open_source(tmp_path / 'bag'))) == 5
@@ -138,7 +138,7 @@ def listing(folder):
     return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.iterdir()}
 
 
-def test_a_write_ahead_log_is_read_and_left_alone(tmp_path):
+def test_bag_with_write_ahead_log_is_read_and_unchanged(tmp_path):
     write_bag(tmp_path / 'made', '/image', records())
     folder = tmp_path / 'odd #name%41?'
     folder.mkdir()
@@ -160,7 +160,7 @@ def test_a_write_ahead_log_is_read_and_left_alone(tmp_path):
 
 @pytest.mark.parametrize('kind', ['sqlite3', 'mcap', 'ros1'])
 @pytest.mark.parametrize('keep', [0.0, 0.02, 0.3, 0.6, 0.9, 0.99])
-def test_a_cut_off_bag_is_an_error(tmp_path, kind, keep):
+def test_bag_cut_off_fails(tmp_path, kind, keep):
     if kind == 'ros1':
         file = write_mixed(tmp_path / 'mixed.bag', ros1=True)
     else:
@@ -173,7 +173,7 @@ def test_a_cut_off_bag_is_an_error(tmp_path, kind, keep):
 
 
 @pytest.mark.parametrize('kind', ['sqlite3', 'mcap', 'ros1'])
-def test_damaged_bytes_give_images_or_our_errors(tmp_path, kind):
+def test_bag_with_damaged_bytes_fails_or_reads(tmp_path, kind):
     if kind == 'ros1':
         file = write_mixed(tmp_path / 'mixed.bag', ros1=True)
     else:
@@ -194,21 +194,21 @@ def test_damaged_bytes_give_images_or_our_errors(tmp_path, kind):
 
 
 @pytest.mark.parametrize('name', ['x.db3', 'x.mcap', 'x.bag'])
-def test_foreign_files(tmp_path, name):
+def test_bag_of_foreign_content_fails(tmp_path, name):
     (tmp_path / name).write_bytes(b'this is no bag ' * 100)
     with pytest.raises(SourceError, match=name):
         open_source(tmp_path / name)
 
 
 @pytest.mark.parametrize('text', ['', 'a: [', 'rosbag2_bagfile_information: {version: 99}', '[1, 2]'])
-def test_foreign_metadata(tmp_path, text):
+def test_bag_with_foreign_metadata_fails(tmp_path, text):
     write_bag(tmp_path / 'bag', '/image', records())
     (tmp_path / 'bag' / 'metadata.yaml').write_text(text)
     with pytest.raises(SourceError, match='damaged, cut off or no bag'):
         open_source(tmp_path / 'bag')
 
 
-def test_writing_never_overwrites_and_leaves_nothing_half_done(tmp_path):
+def test_write_bag_never_overwrites_nor_leaves_parts(tmp_path):
     def broken():
         yield from records(2)
         raise ImageError('the third one')
@@ -223,7 +223,7 @@ def test_writing_never_overwrites_and_leaves_nothing_half_done(tmp_path):
         write_bag(tmp_path / 'other', '/image', records(), 'zip')
 
 
-def test_the_real_old_bag(data_folder):
+def test_bag_of_2019_is_read(data_folder):
     path = data_folder / 'bags' / 'klintan_rosbag2js_sample.db3'
     before = sorted(path.parent.iterdir())
     assert image_topics(path) == {'/image': (RAW, 1), '/image/compressed': (COMPRESSED, 1)}
@@ -234,7 +234,7 @@ def test_the_real_old_bag(data_folder):
     assert sorted(path.parent.iterdir()) == before
 
 
-def test_the_real_ros1_bag(data_folder):
+def test_bag_of_ros1_is_read(data_folder):
     path = data_folder / 'bags' / 'kapture_t265_trimmed_locoffice.bag'
     topics = image_topics(path)
     assert {count for _, count in topics.values()} == {3}

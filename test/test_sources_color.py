@@ -32,7 +32,7 @@ def rgb_of(yuv):
 @pytest.mark.parametrize('encoding', sorted(BAYER))
 @pytest.mark.parametrize(('height', 'width'), MOSAICS)
 @pytest.mark.parametrize('color', [(200, 0, 0), (0, 200, 0), (0, 0, 200), (10, 120, 230)])
-def test_mosaics_of_one_color(encoding, height, width, color):
+def test_bayer_of_one_color_is_exact(encoding, height, width, color):
     scene = np.full((height, width, 3), color, np.uint8)
     for big, padding in ((False, 0), (True, 3)):
         step, data = padded(mosaic(encoding, scene, big), padding)
@@ -43,7 +43,7 @@ def test_mosaics_of_one_color(encoding, height, width, color):
 
 @pytest.mark.parametrize('encoding', sorted(BAYER))
 @pytest.mark.parametrize(('height', 'width'), [(3, 5), (8, 9), (9, 8)])
-def test_mosaics_of_a_ramp(encoding, height, width):
+def test_bayer_of_ramp_is_exact(encoding, height, width):
     y, x = np.mgrid[:height, :width]
     scene = np.dstack([10 + 20 * x, 200 - 12 * x - 6 * y, 30 + 16 * y]).astype(np.uint8)
     step, data = padded(mosaic(encoding, scene), 1)
@@ -53,7 +53,7 @@ def test_mosaics_of_a_ramp(encoding, height, width):
 
 
 @pytest.mark.parametrize('encoding', sorted(BAYER))
-def test_mosaics_are_interpolated_bilinearly(encoding):
+def test_bayer_of_noise_is_bilinear(encoding):
     scene = np.random.default_rng(2).integers(0, 256, (8, 9, 3), np.uint8)
     step, data = padded(mosaic(encoding, scene), 0)
     image = decode_image(8, 9, encoding, False, step, data)
@@ -73,7 +73,7 @@ def test_mosaics_are_interpolated_bilinearly(encoding):
 
 @pytest.mark.parametrize('encoding', sorted(BAYER))
 @pytest.mark.parametrize(('height', 'width'), [(1, 1), (1, 6), (5, 1)])
-def test_mosaics_without_every_color(encoding, height, width):
+def test_bayer_without_every_color_is_rejected(encoding, height, width):
     with pytest.raises(ImageError, match=f'{width}x{height} pixels: expected at least 2x2') as caught:
         decode_image(height, width, encoding, False, 2 * width, bytes(2 * height * width))
     assert caught.value.kind == 'size'
@@ -81,7 +81,7 @@ def test_mosaics_without_every_color(encoding, height, width):
 
 @pytest.mark.parametrize('encoding', YUV)
 @pytest.mark.parametrize('rgb', COLORS)
-def test_yuv_of_known_colors(encoding, rgb):
+def test_yuv_of_known_colors_by_table(encoding, rgb):
     step, data = packed_yuv(encoding, np.full((4, 6, 3), COLORS[rgb], np.uint8))
     image = decode_image(4, 6, encoding, False, step, data)
     assert np.abs(image.astype(int) - rgb).max() <= 2
@@ -89,7 +89,7 @@ def test_yuv_of_known_colors(encoding, rgb):
 
 @pytest.mark.parametrize('encoding', YUV)
 @pytest.mark.parametrize(('height', 'width', 'padding'), [(2, 2, 0), (6, 8, 0), (4, 10, 6), (2, 64, 1)])
-def test_yuv_pixels(encoding, height, width, padding):
+def test_yuv_of_noise_equals_definition(encoding, height, width, padding):
     rng = np.random.default_rng(3)
     yuv = rng.integers(16, 236, (height, width, 3)).astype(np.uint8)
     rows, columns = (1, 1) if encoding == 'nv24' else (1, 2) if encoding in PAIRS else (2, 2)
@@ -105,7 +105,7 @@ def test_yuv_pixels(encoding, height, width, padding):
     )
 
 
-def test_nv24_has_no_need_of_even_sizes():
+def test_nv24_of_odd_size_equals_definition():
     yuv = np.random.default_rng(4).integers(16, 236, (3, 5, 3)).astype(np.uint8)
     step, data = packed_yuv('nv24', yuv, 2)
     assert np.abs(decode_image(3, 5, 'nv24', False, step, data) - rgb_of(yuv)).max() <= 2

@@ -13,7 +13,8 @@ from PIL import Image
 
 from stavpr_ros.errors import ImageError
 from stavpr_ros.sources import files, open_source
-from stavpr_ros.sources.encodings import decode_compressed, decode_compressed_message, decode_message
+from stavpr_ros.sources.files import decode_compressed
+from stavpr_ros.sources.encodings import decode_compressed_message, decode_message
 
 # the color at each pixel of the top-left 2x2, in reading order
 PATTERNS = {'rggb': (0, 1, 1, 2), 'bggr': (2, 1, 1, 0), 'gbrg': (1, 2, 0, 1), 'grbg': (1, 0, 2, 1)}
@@ -25,7 +26,7 @@ def encoded(suffix, image):
 
 
 @pytest.mark.parametrize('suffix', ['.png', '.bmp', '.tiff', '.ppm', '.webp'])
-def test_lossless_files(suffix):
+def test_decode_compressed_of_lossless_file_is_exact(suffix):
     rgb = np.random.default_rng(0).integers(0, 256, (11, 13, 3), np.uint8)
     quality = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == '.webp' else []
     data = cv2.imencode(suffix, rgb[..., ::-1].copy(), quality)[1]
@@ -34,23 +35,23 @@ def test_lossless_files(suffix):
     assert image.flags.c_contiguous
 
 
-def test_jpeg_is_near():
+def test_decode_compressed_of_jpeg_is_close():
     rgb = np.full((16, 24, 3), (200, 100, 30), np.uint8)
     assert np.abs(decode_compressed(encoded('.jpg', rgb[..., ::-1].copy())).astype(int) - rgb).max() <= 4
 
 
 @pytest.mark.parametrize('suffix', ['.png', '.pgm', '.tiff'])
-def test_sixteen_bits_lose_the_lower_byte(suffix):
+def test_decode_compressed_of_16_bits_keeps_upper_byte(suffix):
     gray = (np.arange(12, dtype=np.uint16) * 5000).reshape(3, 4)
     np.testing.assert_array_equal(decode_compressed(encoded(suffix, gray)), np.dstack([gray >> 8] * 3))
 
 
-def test_transparency_is_dropped():
+def test_decode_compressed_drops_transparency():
     bgra = np.random.default_rng(0).integers(0, 256, (5, 6, 4), np.uint8)
     np.testing.assert_array_equal(decode_compressed(encoded('.png', bgra)), bgra[..., 2::-1])
 
 
-def test_a_bomb_is_refused_before_it_is_decoded(monkeypatch):
+def test_decode_compressed_of_too_large_image_is_rejected_first(monkeypatch):
     data = encoded('.png', np.zeros((100, 101), np.uint8))
     monkeypatch.setattr(files, 'MAX_PIXELS', 10_000)
     monkeypatch.setattr(files.cv2, 'imdecode', lambda *_: pytest.fail('decoded'))
@@ -66,7 +67,7 @@ def test_a_bomb_is_refused_before_it_is_decoded(monkeypatch):
 
 @pytest.mark.filterwarnings('ignore::UserWarning')  # Pillow's, on the way to the error
 @given(st.data())
-def test_damaged_files_decode_or_say_why(data):
+def test_decode_compressed_of_damaged_file_decodes_or_fails(data):
     suffix = data.draw(st.sampled_from(['.jpg', '.png', '.bmp', '.tiff', '.pgm', '.webp']))
     file = bytearray(encoded(suffix, np.arange(96, dtype=np.uint8).reshape(8, 12)))
     for _ in range(data.draw(st.integers(1, 8))):
@@ -85,20 +86,20 @@ def test_damaged_files_decode_or_say_why(data):
 @pytest.mark.parametrize(
     'data', [b'', b'\xff', b'no image at all', b'\x89PNG\r\n\x1a\n', b'\xff\xd8\xff\xe0']
 )
-def test_no_image(data):
+def test_decode_compressed_of_no_image_fails(data):
     with pytest.raises(ImageError, match=f'{len(data)} bytes are no image') as caught:
         decode_compressed(data)
     assert caught.value.kind == 'damaged'
 
 
-def test_a_file_that_is_cut_off():
+def test_decode_compressed_of_cut_off_png_fails():
     data = encoded('.png', np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8))
-    with pytest.raises(ImageError, match='is damaged or cut off: copy or record anew') as caught:
+    with pytest.raises(ImageError, match='is damaged or cut off: copy or record it again') as caught:
         decode_compressed(data[:-30])
     assert caught.value.kind == 'damaged'
 
 
-def test_half_a_jpeg():
+def test_decode_compressed_of_cut_off_jpeg_fails():
     rgb = np.full((64, 64, 3), (200, 100, 30), np.uint8)
     small = encoded('.jpg', rgb[:8, :8])
     data = encoded('.jpg', rgb[..., ::-1].copy())
@@ -115,7 +116,7 @@ def test_half_a_jpeg():
 @pytest.mark.parametrize(
     'options', [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]]
 )
-def test_a_jpeg_with_a_video_behind_it(options):
+def test_decode_compressed_of_jpeg_with_video_ignores_it(options):
     """As phones append one; any two bytes may be in it. Noise: the picture has every byte too."""
     bgr = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
     data = cv2.imencode('.jpg', bgr, options)[1].tobytes()
@@ -127,7 +128,7 @@ def test_a_jpeg_with_a_video_behind_it(options):
             decode_compressed(data[:-missing])
 
 
-def test_of_several_pictures_in_a_jpeg_the_first_is_read():
+def test_decode_compressed_of_mpo_reads_first_image():
     first, second = (Image.new('RGB', (64, 64), color) for color in ((200, 100, 30), (0, 0, 0)))
     file = BytesIO()
     first.save(file, 'MPO', save_all=True, append_images=[second])
@@ -137,7 +138,7 @@ def test_of_several_pictures_in_a_jpeg_the_first_is_read():
         decode_compressed(data[: data.index(b'\xff\xd9')])
 
 
-def test_what_opencv_refuses_with_an_error_of_its_own():
+def test_decode_compressed_with_opencv_error_fails():
     data = b'P5 2000000 1 255 ' + bytes(2_000_000)  # wider than it reads
     with pytest.raises(ImageError, match=f'image of {len(data)} bytes is damaged: ') as caught:
         decode_compressed(data)
@@ -160,7 +161,7 @@ def compressed(transport, data):
         'h264',
     ],
 )
-def test_the_bytes_decide(transport):
+def test_compressed_message_format_is_taken_from_bytes(transport):
     rgb = np.random.default_rng(0).integers(0, 256, (5, 6, 3), np.uint8)
     image = decode_message(compressed(transport, encoded('.png', rgb[..., ::-1].copy())))
     np.testing.assert_array_equal(image, rgb)
@@ -180,9 +181,9 @@ def test_the_bytes_decide(transport):
         ' 16SC1 ; png',
     ],
 )
-def test_depth_is_refused_by_name(transport):
+def test_compressed_message_of_depth_is_rejected(transport):
     png = encoded('.png', np.zeros((4, 4), np.uint8))  # a picture, so that nothing but the name is wrong
-    with pytest.raises(ImageError, match='holds depth or measurements, not a picture') as caught:
+    with pytest.raises(ImageError, match='holds depth or measurements, not an image') as caught:
         decode_compressed_message(compressed(transport, png))
     assert repr(transport) in str(caught.value)
     assert caught.value.kind == 'depth'
@@ -200,7 +201,7 @@ def scene_and_mosaic(pattern, deep):
 @pytest.mark.parametrize('bits', [8, 16])
 @pytest.mark.parametrize('target', ['', 'itself'])
 @pytest.mark.parametrize('suffix', ['.png', '.tiff'])
-def test_mosaics_in_files(pattern, bits, target, suffix):
+def test_compressed_message_of_bayer_is_demosaiced(pattern, bits, target, suffix):
     encoding = f'bayer_{pattern}{bits}'
     scene, seen = scene_and_mosaic(pattern, bits == 16)
     transport = f'{encoding}; {suffix[1:]} compressed {encoding if target else ""}'
@@ -208,7 +209,7 @@ def test_mosaics_in_files(pattern, bits, target, suffix):
     np.testing.assert_array_equal(image, scene)
 
 
-def test_a_mosaic_in_a_jpeg():
+def test_compressed_message_of_bayer_jpeg_is_close():
     scene, seen = scene_and_mosaic('gbrg', False)
     data = cv2.imencode('.jpg', seen, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
     image = decode_compressed_message(compressed('bayer_gbrg8; jpeg compressed ', data))
@@ -228,32 +229,32 @@ def test_a_mosaic_in_a_jpeg():
         'jpeg',
     ],
 )
-def test_what_is_no_mosaic_any_more_is_left_alone(transport):
+def test_compressed_message_of_converted_bayer_is_gray(transport):
     _, gray = scene_and_mosaic('rggb', False)
     image = decode_compressed_message(compressed(transport, encoded('.png', gray)))
     np.testing.assert_array_equal(image, np.dstack([gray] * 3))
 
 
-def test_color_is_no_mosaic_whatever_the_format_says():
+def test_compressed_message_of_color_is_no_bayer():
     rgb = np.random.default_rng(0).integers(0, 256, (5, 6, 3), np.uint8)
     message = compressed('bayer_rggb8; png compressed ', encoded('.png', rgb[..., ::-1].copy()))
     np.testing.assert_array_equal(decode_compressed_message(message), rgb)
 
 
-def test_a_mosaic_too_small_is_an_error():
+def test_compressed_message_of_tiny_bayer_fails():
     message = compressed('bayer_rggb8; png compressed ', encoded('.png', np.zeros((1, 5), np.uint8)))
     with pytest.raises(ImageError, match='5x1 pixels: expected at least 2x2') as caught:
         decode_compressed_message(message)
     assert caught.value.kind == 'size'
 
 
-def test_video_is_named():
+def test_compressed_message_of_video_names_format():
     with pytest.raises(ImageError, match="format 'h264': 20 bytes are no image") as caught:
         decode_compressed_message(compressed('h264', bytes([0, 0, 0, 1, 0x67] * 4)))
     assert caught.value.kind == 'damaged'
 
 
-def test_a_folders_errors_keep_their_kind(tmp_path):
+def test_folder_errors_keep_their_kind(tmp_path):
     (tmp_path / '1.png').write_bytes(b'no image')
     (tmp_path / '2.png').write_bytes(encoded('.png', np.zeros((4, 4), np.uint8)))
     errors = []
@@ -261,7 +262,7 @@ def test_a_folders_errors_keep_their_kind(tmp_path):
     assert [error.kind for error in errors] == ['damaged']
 
 
-def test_a_file_that_cannot_be_read(tmp_path):
+def test_folder_with_unreadable_file_fails(tmp_path):
     (tmp_path / '1.png').write_bytes(b'gone before it is read')
     source = open_source(tmp_path)
     (tmp_path / '1.png').unlink()
@@ -278,7 +279,7 @@ def test_a_file_that_cannot_be_read(tmp_path):
     ),
     rest=st.binary(max_size=60),
 )
-def test_random_messages_decode_or_say_why(transport, start, rest):
+def test_compressed_message_of_random_bytes_decodes_or_fails(transport, start, rest):
     data = start + rest
     try:
         with mock.patch.object(files, 'MAX_PIXELS', 10**6):

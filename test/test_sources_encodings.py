@@ -19,7 +19,7 @@ from stavpr_ros.sources.bag import RAW
 from stavpr_ros.sources.encodings import ENCODINGS, decode_image, decode_message
 
 
-def test_every_encoding_is_tested():
+def test_encodings_are_all_tested():
     assert {*CHANNELS, *BAYER, *YUV} == ENCODINGS.keys()
 
 
@@ -28,7 +28,7 @@ def test_every_encoding_is_tested():
 @pytest.mark.parametrize(
     ('height', 'width', 'padding'), [(1, 1, 0), (5, 7, 0), (4, 6, 3), (1, 9, 1), (8, 1, 5)]
 )
-def test_pixels(encoding, big, height, width, padding):
+def test_decode_image_of_every_encoding_is_exact(encoding, big, height, width, padding):
     step, data, expected = message(encoding, height, width, big, padding)
     image = decode_image(height, width, encoding, big, step, data)
     np.testing.assert_array_equal(image, expected)
@@ -48,13 +48,13 @@ def test_pixels(encoding, big, height, width, padding):
         lambda b: np.repeat(np.frombuffer(b, np.uint8), 2)[::2],
     ],
 )
-def test_any_buffer(kind):
+def test_decode_image_of_any_buffer_is_exact(kind):
     step, data, expected = message('rgb8', 4, 5, padding=2)
     np.testing.assert_array_equal(decode_image(4, 5, 'rgb8', False, step, kind(data)), expected)
 
 
 @pytest.mark.parametrize('encoding', sorted(ENCODINGS))
-def test_no_sharing(encoding):
+def test_decode_image_shares_no_memory(encoding):
     data = np.random.default_rng(0).integers(0, 256, 600, np.uint8)
     image = decode_image(4, 6, encoding, False, 48, data[:])
     before = image.copy()
@@ -62,7 +62,7 @@ def test_no_sharing(encoding):
     np.testing.assert_array_equal(image, before)
 
 
-def test_the_last_rows_padding_may_be_missing():
+def test_decode_image_without_last_padding_is_exact():
     step, data, expected = message('bgr8', 3, 4, padding=5)
     np.testing.assert_array_equal(decode_image(3, 4, 'bgr8', False, step, data[:-5]), expected)
     with pytest.raises(ImageError, match=r'45 bytes of data .*expected 46'):
@@ -95,13 +95,13 @@ def test_the_last_rows_padding_may_be_missing():
         ({'encoding': 'nv24', 'height': 2, 'step': 4, 'data': bytes(23)}, 'cut off', 'expected 24'),
         ({'encoding': 'bayer_rggb16', 'step': 7}, 'step', 'expected 8'),
         ({'encoding': '32FC1'}, 'depth', 'depth'),
-        ({'encoding': '32FC1x'}, 'encoding', "'32FC1x' is not read"),
-        ({'encoding': '8UC2'}, 'encoding', "'8UC2' is not read"),
-        ({'encoding': 'bayer_rggb9'}, 'encoding', "'bayer_rggb9' is not read: expected one of rgb8"),
-        ({'encoding': ''}, 'encoding', 'is not read'),
+        ({'encoding': '32FC1x'}, 'encoding', "'32FC1x' is not supported"),
+        ({'encoding': '8UC2'}, 'encoding', "'8UC2' is not supported"),
+        ({'encoding': 'bayer_rggb9'}, 'encoding', "'bayer_rggb9' is not supported: expected one of rgb8"),
+        ({'encoding': ''}, 'encoding', 'is not supported'),
     ],
 )
-def test_lying_headers(change, kind, text):
+def test_decode_image_with_wrong_header_is_rejected(change, kind, text):
     fields = {
         'height': 3,
         'width': 4,
@@ -119,13 +119,13 @@ def test_lying_headers(change, kind, text):
     'encoding',
     [f'{kind}C{n}' for kind in ('8S', '16S', '32S', '32F', '64F') for n in (1, 2, 3, 4)] + ['32FC', '32FC12'],
 )
-def test_measurements_are_refused(encoding):
+def test_decode_image_of_measurements_is_rejected(encoding):
     with pytest.raises(ImageError, match=f'{encoding!r} holds depth or measurements') as caught:
         decode_image(1, 1, encoding, False, 8, bytes(64))
     assert caught.value.kind == 'depth'
 
 
-def test_an_image_too_large_is_refused(monkeypatch):
+def test_decode_image_of_too_large_image_is_rejected(monkeypatch):
     monkeypatch.setattr(files, 'MAX_PIXELS', 12)
     assert decode_image(3, 4, 'mono8', False, 4, bytes(12)).shape == (3, 4, 3)
     with pytest.raises(ImageError, match='13x1 pixels: expected at most 12') as caught:
@@ -133,7 +133,7 @@ def test_an_image_too_large_is_refused(monkeypatch):
     assert caught.value.kind == 'too large'
 
 
-def test_messages_of_either_kind():
+def test_decode_message_of_either_type_is_exact():
     step, data, expected = message('mono16', 4, 5, big=True, padding=1)
     raw = SimpleNamespace(height=4, width=5, encoding='mono16', is_bigendian=1, step=step, data=data)
     np.testing.assert_array_equal(decode_message(raw), expected)
@@ -141,7 +141,7 @@ def test_messages_of_either_kind():
     np.testing.assert_array_equal(decode_message(pgm), expected)
 
 
-def test_a_bags_errors_keep_their_kind(tmp_path):
+def test_bag_errors_keep_their_kind(tmp_path):
     store = get_typestore(Stores.ROS2_JAZZY)
     with Writer(tmp_path / 'bag', version=9) as writer:
         topic = writer.add_connection('/image', RAW, typestore=store)
@@ -157,7 +157,7 @@ def test_a_bags_errors_keep_their_kind(tmp_path):
     assert [error.kind for error in errors] == ['step', 'damaged']
 
 
-def test_errors_have_a_kind():
+def test_image_error_keeps_kind_when_copied():
     assert ImageError('text').kind == 'image'
     error = ImageError('text', kind='step')
     for same in (error, copy.copy(error), pickle.loads(pickle.dumps(error))):
@@ -180,7 +180,7 @@ def check(image, height, width, data):
 )
 @example(1, 2, 'mono8', False, 2**32 - 1, b'ab')
 @example(1, 2, 'bgr16', True, 2**32 - 1, bytes(12))
-def test_random_messages_decode_or_say_why(height, width, encoding, big, step, data):
+def test_decode_image_of_random_message_decodes_or_fails(height, width, encoding, big, step, data):
     try:
         image = decode_image(height, width, encoding, big, step, data)
     except ImageError as error:
@@ -199,7 +199,7 @@ def test_random_messages_decode_or_say_why(height, width, encoding, big, step, d
     padding=st.integers(-1, 5),
     missing=st.integers(-3, 1),
 )
-def test_only_what_must_be_refused_is_refused(encoding, height, width, big, padding, missing):
+def test_decode_image_rejects_exactly_invalid_messages(encoding, height, width, big, padding, missing):
     if encoding in CHANNELS:
         row = len(message(encoding, 1, width)[1])
     else:

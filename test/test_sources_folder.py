@@ -19,7 +19,7 @@ def fill(folder, names):
         cv2.imwrite(str(folder / name), np.full((4, 6, 3), 10 * i, np.uint8))
 
 
-def test_natural_order():
+def test_natural_key_sorts_numbers():
     names = ['10.jpg', 'a2b10.png', '2.jpg', '1.jpg', 'a2b9.png', 'A1.png', '01.jpg', 'a.png', 'frame-3.png']
     assert sorted(names, key=natural_key) == [
         '01.jpg',
@@ -34,7 +34,7 @@ def test_natural_order():
     ]
 
 
-def test_frames(tmp_path):
+def test_folder_yields_frames_in_order(tmp_path):
     fill(tmp_path, ['10.png', '9.PNG', '11.bmp', '.hidden.png'])
     (tmp_path / 'notes.txt').write_text('no image')
     (tmp_path / 'folder.png').mkdir()
@@ -48,7 +48,7 @@ def test_frames(tmp_path):
     assert len(list(source)) == 3
 
 
-def test_records_are_stamped_by_rate(tmp_path):
+def test_folder_records_have_stamps_by_rate(tmp_path):
     fill(tmp_path, ['1.png', '2.png', '3.png'])
     (tmp_path / '2.png').write_bytes(b'damaged')
     records = list(FolderSource(tmp_path, on_error=lambda _: None).records(4))
@@ -58,7 +58,7 @@ def test_records_are_stamped_by_rate(tmp_path):
         next(FolderSource(tmp_path).records(0))
 
 
-def test_a_damaged_file_is_named_or_skipped(tmp_path):
+def test_folder_with_damaged_file_fails_or_skips(tmp_path):
     fill(tmp_path, ['1.png', '3.png'])
     (tmp_path / '2.png').write_bytes(b'\x89PNG damaged')
     with pytest.raises(ImageError, match=r'2\.png: 12 bytes are no image'):
@@ -68,7 +68,7 @@ def test_a_damaged_file_is_named_or_skipped(tmp_path):
     assert ['2.png' in str(error) for error in errors] == [True]
 
 
-def test_what_is_no_folder_of_images(tmp_path):
+def test_open_source_of_no_source_fails(tmp_path):
     with pytest.raises(SourceError, match='holds no images: expected files ending in'):
         open_source(tmp_path)
     with pytest.raises(SourceError, match='does not exist'):
@@ -83,7 +83,7 @@ def test_what_is_no_folder_of_images(tmp_path):
 
 
 @pytest.mark.parametrize('method', ['exists', 'is_dir', 'iterdir'])
-def test_a_folder_that_may_not_be_looked_into(tmp_path, monkeypatch, method):
+def test_folder_without_permission_fails(tmp_path, monkeypatch, method):
     """As user root, permissions forbid nothing."""
 
     def refuse(*_):
@@ -99,7 +99,7 @@ def test_a_folder_that_may_not_be_looked_into(tmp_path, monkeypatch, method):
                 FolderSource(tmp_path)
 
 
-def test_names_that_are_no_utf_8(tmp_path):
+def test_folder_with_names_not_utf8_is_read(tmp_path):
     fill(tmp_path, ['1.png', '2.png'])
     for number, name in (('1', b'caf\xe9.png'), ('2', 'caff\u00e8.png'.encode())):
         (tmp_path / f'{number}.png').rename(tmp_path / os.fsdecode(name))
@@ -110,14 +110,14 @@ def test_names_that_are_no_utf_8(tmp_path):
         list(open_source(tmp_path))
 
 
-def test_importing_sources_is_light():
+def test_import_of_sources_is_light():
     code = (
         'import sys, stavpr_ros.sources; sys.exit(any(m in sys.modules for m in ("rosbags", "cv2", "rclpy")))'
     )
     assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0
 
 
-def test_real_folder(data_folder):
+def test_folder_of_rtabmap_is_read(data_folder):
     source = open_source(data_folder / 'rtabmap_hallway_loop' / 'samples')
     assert [file.name for file in source.files] == [f'{i}.jpg' for i in range(1, 85)]
     assert next(iter(source)).image.shape == (384, 512, 3)

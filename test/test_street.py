@@ -38,7 +38,7 @@ def difference(a, b):
     return float(np.abs(a.astype(float) - b.astype(float)).mean())
 
 
-def test_images_have_the_promised_type_and_are_not_blank(world):
+def test_traverse_images_are_rgb_and_not_blank(world):
     for drive in (first_drive(world, 5, SIZE), second_drive(world, 5, SIZE)):
         for frame in drive:
             assert frame.image.shape == (72, 96, 3)
@@ -47,13 +47,13 @@ def test_images_have_the_promised_type_and_are_not_blank(world):
             assert frame.image.std() > 15
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_gives_others():
+def test_world_with_same_seed_renders_same_bytes():
     one, same, other = (second_drive(World(seed), 40, SIZE) for seed in (3, 3, 4))
     assert all(np.array_equal(one[k].image, same[k].image) for k in (0, 17, 39))
     assert not np.array_equal(one[17].image, other[17].image)
 
 
-def test_an_image_does_not_depend_on_what_was_rendered_before(world):
+def test_traverse_image_is_independent_of_order(world):
     drive = second_drive(world, 30, SIZE)
     alone = drive[12].image
     assert np.array_equal(list(drive)[12].image, alone)
@@ -61,7 +61,7 @@ def test_an_image_does_not_depend_on_what_was_rendered_before(world):
     assert np.array_equal(drive[-18].image, alone)
 
 
-def test_the_same_place_in_the_same_conditions_looks_the_same(world):
+def test_traverse_at_same_place_renders_same_scene(world):
     drive = Drive(world, Route(np.full(2, 100.0), np.zeros(2, bool)), STILL, size=SIZE)
     still, later = drive[0].image, drive[1].image  # only the cars ahead may have moved a little
     assert difference(still, later) < 1.0
@@ -75,7 +75,7 @@ def shift_of_patch(before, after, x, y, size=36, reach=14):
     return int(cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED).argmax()) - reach
 
 
-def test_a_step_aside_moves_near_things_more_than_far_ones(world):
+def test_render_with_lateral_step_shows_parallax(world):
     """Houses at the sides are some 20 m away, what is seen around the vanishing point some 60 m and more."""
     near, far = [], []
     for along in np.arange(20.0, 320.0, 20.0):
@@ -94,18 +94,18 @@ def test_a_step_aside_moves_near_things_more_than_far_ones(world):
      {'sun_azimuth': 250.0}, {'lane': -1.0}, {'traffic': 5}, {'lamps': 0.5}, {'autumn': 1.0},
      {'clouds': 1.0}, {'sun': 0.0}, {'ambient': 0.3}],
 )  # fmt: skip
-def test_every_condition_is_seen(world, change):
+def test_conditions_change_the_image(world, change):
     base = replace(STILL, lamps=0.01)  # with lamps at all, those of the street are lit
     assert difference(view(world, 60.0, base), view(world, 60.0, replace(base, **change))) > 0.3
 
 
-def test_fog_hides_what_is_far_and_exposure_darkens(world):
+def test_conditions_fog_hides_and_exposure_darkens(world):
     clear, fog = view(world, 60.0, STILL), view(world, 60.0, replace(STILL, fog=1.0))
     assert fog[:40].std() < 0.5 * clear[:40].std()
     assert view(world, 60.0, replace(STILL, exposure=0.4)).mean() < 0.7 * clear.mean()
 
 
-def test_the_default_drives_are_what_the_demonstration_needs(world):
+def test_default_traverses_have_expected_lengths_and_detour(world):
     first, second = first_drive(world), second_drive(world)
     assert len(first) == 300
     np.testing.assert_allclose(np.diff(first.position), 2.0)
@@ -117,7 +117,7 @@ def test_the_default_drives_are_what_the_demonstration_needs(world):
     assert np.all(np.diff(second.stamps) > 0)
 
 
-def test_the_second_drive_stops_once_and_drives_at_half_to_twice_the_speed(world):
+def test_second_traverse_stops_once_and_varies_speed(world):
     second = second_drive(world)
     step = np.diff(second.position)
     step = step[np.isfinite(step) & (step < 20)]  # not across the detour
@@ -129,7 +129,7 @@ def test_the_second_drive_stops_once_and_drives_at_half_to_twice_the_speed(world
     assert driving.max() < 4.5
 
 
-def test_the_ground_truth_is_the_nearest_place(world):
+def test_nearest_places_by_hand(world):
     def drive(along, detour):
         return Drive(world, Route(np.array(along), np.array(detour)), STILL, size=SIZE)
 
@@ -141,13 +141,13 @@ def test_the_ground_truth_is_the_nearest_place(world):
         ground_truth(second, first)
 
 
-def test_the_detour_is_another_street(world):
+def test_world_detour_is_another_street(world):
     assert world.detour.seed != world.street.seed
     here = Drive(world, Route(np.array([60.0, 60.0]), np.array([False, True])), STILL, size=SIZE)
     assert difference(here[0].image, here[1].image) > 10.0
 
 
-def test_a_street_is_the_same_for_any_length_and_fits_its_tables():
+def test_make_street_of_any_length_starts_equally():
     short, long = grow_street(5, 100.0), grow_street(5, 400.0)
     cells = int(100.0 / CELL)
     assert np.array_equal(short.lots[short.lot_of[:, :cells]], long.lots[long.lot_of[:, :cells]])
@@ -155,12 +155,12 @@ def test_a_street_is_the_same_for_any_length_and_fits_its_tables():
     assert np.isfinite(long.lots).all()
 
 
-def test_the_ends_of_the_street_can_be_rendered(world):
+def test_render_at_ends_of_street_succeeds(world):
     for along in (0.0, world.length):
         assert view(world, along, RAINY_DUSK).std() > 10
 
 
-def test_settings_out_of_range_are_refused(world):
+def test_street_settings_out_of_range_are_rejected(world):
     with pytest.raises(SettingsError, match='lane is 9'):
         Conditions(lane=9.0)
     with pytest.raises(SettingsError, match='fog is -1'):

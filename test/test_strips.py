@@ -32,7 +32,7 @@ def unit(strips):
 # ------------------------------------------------ cutting
 
 
-def test_superfluous_columns_fall_off_the_right_first():
+def test_cut_strips_drops_surplus_columns_by_hand():
     # 8 columns, 3 strips of 2: r = 2, one lost on each side: (1 2) (3 4) (5 6)
     row = torch.arange(8.0).reshape(1, 1, 1, 8)
     assert cut_strips(row, 3)[:, 0].tolist() == [[1, 2], [3, 4], [5, 6]]
@@ -48,7 +48,7 @@ def test_superfluous_columns_fall_off_the_right_first():
     ('shape', 'W', 'd'),
     [((2, 1488, 7, 7), 7, 10416), ((2, 512, 14, 14), 7, 14336)],  # the paper's two backbones
 )
-def test_sizes_of_the_paper(shape, W, d):
+def test_cut_strips_of_paper_networks_has_expected_shape(shape, W, d):
     strips = cut_strips(torch.zeros(shape), W)
     assert tuple(strips.shape) == (W, 2, d)
     assert strips.dtype == torch.float32
@@ -62,14 +62,14 @@ def test_sizes_of_the_paper(shape, W, d):
     width=st.integers(1, 19),
     W=st.integers(1, 9),
 )
-def test_strips_equal_the_oracle(n, channels, height, width, W):
+def test_cut_strips_equals_oracle(n, channels, height, width, W):
     W = min(W, width)
     size = n * channels * height * width
     maps = np.arange(size, dtype=np.float32).reshape(n, channels, height, width)
     np.testing.assert_array_equal(cut_strips(torch.from_numpy(maps), W).numpy(), oracle.cut_strips(maps, W))
 
 
-def test_strips_of_a_strided_map_of_another_type():
+def test_cut_strips_of_strided_float64_equals_oracle():
     maps = np.random.default_rng(0).random((2, 4, 9, 3))
     strided = torch.from_numpy(maps).permute(0, 3, 1, 2)  # (2, 3, 4, 9)
     expected = oracle.cut_strips(maps.transpose(0, 3, 1, 2).astype(np.float32), 4)
@@ -102,7 +102,7 @@ def test_wrong_axes_are_refused_by_name(shape):
 # ------------------------------------------------ norms
 
 
-def test_norms_by_hand():
+def test_normalize_by_hand():
     # one image, strips (3 4), (0 0), (0 12): norms 5, 0, 12, together 13
     directions, weights = unit(np.array([[[3.0, 4]], [[0, 0]], [[0, 12]]], np.float32))
     np.testing.assert_allclose(directions[:, 0], [[0.6, 0.8], [0, 0], [0, 1]], atol=1e-7)
@@ -116,7 +116,7 @@ def test_a_black_image_has_zero_strips_and_weights():
     assert not weights.any()
 
 
-def test_input_is_left_alone():
+def test_normalize_keeps_its_input():
     strips = random_strips(0, 3, 4, 5, 0.2)
     before = strips.copy()
     unit(strips)
@@ -134,7 +134,7 @@ def test_input_is_left_alone():
     d=st.integers(1, 20),
     zeros=st.sampled_from([0.0, 0.3, 1.0]),
 )
-def test_strip_distances_equal_the_oracle(seed, W, n, d, zeros):
+def test_strip_distances_equal_oracle(seed, W, n, d, zeros):
     query, reference = random_strips(seed, W, 1, d, zeros), random_strips(seed + 1, W, n, d, zeros)
     result = strip_distances(unit(query)[0][:, 0], unit(reference)[0])
     assert tuple(result.shape) == (W, W, n)
@@ -144,7 +144,7 @@ def test_strip_distances_equal_the_oracle(seed, W, n, d, zeros):
     )
 
 
-def test_precision_at_the_size_of_vgg_features():
+def test_strip_distances_at_vgg_size_are_precise():
     query, reference = random_strips(0, 2, 1, 14336, 0.0), random_strips(1, 2, 2, 14336, 0.0)
     reference[0, 0] = 3 * query[0, 0]  # the same place: distance 0
     result = strip_distances(unit(query)[0][:, 0], unit(reference)[0])
@@ -153,13 +153,13 @@ def test_precision_at_the_size_of_vgg_features():
     np.testing.assert_allclose(result.numpy(), expected, rtol=0, atol=TOLERANCE)
 
 
-def test_rows_are_the_query_strips():
+def test_strip_distances_rows_are_query_strips():
     query = torch.tensor([[1.0, 0], [0, 1]])
     reference = torch.tensor([[[1.0, 0]], [[1, 0]]])  # both strips like the query's first
     assert strip_distances(query, reference)[:, :, 0].tolist() == [[0, 0], [1, 1]]
 
 
-def test_zero_strips_are_exactly_one_away_from_everything():
+def test_strip_distances_of_zero_strips_are_one():
     reference = random_strips(1, 4, 3, 6, 0.0)
     reference[2] = 0
     d = strip_distances(torch.zeros(4, 6), unit(reference)[0])
@@ -169,7 +169,7 @@ def test_zero_strips_are_exactly_one_away_from_everything():
     assert (d[:, [0, 1, 3]] < 1).all()
 
 
-def test_distances_are_not_clipped():
+def test_strip_distances_reach_two():
     query = torch.tensor([[0.6, 0.8]])
     assert strip_distances(query, -query[:, None]).item() == pytest.approx(2)
 
@@ -181,7 +181,7 @@ def test_distances_are_not_clipped():
     n=st.integers(0, 6),
     zeros=st.sampled_from([0.0, 0.3, 1.0]),
 )
-def test_no_alignment_equals_the_oracle(seed, W, n, zeros):
+def test_holistic_distances_equal_oracle(seed, W, n, zeros):
     query, reference = random_strips(seed, W, 1, 5, zeros), random_strips(seed + 1, W, n, 5, zeros)
     (x, x_weights), (y, y_weights) = unit(query), unit(reference)
     result = np.asarray(holistic_distances(x[:, 0], x_weights[:, 0], y, y_weights))
@@ -199,7 +199,7 @@ def test_no_alignment_equals_the_oracle(seed, W, n, zeros):
         ((7, 5), (7, 5), '(7, 5)'),
     ],
 )
-def test_strips_that_do_not_fit_are_refused_by_name(query, reference, named):
+def test_distances_of_other_shapes_are_rejected(query, reference, named):
     with pytest.raises(InputError) as error:
         strip_distances(torch.zeros(query), torch.zeros(reference))
     assert named in str(error.value)
@@ -211,14 +211,14 @@ def test_strips_that_do_not_fit_are_refused_by_name(query, reference, named):
 
 
 @pytest.mark.parametrize(('x', 'y', 'named'), [((6,), (7, 3), '(6,)'), ((7,), (7, 4), '(7, 4)')])
-def test_weights_that_do_not_fit_are_refused_by_name(x, y, named):
+def test_holistic_distances_of_other_weights_are_rejected(x, y, named):
     with pytest.raises(InputError) as error:
         holistic_distances(torch.zeros(7, 5), torch.zeros(x), torch.zeros(7, 3, 5), torch.zeros(y))
     assert named in str(error.value)
 
 
 @pytest.mark.parametrize('dtype', [torch.float64, torch.int32])
-def test_another_type_than_float32_is_refused_by_name(dtype):
+def test_strip_distances_of_other_dtype_are_rejected(dtype):
     name = str(dtype).removeprefix('torch.')
     for query, reference in ((dtype, torch.float32), (torch.float32, dtype)):
         with pytest.raises(InputError) as error:

@@ -98,7 +98,7 @@ def expected(net, layer: str, batch: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize('layer', ['body.block', 'body.last', 'body.block.second', 'body.block.relu'])
-def test_inner_layers(net, file, layer):
+def test_torchscript_inner_layer_equals_hook(net, file, layer):
     """The block also takes a second argument, and its ReLU is called twice: the last call counts."""
     backbone = backbone_class('torchscript')(settings(file, layer=layer))
     pictures = images(3)
@@ -107,7 +107,7 @@ def test_inner_layers(net, file, layer):
         torch.testing.assert_close(backbone.feature_maps(pictures), expected(net, layer, batch))
 
 
-def test_nothing_after_the_layer_runs(file):
+def test_torchscript_runs_nothing_after_layer(file):
     """At 32 pixels the head does not fit: what comes before it does not mind."""
     backbone = backbone_class('torchscript')(settings(file, layer='body.last', size=32))
     assert backbone.feature_maps(images(2)).shape == (2, 6, 16, 16)
@@ -115,13 +115,13 @@ def test_nothing_after_the_layer_runs(file):
         backbone_class('torchscript')(settings(file, layer='head', size=32)).feature_maps(images(2))
 
 
-def test_nothing_after_the_layer_changes_what_it_gives(tmp_path):
+def test_torchscript_layer_keeps_its_input(tmp_path):
     torch.jit.save(torch.jit.script(Spoiled()), tmp_path / 'spoiled.pt')
     backbone = backbone_class('torchscript')(settings(tmp_path / 'spoiled.pt', layer='layer'))
     assert (backbone.feature_maps([np.full((16, 16, 3), 7, np.uint8)]) == 8).all()
 
 
-def test_the_files_own_output(net, tmp_path):
+def test_torchscript_output_by_hand(net, tmp_path):
     """Worked by hand: the sum of four pixels; blue first, mean and deviation by channel; batch of two."""
     conv = nn.Conv2d(3, 1, 2, stride=2, bias=False)
     nn.init.constant_(conv.weight, 1)
@@ -137,7 +137,7 @@ def test_the_files_own_output(net, tmp_path):
     assert (maps[1] == 4 * (200 - 20) / 2).all()
 
 
-def test_errors_say_what_to_do(file, tmp_path):
+def test_torchscript_errors_name_file_and_layer(file, tmp_path):
     with pytest.raises(UnavailableError, match='cannot be read'):
         FeatureExtractor('torchscript', settings(tmp_path / 'missing.pt'))
     (tmp_path / 'broken.pt').write_bytes(file.read_bytes()[:-200])
@@ -155,7 +155,7 @@ def test_errors_say_what_to_do(file, tmp_path):
         settings(file, sha256='12')
 
 
-def test_a_layer_in_a_branch(tmp_path):
+def test_torchscript_layer_in_branch_is_rejected(tmp_path):
     torch.jit.save(torch.jit.script(Branch()), tmp_path / 'branch.pt')
     with pytest.raises(SettingsError, match='in a branch or loop'):
         FeatureExtractor('torchscript', settings(tmp_path / 'branch.pt', layer='layer'))
@@ -163,14 +163,14 @@ def test_a_layer_in_a_branch(tmp_path):
     assert maps.shape == (2, 4, 16, 16)
 
 
-def test_a_program_without_modules(tmp_path, net):
+def test_torchscript_frozen_program_has_no_layers(tmp_path, net):
     frozen = torch.jit.freeze(torch.jit.script(net))
     torch.jit.save(frozen, tmp_path / 'frozen.pt')
     with pytest.raises(SettingsError, match='its layers are none'):
         FeatureExtractor('torchscript', settings(tmp_path / 'frozen.pt', layer='head'))
 
 
-def test_a_map_remembers_the_file_not_its_place(file, tmp_path):
+def test_torchscript_file_may_move_but_not_change(file, tmp_path):
     made = FeatureExtractor('torchscript', settings(file, layer='body.last')).settings
     moved = tmp_path / 'moved.pt'
     moved.write_bytes(file.read_bytes())
@@ -183,7 +183,7 @@ def test_a_map_remembers_the_file_not_its_place(file, tmp_path):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='no CUDA device')
-def test_half_precision_on_a_gpu(file, net):
+def test_torchscript_in_half_precision_on_gpu_is_close(file, net):
     backbone = backbone_class('torchscript')(
         settings(file, layer='body.last', half=True, scale=1 / 255), 'cuda'
     )

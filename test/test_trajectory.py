@@ -13,8 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from stavpr_ros.errors import InputError, SettingsError, SourceError
 from stavpr_ros.mapping import Trajectory, distance, rotation
-from stavpr_ros.sources.bag import RAW
-from stavpr_ros.sources.bag_odometry import ODOMETRY, read_odometry
+from stavpr_ros.sources.bag import ODOMETRY, RAW, read_odometry
 
 SECOND = 10**9
 
@@ -41,7 +40,7 @@ def same_rotation(p, q, tolerance):
     return min(np.abs(p - q).max(), np.abs(p + q).max()) <= tolerance
 
 
-def test_between_two_poses():
+def test_trajectory_interpolates_between_poses():
     trajectory = Trajectory()
     trajectory.add(1 * SECOND, turned(0, x=2))
     trajectory.add(2 * SECOND, turned(90, x=6))
@@ -50,8 +49,8 @@ def test_between_two_poses():
     np.testing.assert_array_equal(trajectory.at(2 * SECOND), turned(90, x=6))
 
 
-def test_before_after_and_nothing():
-    trajectory = Trajectory(patience=0.5)
+def test_trajectory_outside_its_poses_returns_none():
+    trajectory = Trajectory(timeout=0.5)
     assert trajectory.at(SECOND) is None
     trajectory.add(2 * SECOND, turned(0, x=1))
     trajectory.add(3 * SECOND, turned(0, x=2))
@@ -61,8 +60,8 @@ def test_before_after_and_nothing():
     assert trajectory.at(3_500_000_001) is None
 
 
-def test_no_line_is_drawn_over_a_long_silence():
-    trajectory = Trajectory(patience=0.5, gap=2)
+def test_trajectory_across_long_gap_returns_none():
+    trajectory = Trajectory(timeout=0.5, max_gap=2)
     for second in (1, 3, 6):
         trajectory.add(second * SECOND, turned(0, x=second))
     assert trajectory.at(2 * SECOND)[0] == 2
@@ -70,7 +69,7 @@ def test_no_line_is_drawn_over_a_long_silence():
     assert trajectory.at(6 * SECOND)[0] == 6
 
 
-def test_an_answer_is_a_copy():
+def test_trajectory_returns_copies():
     trajectory = Trajectory()
     pose = turned(0, x=1)
     trajectory.add(SECOND, pose)
@@ -80,8 +79,8 @@ def test_an_answer_is_a_copy():
     assert trajectory.at(SECOND)[0] == 1
 
 
-def test_late_poses_are_sorted_in_and_equal_stamps_replaced():
-    trajectory = Trajectory(patience=0.5)
+def test_trajectory_sorts_late_and_replaces_equal_stamps():
+    trajectory = Trajectory(timeout=0.5)
     for stamp, x in ((10, 0), (20, 10), (15, 8), (20, 12)):
         trajectory.add(stamp * SECOND // 10, turned(0, x=x))
     assert len(trajectory) == 3
@@ -89,8 +88,8 @@ def test_late_poses_are_sorted_in_and_equal_stamps_replaced():
     assert trajectory.at(1_750_000_000)[0] == 10
 
 
-def test_a_clock_that_jumps_back_makes_it_forget():
-    trajectory = Trajectory(patience=0.5)
+def test_trajectory_after_clock_jump_starts_over():
+    trajectory = Trajectory(timeout=0.5)
     for stamp in (10 * SECOND, 11 * SECOND, 10_500_000_000):
         trajectory.add(stamp, turned(0))
     assert len(trajectory) == 3
@@ -100,7 +99,7 @@ def test_a_clock_that_jumps_back_makes_it_forget():
     assert trajectory.at(10_500_000_000)[0] == 5
 
 
-def test_bounded():
+def test_trajectory_keeps_at_most_capacity():
     trajectory = Trajectory(capacity=16)
     for i in range(1, 1001):
         trajectory.add(i, turned(0, x=i))
@@ -124,7 +123,7 @@ def test_bounded():
         (np.zeros(7), 'quaternion of zeros'),
     ],
 )
-def test_no_pose(pose, words):
+def test_trajectory_with_invalid_pose_changes_nothing(pose, words):
     trajectory = Trajectory()
     trajectory.add(2 * SECOND, turned(0))
     with pytest.raises(InputError, match=words):
@@ -133,21 +132,21 @@ def test_no_pose(pose, words):
     assert trajectory.at(2 * SECOND) is not None
 
 
-def test_no_stamp_and_no_settings():
+def test_trajectory_with_invalid_stamp_or_settings_fails():
     with pytest.raises(InputError, match='stamp 0'):
         Trajectory().add(0, turned(0))
-    for wrong in ({'patience': -1}, {'patience': math.nan}, {'capacity': 0}, {'gap': math.nan}):
+    for wrong in ({'timeout': -1}, {'timeout': math.nan}, {'capacity': 0}, {'max_gap': math.nan}):
         with pytest.raises(SettingsError, match=next(iter(wrong))):
             Trajectory(**wrong)
 
 
-def test_quaternions_are_normalized():
+def test_trajectory_normalizes_quaternions():
     trajectory = Trajectory()
     trajectory.add(1, np.array([0, 0, 0, 0, 0, 3.0, 4.0]))
     np.testing.assert_allclose(trajectory.at(1)[3:], [0, 0, 0.6, 0.8])
 
 
-def test_distance_and_rotation():
+def test_distance_and_rotation_by_hand():
     a = np.array([1, 2, 3, 0, 0, 0, 1.0])
     assert distance(a, np.array([1, 5, 7, 0, 0, 0, 1.0])) == 5
     assert rotation(turned(10), turned(10)) == 0
@@ -164,7 +163,7 @@ def test_distance_and_rotation():
     flip=st.booleans(),
     axis=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda axis: sum(x * x for x in axis) > 0.01),
 )
-def test_rotations_turn_evenly_on_the_shorter_arc(first, angle, part, flip, axis):
+def test_trajectory_turns_evenly_on_shorter_arc(first, angle, part, flip, axis):
     """A pose turned by an angle about an axis of its own: after that part of the time, that part of it."""
     axis = np.array(axis) / np.linalg.norm(axis)
     start = turned(first, x=-4, axis=(0.6, 0, 0.8))
@@ -180,12 +179,12 @@ def test_rotations_turn_evenly_on_the_shorter_arc(first, angle, part, flip, axis
     part = (stamp - SECOND) / SECOND
     pose = trajectory.at(stamp)
     assert pose[0] == pytest.approx(-4 + 10 * part)
-    assert same_rotation(pose[3:], after(angle * part), 2e-6)  # nearly parallel ones go straight
+    assert same_rotation(pose[3:], after(angle * part), 1e-12)
     assert np.linalg.norm(pose[3:]) == pytest.approx(1, abs=1e-12)
     assert rotation(start, end) == pytest.approx(abs(angle), abs=1e-6)
 
 
-def test_one_thread_adds_while_another_asks():
+def test_trajectory_is_read_while_another_thread_adds():
     trajectory, failures = Trajectory(capacity=64), []
 
     def add():
@@ -261,7 +260,7 @@ def write_odometry(path, stamps, ros1=False, images=()):
 
 
 @pytest.mark.parametrize('ros1', [False, True])
-def test_odometry_of_a_bag(tmp_path, ros1):
+def test_read_odometry_returns_sorted_poses(tmp_path, ros1):
     # the third came late, the last has no stamp of its own
     stamps = [5 * SECOND, 5 * SECOND + 7, 5 * SECOND + 3, 0]
     path = write_odometry(tmp_path / 'drive.bag', stamps, ros1=ros1)
@@ -271,7 +270,7 @@ def test_odometry_of_a_bag(tmp_path, ros1):
     assert Trajectory.from_arrays(when, poses).at(5 * SECOND + 5)[0] == pytest.approx(1.5)
 
 
-def test_odometry_that_is_not_there(tmp_path):
+def test_read_odometry_of_missing_topic_fails(tmp_path):
     path = write_odometry(tmp_path / 'bag', [SECOND])
     with pytest.raises(SourceError, match=r"'/other' is not in .*: topics of that type are /odom"):
         read_odometry(path, '/other')
@@ -283,13 +282,13 @@ def test_odometry_that_is_not_there(tmp_path):
         read_odometry(tmp_path / 'missing', '/odom')
 
 
-def test_odometry_whose_clock_jumps_back(tmp_path):
+def test_read_odometry_with_clock_jump_fails(tmp_path):
     path = write_odometry(tmp_path / 'bag', [9 * SECOND, 10 * SECOND, 3 * SECOND, 4 * SECOND])
     with pytest.raises(SourceError, match=r'back by 7\.0 s at message 2'):
         read_odometry(path, '/odom')
 
 
-def test_recorded_poses_that_are_none_are_named():
+def test_from_arrays_with_invalid_pose_names_it():
     poses = np.array([turned(0), np.zeros(7)])
     with pytest.raises(InputError, match='pose number 1'):
         Trajectory.from_arrays(np.array([1, 2]), poses)

@@ -99,7 +99,7 @@ def tiny(**settings) -> Tiny:
     return backbone
 
 
-def test_the_cache_is_where_the_desktop_wants_it(monkeypatch, tmp_path):
+def test_cache_folder_follows_xdg(monkeypatch, tmp_path):
     monkeypatch.setenv('XDG_CACHE_HOME', '/somewhere')
     assert str(cache_folder()) == '/somewhere/stavpr_ros'
     monkeypatch.setenv('XDG_CACHE_HOME', '')
@@ -107,21 +107,21 @@ def test_the_cache_is_where_the_desktop_wants_it(monkeypatch, tmp_path):
     assert cache_folder() == tmp_path / '.cache' / 'stavpr_ros'
 
 
-def test_the_official_files():
+def test_published_files_have_official_names():
     from stavpr_ros.features.paper_networks import DenseNet161Places365, VGG16Pool4
 
     assert DenseNet161Places365.published.name == 'densenet161_places365.pth.tar'
     assert VGG16Pool4.published.name == f'vgg16-{VGG16Pool4.published.sha256}.pth'
 
 
-def test_nothing_is_downloaded_unasked(server, cache):
+def test_network_by_default_downloads_nothing(server, cache):
     with pytest.raises(UnavailableError, match=rf"{cache}/tiny\.pth.*'download'.*{server.address}"):
         Tiny(PublishedSettings())
     assert server.asked == 0
     assert not cache.exists()
 
 
-def test_download_once_then_from_the_cache(server, cache, content, capsys):
+def test_download_happens_once(server, cache, content, capsys):
     first = tiny(model='download')
     digest = hashlib.sha256(content).hexdigest()
     assert first.settings.sha256 == digest
@@ -144,7 +144,7 @@ def test_download_once_then_from_the_cache(server, cache, content, capsys):
         ({'body': b''}, 'cannot be read as a file of weights'),
     ],
 )
-def test_a_download_that_fails_leaves_nothing_half(server, cache, changes, message):
+def test_download_that_fails_leaves_no_partial_file(server, cache, changes, message):
     for name, value in changes.items():
         setattr(server, name, value)
     with pytest.raises(UnavailableError, match=message):
@@ -153,7 +153,7 @@ def test_a_download_that_fails_leaves_nothing_half(server, cache, changes, messa
     assert left == ({'tiny.pth', 'tiny.pth.sha256'} if 'body' in changes else set())
 
 
-def test_no_network(cache, monkeypatch):
+def test_download_without_network_fails_with_advice(cache, monkeypatch):
     with socket.socket() as free:
         free.bind(('127.0.0.1', 0))
         address = f'http://127.0.0.1:{free.getsockname()[1]}/tiny.pth'
@@ -163,7 +163,7 @@ def test_no_network(cache, monkeypatch):
     assert list(cache.iterdir()) == []
 
 
-def test_an_interrupted_download_leaves_nothing(server, cache, monkeypatch):
+def test_download_interrupted_leaves_nothing(server, cache, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -173,14 +173,14 @@ def test_an_interrupted_download_leaves_nothing(server, cache, monkeypatch):
     assert list(cache.iterdir()) == []
 
 
-def test_a_cache_that_cannot_be_written(server, tmp_path, monkeypatch):
+def test_download_to_unwritable_cache_fails(server, tmp_path, monkeypatch):
     (tmp_path / 'file').touch()
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'file'))
     with pytest.raises(UnavailableError, match='cannot be'):
         Tiny(PublishedSettings(model='download'))
 
 
-def test_a_published_hash_is_held_against_the_download(server, cache, content, monkeypatch, capsys):
+def test_download_with_other_published_hash_is_rejected(server, cache, content, monkeypatch, capsys):
     monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address, sha256='0123abcd'))
     with pytest.raises(UnavailableError, match=r'expected 0123abcd: it was changed or damaged'):
         Tiny(PublishedSettings(model='download'))
@@ -191,7 +191,7 @@ def test_a_published_hash_is_held_against_the_download(server, cache, content, m
     assert 'as published' in capsys.readouterr().err
 
 
-def test_the_first_download_is_held_against_later_ones(server, cache, content):
+def test_download_unlike_the_first_is_rejected(server, cache, content):
     """A file that was deleted and got again must be that of the first time, while the note is there."""
     tiny(model='download')
     (cache / 'tiny.pth').unlink()
@@ -203,21 +203,21 @@ def test_the_first_download_is_held_against_later_ones(server, cache, content):
     tiny(model='download')
 
 
-def test_the_users_hash_is_held_against_the_download(server, cache, content):
+def test_download_with_other_requested_hash_is_rejected(server, cache, content):
     with pytest.raises(UnavailableError, match='expected 0000'):
         Tiny(PublishedSettings(model='download', sha256='0' * 64))
     assert list(cache.iterdir()) == []
     tiny(model='download', sha256=hashlib.sha256(content).hexdigest())
 
 
-def test_a_file_that_changed_since_its_download_is_noticed(server, cache, content):
+def test_weights_changed_since_download_are_rejected(server, cache, content):
     tiny(model='download')
     (cache / 'tiny.pth').write_bytes(content[:-1] + b'\x01')
     with pytest.raises(UnavailableError, match='it is damaged or another file; delete it'):
         Tiny(PublishedSettings())
 
 
-def test_parameters_of_a_file_that_was_saved_in_training(server, tmp_path):
+def test_weights_saved_in_training_load_as_float32(server, tmp_path):
     torch.save(dict(Tiny.whole_network().half().named_parameters()), tmp_path / 'a.pth')
     with pytest.raises(UnavailableError, match=r"lacks '2\.running_mean' and 1 more"):
         Tiny(PublishedSettings(model=str(tmp_path / 'a.pth')))
@@ -227,14 +227,14 @@ def test_parameters_of_a_file_that_was_saved_in_training(server, tmp_path):
     assert (maps.dtype, maps.requires_grad) == (torch.float32, False)
 
 
-def test_another_file_than_the_maps(server, tmp_path, content):
+def test_weights_of_other_hash_than_map_are_rejected(server, tmp_path, content):
     path = tmp_path / 'mine.pth'
     path.write_bytes(content)
     with pytest.raises(FeatureMismatchError, match='give the file that the map was built with'):
         Tiny(PublishedSettings(model=str(path), sha256='0' * 64))
 
 
-def test_hashes_that_are_known(tmp_path):
+def test_expected_hash_is_published_or_noted(tmp_path):
     published = PublishedFile('http://a/b/net-89abcdef.pth', sha256='89abcdef')
     assert expected_hash(tmp_path / 'net-89abcdef.pth', published) == '89abcdef'
     assert expected_hash(tmp_path / 'other.pth', published) == ''
@@ -265,7 +265,7 @@ WEIGHT = torch.arange(6.0).reshape(2, 3)
     ],
     ids=['plain', 'parameters', 'with entries', 'Python 2'],
 )
-def test_kinds_of_checkpoints(tmp_path, content):
+def test_read_checkpoint_of_every_format(tmp_path, content):
     parameters = read(tmp_path, content)
     assert list(parameters) == ['a.weight']
     assert torch.equal(parameters['a.weight'], WEIGHT)
@@ -280,19 +280,19 @@ class Hostile:
 
 
 @pytest.mark.filterwarnings('ignore:Detected pickle protocol')
-def test_nothing_in_a_file_is_executed(tmp_path):
+def test_read_checkpoint_executes_nothing(tmp_path):
     mark = tmp_path / 'executed'
     old = OldPickle().file({'state_dict': Call(Global('posix', 'mkdir'), (str(mark),))})
     for hostile in (saved({'a.weight': Hostile(str(mark))}), old, pickle.dumps(Hostile(str(mark)))):
         with pytest.raises(UnavailableError, match=r'some\.pth cannot be read as a file of weights'):
             read(tmp_path, hostile)
         assert not mark.exists()
-    with pytest.raises(UnavailableError, match=r'asks for posix\.mkdir, .* not executed'):
+    with pytest.raises(UnavailableError, match=r'requires posix\.mkdir, .* not executed'):
         read(tmp_path, old)
 
 
 @pytest.mark.filterwarnings('ignore::DeprecationWarning', 'ignore:.*looks like a TorchScript archive')
-def test_files_that_are_no_weights(tmp_path, content):
+def test_read_checkpoint_of_other_files_fails(tmp_path, content):
     stream = io.BytesIO()
     torch.jit.save(torch.jit.script(nn.ReLU()), stream)
     old = OldPickle().file({'a.weight': WEIGHT})
@@ -305,7 +305,7 @@ def test_files_that_are_no_weights(tmp_path, content):
 
 
 @pytest.mark.filterwarnings('ignore:Detected pickle protocol')
-def test_every_byte_counts(tmp_path, content):
+def test_read_checkpoint_with_damage_fails_or_reads(tmp_path, content):
     """Damage anywhere is an error of ours, or harmless; never one of torch's or Python's."""
     rng = np.random.default_rng(0)
     for file in (content, OldPickle().file({'a.weight': WEIGHT})):
@@ -318,7 +318,7 @@ def test_every_byte_counts(tmp_path, content):
                 assert 'some.pth' in str(error)  # noqa: PT017
 
 
-def test_a_folder_or_nothing_instead_of_a_file(tmp_path, server):
+def test_weights_of_folder_or_missing_file_fail(tmp_path, server):
     for path in (tmp_path, tmp_path / 'gone.pth'):
         with pytest.raises(UnavailableError, match='cannot be read'):
             Tiny(PublishedSettings(model=str(path)))

@@ -1,10 +1,10 @@
 """``ros2 run stavpr_ros build_map``: make a reference map from a folder of images or a bag."""
 
 import argparse
-import sys
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
+import sys
 from typing import TYPE_CHECKING
 
 from stavpr_ros.errors import ImageError, SettingsError, SourceError, StavprError
@@ -14,7 +14,6 @@ from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
     import numpy as np
-
     from stavpr_ros.mapping import KeyframeSettings, PlaceMap, Trajectory
     from stavpr_ros.sources.bag import BagSource
     from stavpr_ros.sources.folder import FolderSource
@@ -24,12 +23,13 @@ EPILOG = """
 examples:
   build_map --input drive/ --output route.stavpr
   build_map --input drive.bag --topic /camera/image_raw --output route.stavpr
-  build_map --input drive.bag --output route.stavpr --odometry /odom --keyframe-distance 1 --keyframe-angle 15
+  build_map --input drive.bag --output route.stavpr --odometry /odom \\
+      --keyframe-distance 1 --keyframe-angle 15
   build_map --input drive/ --output route.stavpr --projection 512 --features onnx \\
       --onnx-model squeezenet.onnx --onnx-layer fire6/concat_1
 
-exit codes: 0 the map is written; 1 it is not (the reason is printed, a map that was there is untouched);
-2 usage; 130 interrupted (it says whether the map is written)
+exit codes: 0 the map is written; 1 it is not (the reason is printed, an earlier map is untouched);
+2 usage; 130 interrupted (it prints whether the map is written)
 """
 
 
@@ -38,7 +38,7 @@ def _parser() -> argparse.ArgumentParser:
 
     parser = argparse.ArgumentParser(
         prog='build_map',
-        description='Make a reference map: one place for each image or keyframe, in the order of the route.',
+        description='Build a reference map: one place for each image or keyframe.',
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -51,20 +51,28 @@ def _parser() -> argparse.ArgumentParser:
         '--every', type=int, default=1, metavar='N', help='take every N-th image (%(default)s)'
     )
     parser.add_argument(
-        '--poses', metavar='CSV', help='one line an image: x,y,z or x,y,z,qx,qy,qz,qw (meters, quaternion)'
+        '--poses',
+        metavar='CSV',
+        help='one line an image: x,y,z or x,y,z,qx,qy,qz,qw (meters, quaternion)',
     )
     parser.add_argument(
-        '--odometry', metavar='TOPIC', help='nav_msgs/Odometry of the same bag: where each place was seen'
+        '--odometry',
+        metavar='TOPIC',
+        help='nav_msgs/Odometry of the same bag: poses of the places',
     )
-    parser.add_argument('--no-thumbnails', action='store_true', help='keep no small pictures of the places')
+    parser.add_argument(
+        '--no-thumbnails', action='store_true', help='keep no thumbnails of the places'
+    )
     parser.add_argument(
         '--thumbnail-width',
         type=int,
         metavar='PX',
-        help='of these pictures (192); larger ones do not help the geometric check of the node',
+        help='of the thumbnails (192); larger ones do not help the geometric check',
     )
     parser.add_argument(
-        '--skip-bad-images', action='store_true', help='go on after an image that cannot be read'
+        '--skip-bad-images',
+        action='store_true',
+        help='continue after an image that cannot be read',
     )
     _add_keyframe_options(parser)
     add_feature_options(parser)
@@ -74,17 +82,17 @@ def _parser() -> argparse.ArgumentParser:
 def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         'keyframes',
-        'Only images that differ enough from the last place become places. All rules given must agree, but '
-        'meters and degrees are one rule: moved so far or turned so much.',
+        'Only images that differ enough from the last place become places. All rules must be met; '
+        'distance and angle are one rule, met by either. 0: off.',
     )
-    for name, metavar, what in (
-        ('seconds', 'S', 'time since the last place; for bags'),
-        ('meters', 'M', 'way since the last place; needs --odometry or --poses'),
-        ('degrees', 'DEG', 'angle turned since the last place; likewise'),
-        ('change', 'C', 'change of the picture, 0 to 2; a standing camera stays below 0.004'),
+    for name, metavar, text in (
+        ('interval', 'S', 'seconds since the last place; for bags'),
+        ('distance', 'M', 'meters from the last place; needs --odometry or --poses'),
+        ('angle', 'DEG', 'degrees from the last place; needs --odometry or --poses'),
+        ('change', 'C', 'change of the image, 0 to 2; a standing camera stays below 0.004'),
     ):
         group.add_argument(
-            f'--keyframe-{name}', type=float, default=0.0, metavar=metavar, help=f'{what} (0: off)'
+            f'--keyframe-{name}', type=float, default=0.0, metavar=metavar, help=text
         )
 
 
@@ -105,7 +113,7 @@ class _Images:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """Refuse options that contradict each other, before anything is read."""
+    """Reject options that contradict each other, before anything is read."""
     from stavpr_ros.sources.bag_file import is_bag
 
     moving = arguments.keyframe_distance or arguments.keyframe_angle
@@ -113,15 +121,21 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.every < 1:
         raise SettingsError(f'--every {arguments.every} must be at least 1')
     if arguments.poses and arguments.skip_bad_images:
-        raise SettingsError('--poses and --skip-bad-images: a skipped image would shift the poses; give one')
+        raise SettingsError(
+            '--poses and --skip-bad-images: a skipped image would shift the poses; give one'
+        )
     if arguments.poses and arguments.odometry:
-        raise SettingsError('--poses and --odometry: both say where the places are; give one')
+        raise SettingsError('--poses and --odometry: both give the poses of the places; give one')
     if moving and not (arguments.poses or arguments.odometry):
         raise SettingsError('--keyframe-distance and --keyframe-angle need --odometry or --poses')
     if arguments.odometry and not bag:
-        raise SettingsError(f'--odometry: {arguments.input} is no bag; give --poses with a folder of images')
+        raise SettingsError(
+            f'--odometry: {arguments.input} is no bag; give --poses with a folder of images'
+        )
     if arguments.keyframe_interval and not bag:
-        raise SettingsError(f'--keyframe-interval: {arguments.input} is no bag, its images have no times')
+        raise SettingsError(
+            f'--keyframe-interval: {arguments.input} is no bag, its images have no stamps'
+        )
     if arguments.thumbnail_width is not None and arguments.no_thumbnails:
         raise SettingsError('--thumbnail-width and --no-thumbnails: give one')
     require_room(arguments.output)
@@ -142,7 +156,7 @@ def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajecto
     """Read the poses of all images of the source, or the odometry."""
     from stavpr_ros.evaluation.ground_truth_files import read_poses
     from stavpr_ros.mapping import Trajectory
-    from stavpr_ros.sources.bag_odometry import read_odometry
+    from stavpr_ros.sources.bag import read_odometry
 
     if arguments.odometry:
         return Trajectory.from_arrays(*read_odometry(arguments.input, arguments.odometry))
@@ -154,7 +168,9 @@ def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajecto
             f'poses {arguments.poses} has {len(poses)} lines for {images} images: give one each'
         )
     if arguments.keyframe_angle and not oriented:
-        raise SettingsError(f'--keyframe-angle: {arguments.poses} has no orientations, leave it out')
+        raise SettingsError(
+            f'--keyframe-angle: {arguments.poses} has no orientations, leave it out'
+        )
     return poses[:: arguments.every]
 
 
@@ -172,7 +188,9 @@ def _build(arguments: argparse.Namespace) -> 'PlaceMap':
 
     _check(arguments)
     keyframes, extractor = _keyframes(arguments), make_extractor(arguments)
-    source = open_source(arguments.input, arguments.topic, skip if arguments.skip_bad_images else None)
+    source = open_source(
+        arguments.input, arguments.topic, skip if arguments.skip_bad_images else None
+    )
     images = _Images(source, arguments.every)
     width = THUMBNAIL_WIDTH if arguments.thumbnail_width is None else arguments.thumbnail_width
     place_map = build_map(
@@ -185,8 +203,8 @@ def _build(arguments: argparse.Namespace) -> 'PlaceMap':
     )
     if arguments.odometry and not place_map.has_poses:
         raise SourceError(
-            f'--odometry {arguments.odometry}: no image was taken while it has poses; do the stamps of both '
-            'come from one clock?'
+            f'--odometry {arguments.odometry}: no image has a pose; are the stamps of both from '
+            'one clock?'
         )
     if skipped:
         print(f'{len(skipped)} images skipped', file=sys.stderr)
@@ -195,7 +213,7 @@ def _build(arguments: argparse.Namespace) -> 'PlaceMap':
 
 
 def _known_poses(place_map: 'PlaceMap') -> str:
-    """Say of how many places the pose is known, if of any."""
+    """Return the number of places with a pose, in words; '' if none has."""
     known = sum(place_map.pose(place) is not None for place in range(len(place_map)))
     return f', {known} of them with a pose' if known else ''
 
@@ -213,27 +231,27 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
     except InputError as error:
         print(f'no threshold is suggested for mode paper: {error}')
         return
-    print(f'threshold to start with in mode paper: {suggestion.threshold:.3f} (mode robust needs none)')
+    print(f'suggested threshold for mode paper: {suggestion.threshold:.3f} (mode robust: 1)')
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
     obey_signals()
     wait_passively()
-    outcome = 'nothing was written'
+    state = 'nothing was written'
     try:
         from stavpr_ros.mapping import save_map
 
         arguments = _parser().parse_args(args)
         place_map = _build(arguments)
         save_map(place_map, arguments.output)
-        outcome = f'{arguments.output} is written, only the threshold for mode paper is not known'
+        state = f'{arguments.output} is written, without a suggested threshold'
         _report(place_map, arguments.output)
     except StavprError as error:
         print(f'build_map: {error}', file=sys.stderr)
         return 2 if isinstance(error, SettingsError) else 1
     except KeyboardInterrupt:
-        print(f'build_map: interrupted, {outcome}', file=sys.stderr)
+        print(f'build_map: interrupted, {state}', file=sys.stderr)
         return 130
     return 0
 

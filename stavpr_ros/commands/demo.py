@@ -1,37 +1,31 @@
-"""``ros2 run stavpr_ros demo``: the whole way once, from two drives to matches, numbers and a picture."""
+"""``ros2 run stavpr_ros demo``: from two traverses to matches, numbers and plots, over ROS."""
 
 import argparse
-import shutil
+from pathlib import Path
 import sys
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from stavpr_ros.errors import InputError, SettingsError, SourceError, StavprError
 from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from stavpr_ros.demonstration.street import Drive
-    from stavpr_ros.evaluation.records import TraverseEvaluation
-    from stavpr_ros.features import FeatureExtractor
+    from stavpr_ros.demonstration.recordings import LoopTraverse, TraversePair
     from stavpr_ros.mapping import PlaceMap
 
-TOPIC = '/camera/image_raw'
-EXCLUDE, CHECK = 50, 'sift'  # of --loop, unless told otherwise
+EXCLUDE_PLACES, GEOMETRIC_CHECK = 50, 'sift'  # defaults with --loop
+SYNTHETIC = 'synthetic'
 
 DESCRIPTION = """
-Without options: makes a street, drives along it twice (the second time at dusk in the rain, from the other
-lane, at another and varying speed, with a detour that the map has never seen), writes two bags, builds the
-map from the first, starts the node, replays the second bag into it over ROS, listens from a third process,
-and tells and draws what came out. With --map and --query: the same with your own folders of images or bags.
+Without options: renders two traverses of a synthetic street (the second at dusk in the rain, on
+the other lane, at a varying speed, with a detour that is not in the map), writes two bags, builds
+the map from the first, starts the node, replays the second bag into it over ROS, records the
+matches in a third process, and reports and plots the result. With --map and --query: the same with
+your own folders of images or bags.
 
-With --loop: one drive that comes back to where it was is replayed into the node in operation loop_closure,
-which compares it with its own past; --loop without a value drives twice along a made-up street.
+With --loop: one traverse that passes places again is replayed into the node in operation
+loop_closure, which compares it with its own past; 'synthetic' is the synthetic street, twice.
 """
 
 EPILOG = """
@@ -39,27 +33,11 @@ examples:
   demo
   demo --map monday/ --query tuesday/ --truth identity --tolerance 3
   demo --map monday.bag --query tuesday.bag --topic /camera/image_raw --threshold 0.2
-  demo --loop
-  demo --loop round/ --truth closures.png --exclude 100
+  demo --loop synthetic
+  demo --loop round/ --truth closures.png --exclude-places 100
 
 exit codes: 0 done, 1 something failed (the reason is printed), 2 usage, 130 interrupted
 """
-
-
-@dataclass(frozen=True)
-class Drives:
-    """
-    What the map is made from and what is replayed.
-
-    :param topics: image topics of both; None where there is one only, or no bag.
-    :param truth: true place of each query image, -1 = not in the map; None = unknown.
-    """
-
-    reference: str
-    query: str
-    topics: tuple[str | None, str | None]
-    truth: 'np.ndarray | None'
-    title: str
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -71,142 +49,117 @@ def _parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        '--output', default='demo_output', metavar='FOLDER', help='where all is written (%(default)s)'
-    )
-    parser.add_argument('--map', metavar='FOLDER|BAG', help='first drive: the map is made from it')
-    parser.add_argument('--query', metavar='FOLDER|BAG', help='second drive: it is replayed')
-    parser.add_argument(
-        '--loop', nargs='?', const='', metavar='FOLDER|BAG', help='a drive that closes loops; see above'
-    )
-    parser.add_argument(
-        '--exclude',
-        type=int,
-        metavar='N',
-        help=f'with --loop: the latest N images are not compared ({EXCLUDE})',
-    )
-    parser.add_argument(
-        '--check',
-        choices=('none', 'orb', 'sift'),
-        help=f'with --loop: geometric check of the matches, by keypoints ({CHECK})',
-    )
-    parser.add_argument('--topic', help='image topic of the bags, if they have several')
-    parser.add_argument(
-        '--truth',
-        metavar='identity|FILE',
-        help='identity: image i of the query was taken at image i of the map; with --loop a FILE: pairs of '
-        'images (.csv), or a square array (.npy) or black and white image of loop closures',
-    )
-    parser.add_argument(
-        '--tolerance', type=int, default=3, help='places that a right match may be off (%(default)s)'
-    )
-    parser.add_argument(
-        '--sequence-length', type=int, default=20, metavar='L', help='images in the window (%(default)s)'
-    )
-    parser.add_argument('--mode', default='robust', choices=('paper', 'robust'), help='of the node (robust)')
-    parser.add_argument(
-        '--threshold',
-        type=float,
-        help='of the node (robust: 1, with --loop 0.8; paper: found from the first drive alone)',
-    )
-    parser.add_argument(
-        '--world-seed', type=int, default=7, help='another number, another street (%(default)s)'
-    )
+    add = parser.add_argument
+    add('--output', default='demo_output', metavar='FOLDER', help='output folder (%(default)s)')
+    add('--map', metavar='FOLDER|BAG', help='first traverse: the map is built from it')
+    add('--query', metavar='FOLDER|BAG', help='second traverse: it is replayed')
+    add(
+        '--loop', nargs='?', const=SYNTHETIC, metavar='FOLDER|BAG|synthetic',
+        help=f'a traverse that passes places again ({SYNTHETIC})',
+    )  # fmt: skip
+    add('--topic', help='image topic of the bags, if they have several')
+    add(
+        '--truth', metavar='identity|FILE',
+        help='identity: image i of the query shows place i of the map; with --loop a FILE: pairs '
+        'of images (.csv), or a square array (.npy) or black and white image of loop closures',
+    )  # fmt: skip
+    add('--tolerance', type=int, default=3, help='places that a correct match may be off '
+        '(%(default)s)')  # fmt: skip
+    add('--sequence-length', type=int, default=20, metavar='L', help='images in the window '
+        '(%(default)s)')  # fmt: skip
+    add('--mode', default='robust', choices=('paper', 'robust'), help='of the node (%(default)s)')
+    add(
+        '--threshold', type=float,
+        help='of the node (robust: 1, with --loop 0.8; paper: estimated from the first traverse)',
+    )  # fmt: skip
+    add(
+        '--exclude-places', type=int, metavar='N',
+        help=f'with --loop: the latest N places are not compared ({EXCLUDE_PLACES})',
+    )  # fmt: skip
+    add(
+        '--geometric-check', choices=('none', 'orb', 'sift'),
+        help=f'with --loop: verification of matches by keypoints ({GEOMETRIC_CHECK})',
+    )  # fmt: skip
+    add('--street-seed', type=int, default=7, help='seed of the synthetic street (%(default)s)')
     add_feature_options(parser)
     return parser
 
 
-def say(text: str) -> None:
-    """Print a line at once."""
+def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """Reject options that contradict each other."""
+    if arguments.threshold is not None and not arguments.threshold > 0:
+        parser.error(f'--threshold {arguments.threshold} must be above 0')
+    for name, least in (('tolerance', 0), ('exclude_places', 1), ('sequence_length', 2)):
+        value = getattr(arguments, name)
+        if value is not None and value < least:
+            parser.error(f'--{name.replace("_", "-")} {value} must be at least {least}')
+    truth = arguments.truth
+    if arguments.loop is not None:
+        if arguments.map or arguments.query:
+            parser.error('--loop is one traverse: leave --map and --query out')
+        if truth == 'identity' or (truth and arguments.loop == SYNTHETIC):
+            parser.error(
+                '--loop FOLDER takes a file as --truth; that of the synthetic street is '
+                'known'
+            )
+        if arguments.mode == 'paper' and arguments.threshold is None:
+            parser.error('--loop in mode paper needs --threshold')
+        return
+    if arguments.exclude_places is not None or arguments.geometric_check is not None:
+        parser.error('--exclude-places and --geometric-check go with --loop')
+    if (arguments.map is None) != (arguments.query is None):
+        parser.error('--map and --query go together')
+    if truth and arguments.map is None:
+        parser.error('--truth goes with --map and --query')
+    if truth not in (None, 'identity'):
+        parser.error(
+            f'--truth {truth}: expected identity; files are for --loop, and for evaluate'
+        )
+
+
+def _print(text: object) -> None:
     print(text, flush=True)
 
 
-def image_records(drive: 'Drive', name: str, epoch: int | None = None) -> Iterator[Any]:
-    """
-    Render a made-up drive.
-
-    :param epoch: stamp of its first image, ns; None = the drive's own.
-    """
-    from tqdm import tqdm
-
-    from stavpr_ros.sources.frame import ImageRecord
-
-    later = 0 if epoch is None else epoch - int(drive.stamps[0])
-    for frame in tqdm(drive, desc=name, unit='image', disable=None):
-        yield ImageRecord.of_image(frame.image, frame.stamp + later, frame_id='camera')
+def _skip(error: StavprError) -> None:
+    _print(f'   skipped: {error}')
 
 
-def make_room(bag: Path) -> None:
-    """
-    Remove the bag that an earlier demonstration wrote.
+def _require_all(place_map: 'PlaceMap', images: int) -> None:
+    """Reject a ground truth by number where images were skipped."""
+    if len(place_map) != images:
+        raise SourceError(
+            'images were skipped: the ground truth of the others is unknown; repair or remove them'
+        )
 
-    :raises SourceError: something else is there; it is left alone.
-    """
-    from stavpr_ros.sources.bag_file import METADATA
 
+def _run(arguments: argparse.Namespace) -> None:
+    began = time.monotonic()
+    folder = Path(arguments.output)
     try:
-        if {file.name for file in bag.iterdir()} <= {METADATA, f'{bag.name}.db3'}:
-            shutil.rmtree(bag)
-            return
-    except FileNotFoundError:
-        return
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SourceError(f'{bag} cannot be replaced: {error}; choose another --output') from error
-    raise SourceError(
-        f'{bag} is there already and no bag of an earlier demo: it is left alone; choose another --output'
-    )
+        raise SourceError(f'folder {folder} cannot be made: {error}') from error
+    if arguments.loop is None:
+        _localization(arguments, folder)
+    else:
+        _loop_closure(arguments, folder)
+    _print(f'   {time.monotonic() - began:.0f} s in all')
 
 
-def _make_world(folder: Path, seed: int) -> Drives:
-    """Drive twice through a made-up street and write a bag of each drive."""
-    from stavpr_ros.demonstration.street import World, first_drive, ground_truth, second_drive
-    from stavpr_ros.sources.bag_writer import write_bag
+def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair':
+    from stavpr_ros.demonstration.recordings import own_pair, synthetic_pair
 
-    say('1. Two drives through a made-up street')
-    bags = folder / 'first_drive', folder / 'second_drive'
-    for bag in bags:
-        make_room(bag)
-    world = World(seed)
-    first, second = first_drive(world), second_drive(world)
-    for drive, bag in zip((first, second), bags, strict=True):
-        write_bag(bag, TOPIC, image_records(drive, bag.name.replace('_', ' ')))
-    title = 'A made-up street, by day and in the rain at dusk'
-    return Drives(str(bags[0]), str(bags[1]), (TOPIC, TOPIC), ground_truth(first, second), title)
-
-
-def _users_drives(arguments: argparse.Namespace) -> Drives:
-    import numpy as np
-
-    from stavpr_ros.sources import open_source
-    from stavpr_ros.sources.bag_file import is_bag
-
-    say(f'1. Your drives: {arguments.map} is the map, {arguments.query} the query')
-    paths = arguments.map, arguments.query
-    first, second = (arguments.topic if is_bag(Path(path)) else None for path in paths)
-    places, images = len(open_source(arguments.map, first)), len(open_source(arguments.query, second))
-    if arguments.topic is not None and first is second is None:
-        raise SettingsError(f'--topic {arguments.topic}: neither drive is a bag; leave it out')
+    if not arguments.map:
+        _print('1. Two traverses of a synthetic street')
+        return synthetic_pair(folder, arguments.street_seed)
+    _print(f'1. Your traverses: {arguments.map} is the map, {arguments.query} the query')
+    identity = arguments.truth == 'identity'
     length = arguments.sequence_length
-    if images < length:
-        raise SettingsError(f'{arguments.query} has {images} images: the window alone needs {length}')
-    truth = None
-    if arguments.truth == 'identity':
-        if images > places:
-            raise SettingsError(f'--truth identity: {images} query images on a map of {places} places')
-        truth = np.arange(images)
-    title = f'{Path(arguments.query).name} recognized on the map of {Path(arguments.map).name}'
-    return Drives(*paths, (first, second), truth, title)
+    return own_pair(arguments.map, arguments.query, arguments.topic, identity, length)
 
 
-def extract_map(path: str, topic: str | None, extractor: 'FeatureExtractor') -> 'PlaceMap':
-    """Describe a drive; images that cannot be read are said and skipped, as the replay does."""
-    from stavpr_ros.mapping import build_map
-    from stavpr_ros.sources import open_source
-
-    return build_map(open_source(path, topic, lambda error: say(f'   skipped: {error}')), extractor)
-
-
-def _choose_threshold(place_map: 'PlaceMap', mode: str, given: float | None) -> float:
+def _threshold(place_map: 'PlaceMap', mode: str, given: float | None) -> float:
     from stavpr_ros.recognition.robust.options import THRESHOLD
     from stavpr_ros.recognition.threshold import suggest_threshold
 
@@ -218,89 +171,98 @@ def _choose_threshold(place_map: 'PlaceMap', mode: str, given: float | None) -> 
         threshold = suggest_threshold(place_map, progress=True).threshold
     except InputError as error:
         raise SettingsError(f'{error}; give --threshold') from error
-    say(f'   threshold {threshold:.3f}, from the first drive alone')
+    _print(f'   threshold {threshold:.3f}, estimated from the first traverse')
     return threshold
 
 
-def _tell(result: 'TraverseEvaluation', folder: Path) -> None:
-    say('\n4. What came out')
-    for line in result.summary().splitlines():
-        say(f'   {line}')
-    say(f'   pictures and records are in {folder}/; look at {folder / "demo.png"}')
-
-
-def _run(arguments: argparse.Namespace) -> None:
-    """Do what is asked for, in a folder."""
-    began = time.monotonic()
-    folder = Path(arguments.output)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SourceError(f'folder {folder} cannot be made: {error}') from error
-    if arguments.loop is None:
-        _two_drives(arguments, folder)
-    else:
-        from stavpr_ros.commands.loop_demo import close_loops
-
-        close_loops(arguments, folder)
-    say(f'   {time.monotonic() - began:.0f} s in all')
-
-
-def _two_drives(arguments: argparse.Namespace, folder: Path) -> None:
+def _localization(arguments: argparse.Namespace, folder: Path) -> None:
+    """Recognize the second traverse on a map of the first."""
     from stavpr_ros.commands.feature_options import make_extractor
     from stavpr_ros.demonstration.plots import draw_result
     from stavpr_ros.evaluation.records import evaluate_records
     from stavpr_ros.mapping import save_map
     from stavpr_ros.ros.live import run_live
 
-    drives = _users_drives(arguments) if arguments.map else _make_world(folder, arguments.world_seed)
-
-    map_path = folder / 'map.stavpr'
-    say(f'2. The map of the first drive: {map_path}')
-    place_map = extract_map(drives.reference, drives.topics[0], make_extractor(arguments))
+    pair = _traverse_pair(arguments, folder)
+    length, map_path = arguments.sequence_length, folder / 'map.stavpr'
+    _print(f'2. The map of the first traverse: {map_path}')
+    place_map = pair.reference.build_map(make_extractor(arguments), _skip)
     save_map(place_map, map_path)
-    threshold = _choose_threshold(place_map, arguments.mode, arguments.threshold)
+    threshold = _threshold(place_map, arguments.mode, arguments.threshold)
 
-    say('3. The second drive through the node, over ROS, with replay and listener as processes of their own')
-    query = extract_map(drives.query, drives.topics[1], place_map.extractor())
-    if drives.truth is not None and len(query) != len(drives.truth):
-        raise SourceError('images were skipped: the truth of the others is not known; repair or remove them')
+    _print('3. The second traverse through the node, over ROS, with a replay and a recorder')
+    query = pair.query.build_map(place_map.extractor(), _skip)
+    if pair.true_places is not None:
+        _require_all(query, len(pair.true_places))
     parameters = {
         'map_path': map_path,
         'mode': arguments.mode,
         'threshold': threshold,
-        'sequence_length': arguments.sequence_length,
-        'keyframe_change': 0.0,  # every image is judged
+        'sequence_length': length,
+        'keyframe_change': 0.0,  # every image is evaluated
     }
-    records = run_live(parameters, drives.query, len(query), folder, drives.topics[1])
-    result = evaluate_records(records, arguments.sequence_length, threshold, drives.truth, arguments.tolerance)
-    draw_result(result, query, place_map, threshold, drives.title, folder)
-    _tell(result, folder)
+    records = run_live(parameters, pair.query.path, len(query), folder, pair.query.topic)
+    result = evaluate_records(records, length, threshold, pair.true_places, arguments.tolerance)
+    draw_result(result, query, place_map, threshold, pair.title, folder)
+    _report('4', result.summary(), folder / 'demo.png')
 
 
-def _refuse_wrong_usage(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    if arguments.threshold is not None and not arguments.threshold > 0:
-        parser.error(f'--threshold {arguments.threshold} must be above 0')
-    for name, least in (('tolerance', 0), ('exclude', 1), ('sequence_length', 2)):
-        value = getattr(arguments, name)
-        if value is not None and value < least:
-            parser.error(f'--{name.replace("_", "-")} {value} must be at least {least}')
-    if arguments.loop is not None:
-        if arguments.map or arguments.query:
-            parser.error('--loop is one drive: leave --map and --query out')
-        if arguments.truth == 'identity' or (arguments.truth and not arguments.loop):
-            parser.error('--loop FOLDER takes a file as --truth; the made-up street knows its own')
-        if arguments.mode == 'paper' and arguments.threshold is None:
-            parser.error('--loop in mode paper needs --threshold')
-        return
-    if arguments.exclude is not None or arguments.check is not None:
-        parser.error('--exclude and --check go with --loop')
-    if (arguments.map is None) != (arguments.query is None):
-        parser.error('--map and --query go together')
-    if arguments.truth and arguments.map is None:
-        parser.error('--truth goes with --map and --query: the made-up street knows its own')
-    if arguments.truth not in (None, 'identity'):
-        parser.error(f'--truth {arguments.truth}: expected identity; files are for --loop, and for evaluate')
+def _loop_traverse(arguments: argparse.Namespace, folder: Path, exclude: int) -> 'LoopTraverse':
+    from stavpr_ros.demonstration.recordings import own_loop, synthetic_loop
+
+    tolerance = arguments.tolerance
+    if arguments.loop == SYNTHETIC:
+        _print('1. One traverse twice along a synthetic street, then on the other lane and with '
+               'a detour')  # fmt: skip
+        return synthetic_loop(folder, arguments.street_seed, exclude, tolerance)
+    _print(f'1. Your traverse: {arguments.loop}')
+    return own_loop(arguments.loop, arguments.topic, arguments.truth, exclude, tolerance)
+
+
+def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
+    """Find the loop closures of one traverse."""
+    from stavpr_ros.commands.feature_options import make_extractor
+    from stavpr_ros.demonstration.loops import draw_loops, read_result
+    from stavpr_ros.recognition.robust.options import LOOP_THRESHOLD
+    from stavpr_ros.ros.live import run_loop_closure
+
+    exclude = arguments.exclude_places or EXCLUDE_PLACES
+    length = arguments.sequence_length
+    traverse = _loop_traverse(arguments, folder, exclude)
+    recording = traverse.recording
+    if exclude + length >= traverse.N:
+        raise SettingsError(
+            f'{recording.path} has {traverse.N} images: --exclude-places {exclude} leaves no '
+            f'window of {length}'
+        )
+    extractor = make_extractor(arguments)
+    place_map = recording.build_map(extractor, _skip)
+    if traverse.ground_truth is not None:
+        _require_all(place_map, traverse.N)
+    features = folder / 'features.stavpr'
+    recording.save_feature_settings(extractor, features)
+
+    _print('2. The traverse through the node, over ROS, with a replay and recorders')
+    parameters = {
+        'map_path': features,
+        'mode': arguments.mode,
+        'threshold': arguments.threshold or LOOP_THRESHOLD,
+        'sequence_length': length,
+        'exclude_places': exclude,
+        'geometric_check': arguments.geometric_check or GEOMETRIC_CHECK,
+    }
+    matches, closures = run_loop_closure(
+        parameters, recording.path, len(place_map), folder, recording.topic
+    )
+    result = read_result(matches, closures, traverse.ground_truth, exclude)
+    _report('3', result.summary(), draw_loops(result, place_map, traverse.title, folder))
+
+
+def _report(number: str, summary: str, plot: Path) -> None:
+    _print(f'\n{number}. Result')
+    for line in summary.splitlines():
+        _print(f'   {line}')
+    _print(f'   plots and records are in {plot.parent}/; start with {plot}')
 
 
 def main(args: list[str] | None = None) -> int:
@@ -310,7 +272,7 @@ def main(args: list[str] | None = None) -> int:
     try:
         parser = _parser()
         arguments = parser.parse_args(args)
-        _refuse_wrong_usage(parser, arguments)
+        _check(parser, arguments)
         _run(arguments)
     except StavprError as error:
         print(f'demo: {error}', file=sys.stderr)

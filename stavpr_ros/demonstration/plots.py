@@ -19,7 +19,9 @@ def outcomes_of(result: TraverseEvaluation) -> list[Outcome]:
     if result.true_places is None or result.correct is None:
         return ['match' if accepted else 'no match' for accepted in result.accepted]
     names: list[Outcome] = []
-    for accepted, correct, truth in zip(result.accepted, result.correct, result.true_places, strict=True):
+    for accepted, correct, truth in zip(
+        result.accepted, result.correct, result.true_places, strict=True
+    ):
         missed: Outcome = 'unseen' if truth < 0 else 'no match'
         names.append(('right' if correct else 'wrong') if accepted else missed)
     return names
@@ -56,7 +58,9 @@ def _pair(
     place = int(result.matched[image])
     shown = place_map.thumbnail(place) if place >= 0 else None
     if shown is not None:
-        shown = cv2.resize(shown, (picture.shape[1], picture.shape[0]), interpolation=cv2.INTER_CUBIC)
+        shown = cv2.resize(
+            shown, (picture.shape[1], picture.shape[0]), interpolation=cv2.INTER_CUBIC
+        )
     return MatchPair(picture, shown, _caption(result, image), outcome)
 
 
@@ -66,7 +70,12 @@ def _matrix(features: LocalFeatures, place_map: PlaceMap) -> np.ndarray:
 
 
 def draw_result(
-    result: TraverseEvaluation, query: PlaceMap, place_map: PlaceMap, threshold: float, title: str, folder: Path
+    result: TraverseEvaluation,
+    query: PlaceMap,
+    place_map: PlaceMap,
+    threshold: float,
+    title: str,
+    folder: Path,
 ) -> None:
     """
     Draw the page ``demo.png``, and its parts in pictures of their own.

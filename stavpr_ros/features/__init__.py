@@ -5,7 +5,7 @@ The names below are imported on first use: :mod:`stavpr_ros.features.registry` l
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from stavpr_ros.features.extractor import FeatureExtractor, FeatureSettings, LocalFeatures

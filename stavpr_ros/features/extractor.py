@@ -1,17 +1,16 @@
 """Images to local features: backbone, strips, projection; and the record of their settings."""
 
-import dataclasses
-import json
 from collections.abc import Sequence
+import dataclasses
 from dataclasses import dataclass
+import json
 from typing import Any
 
 import numpy as np
-import torch
-
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, SettingsError
 from stavpr_ros.features.projection import Projection
 from stavpr_ros.features.registry import Backbone, backbone_class, settings_class
+import torch
 
 
 @dataclass(frozen=True)
@@ -162,7 +161,8 @@ class FeatureExtractor:
         extractor = cls(settings.kind, backbone, settings.strips, projection, device=device)
         if extractor.settings != settings:
             raise FeatureMismatchError(
-                f'this extractor has the settings {extractor.settings.to_json()}, the map requires '
+                f'this extractor has the settings {extractor.settings.to_json()}, the map '
+                'requires '
                 f'{settings.to_json()}'
             )
         return extractor

@@ -7,18 +7,17 @@ Detection", CVPR 2005; one channel an orientation, the mean over the four normal
 a compiled kernel computes them image by image, elsewhere torch for the whole batch.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+import math
 
 import cv2
 import numpy as np
-import torch
-from torch.nn.functional import avg_pool2d, pad
-
 from stavpr_ros.features.gradient_kernel import gradient_maps
 from stavpr_ros.features.preprocessing import resize_square
 from stavpr_ros.features.registry import GradientSettings
+import torch
+from torch.nn.functional import avg_pool2d, pad
 
 FLOOR = 1e-4  # squared gradient (intensities 0..1) below which a block counts as flat
 PER_THREAD = 8  # images at least: starting a thread costs as much as one or two images
@@ -90,7 +89,7 @@ def feature_maps_by_torch(gray: torch.Tensor, settings: GradientSettings) -> tor
 
 
 def _histograms(gray: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
-    """Pool the gradients by orientation over cells that overlap by half, (n, bins, cells, cells)."""
+    """Pool the gradients over cells that overlap by half, (n, bins, cells, cells)."""
     padded = pad(gray[:, None].float() / 255, (1, 1, 1, 1), mode='replicate')
     dx = padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]
     dy = padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]
@@ -99,7 +98,9 @@ def _histograms(gray: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
     position = (torch.atan2(dy, dx) * (bins / period)).remainder_(bins)
     centers = torch.arange(bins, dtype=torch.float32, device=gray.device)
     offset = (position - centers[None, :, None, None]).abs_()
-    share = torch.clamp_(1 - torch.minimum(offset, bins - offset), min=0)  # linear between two bins
+    share = torch.clamp_(
+        1 - torch.minimum(offset, bins - offset), min=0
+    )  # linear between two bins
     cell = settings.cell
     return avg_pool2d(share.mul_(torch.hypot(dx, dy)), 2 * cell, stride=cell, padding=cell // 2)
 

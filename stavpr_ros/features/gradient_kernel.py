@@ -10,7 +10,6 @@ two by two of them. No ``fastmath``: the features are equal on every machine.
 
 import cv2
 import numpy as np
-
 from stavpr_ros.compilation import kernel
 
 F = np.float32
@@ -48,14 +47,16 @@ def _feature_maps(padded: np.ndarray, cell: int, period: F, floor: F, maps: np.n
     orientations, cells = maps.shape[:2]
     chunks = np.empty((cells + 1, orientations, cells + 1), F)
     _sum_over_chunks(padded, cell, period, chunks)
-    energy = np.empty((cells + 2, cells + 2), F)  # with a border of one cell, equal to its neighbor
+    energy = np.empty(
+        (cells + 2, cells + 2), F
+    )  # with a border of one cell, equal to its neighbor
     _chunks_to_cells(chunks, F(1) / (FULL_SCALE * F(4 * cell * cell)), maps, energy)
     _normalize(maps, energy, floor)
 
 
 @kernel
 def _sum_over_chunks(padded: np.ndarray, cell: int, period: F, chunks: np.ndarray) -> None:
-    """Add up the gradients of each chunk by orientation; chunks is (rows, orientations, columns)."""
+    """Sum the gradients of each chunk by orientation; chunks: (rows, orientations, columns)."""
     size, orientations = padded.shape[0] - 2, chunks.shape[1]
     position, magnitude = np.empty(size, F), np.empty(size, F)
     columns = np.empty((orientations, size), F)
@@ -64,7 +65,9 @@ def _sum_over_chunks(padded: np.ndarray, cell: int, period: F, chunks: np.ndarra
         columns[:] = 0
         first, end = _chunk(row, cell, size)
         for y in range(first, end):
-            _to_polar(padded[y], padded[y + 1], padded[y + 2], period, per_turn, position, magnitude)
+            _to_polar(
+                padded[y], padded[y + 1], padded[y + 2], period, per_turn, position, magnitude
+            )
             _share_out(position, magnitude, columns)
         for b in range(orientations):
             for column in range(chunks.shape[2]):
@@ -77,7 +80,7 @@ def _sum_over_chunks(padded: np.ndarray, cell: int, period: F, chunks: np.ndarra
 
 @kernel
 def _chunk(index: int, cell: int, size: int) -> tuple[int, int]:
-    """Return the first pixel of a chunk and the one after its last; those at the border are cut."""
+    """Return the first pixel of a chunk and the one after its last, cut at the border."""
     start = index * cell - cell // 2
     return max(0, start), min(size, start + cell)
 
@@ -103,7 +106,9 @@ def _to_polar(
         width, height = abs(dx), abs(dy)
         longer = width if width > height else height
         shorter = height if width > height else width
-        t = shorter / (longer if longer > F(1) else F(1))  # whole numbers: longer is 0 or at least 1
+        t = shorter / (
+            longer if longer > F(1) else F(1)
+        )  # whole numbers: longer is 0 or at least 1
         u = t * t
         turn = t * (P0 + u * (P1 + u * (P2 + u * (P3 + u * (P4 + u * (P5 + u * P6))))))
         turn = F(0.25) - turn if height > width else turn

@@ -11,12 +11,11 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-import torch
-
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.preprocessing import resize_square
 from stavpr_ros.features.registry import OnnxSettings
 from stavpr_ros.features.weights import open_weights
+import torch
 
 
 def _import_extra() -> tuple[ModuleType, ModuleType]:

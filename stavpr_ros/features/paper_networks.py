@@ -9,27 +9,26 @@ VGG16: configuration D of Simonyan, Zisserman, "Very deep convolutional networks
 image recognition", ICLR 2015, with torchvision's ImageNet weights; its fourth pooling layer.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
+import re
 from typing import ClassVar
 
 import numpy as np
-import torch
-from torch import nn
-from torch.nn.functional import avg_pool2d, max_pool2d, relu
-
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features.preprocessing import BatchMaker
 from stavpr_ros.features.registry import CACHED, DOWNLOAD, PublishedSettings
 from stavpr_ros.features.weights import (
-    PublishedFile,
     expected_hash,
     find_weights,
     load_parameters,
     open_weights,
+    PublishedFile,
     read_checkpoint,
 )
+import torch
+from torch import nn
+from torch.nn.functional import avg_pool2d, max_pool2d, relu
 
 PER_PASS = 32  # images that go through a network together: bounds its memory
 

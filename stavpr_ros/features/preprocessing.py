@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import torch
-
 from stavpr_ros.features.registry import IMAGENET_MEAN, IMAGENET_STD
+import torch
 
 
 def resize_square(image: np.ndarray, size: int, method: str) -> np.ndarray:

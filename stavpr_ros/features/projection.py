@@ -1,22 +1,21 @@
 """Gaussian random projection (GRP) of local features to fewer dimensions (section 3)."""
 
-import hashlib
 from dataclasses import dataclass
 from functools import cached_property
+import hashlib
 
 import numpy as np
-import torch
-
 from stavpr_ros.errors import InputError, SettingsError
+import torch
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
     """
-    A fixed linear map of local features; a map file keeps its matrix, so that it is the same everywhere.
+    A fixed linear map of local features; map files store its matrix.
 
     :param matrix: shape (d, dimension), float32.
-    :param name: how it was made, for people.
+    :param name: description of its origin.
     """
 
     matrix: np.ndarray
@@ -25,13 +24,14 @@ class Projection:
     @classmethod
     def gaussian(cls, dimension_in: int, dimension: int = 512, seed: int = 0) -> 'Projection':
         """
-        Draw a Gaussian matrix, entries of variance 1 / dimension, so that norms are kept on average.
+        Draw a Gaussian matrix, entries of variance 1 / dimension: norms are kept on average.
 
         :raises SettingsError: a dimension below 1, or a negative seed.
         """
         if dimension_in < 1 or dimension < 1 or seed < 0:
             raise SettingsError(
-                f'projection {dimension_in} -> {dimension}, seed {seed}: expected dimensions >= 1, seed >= 0'
+                f'projection {dimension_in} -> {dimension}, seed {seed}: expected dimensions >= '
+                '1, seed >= 0'
             )
         matrix = np.random.default_rng(seed).standard_normal((dimension_in, dimension))
         return cls(
@@ -41,7 +41,7 @@ class Projection:
 
     @cached_property
     def identity(self) -> str:
-        """What two projections must share to be the same: their name and the hash of their matrix."""
+        """Name and hash of the matrix; equal for equal projections only."""
         digest = hashlib.sha256(np.ascontiguousarray(self.matrix).tobytes()).hexdigest()
         return f'{self.name}, sha256 {digest[:16]}'
 
@@ -55,6 +55,7 @@ class Projection:
         """
         if strips.shape[-1] != self.matrix.shape[0]:
             raise InputError(
-                f'local features have d = {strips.shape[-1]}, the projection takes {self.matrix.shape[0]}'
+                f'local features have d = {strips.shape[-1]}, the projection takes '
+                f'{self.matrix.shape[0]}'
             )
         return strips @ torch.from_numpy(self.matrix).to(strips.device)

@@ -4,12 +4,12 @@ The kinds of features: their settings, and the table of the kinds.
 Imports neither torch nor OpenCV, so that parameters and command-line options load quickly.
 """
 
+from collections.abc import Sequence
 import dataclasses
+from dataclasses import dataclass
 import importlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TYPE_CHECKING
 
 from stavpr_ros.errors import SettingsError
 
@@ -25,7 +25,12 @@ _RESIZE_HELP = 'how images are resized: bilinear, or area (averages, no aliasing
 _HALF_HELP = 'float16 on a GPU: faster, nearly the same features; no effect on a CPU'
 
 
-def setting(default: Any = dataclasses.MISSING, *, help: str, identity: bool = True) -> Any:
+def setting(
+    default: Any = dataclasses.MISSING,
+    *,
+    help: str,  # noqa: A002  (as argparse has it)
+    identity: bool = True,
+) -> Any:
     """
     Declare a field of a kind's settings.
 

@@ -6,19 +6,18 @@ reach files through torch's operators: take such files only from a source that y
 would trust a program.
 """
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+import re
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.preprocessing import BatchMaker
 from stavpr_ros.features.registry import TorchScriptSettings
 from stavpr_ros.features.weights import expected_hash, last_line, open_weights
+import torch
 
 
 class TorchScript:
@@ -92,7 +91,9 @@ def up_to_module(
     """
     modules = [path for path, _ in network.named_modules() if path]
     if layer not in modules:
-        shown = ', '.join(modules[:60]) + (', ...' if len(modules) > 60 else '') if modules else 'none'
+        shown = (
+            ', '.join(modules[:60]) + (', ...' if len(modules) > 60 else '') if modules else 'none'
+        )
         raise SettingsError(f'{name} has no layer {layer!r}: its layers are {shown}')
     cuts: list[tuple[_Cut, Any]] = []  # and the module whose program is cut
     module, method = network._c, 'forward'
@@ -101,7 +102,8 @@ def up_to_module(
         cut = _before_call(module._get_method(method).graph.copy(), rest)
         if cut is None:
             raise SettingsError(
-                f'{name} has the layer {layer!r}, but calls it in a branch or loop, or not at all: '
+                f'{name} has the layer {layer!r}, but calls it in a branch or loop, or not at '
+                'all: '
                 'make the file with torch.jit.trace, or of the part up to this layer'
             )
         cuts.append((cut, module))

@@ -1,24 +1,23 @@
 """Files of weights: paths, downloads, hashes; and checkpoints into networks."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 import hashlib
 import http.client
 import os
+from pathlib import Path
 import re
 import sys
 import tempfile
+from typing import Any, BinaryIO, IO
 import urllib.request
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import IO, Any, BinaryIO
 
 import numpy as np
+from stavpr_ros.errors import FeatureMismatchError, UnavailableError
+from stavpr_ros.features.registry import CACHED, DOWNLOAD
 import torch
 from torch import nn
 from tqdm import tqdm
-
-from stavpr_ros.errors import FeatureMismatchError, UnavailableError
-from stavpr_ros.features.registry import CACHED, DOWNLOAD
 
 TIMEOUT = 30  # seconds without a byte
 PIECE = 1 << 20  # bytes
@@ -166,7 +165,7 @@ def download(address: str, path: Path, expected: str = '') -> None:
 
 def _fetch(address: str, file: IO[bytes], name: str) -> str:
     """Copy the content of an address into a file and return its sha256."""
-    digest = hashlib.sha256()
+    digest, received = hashlib.sha256(), 0
     with urllib.request.urlopen(address, timeout=TIMEOUT) as response:
         length = response.headers.get('Content-Length')
         total = int(length) if length and length.isdigit() else None
@@ -174,8 +173,8 @@ def _fetch(address: str, file: IO[bytes], name: str) -> str:
             while piece := response.read(PIECE):
                 file.write(piece)
                 digest.update(piece)
+                received += len(piece)
                 bar.update(len(piece))
-            received = file.tell()
     if total is not None and received != total:
         raise OSError(f'only {received} of {total} bytes received')
     return digest.hexdigest()
@@ -198,7 +197,7 @@ def read_checkpoint(file: BinaryIO, name: str) -> dict[str, torch.Tensor]:
         reason = last_line(error)
         blocked = re.search(r'GLOBAL (\S+)', str(error))
         if blocked:
-            reason = f'it asks for {blocked[1]}, which is not plain weights and was not executed'
+            reason = f'it requires {blocked[1]}, which is not plain weights and was not executed'
         raise UnavailableError(f'{name} cannot be read as a file of weights: {reason}') from error
     if isinstance(content, Mapping) and isinstance(content.get('state_dict'), Mapping):
         content = content['state_dict']
@@ -224,9 +223,7 @@ def _kind(value: Any) -> str:
     return 'nothing' if empty else f'a {type(value).__name__}'
 
 
-def load_parameters(
-    network: nn.Module, parameters: Mapping[str, torch.Tensor], name: str
-) -> None:
+def load_parameters(network: nn.Module, parameters: Mapping[str, torch.Tensor], name: str) -> None:
     """
     Load all parameters of a network, which must be there and fit, and no others; cpu, float32.
 
@@ -258,9 +255,7 @@ def load_parameters(
         # numpy: torch would start its threads for each of 800 parameters
         if not np.isfinite(floats[key].numpy()).all():
             raise UnavailableError(f'{name} is damaged: {key} holds NaN or infinite numbers')
-    counters = {
-        key: torch.zeros((), dtype=torch.long) for key in state if key.endswith(COUNTER)
-    }
+    counters = {key: torch.zeros((), dtype=torch.long) for key in state if key.endswith(COUNTER)}
     network.load_state_dict(floats | counters, assign=True)
 
 

@@ -7,16 +7,15 @@ from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
-
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping.keyframes import KeyframeSelector, KeyframeSettings
-from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH, PlaceMap, encode_thumbnail
-from stavpr_ros.mapping.trajectory import Trajectory, checked_pose
+from stavpr_ros.mapping.place_map import encode_thumbnail, PlaceMap, THUMBNAIL_WIDTH
+from stavpr_ros.mapping.trajectory import checked_pose, Trajectory
 from stavpr_ros.sources.frame import Frame
+from tqdm import tqdm
 
-BATCH = 16  # images described at a time
+BATCH = 16  # images extracted at a time
 
 
 class _Place(NamedTuple):
@@ -27,9 +26,11 @@ class _Place(NamedTuple):
     pose: np.ndarray | None
 
 
-def extract_features(frames: Iterable[Frame], extractor: FeatureExtractor, progress: bool = True) -> LocalFeatures:
+def extract_features(
+    frames: Iterable[Frame], extractor: FeatureExtractor, progress: bool = True
+) -> LocalFeatures:
     """
-    Describe every image of a sequence, in batches.
+    Extract the features of every image of a sequence, in batches.
 
     :param frames: a sequence of frames; its length, if it has one, scales the progress bar.
     :returns: local features of all images.
@@ -50,21 +51,23 @@ def build_map(
     """
     Make a map with one place for each image, or for each keyframe.
 
-    The next images are decoded by another thread while the last ones are described.
+    The next images are decoded by another thread during the extraction of the last ones.
 
-    :param frames: images in the order in which the route was driven.
-    :param extractor: makes their features; the map remembers its settings.
-    :param poses: of each image, shape (images, 7), see :class:`PlaceMap`; or by the images' stamps.
-    :param thumbnails: keep a small picture of each place.
+    :param frames: images in the order of the route.
+    :param extractor: of their features; the map records its settings.
+    :param poses: of each image, shape (images, 7), see :class:`PlaceMap`; or by their stamps.
+    :param thumbnails: keep a small image of each place.
     :param progress: show a progress bar.
-    :param keyframes: which images become places; None = all.
-    :param thumbnail_width: of the small pictures, pixels.
-    :raises InputError: no images, none that became a place, or poses that do not fit.
+    :param keyframes: minimum differences between places; None = every image is one.
+    :param thumbnail_width: pixels.
+    :raises InputError: no images, no places, or poses that do not fit.
     :raises SettingsError: a rule of motion without poses.
     """
     keyframes = keyframes or KeyframeSettings()
     if keyframes.needs_poses and poses is None:
-        raise SettingsError('keyframe meters or degrees without poses: give poses, or leave these rules out')
+        raise SettingsError(
+            'keyframe distance or angle without poses: give poses, or leave them out'
+        )
     if thumbnail_width < 1:
         raise SettingsError(f'thumbnail width {thumbnail_width} must be at least 1 pixel')
     places = _places(frames, poses, keyframes)
@@ -73,27 +76,29 @@ def build_map(
     total = len(frames) if isinstance(frames, Sized) else None
     with (
         closing(_batches_ahead(places)) as batches,
-        tqdm(total=total, unit='image', desc='describing', disable=None if progress else True) as bar,
+        tqdm(
+            total=total, unit='image', desc='extracting', disable=None if progress else True
+        ) as bar,
     ):
         for batch in batches:
             features.append(extractor.extract([place.frame.image for place in batch]))
             for _, frame, pose in batch:
-                picture = encode_thumbnail(frame.image, thumbnail_width) if thumbnails else b''
-                found.append((frame.stamp, frame.identifier, pose, picture))
+                thumbnail = encode_thumbnail(frame.image, thumbnail_width) if thumbnails else b''
+                found.append((frame.stamp, frame.identifier, pose, thumbnail))
             bar.update(batch[-1].number + 1 - bar.n)
-    stamps, ids, known, pictures = zip(*found, strict=True)
+    stamps, ids, known, encoded = zip(*found, strict=True)
     return PlaceMap(
         features=LocalFeatures.concatenate(features).to('cpu'),
         projection=extractor.projection,
         stamps=np.array(stamps, np.int64),
         ids=ids,
         poses=_rows(known),
-        thumbnails=pictures if thumbnails else (),
+        thumbnails=encoded if thumbnails else (),
     )
 
 
 def _batches_ahead(places: Generator[_Place, None, None]) -> Generator[list[_Place], None, None]:
-    """Give batches; while one is used, the next is made by a thread of its own, always the same one."""
+    """Yield batches; one other thread makes the next batch in the meantime."""
 
     def take() -> list[_Place]:
         return list(islice(places, BATCH))
@@ -158,7 +163,7 @@ def _pose(row: np.ndarray, name: str) -> np.ndarray | None:
 
 
 def _rows(poses: Iterable[np.ndarray | None]) -> np.ndarray | None:
-    """Return poses as rows, NaN where one is unknown; None if all are."""
+    """Return poses as rows, NaN where unknown; None if all are unknown."""
     rows = [np.full(7, np.nan) if pose is None else pose for pose in poses]
     table = np.array(rows, np.float64)
     return None if np.isnan(table).all() else table

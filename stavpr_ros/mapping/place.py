@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-
 from stavpr_ros.mapping.growing_map import GrowingMap
 from stavpr_ros.mapping.place_map import PlaceMap
 
@@ -28,7 +27,7 @@ def place_at(places: PlaceMap | GrowingMap, index: int) -> Place:
     """
     Return stamp, identifier and pose of a place.
 
-    :param index: 0-based; in a growing map counted from its start, what it has forgotten included.
+    :param index: 0-based; in a growing map counted from its start, evicted places included.
     """
     if isinstance(places, GrowingMap):
         index -= places.first
@@ -39,7 +38,7 @@ def place_at(places: PlaceMap | GrowingMap, index: int) -> Place:
 
 
 def place_thumbnail(places: PlaceMap | GrowingMap, index: int) -> np.ndarray | None:
-    """Return the image that is kept of a place, RGB (h, w, 3) uint8, or None; indices as above."""
+    """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None; indices as above."""
     if isinstance(places, PlaceMap):
         return places.thumbnail(index)
     content = places.thumbnails[index - places.first]

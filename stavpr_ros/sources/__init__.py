@@ -1,4 +1,4 @@
-"""Everything that turns folders, bags and messages into images."""
+"""Folders, bags and messages to images."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,20 +19,24 @@ def open_source(
     """
     Open a folder of images or a bag, whichever it is.
 
-    :param path: a folder of images; a ROS 2 bag (its folder, or its .db3 or .mcap file); a ROS 1 .bag file.
-    :param topic: the bag's image topic; may be left out if there is only one. Not for folders of images.
-    :param on_error: called with the error of an image that cannot be decoded, which is then skipped;
-        without it the error is raised.
-    :raises SourceError: it cannot be read, or which topic is meant is not clear.
+    :param path: a folder of images; a ROS 2 bag (its folder, or its .db3 or .mcap file); a ROS 1
+        .bag file.
+    :param topic: the bag's image topic; may be left out if there is only one. Not for folders of
+        images.
+    :param on_error: called with the error of an image that cannot be decoded, which is then
+        skipped; without it the error is raised.
+    :raises SourceError: it cannot be read, or the topic is ambiguous.
     """
     path = Path(path)
     try:
         there = path.exists()
     except OSError as error:
-        raise SourceError(f'{path} cannot be read: {error}; check its name and permissions') from error
+        raise SourceError(
+            f'{path} cannot be read: {error}; check its name and permissions'
+        ) from error
     if not there:
         raise SourceError(f'{path} does not exist: expected a folder of images or a bag')
-    # imported here: rosbags and OpenCV take a moment that `import stavpr_ros` must not
+    # imported on use: rosbags and OpenCV load slowly
     from stavpr_ros.sources.bag import BagSource, is_bag
     from stavpr_ros.sources.folder import FolderSource
 
@@ -44,5 +48,7 @@ def open_source(
             'or a ROS 1 .bag'
         )
     if topic is not None:
-        raise SourceError(f'topic {topic!r} was given, but {path} is a folder of images: leave the topic out')
+        raise SourceError(
+            f'topic {topic!r} was given, but {path} is a folder of images: leave the topic out'
+        )
     return FolderSource(path, on_error)

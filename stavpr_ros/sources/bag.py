@@ -1,11 +1,12 @@
-"""The images of one topic of a ROS 1 or ROS 2 bag as a sequence."""
+"""The images of one topic of a ROS 1 or ROS 2 bag as a sequence, and its odometry."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from stavpr_ros.errors import ImageError, SourceError
-from stavpr_ros.sources.bag_file import OpenBag, is_bag, message_type, open_bag, reading
+from stavpr_ros.sources.bag_file import is_bag, message_type, open_bag, OpenBag, reading
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.frame import Frame, ImageRecord
 
@@ -13,7 +14,9 @@ __all__ = ['BagSource', 'ImageRecord', 'image_topics', 'is_bag']
 
 RAW = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+ODOMETRY = 'nav_msgs/msg/Odometry'
 SECOND = 1_000_000_000
+LATE = SECOND // 2  # messages may be out of order by so much; more is a clock that jumped back
 Item = TypeVar('Item')
 
 
@@ -26,21 +29,24 @@ def image_topics(path: str | Path) -> dict[str, tuple[str, int]]:
     :raises SourceError: the bag cannot be read.
     """
     with open_bag(Path(path)) as bag:
-        return {topic: found for topic, found in _topics(bag).items() if found[0] in {RAW, COMPRESSED}}
+        return {
+            topic: found for topic, found in _topics(bag).items() if found[0] in {RAW, COMPRESSED}
+        }
 
 
 class BagSource:
     """
     The images of one topic, raw or compressed, in the order of recording.
 
-    Iterating gives :class:`Frame` with the header's stamp (the time of recording where that is 0) and
-    ``topic#i`` as identifier, i counting the topic's messages from 0. Every iteration opens the bag anew.
+    Iterating yields :class:`Frame` with the header's stamp (the time of recording where that is 0)
+    and ``topic#i`` as identifier, i counting the topic's messages from 0. Every iteration opens
+    the bag again.
 
     :param path: a ROS 1 .bag file; a ROS 2 bag: its folder, or its .db3 or .mcap file.
     :param topic: the image topic; may be left out if there is only one.
-    :param on_error: called with the :class:`ImageError` of an image that cannot be decoded, which is then
-        skipped; without it the error is raised.
-    :raises SourceError: the bag cannot be read, there is no such topic, or which one is meant is not clear.
+    :param on_error: called with the :class:`ImageError` of an image that cannot be decoded, which
+        is then skipped; without it the error is raised.
+    :raises SourceError: the bag cannot be read, the topic is missing or ambiguous.
     """
 
     def __init__(
@@ -59,7 +65,7 @@ class BagSource:
         self.message_type, self._count = topics[self.topic]
 
     def __len__(self) -> int:
-        """Return the number of the topic's messages, decodable or not, as the bag states it."""
+        """Return the number of the topic's messages, decodable or not, as stated by the bag."""
         return self._count
 
     def __iter__(self) -> Iterator[Frame]:
@@ -68,7 +74,7 @@ class BagSource:
 
     def records(self) -> Iterator[ImageRecord]:
         """
-        Give the messages as they were recorded; compressed images decoded to ``rgb8``.
+        Yield the messages as recorded; compressed images decoded to ``rgb8``.
 
         :raises SourceError: the bag is damaged further on, or ends early.
         """
@@ -100,7 +106,9 @@ class BagSource:
                 try:
                     item = finish(index, time_ns, self._message(bag, raw))
                 except ImageError as error:
-                    named = ImageError(f'{self.path}, {self.topic}#{index}: {error}', kind=error.kind)
+                    named = ImageError(
+                        f'{self.path}, {self.topic}#{index}: {error}', kind=error.kind
+                    )
                     if self.on_error is None:
                         raise named from error
                     self.on_error(named)
@@ -108,8 +116,9 @@ class BagSource:
                 yield item
             if index + 1 < self._count:
                 raise SourceError(
-                    f'{self.path} ends early: {index + 1} of the {self._count} messages of {self.topic} '
-                    'that it states are there; try `ros2 bag reindex`'
+                    f'{self.path} ends early: {index + 1} of the {self._count} messages of '
+                    f'{self.topic} '
+                    'that it states are present; try `ros2 bag reindex`'
                 )
 
     def _messages(self, bag: OpenBag) -> Iterator[tuple[int, bytes]]:
@@ -121,7 +130,7 @@ class BagSource:
     def _message(self, bag: OpenBag, raw: bytes) -> Any:
         try:
             return bag.deserialize(raw, self.message_type)
-        except Exception as error:  # garbage makes a parser raise errors of many kinds
+        except Exception as error:  # garbage raises errors of any type
             raise ImageError(
                 f'{len(raw)} bytes are no {self.message_type}: {error}', kind='damaged'
             ) from error
@@ -143,24 +152,96 @@ def _topics(bag: OpenBag) -> dict[str, tuple[str, int]]:
 
 
 def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -> str:
-    """Find the topic that is meant, or say what there is."""
+    """Return the requested topic, or the only one; an error lists the topics."""
     images = {name: found for name, found in topics.items() if found[0] in {RAW, COMPRESSED}}
     if topic is not None:
         name = next((name for name in topics if name.lstrip('/') == topic.lstrip('/')), None)
         if name in images:
             if not images[name][1]:
-                raise SourceError(f'topic {name!r} of {path} has no messages: there are {_listed(images)}')
+                raise SourceError(
+                    f'topic {name!r} of {path} has no messages: there are {_listed(images)}'
+                )
             return name
-        what = 'is not in' if name is None else f'is of type {topics[name][0]}, not an image, in'
-        raise SourceError(f'topic {topic!r} {what} {path}: expected one of {_listed(images or topics)}')
+        where = 'is not in' if name is None else f'is of type {topics[name][0]}, not an image, in'
+        raise SourceError(
+            f'topic {topic!r} {where} {path}: expected one of {_listed(images or topics)}'
+        )
     filled = {name: found for name, found in images.items() if found[1]}
     if len(filled) == 1:
         return next(iter(filled))
     if filled:
-        raise SourceError(f'{path} has {len(filled)} image topics, choose one (--topic): {_listed(filled)}')
-    raise SourceError(f'{path} has no images (expected {RAW} or {COMPRESSED}): there are {_listed(topics)}')
+        raise SourceError(
+            f'{path} has {len(filled)} image topics, choose one (--topic): {_listed(filled)}'
+        )
+    raise SourceError(
+        f'{path} has no images (expected {RAW} or {COMPRESSED}): there are {_listed(topics)}'
+    )
 
 
 def _listed(topics: dict[str, tuple[str, int]]) -> str:
     rows = [f'{name} ({kind}, {count} messages)' for name, (kind, count) in topics.items()]
     return ', '.join(rows) or 'no topics at all'
+
+
+def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Read the poses of one topic of ``nav_msgs/Odometry``.
+
+    :param path: a ROS 1 .bag file; a ROS 2 bag: its folder, or its .db3 or .mcap file.
+    :param topic: with or without the leading slash.
+    :returns: stamps of the headers (times of recording where they are 0), ns, shape (m,), int64,
+        in order; x y z (meters) and quaternion x y z w, shape (m, 7), float64, as recorded.
+    :raises SourceError: the bag cannot be read, the topic is missing, or time jumps back in it.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise SourceError(f'{path} does not exist: expected a bag')
+    stamps, poses = [], []
+    with open_bag(path) as bag:
+        wanted = _connections(bag, path, topic)
+        with reading(path):
+            for connection, time_ns, raw in bag.reader.messages(wanted):
+                message = bag.deserialize(raw, message_type(connection))
+                stamp = message.header.stamp
+                stamps.append(stamp.sec * SECOND + stamp.nanosec or time_ns)
+                poses.append(_pose(message.pose.pose))
+    if not stamps:
+        raise SourceError(f'odometry {topic!r} of {path} has no messages: expected at least one')
+    when, where = np.array(stamps, np.int64), np.array(poses, np.float64)
+    _require_one_run(when, f'odometry {topic!r} of {path}')
+    order = np.argsort(when, kind='stable')
+    return when[order], where[order]
+
+
+def _connections(bag: OpenBag, path: Path, topic: str) -> list[Any]:
+    found = [
+        connection
+        for connection in bag.connections
+        if connection.topic.strip('/') == topic.strip('/')
+    ]
+    kinds = {message_type(connection) for connection in found}
+    if kinds == {ODOMETRY}:
+        return found
+    where = (
+        f'is of type {" and ".join(sorted(kinds))}, not {ODOMETRY}, in' if kinds else 'is not in'
+    )
+    others = {
+        connection.topic for connection in bag.connections if message_type(connection) == ODOMETRY
+    }
+    listed = ', '.join(sorted(others)) or 'none'
+    raise SourceError(f'odometry topic {topic!r} {where} {path}: topics of that type are {listed}')
+
+
+def _pose(pose: Any) -> tuple[float, ...]:
+    p, q = pose.position, pose.orientation
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
+
+
+def _require_one_run(stamps: np.ndarray, name: str) -> None:
+    back = np.maximum.accumulate(stamps) - stamps
+    if back.max() > LATE:
+        i = int(np.argmax(back > LATE))
+        raise SourceError(
+            f'{name} goes back by {back[i] / SECOND:.1f} s at message {i}: expected one run, cut '
+            'the bag'
+        )

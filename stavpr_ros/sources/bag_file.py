@@ -1,25 +1,24 @@
-"""Opens bag files of every kind with rosbags, without ever writing beside them."""
+"""Opens bag files of every kind with rosbags, without writing beside them."""
 
-import shutil
-import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+import shutil
+import sqlite3
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
-from rosbags.typesys import Stores, get_typestore
-
+from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import SourceError, StavprError
 
 METADATA = 'metadata.yaml'
 STORAGE_SUFFIXES = frozenset({'.db3', '.mcap'})
 LOG_SUFFIXES = ('-wal', '-journal')
-"""What SQLite keeps beside a database: writes that are not in the database itself yet."""
+"""Files of SQLite beside a database with writes that are not in the database yet."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +27,8 @@ class OpenBag:
     A bag that is open for reading.
 
     :param reader: of rosbags.
-    :param deserialize: (bytes, message type) to message. Only types of ``sensor_msgs`` and ``nav_msgs`` are
-        read, which are the same in every distribution: no definition is needed from the bag, old ones have
-        none.
+    :param deserialize: (bytes, message type) to message. Only types of ``sensor_msgs`` and
+        ``nav_msgs`` are read, equal in every distribution: no definition in the bag is needed.
     """
 
     reader: Ros1Reader | Ros2Reader
@@ -38,15 +36,15 @@ class OpenBag:
 
     @property
     def connections(self) -> list[Connection]:
-        """What was recorded, one entry per topic and publisher."""
+        """The recorded connections, one per topic and publisher."""
         return list(self.reader.connections)
 
 
 def is_bag(path: Path) -> bool:
     """
-    Tell a bag from a folder of images by its names; whether it is sound shows on reading.
+    Return whether a path is a bag and no folder of images, by names only.
 
-    :raises SourceError: the folder cannot be looked into.
+    :raises SourceError: the folder cannot be listed.
     """
     with reading(path):
         if path.is_dir():
@@ -55,7 +53,7 @@ def is_bag(path: Path) -> bool:
 
 
 def message_type(connection: Connection) -> str:
-    """Full name of the type; bags of before 2019 say ``sensor_msgs/Image``."""
+    """Return the full name of the type; in bags from before 2019 ``msg`` is missing."""
     package, _, name = connection.msgtype.rpartition('/')
     return connection.msgtype if package.endswith('/msg') else f'{package}/msg/{name}'
 
@@ -86,16 +84,19 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn what rosbags raises on a damaged file, errors of many kinds, into one that names the file."""
+    """Turn errors of rosbags on a damaged file, of any type, into one that names the file."""
     try:
         yield
     except StavprError:
         raise
     except OSError as error:
-        raise SourceError(f'{path} cannot be read: {error}; check its name and permissions') from error
+        raise SourceError(
+            f'{path} cannot be read: {error}; check its name and permissions'
+        ) from error
     except Exception as error:
         raise SourceError(
-            f'{path} is damaged, cut off or no bag: expected a ROS 2 bag (folder, .db3, .mcap) or a ROS 1 '
+            f'{path} is damaged, cut off or no bag: expected a ROS 2 bag (folder, .db3, .mcap) or '
+            'a ROS 1 '
             f'.bag ({type(error).__name__}: {error}); try `ros2 bag reindex` or `rosbag reindex`'
         ) from error
 
@@ -106,10 +107,10 @@ def _storage_files(folder: Path) -> list[Path]:
 
 def _stage(path: Path, scratch: Path) -> Path:
     """
-    Make links (copies where needed) in a folder of our own, and give the path to open there.
+    Link (copy where needed) a bag into a scratch folder, and return the path to open there.
 
-    rosbags opens databases as immutable, which writes nothing, but does not see what SQLite keeps in its
-    logs; and it does not quote file names. Both are settled by giving it files of ours.
+    rosbags opens databases as immutable: it writes nothing, but ignores the logs of SQLite; and it
+    does not quote file names. A staged copy avoids both.
     """
     if path.is_file():
         return _stage_file(path, scratch / f'bag{path.suffix}')
@@ -124,12 +125,13 @@ def _stage(path: Path, scratch: Path) -> Path:
 
 
 def _only_storage_file(folder: Path) -> Path:
-    """Find the one file of a bag whose recording was killed before its metadata was written."""
+    """Return the only file of a bag whose recording ended before its metadata was written."""
     files = _storage_files(folder)
     if len(files) != 1:
         names = ', '.join(file.name for file in files) or 'none'
         raise SourceError(
-            f'{folder} has no {METADATA}: expected exactly one .db3 or .mcap file then, found {names}; '
+            f'{folder} has no {METADATA}: expected exactly one .db3 or .mcap file then, found '
+            f'{names}; '
             'run `ros2 bag reindex`, or name one of the files'
         )
     return files[0]
@@ -138,7 +140,11 @@ def _only_storage_file(folder: Path) -> Path:
 def _stage_file(file: Path, target: Path) -> Path:
     if target.is_dir():
         target /= f'bag{file.suffix}'
-    logs = [log for end in LOG_SUFFIXES if (log := Path(f'{file}{end}')).exists() and log.stat().st_size]
+    logs = [
+        log
+        for end in LOG_SUFFIXES
+        if (log := Path(f'{file}{end}')).exists() and log.stat().st_size
+    ]
     if file.suffix != '.db3' or not logs:
         target.symlink_to(file.resolve())
         return target
@@ -147,7 +153,7 @@ def _stage_file(file: Path, target: Path) -> Path:
         shutil.copyfile(log, f'{target}{log.name.removeprefix(file.name)}')
     database = sqlite3.connect(target)
     try:
-        # opening it rolls a journal back; this brings a write-ahead log home
+        # opening rolls a journal back; this writes a write-ahead log into the database
         database.execute('PRAGMA wal_checkpoint(TRUNCATE)').fetchall()
     finally:
         database.close()

@@ -1,15 +1,14 @@
 """Writes image records into a new ROS 2 bag."""
 
-import shutil
 from collections.abc import Iterable
 from pathlib import Path
+import shutil
 
 import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
-
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.sources.bag import RAW, SECOND
 from stavpr_ros.sources.frame import ImageRecord
@@ -26,7 +25,7 @@ def write_bag(
     storage: str = 'sqlite3',
 ) -> int:
     """
-    Write a bag with one topic of raw images; what was written is removed again if that fails.
+    Write a bag with one topic of raw images; on an error the folder is removed.
 
     :param path: the bag's folder, which must not exist yet.
     :param topic: topic of the images.
@@ -40,7 +39,9 @@ def write_bag(
     if plugin is None:
         raise SettingsError(f'storage {storage!r}: expected one of {", ".join(STORAGES)}')
     if path.exists():
-        raise SourceError(f'{path} exists already: expected a new folder; remove it or choose another name')
+        raise SourceError(
+            f'{path} exists already: expected a new folder; remove it or choose another name'
+        )
     typestore = get_typestore(Stores.ROS2_JAZZY)
     count = 0
     try:
@@ -52,12 +53,16 @@ def write_bag(
     except BaseException as error:
         shutil.rmtree(path, ignore_errors=True)
         if isinstance(error, OSError):
-            raise SourceError(f'{path} cannot be written: {error}; check permissions and space') from error
+            raise SourceError(
+                f'{path} cannot be written: {error}; check permissions and space'
+            ) from error
         raise
     return count
 
 
-def _write(writer: Writer, connection: Connection, typestore: Typestore, record: ImageRecord) -> None:
+def _write(
+    writer: Writer, connection: Connection, typestore: Typestore, record: ImageRecord
+) -> None:
     types = typestore.types
     seconds, nanoseconds = divmod(record.stamp_ns, SECOND)
     stamp = types['builtin_interfaces/msg/Time'](sec=seconds, nanosec=nanoseconds)

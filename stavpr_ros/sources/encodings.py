@@ -1,29 +1,30 @@
-"""Messages' bytes to one kind of image: RGB, uint8, shape (height, width, 3), C-contiguous."""
+"""
+The pixels and messages of ROS images to RGB, uint8, shape (height, width, 3), C-contiguous.
 
-import re
+Raw encodings (byte orders, Bayer mosaics, YUV), and messages, raw or compressed.
+"""
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+import re
 from typing import Any
 
 import cv2
 import numpy as np
-
 from stavpr_ros.errors import ImageError
-from stavpr_ros.sources.color import convert, copy, demosaic, keep, nv24_to_rgb
-from stavpr_ros.sources.files import check_pixels, decode_compressed, decode_file, flat_bytes
-
-__all__ = [
-    'ENCODINGS',
-    'Encoding',
-    'decode_compressed',
-    'decode_compressed_message',
-    'decode_image',
-    'decode_message',
-]
+from stavpr_ros.sources.files import check_pixels, convert, decode_file, flat_bytes
 
 _MEASUREMENTS = re.compile(r'(8S|16S|32[SUF]|64[SUF])C\d*')
-"""Encodings of depth images, vectors and other measurements: there is no brightness in them."""
+"""Encodings of depth images, vectors and other measurements, without brightness."""
+# Rows: R, G, B of Y, U, V and 1: BT.601 in the range of video (Y 16..235), as in OpenCV.
+_RGB_OF_YUV = np.array(
+    [
+        [1.164, 0.0, 1.596, -16 * 1.164 - 128 * 1.596],
+        [1.164, -0.391, -0.813, -16 * 1.164 + 128 * (0.391 + 0.813)],
+        [1.164, 2.018, 0.0, -16 * 1.164 - 128 * 2.018],
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -33,10 +34,10 @@ class Encoding:
 
     :param channels: values per pixel.
     :param value_bytes: bytes per value, 1 or 2; of two only the more significant one is used.
-    :param to_rgb: takes uint8 (rows, width, channels), a view of the message unless the values had two
-        bytes; gives a new RGB array (height, width, 3), C-contiguous.
+    :param to_rgb: takes uint8 (rows, width, channels), a view of the message unless the values had
+        two bytes; gives a new RGB array (height, width, 3), C-contiguous.
     :param block: (rows, columns) of the pixels that share a color: the size is a multiple of it.
-    :param chroma_rows: rows of ``step`` bytes with color below the picture, per row of the picture.
+    :param chroma_rows: rows of ``step`` bytes with color below the image, per row of the image.
     """
 
     channels: int
@@ -46,10 +47,62 @@ class Encoding:
     chroma_rows: float = 0
 
 
+def copy(pixels: np.ndarray) -> np.ndarray:
+    """Copy RGB pixels out of the message."""
+    return np.array(pixels, order='C')
+
+
+def keep(pixels: np.ndarray) -> np.ndarray:
+    """Leave RGB pixels alone that are a copy already."""
+    return pixels
+
+
+def demosaic(code: int, mosaic: np.ndarray) -> np.ndarray:
+    """
+    Interpolate (bilinear) the two missing colors of each pixel behind a Bayer filter.
+
+    ROS names a mosaic by its top-left 2x2 pixels in reading order, as OpenCV's codes of four
+    letters do; codes of two letters (``BayerBG``) name the 2x2 pixels from (1, 1).
+
+    :param code: ``cv2.COLOR_Bayer....2RGB``.
+    :param mosaic: uint8, shape (height, width) or (height, width, 1); rows may be apart.
+    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
+    :raises ImageError: fewer than 2 rows or columns: some color is missing.
+    """
+    height, width = mosaic.shape[:2]
+    if min(height, width) < 2:
+        raise ImageError(
+            f'Bayer mosaic of {width}x{height} pixels: expected at least 2x2; check the camera '
+            'driver',
+            kind='size',
+        )
+    if min(height, width) > 2:
+        return convert(code, mosaic)
+    # OpenCV returns black below 3x3; mirroring by two keeps the colors of the pattern in place
+    larger = cv2.copyMakeBorder(mosaic, 2, 2, 2, 2, cv2.BORDER_REFLECT_101)
+    return copy(convert(code, larger)[2:-2, 2:-2])
+
+
+def nv24_to_rgb(planes: np.ndarray) -> np.ndarray:
+    """
+    Convert YUV 4:4:4 in two planes; OpenCV has no code for it.
+
+    :param planes: uint8, shape (3 * height, width, 1), rows any ``step`` apart: a plane of Y, then
+        one of alternating U and V, whose rows are twice as long, padding included.
+    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
+    """
+    height, width, step = planes.shape[0] // 3, planes.shape[1], planes.strides[0]
+    # The last row ends at (3 * height - 2) * step + 2 * width: within `planes`, as width <= step.
+    chroma = np.lib.stride_tricks.as_strided(planes[height:], (height, width, 2), (2 * step, 2, 1))
+    yuv = np.empty((height, width, 3), np.uint8)
+    cv2.mixChannels([planes[:height], chroma], [yuv], [0, 0, 1, 1, 2, 2])
+    return np.asarray(cv2.transform(yuv, _RGB_OF_YUV))
+
+
 _FROM_BGR = partial(convert, cv2.COLOR_BGR2RGB)
 _FROM_RGBA = partial(convert, cv2.COLOR_RGBA2RGB)
 _FROM_BGRA = partial(convert, cv2.COLOR_BGRA2RGB)
-_FROM_GREY = partial(convert, cv2.COLOR_GRAY2RGB)
+_FROM_GRAY = partial(convert, cv2.COLOR_GRAY2RGB)
 _FROM_RGGB = partial(demosaic, cv2.COLOR_BayerRGGB2RGB)
 _FROM_BGGR = partial(demosaic, cv2.COLOR_BayerBGGR2RGB)
 _FROM_GBRG = partial(demosaic, cv2.COLOR_BayerGBRG2RGB)
@@ -62,17 +115,19 @@ ENCODINGS: dict[str, Encoding] = {
     'bgr8': Encoding(3, 1, _FROM_BGR),
     'rgba8': Encoding(4, 1, _FROM_RGBA),
     'bgra8': Encoding(4, 1, _FROM_BGRA),
-    'mono8': Encoding(1, 1, _FROM_GREY),
-    'mono16': Encoding(1, 2, _FROM_GREY),
+    'mono8': Encoding(1, 1, _FROM_GRAY),
+    'mono16': Encoding(1, 2, _FROM_GRAY),
     'rgb16': Encoding(3, 2, keep),
     'bgr16': Encoding(3, 2, _FROM_BGR),
     'rgba16': Encoding(4, 2, _FROM_RGBA),
     'bgra16': Encoding(4, 2, _FROM_BGRA),
     # OpenCV's names; color is BGR there, as cv_bridge has it
-    '8UC1': Encoding(1, 1, _FROM_GREY),
+    '8UC1': Encoding(1, 1, _FROM_GRAY),
     '8UC3': Encoding(3, 1, _FROM_BGR),
     '8UC4': Encoding(4, 1, _FROM_BGRA),
-    '16UC1': Encoding(1, 2, _FROM_GREY),  # industrial cameras mean gray by it; depth cameras do not
+    '16UC1': Encoding(
+        1, 2, _FROM_GRAY
+    ),  # industrial cameras mean gray by it; depth cameras do not
     '16UC3': Encoding(3, 2, _FROM_BGR),
     '16UC4': Encoding(4, 2, _FROM_BGRA),
     'bayer_rggb8': Encoding(1, 1, _FROM_RGGB),
@@ -87,11 +142,15 @@ ENCODINGS: dict[str, Encoding] = {
     'yuv422': Encoding(2, 1, _FROM_UYVY, block=(1, 2)),
     'yuyv': Encoding(2, 1, _FROM_YUYV, block=(1, 2)),
     'yuv422_yuy2': Encoding(2, 1, _FROM_YUYV, block=(1, 2)),
-    'nv12': Encoding(1, 1, partial(convert, cv2.COLOR_YUV2RGB_NV12), block=(2, 2), chroma_rows=0.5),
-    'nv21': Encoding(1, 1, partial(convert, cv2.COLOR_YUV2RGB_NV21), block=(2, 2), chroma_rows=0.5),
+    'nv12': Encoding(
+        1, 1, partial(convert, cv2.COLOR_YUV2RGB_NV12), block=(2, 2), chroma_rows=0.5
+    ),
+    'nv21': Encoding(
+        1, 1, partial(convert, cv2.COLOR_YUV2RGB_NV21), block=(2, 2), chroma_rows=0.5
+    ),
     'nv24': Encoding(1, 1, nv24_to_rgb, chroma_rows=2),
 }
-"""Every raw encoding that is read; a further one is a further row."""
+"""The supported raw encodings."""
 
 
 def decode_image(
@@ -105,19 +164,19 @@ def decode_image(
     """
     Decode the fields of a raw ``sensor_msgs/Image``.
 
-    The bytes are viewed in place, whatever ``step`` is, and the result has memory of its own, so it stays
-    valid when the message goes. Sixteen bits become eight by dropping the lower byte. YUV is taken as BT.601
-    in the range of video, as cv_bridge does.
+    The bytes are viewed in place for any ``step``; the result has memory of its own. Of sixteen
+    bits the lower eight are dropped. YUV is BT.601 in the range of video, as in cv_bridge.
 
-    :param height: rows of the picture; NV12, NV21 and NV24 have rows of color below them.
+    :param height: rows of the image; NV12, NV21 and NV24 have rows of color below them.
     :param width: pixels per row.
     :param encoding: a key of :data:`ENCODINGS`.
     :param is_bigendian: byte order of 16 bit values.
     :param step: bytes from one row to the next; rows may be padded.
-    :param data: the bytes: anything with the buffer protocol. The last row's padding may be missing.
+    :param data: the bytes: anything with the buffer protocol. The last row's padding may be
+        missing.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous, own memory.
-    :raises ImageError: header and data contradict each other, the encoding is not read, or the image has
-        more than :data:`stavpr_ros.sources.files.MAX_PIXELS` pixels.
+    :raises ImageError: header and data contradict each other, the encoding is unsupported, or the
+        image has more than :data:`stavpr_ros.sources.files.MAX_PIXELS` pixels.
     """
     layout = _layout(encoding)
     row = width * layout.channels * layout.value_bytes
@@ -127,15 +186,18 @@ def decode_image(
     needed = (rows - 1) * step + row
     if flat.size < needed:
         raise ImageError(
-            f'{flat.size} bytes of data for {width}x{height} {encoding} with step {step}: expected {needed} '
+            f'{flat.size} bytes of data for {width}x{height} {encoding} with step {step}: '
+            f'expected {needed} '
             'or more; the image is cut off',
             kind='cut off',
         )
-    check_pixels(width, height)  # after the data, which shows whether it is a lie
+    check_pixels(width, height)  # last: a wrong header fails the checks above
     values = width * layout.channels
     if layout.value_bytes == 1:
         strides = (step, layout.channels, 1)
-        return layout.to_rgb(np.ndarray((rows, width, layout.channels), np.uint8, flat, 0, strides))
+        return layout.to_rgb(
+            np.ndarray((rows, width, layout.channels), np.uint8, flat, 0, strides)
+        )
     # the more significant byte lies first if big-endian
     pairs: np.ndarray = np.ndarray((rows, values, 2), np.uint8, flat, 0, (step, 2, 1))
     high = cv2.extractChannel(pairs, 0 if is_bigendian else 1)
@@ -144,9 +206,10 @@ def decode_image(
 
 def decode_message(message: Any) -> np.ndarray:
     """
-    Decode an image message, raw or compressed, of rclpy or of rosbags, or anything with its fields.
+    Decode an image message, raw or compressed, of rclpy or rosbags, or any object with its fields.
 
-    :param message: a ``sensor_msgs/CompressedImage`` if it has a ``format``, else a ``sensor_msgs/Image``.
+    :param message: a ``sensor_msgs/CompressedImage`` if it has a ``format``, else a
+        ``sensor_msgs/Image``.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous, own memory.
     :raises ImageError: see :func:`decode_image` and :func:`decode_compressed_message`.
     """
@@ -166,8 +229,8 @@ def decode_compressed_message(message: Any) -> np.ndarray:
     """
     Decode a ``sensor_msgs/CompressedImage``.
 
-    The bytes decide which kind of file it is. What ``format`` says is needed twice: to refuse depth images,
-    and to find Bayer mosaics, which image_transport packs as they are into gray files.
+    The bytes decide the file format. The message's ``format`` is needed twice: to reject depth
+    images, and to detect Bayer mosaics, which image_transport stores as gray files.
 
     :param message: anything with ``format`` and ``data``.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
@@ -176,7 +239,7 @@ def decode_compressed_message(message: Any) -> np.ndarray:
     original = message.format.partition(';')[0].strip()
     if 'compresseddepth' in message.format.lower() or _MEASUREMENTS.fullmatch(original):
         raise ImageError(
-            f'compressed format {message.format!r} holds depth or measurements, not a picture: '
+            f'compressed format {message.format!r} holds depth or measurements, not an image: '
             "choose the camera's color or gray topic",
             kind='depth',
         )
@@ -190,8 +253,8 @@ def _demosaic_of(transport: str) -> Callable[[np.ndarray], np.ndarray] | None:
     """
     Find the Bayer mosaic in a format such as ``bayer_rggb8; png compressed``.
 
-    After ``compressed`` comes what the image was converted to first: nothing or the same mosaic if it was
-    not, ``mono8`` or ``bgr8`` if there is no mosaic any more.
+    After ``compressed`` stands the encoding before compression: nothing or the same mosaic if it
+    was not converted, ``mono8`` or ``bgr8`` if it is no mosaic any more.
     """
     original, _, rest = transport.partition(';')
     _, compressed, target = rest.partition('compressed')
@@ -208,12 +271,14 @@ def _layout(encoding: str) -> Encoding:
     known = ', '.join(ENCODINGS)
     if _MEASUREMENTS.fullmatch(encoding):
         raise ImageError(
-            f'encoding {encoding!r} holds depth or measurements, not a picture: expected one of {known}; '
+            f'encoding {encoding!r} holds depth or measurements, not an image: expected one of '
+            f'{known}; '
             "choose the camera's color or gray topic",
             kind='depth',
         )
     raise ImageError(
-        f'encoding {encoding!r} is not read: expected one of {known}; set the driver, or use image_proc',
+        f'encoding {encoding!r} is not supported: expected one of {known}; set the driver, or use '
+        'image_proc',
         kind='encoding',
     )
 
@@ -221,19 +286,23 @@ def _layout(encoding: str) -> Encoding:
 def _check_header(height: int, width: int, encoding: str, step: int, row: int) -> None:
     if height < 1 or width < 1:
         raise ImageError(
-            f'image of {width}x{height} pixels: expected at least 1x1; check the camera driver', kind='size'
+            f'image of {width}x{height} pixels: expected at least 1x1; check the camera driver',
+            kind='size',
         )
     rows, columns = ENCODINGS[encoding].block
     if height % rows or width % columns:
         raise ImageError(
-            f'{encoding} image of {width}x{height} pixels: expected a width that is a multiple of {columns} '
-            f'and a height that is a multiple of {rows}, since so many pixels share a color; check the '
+            f'{encoding} image of {width}x{height} pixels: expected a width that is a multiple of '
+            f'{columns} '
+            f'and a height that is a multiple of {rows}, since so many pixels share a color; '
+            'check the '
             'camera driver',
             kind='size',
         )
     if step < row:
         raise ImageError(
-            f'step of {step} bytes is too small for a row of {width} {encoding} pixels: expected {row} or '
+            f'step of {step} bytes is too small for a row of {width} {encoding} pixels: expected '
+            f'{row} or '
             'more; check the camera driver',
             kind='step',
         )

@@ -1,49 +1,50 @@
-"""Bytes of image files to one kind of image: RGB, uint8, shape (height, width, 3), C-contiguous."""
+"""Image files to RGB, uint8, shape (height, width, 3), C-contiguous."""
 
-import re
 from collections.abc import Callable
 from io import BytesIO
+import re
 from typing import Any
 
 import cv2
 import numpy as np
 from PIL import Image
-
 from stavpr_ros.errors import ImageError
-from stavpr_ros.sources.color import convert
 
 MAX_PIXELS = 64_000_000
-"""Largest image that is decoded: a small file may claim a picture that fills the memory."""
+"""Largest decoded image: the header of a small file may claim one that exhausts the memory."""
 
 JPEG_MARKER = re.compile(rb'\xff[\xc0-\xcf\xd9-\xfe]')
-"""What a length and so many bytes follow, and END_OF_JPEG; the picture's own bytes never look so."""
+"""Markers before a segment (length and bytes), and the end; never within compressed pixels."""
 END_OF_JPEG = b'\xff\xd9'
 
 COMPRESSED_FORMATS = ('JPEG', 'PNG', 'BMP', 'TIFF', 'PPM', 'WEBP')
-"""What :func:`decode_compressed` reads, in Pillow's names."""
+"""The supported files, in Pillow's names."""
 
 
 def decode_compressed(data: Any) -> np.ndarray:
     """
     Decode the bytes of an image file: JPEG, PNG, BMP, TIFF, PNM, WebP.
 
-    Gray, 16 bit and transparent images come out as RGB uint8 too; a rotation that the camera noted (EXIF) is
+    Gray, 16 bit and transparent images become RGB uint8 too; a rotation in the EXIF data is
     applied.
 
     :param data: the file's bytes: anything with the buffer protocol.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
-    :raises ImageError: not such a file, damaged, cut off, or of more than :data:`MAX_PIXELS` pixels.
+    :raises ImageError: not such a file, damaged, cut off, or of more than :data:`MAX_PIXELS`
+        pixels.
     """
     return decode_file(flat_bytes(data))
 
 
-def decode_file(flat: np.ndarray, demosaic: Callable[[np.ndarray], np.ndarray] | None = None) -> np.ndarray:
+def decode_file(
+    flat: np.ndarray, demosaic: Callable[[np.ndarray], np.ndarray] | None = None
+) -> np.ndarray:
     """
     Decode a file.
 
     :param flat: the file's bytes, shape (size,), uint8.
-    :param demosaic: makes RGB of a gray image (height, width), which is a Bayer mosaic; not called if the
-        file has color.
+    :param demosaic: converts a gray image (height, width), a Bayer mosaic, to RGB; not called if
+        the file has color.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
     :raises ImageError: see :func:`decode_compressed`.
     """
@@ -59,18 +60,30 @@ def decode_file(flat: np.ndarray, demosaic: Callable[[np.ndarray], np.ndarray] |
         ) from error
 
 
+def convert(code: int, pixels: np.ndarray) -> np.ndarray:
+    """
+    Convert with one of OpenCV's codes.
+
+    :param code: ``cv2.COLOR_...2RGB``.
+    :param pixels: uint8, shape (rows, width, channels); rows may be apart.
+    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
+    """
+    return np.asarray(cv2.cvtColor(pixels, code))
+
+
 def _unpack(flat: np.ndarray, mode: int) -> np.ndarray:
     image = cv2.imdecode(flat, mode)
     if image is None:
         raise ImageError(
-            f'compressed image of {flat.size} bytes is damaged or cut off: copy or record anew',
+            f'compressed image of {flat.size} bytes is damaged or cut off: copy or record it '
+            'again',
             kind='damaged',
         )
     return np.asarray(image)
 
 
 def check_pixels(width: int, height: int) -> None:
-    """Refuse an image of more than :data:`MAX_PIXELS` pixels."""
+    """Reject an image of more than :data:`MAX_PIXELS` pixels."""
     if width * height > MAX_PIXELS:
         raise ImageError(
             f'image of {width}x{height} pixels: expected at most {MAX_PIXELS}; scale it down',
@@ -79,7 +92,7 @@ def check_pixels(width: int, height: int) -> None:
 
 
 def _check_file(flat: np.ndarray) -> str:
-    """Read the header only, for the mode: the decoder would take the memory first and complain afterwards."""
+    """Check the header and return Pillow's mode, before the decoder allocates the image."""
     try:
         with Image.open(BytesIO(flat.data), formats=COMPRESSED_FORMATS) as header:
             width, height = header.size
@@ -88,20 +101,21 @@ def _check_file(flat: np.ndarray) -> str:
         raise ImageError(
             f'{error}: expected at most {MAX_PIXELS}; scale it down', kind='too large'
         ) from error
-    except Exception as error:  # a damaged header makes Pillow raise errors of many kinds
+    except Exception as error:  # a damaged header raises errors of any type
         raise ImageError(
-            f'{flat.size} bytes are no image, or damaged: expected {", ".join(COMPRESSED_FORMATS)}: {error}',
+            f'{flat.size} bytes are no image, or damaged: expected '
+            f'{", ".join(COMPRESSED_FORMATS)}: {error}',
             kind='damaged',
         ) from error
     check_pixels(width, height)
-    if kind in ('JPEG', 'MPO'):  # MPO: several pictures in one file, of which the first is read
+    if kind in ('JPEG', 'MPO'):  # MPO: several images, the first is read
         _check_end_of_jpeg(flat.tobytes())
     return mode
 
 
 def _check_end_of_jpeg(data: bytes) -> None:
-    """Refuse half a picture, whose rest OpenCV before version 5 makes up in gray."""
-    # segment by segment: a thumbnail in one, and a video behind the picture, have the same two bytes
+    """Reject an incomplete image: OpenCV before version 5 fills the rest with gray."""
+    # segment by segment: a thumbnail or a video in the file may contain the same two bytes
     at = 2
     while found := JPEG_MARKER.search(data, at):
         at = found.end()
@@ -109,7 +123,8 @@ def _check_end_of_jpeg(data: bytes) -> None:
             return
         at += int.from_bytes(data[at : at + 2], 'big')
     raise ImageError(
-        f'compressed image of {len(data)} bytes is cut off: expected the end of a JPEG; copy it anew',
+        f'compressed image of {len(data)} bytes is cut off: expected the end of a JPEG; copy it '
+        'again',
         kind='cut off',
     )
 

@@ -1,14 +1,13 @@
 """A folder of image files as a sequence."""
 
-import os
-import re
 from collections.abc import Callable, Iterator
+import os
 from pathlib import Path
+import re
 
 import numpy as np
-
 from stavpr_ros.errors import ImageError, InputError, SourceError
-from stavpr_ros.sources.encodings import decode_compressed
+from stavpr_ros.sources.files import decode_compressed
 from stavpr_ros.sources.frame import Frame, ImageRecord
 
 SUFFIXES = frozenset({'.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'})
@@ -16,14 +15,14 @@ SECOND = 1_000_000_000
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
-    """Sort key that puts ``2.jpg`` before ``10.jpg``; the name itself decides between ``1`` and ``01``."""
-    # the parts alternate between text and number, so that like is compared with like
+    """Return a sort key with ``2.jpg`` before ``10.jpg`` (and ``01`` before ``1``)."""
+    # the parts alternate between text and number: equal positions have equal types
     parts = re.split(r'(\d+)', name)
     return [int(part) if i % 2 else part.casefold() for i, part in enumerate(parts)], name
 
 
 def text_of(path: str | Path) -> str:
-    """Return a path, or a name, as text that can be written; bytes of it that are no UTF-8 are replaced."""
+    """Return a path or name as printable text; bytes that are no UTF-8 are replaced."""
     return os.fsencode(path).decode('utf-8', 'replace')
 
 
@@ -31,15 +30,17 @@ class FolderSource:
     """
     The images of one folder in natural order; sub-folders and hidden files are left out.
 
-    Iterating gives :class:`Frame` with the file's name as identifier and an unknown stamp.
+    Iterating yields :class:`Frame` with the file's name as identifier and an unknown stamp.
 
     :param path: the folder.
-    :param on_error: called with the :class:`ImageError` of a file that cannot be read, which is then
-        skipped; without it the error is raised.
+    :param on_error: called with the :class:`ImageError` of a file that cannot be read, which is
+        then skipped; without it the error is raised.
     :raises SourceError: there is no such folder, or no image in it.
     """
 
-    def __init__(self, path: str | Path, on_error: Callable[[ImageError], None] | None = None) -> None:
+    def __init__(
+        self, path: str | Path, on_error: Callable[[ImageError], None] | None = None
+    ) -> None:
         self.path = Path(path)
         self.on_error = on_error
         try:
@@ -47,11 +48,14 @@ class FolderSource:
                 raise SourceError(f'{self.path} is not a folder: expected a folder of images')
             files = [file for file in self.path.iterdir() if _is_image(file)]
         except OSError as error:
-            raise SourceError(f'{self.path} cannot be listed: {error.strerror}; check permissions') from error
+            raise SourceError(
+                f'{self.path} cannot be listed: {error.strerror}; check permissions'
+            ) from error
         if not files:
             expected = ' '.join(sorted(SUFFIXES))
             raise SourceError(
-                f'{self.path} holds no images: expected files ending in {expected}, not in sub-folders'
+                f'{self.path} holds no images: expected files ending in {expected}, not in '
+                'sub-folders'
             )
         self.files: list[Path] = sorted(files, key=lambda file: natural_key(file.name))
 
@@ -66,9 +70,9 @@ class FolderSource:
 
     def records(self, frames_per_second: float) -> Iterator[ImageRecord]:
         """
-        Give the images as messages; file i (from 1) is stamped i / frames_per_second, since 0 means unknown.
+        Yield the images as messages; file i, from 1, has the stamp i / frames_per_second.
 
-        :param frames_per_second: frame rate to pretend, above 0.
+        :param frames_per_second: assumed frame rate, above 0.
         """
         if not frames_per_second > 0:
             raise InputError(f'{frames_per_second} frames per second: expected more than 0')
@@ -96,7 +100,8 @@ def _read(file: Path) -> np.ndarray:
         return decode_compressed(file.read_bytes())
     except OSError as error:
         raise ImageError(
-            f'{text_of(file)} cannot be read: {error.strerror}; check its permissions', kind='unreadable'
+            f'{text_of(file)} cannot be read: {error.strerror}; check its permissions',
+            kind='unreadable',
         ) from error
     except ImageError as error:
         raise ImageError(f'{text_of(file)}: {error}', kind=error.kind) from error

@@ -1,4 +1,4 @@
-"""What sources give: an image ready to use, or an image message as it was recorded."""
+"""The items of sources: a decoded image, or an image message as recorded."""
 
 from dataclasses import dataclass
 from typing import Any, Self
@@ -13,7 +13,7 @@ class Frame:
 
     :param image: RGB, uint8, shape (height, width, 3), C-contiguous.
     :param stamp: when it was taken, nanoseconds; 0 = unknown.
-    :param identifier: what to call it: a file name, or topic and number.
+    :param identifier: a file name, or topic and number.
     """
 
     image: np.ndarray

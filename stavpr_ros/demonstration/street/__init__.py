@@ -1,27 +1,27 @@
 """A synthetic street and two traverses of it, for the demonstration and for tests."""
 
 from stavpr_ros.demonstration.street.traverses import (
-    GOOD_LIGHT,
-    RAINY_DUSK,
     Conditions,
-    Traverse,
+    first_traverse,
+    GOOD_LIGHT,
+    nearest_places,
+    RAINY_DUSK,
     Route,
+    second_traverse,
+    Traverse,
     World,
     WorldFrame,
-    first_traverse,
-    ground_truth,
-    second_traverse,
 )
 
 __all__ = [
     'GOOD_LIGHT',
     'RAINY_DUSK',
     'Conditions',
-    'Traverse',
     'Route',
+    'Traverse',
     'World',
     'WorldFrame',
     'first_traverse',
-    'ground_truth',
+    'nearest_places',
     'second_traverse',
 ]

@@ -13,7 +13,6 @@ facing the camera.
 from math import floor, sqrt
 
 from numba import njit
-
 from stavpr_ros.demonstration.street.street import (
     CAR,
     CELL,

@@ -13,9 +13,8 @@ per wall.
 from dataclasses import dataclass
 from math import atan, cos, exp, hypot, pi, sin
 
-import numpy as np
 from numba import njit
-
+import numpy as np
 from stavpr_ros.demonstration.street.objects import draw_things
 from stavpr_ros.demonstration.street.street import (
     CELL,
@@ -25,9 +24,9 @@ from stavpr_ros.demonstration.street.street import (
     LOT_SETBACK,
     LOT_START,
     SIDE_STREET,
+    Street,
     THING_ALONG,
     VIEW,
-    Street,
 )
 from stavpr_ros.demonstration.street.surfaces import ground, hash01, noise, sky
 from stavpr_ros.demonstration.street.walls import roof_height, wall
@@ -43,7 +42,7 @@ FAR = 1e4
 
 # Columns of the table of walls that a column of samples meets.
 WALL_DEPTH, WALL_TOP, WALL_LOT, WALL_ALONG, WALL_FRONT, WALL_ROW = range(6)
-# What the kernels know of light: numbers in one array, in this order.
+# Light as one array of numbers for the kernels, in this order.
 (SUN, SUN_RIGHT, SUN_AHEAD, SUN_UP, AMBIENT, LAMPS, COVER, WET, FOLIAGE, SUN_AZIMUTH, SKY_SEED,
  FOG, EXPOSURE, WARMTH, RAIN, NOISE) = range(16)  # fmt: skip
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from random import Random
 
 import numpy as np
-
 from stavpr_ros.errors import SettingsError
 
 CELL = 0.5  # meters of the route that share one entry of the tables

@@ -12,7 +12,6 @@ machine. The arithmetic is float64 because it is scalar: float32 would be no fas
 from math import floor, sin, sqrt
 
 from numba import njit
-
 from stavpr_ros.demonstration.street.street import PARK, ROAD_HALF_WIDTH, SIDE_STREET
 
 _X, _Y, _SEED, _MIX = (

@@ -13,17 +13,16 @@ from math import radians
 from typing import overload
 
 import numpy as np
-
-from stavpr_ros.demonstration.street.rendering import View, light_vector, render
+from stavpr_ros.demonstration.street.rendering import light_vector, render, View
 from stavpr_ros.demonstration.street.street import (
     CAR,
     CELL,
     LEFT_NEAR,
     LOT_KIND,
-    SIDE_STREET,
-    VAN,
-    Street,
     make_street,
+    SIDE_STREET,
+    Street,
+    VAN,
 )
 from stavpr_ros.demonstration.street.surfaces import hash01, noise
 from stavpr_ros.errors import InputError, SettingsError
@@ -142,7 +141,8 @@ class World:
             )
         if not 0 < self.detour_from <= self.detour_to < self.length:
             raise SettingsError(
-                f'detour from {self.detour_from} m to {self.detour_to} m; expected both inside the '
+                f'detour from {self.detour_from} m to {self.detour_to} m; expected both inside '
+                'the '
                 f'street of {self.length} m, in this order'
             )
 
@@ -287,7 +287,7 @@ def second_traverse(
     return Traverse(world, Route(along, detour), conditions, SECOND_EPOCH, size)
 
 
-def ground_truth(first: Traverse, second: Traverse) -> np.ndarray:
+def nearest_places(first: Traverse, second: Traverse) -> np.ndarray:
     """
     Return the place of the first traverse that is nearest to each image of the second.
 

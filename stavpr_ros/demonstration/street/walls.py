@@ -7,7 +7,6 @@
 from math import floor, sin
 
 from numba import njit
-
 from stavpr_ros.demonstration.street.street import (
     BRICK,
     HALL,
@@ -202,7 +201,7 @@ def _house_bay(lots, lot, along, height, x, y, bay, story, shade, lamps):
 
 @njit(cache=True, error_model='numpy')
 def letters(along, height, seed):
-    """Tell whether a point of a sign lies on a stroke of its writing."""
+    """Return whether a point of a sign lies on a stroke of its writing."""
     x = along / 0.55
     letter = floor(x)
     x -= floor(x)
