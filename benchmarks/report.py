@@ -1,192 +1,137 @@
-"""
-The Markdown table of a run, made from its JSON alone.
+"""The Markdown report of a run of benchmarks/matching.py."""
 
-``python benchmarks/report.py RESULTS.json`` writes it again beside the file.
-"""
+from collections.abc import Sequence
+from typing import Any
 
-import argparse
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from lower_bounds import Peaks
+from memory import TARGET, Memory
+from results import Row, heading, number_text, seconds_text, table
+from run import Skipped
 
-from marks import undecided
-from records import Record, load
-
-UNITS = ((1.0, 's'), (1e-3, 'ms'), (1e-6, 'µs'))
-
-
-def seconds_text(seconds: float | None) -> str:
-    """Return a duration with three digits and a unit."""
-    if seconds is None:
-        return '-'
-    scale, unit = next(((s, u) for s, u in UNITS if seconds >= s), UNITS[-1])
-    return f'{number_text(seconds / scale)} {unit}'
+ROBUST_STAGES = (
+    'mean_centering', 'image_distances', 'query_znorm', 'window_push', 'reference_znorm', 'velocity_search',
+    'selection', 'path_trace',
+)  # fmt: skip
 
 
-def number_text(value: float | None) -> str:
-    """Return a number with three digits, without an exponent where it is readable so."""
-    if value is None:
-        return '-'
-    if value == 0 or 1e-3 <= abs(value) < 1e6:
-        digits = 2 if abs(value) < 10 else 1 if abs(value) < 100 else 0
-        return f'{value:,.{digits}f}' if abs(value) >= 0.1 or value == 0 else f'{value:.3g}'
-    return f'{value:.3g}'
+def _find(rows: Sequence[Row], stage: str, mode: str, n: int, d: int, precision: str) -> Row | None:
+    """Return the row of a stage; stages without features and centering are measured in float32 only."""
+    for row in rows:
+        if (row.stage, row.n) == (stage, n) and row.mode in ('', mode) and row.d in (0, d):
+            if row.precision == precision or row.stage != 'image_distances':
+                return row
+    return None
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a Markdown table."""
-    lines = ['| ' + ' | '.join(cells) + ' |' for cells in (head, *rows)]
-    return [lines[0], '|' + ' --- |' * len(head), *lines[1:]]
+def frame_section(rows: Sequence[Row]) -> list[str]:
+    """Return the table of whole frames in mode robust, stage by stage."""
+    lines = []
+    for row in rows:
+        if row.stage != 'frame' or row.mode != 'robust':
+            continue
+        parts = [_find(rows, name, 'robust', row.n, row.d, row.precision) for name in ROBUST_STAGES]
+        total = sum(part.median_s for part in parts if part)
+        lines.append(
+            [f'{row.n:,}', str(row.d), row.precision, *(seconds_text(p.median_s if p else None) for p in parts)]
+            + [seconds_text(total), f'{seconds_text(row.median_s)} ± {seconds_text(row.spread_s)}']
+            + [seconds_text(row.lower_bound_s), number_text(row.ratio)]
+        )
+    head = ('n', 'd', 'precision', *(name.replace('_', ' ') for name in ROBUST_STAGES))
+    head += ('sum of stages', 'frame (update)', 'lower bound', 'ratio')
+    title = '## A frame in mode robust (the default), stage by stage'
+    return [title, '', *table(head, lines)] if lines else []
 
 
-def _heading(first: Record) -> list[str]:
-    about, versions = first.extra.get('machine', {}), first.extra.get('versions', {})
-    names = ', '.join(f'{name.replace("_", " ")} {value}' for name, value in about.items() if value != '')
+def stage_section(rows: Sequence[Row]) -> list[str]:
+    """Return the table of all rows."""
+    lines = [
+        [
+            row.stage, row.mode or 'both', f'{row.n:,}', str(row.d or '-'), row.precision,
+            seconds_text(row.median_s), seconds_text(row.spread_s), str(row.runs),
+            seconds_text(row.lower_bound_s), number_text(row.ratio),
+            number_text(row.extra['cells_per_s'] / 1e9) if 'cells_per_s' in row.extra else '-',
+        ]
+        for row in rows
+    ]  # fmt: skip
+    head = ('stage', 'mode', 'n', 'd', 'precision', 'median', 'spread', 'runs', 'lower bound', 'ratio')
+    return ['## All stages', '', *table((*head, 'G cells/s'), lines)]
+
+
+def peer_section(rows: Sequence[Row]) -> list[str]:
+    """Return the table of comparisons; losses against peers that do the whole work are counted."""
+    pairs = [(row, peer) for row in rows for peer in row.peers]
+    whole = [peer for _, peer in pairs if not peer.partial]
+    lines = [
+        [
+            row.stage, row.mode or 'both', f'{row.n:,}', str(row.d or '-'), row.precision, peer.name,
+            seconds_text(row.median_s), seconds_text(peer.median_s), seconds_text(peer.spread_s),
+            number_text(peer.ratio), peer.note + ('; a part of the work' if peer.partial else ''),
+        ]
+        for row, peer in pairs
+    ]  # fmt: skip
+    head = ('stage', 'mode', 'n', 'd', 'precision', 'peer', 'ours', 'peer, median', 'spread', 'peer / ours', '')
+    lost = sum(peer.ratio < 1 for peer in whole)
+    return [f'## Beside peers ({lost} of {len(whole)} lost)', '', *table(head, lines)] if pairs else []
+
+
+def memory_section(measured: Sequence[Memory]) -> list[str]:
+    """Return the table of resident memory."""
+    lines = [
+        [
+            m.operation, m.mode, m.precision, f'{m.n:,}', str(m.d), f'{m.feature_bytes / 1e6:,.0f} MB',
+            f'{m.resident_bytes / 1e6:,.0f} MB', number_text(m.ratio),
+            f'<= {TARGET}', 'reached' if m.ratio <= TARGET else '**not reached**',
+        ]
+        for m in measured
+    ]  # fmt: skip
+    head = ('operation', 'mode', 'precision', 'n', 'd', 'features', 'resident', 'resident / features', 'target', '')
+    return ['## Memory', '', *table(head, lines)] if measured else []
+
+
+def target_section(targets: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the table of targets."""
+    outcome = {True: 'reached', False: '**not reached**', None: 'not measured'}
+    lines = [
+        [t['target'], t.get('precision', '-'), number_text(t['value']), t.get('wanted', '-')]
+        + [outcome[t['reached']]]
+        for t in targets
+    ]
+    return ['## Targets', '', *table(('target', 'precision', 'value', 'wanted', ''), lines)]
+
+
+def peak_section(peaks: Peaks) -> list[str]:
+    """Return the table of the machine's peaks."""
+    lines = [['read bandwidth', f'{peaks.bytes_per_s / 1e9:,.1f} GB/s', peaks.sources.get('read', 'read')]]
+    lines += [
+        [f'matrix product, {dtype}', f'{rate / 1e9:,.0f} G operations/s', peaks.sources.get(dtype, 'product')]
+        for dtype, rate in peaks.operations_per_s.items()
+    ]
+    return ['## Peaks, measured in the same run', '', *table(('peak', 'best', 'seen in'), lines)]
+
+
+def skipped_section(skipped: Sequence[Skipped]) -> list[str]:
+    """Return the table of everything that was left out."""
+    lines = [[s.stage, f'{s.n:,}', str(s.d or '-'), s.reason] for s in skipped]
+    return ['## Left out', '', *table(('stage or peer', 'n', 'd', 'reason'), lines)] if skipped else []
+
+
+def report(
+    about: dict[str, Any],
+    rows: Sequence[Row],
+    memory: Sequence[Memory],
+    targets: Sequence[dict[str, Any]],
+    peaks: Peaks,
+    skipped: Sequence[Skipped],
+) -> list[str]:
+    """Return the lines of the report."""
+    machine = about['machine']
     return [
-        f'# Matching on {about.get("gpu") or about.get("cpu", "an unknown machine")}',
-        '',
-        f'Commit {first.extra.get("commit")}, {first.extra.get("date")}. Machine: {names}.',
-        'Versions: ' + ', '.join(f'{name} {value}' for name, value in versions.items()) + '.',
-        'How to read and repeat it: benchmarks/README.md.',
-        '',
+        *heading(f'Matching on {machine.get("gpu") or machine["cpu"]}', about),
+        *frame_section(rows),
+        *memory_section(memory),
+        *target_section(targets),
+        *stage_section(rows),
+        *peer_section(rows),
+        *peak_section(peaks),
+        *skipped_section(skipped),
     ]
-
-
-def _ceilings(records: Sequence[Record]) -> list[str]:
-    rows = []
-    for record in records:
-        said = record.extra
-        if 'bytes_per_s' in said:
-            rows.append([record.name, f'{said["bytes_per_s"] / 1e9:,.1f} GB/s', said['source']])
-        else:
-            rows.append(
-                [record.name, f'{said["operations_per_s"] / 1e9:,.0f} G operations/s', said['source']]
-            )
-    return ['## Ceilings, measured in the same run', '', *table(('what', 'best', 'seen in'), rows), '']
-
-
-def marks_section(records: Sequence[Record]) -> list[str]:
-    """Return the lines of the table of marks."""
-    rows = [
-        [
-            mark['mark'],
-            ', '.join(
-                [
-                    record.dtype,
-                    *(f'{key} = {record.extra[key]}' for key in ('xi', 'data') if key in record.extra),
-                ]
-            ),
-            number_text(mark['value']) if mark['value'] >= 1e-2 else f'{mark["value"]:.3g}',
-            mark['wanted'],
-            'reached' if mark['reached'] else '**not reached**',
-        ]
-        for record in records
-        for mark in record.marks
-    ]
-    rows.sort(key=lambda row: row[0])
-    rows += [[text, '', '-', '', 'not measured'] for text in undecided(records, records[0].device)]
-    return ['## Marks', '', *table(('mark', 'of', 'value', 'wanted', ''), rows), '']
-
-
-def lost(record: Record) -> bool:
-    """Whether a peer that does the whole work was faster."""
-    return (record.speedup or 1) < 1 and not record.extra.get('peer_part')
-
-
-Column = tuple[str, Callable[[Record], str]]
-SIZE: tuple[Column, ...] = (
-    ('n', lambda record: f'{record.n:,}'),
-    ('d', lambda record: f'{record.dim:,}' if record.dim else '-'),
-    ('dtype', lambda record: record.dtype),
-    ('xi', lambda record: str(record.extra.get('xi', '-'))),
-    ('data', lambda record: str(record.extra.get('data', '-'))),
-)
-OWN: tuple[Column, ...] = (
-    ('median', lambda record: seconds_text(record.median_s)),
-    ('spread', lambda record: seconds_text(record.spread_s)),
-    ('runs', lambda record: str(record.runs)),
-    ('floor', lambda record: seconds_text(record.floor_s)),
-    ('median / floor', lambda record: number_text(record.ratio_to_floor)),
-)
-CELLS: Column = ('G cells/s', lambda record: number_text(record.extra['cells_per_s'] / 1e9))
-EVENTS: Column = ('device alone', lambda record: seconds_text(record.extra['events_s']))
-PEERS: tuple[Column, ...] = (
-    ('peer', lambda record: f'{record.peer} {record.extra.get("peer_version", "")}'.strip()),
-    ('ours', lambda record: seconds_text(record.median_s)),
-    ('peer, median', lambda record: seconds_text(record.peer_median_s)),
-    ('spread', lambda record: seconds_text(record.peer_spread_s)),
-    ('starts timed', lambda record: str(record.extra.get('peer_sample', '-'))),
-    ('form', lambda record: str(record.extra.get('peer_what', '-')).removeprefix('torch.mm, ')),
-    ('peer / ours', lambda record: number_text(record.speedup)),
-    ('', lambda record: 'loss' if lost(record) else ''),
-)
-
-
-def _columns(records: Sequence[Record], columns: Sequence[Column]) -> list[str]:
-    """Return the table of these records, without columns that say nothing."""
-    cells = [[value(record) for _, value in columns] for record in records]
-    kept = [i for i in range(len(columns)) if any(row[i] not in ('-', '') for row in cells)]
-    return table([columns[i][0] for i in kept], [[row[i] for i in kept] for row in cells])
-
-
-def _stage(name: str, records: Sequence[Record]) -> list[str]:
-    lines = [f'## {name}', '']
-    own = [record for record in records if record.peer is None]
-    columns = [*SIZE, *OWN]
-    columns += [CELLS] if all('cells_per_s' in record.extra for record in own) else []
-    columns += [EVENTS] if all('events_s' in record.extra for record in own) else []
-    lines += [*_columns(own, columns), ''] if own else []
-    against = [record for record in records if record.peer is not None]
-    if against:
-        rivals = [record for record in against if not record.extra.get('peer_part')]
-        losses = f'{sum(map(lost, rivals))} of {len(rivals)} lost'
-        lines += [f'Against others ({losses}):' if rivals else 'Beside a part of the work:', '']
-        lines += [*_columns(against, [*SIZE, *PEERS]), '']
-        notes = {record.peer: record.extra.get('peer_note') for record in against}
-        lines += [f'* {peer}: {note}' for peer, note in notes.items() if note] + ['']
-    return lines
-
-
-def _skipped(records: Sequence[Record]) -> list[str]:
-    if not records:
-        return []
-    rows = [
-        [
-            record.name,
-            record.peer or '',
-            f'{record.n:,}',
-            f'{record.dim:,}',
-            record.dtype,
-            str(record.skipped),
-        ]
-        for record in records
-    ]
-    return ['## Not measured', '', *table(('stage', 'peer', 'n', 'd', 'dtype', 'why'), rows), '']
-
-
-def markdown(records: Sequence[Record]) -> str:
-    """Return the report of a run."""
-    measured = [record for record in records if record.median_s is not None]
-    ceilings = [record for record in records if record.name.startswith('ceiling_')]
-    lines = _heading(records[0]) + marks_section(records) + _ceilings(ceilings)
-    for name in dict.fromkeys(record.name for record in measured):
-        lines += _stage(name, [record for record in measured if record.name == name])
-    lines += _skipped([record for record in records if record.skipped])
-    return '\n'.join(lines).rstrip() + '\n'
-
-
-def write(path: Path) -> Path:
-    """Write the report of a JSON file beside it."""
-    target = path.with_suffix('.md')
-    target.write_text(markdown(load(path)), encoding='utf-8')
-    return target
-
-
-def main() -> None:
-    """Run the command."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('results', type=Path, help='what benchmarks/matching.py wrote')
-    print(f'wrote {write(parser.parse_args().results)}')
-
-
-if __name__ == '__main__':
-    main()
