@@ -21,8 +21,8 @@ from stavpr_ros.commands.loop_demo import read_result
 from stavpr_ros.commands.record import loop_closure_record, match_record
 from stavpr_ros.demonstration.loop_plots import choose_closures
 from stavpr_ros.errors import SourceError
-from stavpr_ros.evaluation.drive import judge
 from stavpr_ros.evaluation.ground_truth import GroundTruth
+from stavpr_ros.evaluation.records import evaluate_records
 from stavpr_ros.mapping import load_map
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
@@ -382,7 +382,7 @@ def test_an_invalid_image_does_not_shift_the_judgment():
     """Windows of 3; image 3 is in none, so the window that ends with image 4 holds images 1, 2 and 4."""
     records = [record('WARMING_UP'), record('WARMING_UP'), record('MATCH', 1), record('INVALID_IMAGE')]
     records += [record('MATCH', 2), record('MATCH', 4)]
-    result = judge(records, 3, 0.5, np.array([0, 1, 2, 3, 4, 5]), 0)
-    assert result.answers.places.tolist() == [0, 1, 2, -1, 4, 5]
-    assert result.score.true_positives == 5
-    assert result.score.false_negatives == 1
+    result = evaluate_records(records, 3, 0.5, np.array([0, 1, 2, 3, 4, 5]), 0)
+    assert result.matches.places.tolist() == [0, 1, 2, -1, 4, 5]
+    assert result.counts.true_positives == 5
+    assert result.counts.false_negatives == 1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stavpr_ros.errors import InputError, UnavailableError
-from stavpr_ros.evaluation.curves import Ranking, evaluate_ranking, false_alarm_rate, nearest_places
+from stavpr_ros.evaluation.metrics import Ranking, evaluate_ranking, false_alarm_rate, smallest_indices
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 
 pytest.importorskip('sklearn', reason='the extra evaluation is not installed')
@@ -108,12 +108,12 @@ def test_false_alarms():
 
 def test_nearest_places():
     row = np.array([3, 1, np.inf, 1, 2, np.nan, 1], np.float32)
-    assert nearest_places(row, 2).tolist() == [1, 3]
-    assert nearest_places(row, 20).tolist() == [1, 3, 6, 4, 0]
-    assert nearest_places(np.array([]), 3).tolist() == []
+    assert smallest_indices(row, 2).tolist() == [1, 3]
+    assert smallest_indices(row, 20).tolist() == [1, 3, 6, 4, 0]
+    assert smallest_indices(np.array([]), 3).tolist() == []
     rng = np.random.default_rng(1)
     many = rng.integers(0, 9, 200).astype(np.float32)
-    assert nearest_places(many, 20).tolist() == np.argsort(many, kind='stable')[:20].tolist()
+    assert smallest_indices(many, 20).tolist() == np.argsort(many, kind='stable')[:20].tolist()
 
 
 def test_a_ranking_has_a_score_a_query():

@@ -14,8 +14,8 @@ from conftest import route_images
 
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.commands import evaluate
-from stavpr_ros.evaluation.metrics import best_f1, frame_answers
-from stavpr_ros.evaluation.offline import recognize_all, window_answers
+from stavpr_ros.evaluation.evaluate import recognize_all
+from stavpr_ros.evaluation.metrics import best_f1, image_matches
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
@@ -126,7 +126,7 @@ def test_the_numbers_are_those_of_the_recognizer(drives, judged, options, spatia
     query = build_map(open_source(drives / 'aside'), extractor, progress=False).features[::2]
     settings = RecognizerSettings(1.0, spatial=spatial, sequence=SequenceSettings(8, 1.5))
     recognizer = PlaceRecognizer(place_map, settings)
-    answers = frame_answers(window_answers(recognize_all(recognizer, query)), 8)
+    answers = image_matches(recognize_all(recognizer, query), 8)
     right = np.abs(answers.places - np.arange(0, PLACES, 2)) <= 2
     best = best_f1(answers.distances, right)
     assert found['sequence']['f1'] == best.f1

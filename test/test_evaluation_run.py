@@ -7,12 +7,12 @@ import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.errors import InputError
-from stavpr_ros.evaluation.curves import Ranking
+from stavpr_ros.evaluation.metrics import Ranking
 from stavpr_ros.evaluation.evaluate import (
-    DistancePicture,
+    ReducedDistances,
     TraverseResults,
     centered_images,
-    evaluate_answers,
+    evaluate_traverse,
     recognize_traverse,
 )
 from stavpr_ros.evaluation.ground_truth import GroundTruth
@@ -27,16 +27,16 @@ class Scripted:
     def __init__(self, rows, answers, candidates):
         self.rows, self.answers, self.listed, self.at = rows, answers, candidates, -1
 
-    def add(self, features):
+    def update(self, features):
         assert len(features) == 1
         self.at += 1
         found = self.answers[self.at]
         if found is None:
-            return Match(Status.WARMING_UP, '', None, np.empty((0, 2), np.int32), 1.0)
+            return Match(Status.WARMING_UP)
         path = np.array(found, np.int32)
         middle = int(path[1, 1])
         nearest = SequenceMatch(int(path[0, 1]), int(path[-1, 1]), middle, 0.25, -1, float('nan'))
-        return Match(Status.MATCH, '', nearest, path, 1.0)
+        return Match(Status.MATCH, sequence=nearest, path=path)
 
     def newest_row(self):
         return np.array(self.rows[self.at], np.float32)
@@ -63,11 +63,11 @@ def test_every_image_gets_its_answers(small_map):
     assert found.single.best.tolist() == [0, 1, 2, 5]
     assert found.single.scores.tolist() == [1, 2, 1, 0]
     assert found.single.places[2, :6].tolist() == [2, 0, 1, 3, 5, -1]
-    assert [view.image for view in found.views] == [1, 2]
-    view = found.views[1]
+    assert [view.image for view in found.windows] == [1, 2]
+    view = found.windows[1]
     assert (view.first, view.newest) == (0, 3)
     np.testing.assert_array_equal(view.distances[1], [9, 9, 1, 9, np.nan, 9])
-    np.testing.assert_array_equal(found.picture.values[0], [1, 5, 5, 5, 5, 5])
+    np.testing.assert_array_equal(found.distances.values[0], [1, 5, 5, 5, 5, 5])
 
 
 def test_long_drives_are_pictured_by_the_smallest_of_each_block(monkeypatch, small_map):
@@ -77,7 +77,7 @@ def test_long_drives_are_pictured_by_the_smallest_of_each_block(monkeypatch, sma
     rows = [[5, 4, 9], [3, 8, 7], [6, 6, 1], [2, 6]]  # the last one knows two places only
     online = Scripted(rows, [None] * 4, [None] * 4)
     settings = RecognizerSettings(1.0, sequence=SequenceSettings(length=3))
-    picture = recognize_traverse(online, small_map.features[:4], 3, settings).picture
+    picture = recognize_traverse(online, small_map.features[:4], 3, settings).distances
     assert picture.block == (2, 2)
     assert picture.values.tolist() == [[3, 7], [2, 1]]
 
@@ -105,9 +105,9 @@ def test_the_worst_mistakes():
     for image, place, score in ((10, 40, 0.5), (12, 41, 0.6), (30, 33, 0.1), (50, 5, 0.2), (55, 6, np.inf)):
         places[image], scores[image] = place, score
     answers = Ranking(places[:, None], scores)
-    drive = TraverseResults(answers, answers, np.zeros(60), (), DistancePicture(np.zeros((1, 1)), (60, 60)))
-    evaluation = evaluate_answers(drive, GroundTruth.identity(60, 60, 1), 20)
+    drive = TraverseResults(answers, answers, np.zeros(60), (), ReducedDistances(np.zeros((1, 1)), (60, 60)))
+    evaluation = evaluate_traverse(drive, GroundTruth.identity(60, 60, 1), 20)
     assert worst_mistakes(evaluation, 9) == [50, 10, 30]
     assert worst_mistakes(evaluation, 1) == [50]
-    with pytest.raises(InputError, match='59 images: 60 came'):
-        evaluate_answers(drive, GroundTruth.identity(59, 59, 1), 20)
+    with pytest.raises(InputError, match='59 images for 60'):
+        evaluate_traverse(drive, GroundTruth.identity(59, 59, 1), 20)

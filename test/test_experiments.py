@@ -116,7 +116,7 @@ def test_a_column_is_one_evaluation(tmp_path):
         assert found[other]['threshold'] != found['sta_vpr']['threshold'], other
     assert found['spatial']['threshold'] != found['sta_vpr']['threshold']
     assert found['no_alignment']['threshold'] != found['temporal']['threshold']
-    assert found['without_speeds']['threshold'] != found['robust']['threshold']
+    assert found['without_velocity_search']['threshold'] != found['robust']['threshold']
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from stavpr_ros.evaluation.drive import judge
-from stavpr_ros.evaluation.metrics import best_f1, frame_answers
-from stavpr_ros.evaluation.offline import recognize_all, window_answers
+from stavpr_ros.evaluation.evaluate import recognize_all
+from stavpr_ros.evaluation.metrics import best_f1, image_matches
+from stavpr_ros.evaluation.records import evaluate_records
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, extract_features, save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
@@ -43,12 +43,12 @@ def test_the_node_is_the_core(bags, request, tmp_path, kind, mode, known_f1, rec
 
     query = extract_features(open_source(bags / 'day_right'), extractor, progress=False)
     offline = recognize_all(PlaceRecognizer(place_map, RecognizerSettings(threshold, mode=mode)), query)
-    expected = frame_answers(window_answers(offline), 20)
+    expected = image_matches(offline, 20)
 
     parameters = {'map_path': map_path, 'threshold': threshold, 'mode': mode}
     records = run_live(parameters, str(bags / 'day_right'), len(query), tmp_path)
     truth = np.arange(len(query))
-    live = judge(records, 20, threshold, truth, TOLERANCE).answers
+    live = evaluate_records(records, 20, threshold, truth, TOLERANCE).matches
 
     np.testing.assert_array_equal(live.places, expected.places)
     np.testing.assert_allclose(live.distances, expected.distances, atol=2e-6)

@@ -21,7 +21,7 @@ from stavpr_ros.alignment import (
     strip_distances,
 )
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.evaluation.offline import recognize_all
+from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.mapping import build_map, extract_features

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from stavpr_ros.alignment import SequenceMatch
 from stavpr_ros.errors import InputError
-from stavpr_ros.evaluation.metrics import WindowAnswer, best_f1, frame_answers, score_at, sweep
+from stavpr_ros.evaluation.metrics import best_f1, counts_at, image_matches, sweep
+from stavpr_ros.recognition import Match, Status
 
 
 def test_counts_by_hand():
@@ -12,12 +14,12 @@ def test_counts_by_hand():
     distances = np.array([0.1, 0.2, 0.5, 0.6])
     correct = np.array([True, False, True, False])
     has_match = np.array([True, True, True, False])
-    score = score_at(0.3, distances, correct, has_match)
+    score = counts_at(0.3, distances, correct, has_match)
     assert (score.true_positives, score.false_positives, score.false_negatives) == (1, 1, 1)
     assert score.precision == 0.5
     assert score.recall == 0.5
     assert score.f1 == 0.5
-    assert score_at(0.2, distances, correct).false_positives == 0  # accepted means below, not at
+    assert counts_at(0.2, distances, correct).false_positives == 0  # accepted means below, not at
 
 
 def test_best_f1_by_hand():
@@ -39,8 +41,12 @@ def test_shapes_must_agree():
         best_f1(np.zeros(3), np.zeros(2, bool))
 
 
-def window(middle: int, path: list[tuple[int, int]], distance: float = 0.1) -> WindowAnswer:
-    return WindowAnswer(middle, distance, np.array(path, np.int32))
+def window(middle, path, distance=0.1):
+    nearest = SequenceMatch(path[0][1], path[-1][1], middle, distance, -1, float('nan'))
+    return Match(Status.NO_MATCH, sequence=nearest, path=np.array(path, np.int32))
+
+
+NONE = Match(Status.WARMING_UP)
 
 
 def test_frame_answers_by_hand():
@@ -49,14 +55,14 @@ def test_frame_answers_by_hand():
     are images 1, 2, 3. Image 0 is read off the first path, images 4 and 5 off the last one's.
     """
     windows = [
-        None,
-        None,
-        None,
+        NONE,
+        NONE,
+        NONE,
         window(11, [(0, 10), (0, 11), (0, 12), (1, 12), (2, 12), (3, 12)], 0.3),
         window(12, [(0, 11), (1, 12), (2, 13), (3, 14)], 0.2),
         window(14, [(0, 12), (1, 13), (2, 15), (3, 16), (3, 17)], 0.4),
     ]
-    answers = frame_answers(windows, 4)
+    answers = image_matches(windows, 4)
     assert answers.places.tolist() == [11, 11, 12, 14, 15, 16]
     assert answers.distances.tolist() == [0.3, 0.3, 0.2, 0.4, 0.4, 0.4]
     assert answers.within(np.array([11, 14, -1, 14, 12, 19]), 2).tolist() == [
@@ -70,7 +76,7 @@ def test_frame_answers_by_hand():
 
 
 def test_no_window_no_answer():
-    answers = frame_answers([None, None], 4)
+    answers = image_matches([NONE, NONE], 4)
     assert answers.places.tolist() == [-1, -1]
     assert np.isinf(answers.distances).all()
 

@@ -13,7 +13,7 @@ from std_msgs.msg import Float32, Int32
 
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.evaluation.offline import recognize_all
+from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
 LENGTH, THRESHOLD = 5, 0.2

@@ -13,8 +13,7 @@ from stavpr_msgs.msg import LoopClosure, PlaceMatch
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import frame_answers, score_at
-from stavpr_ros.evaluation.offline import window_answers
+from stavpr_ros.evaluation.metrics import counts_at, image_matches
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import load_map
 from stavpr_ros.pipeline import PipelineSettings
@@ -140,8 +139,8 @@ def test_the_hallway_is_closed(bench, start, data_folder):
         places[closure.query_index] = closure.place_index
     told = np.flatnonzero(places >= 0)
     correct = truth.accepts(places)
-    offline = frame_answers(window_answers(driven.core), 20)
-    score = score_at(1.0, offline.distances, truth.accepts(offline.places), truth.has_match)
+    offline = image_matches(driven.core, 20)
+    score = counts_at(1.0, offline.distances, truth.accepts(offline.places), truth.has_match)
     print(f'hallway: {len(told)} loop closures, {correct[told].mean():.3f} right, '
           f'{correct.sum()} of {truth.has_match.sum()} places; core with its ends '
           f'precision {score.precision:.3f}, recall {score.recall:.3f}')  # fmt: skip

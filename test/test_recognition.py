@@ -6,7 +6,7 @@ import torch
 
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings, align_sequence, best_match, match_sequence
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
-from stavpr_ros.evaluation.offline import recognize_all
+from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status

@@ -9,9 +9,9 @@ import torch
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.demonstration.street import World, first_drive
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
+from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import best_f1, frame_answers, score_at
-from stavpr_ros.evaluation.offline import recognize_all, window_answers
+from stavpr_ros.evaluation.metrics import best_f1, counts_at, image_matches
 from stavpr_ros.evaluation.warp import warp_indices
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import build_map, extract_features
@@ -316,9 +316,9 @@ def as_map(features):
 
 def judged(reference, query, truth):
     """Best F1, and the precision at the default threshold."""
-    answers = frame_answers(window_answers(recognize_all(robust(as_map(reference)), query)), 20)
+    answers = image_matches(recognize_all(robust(as_map(reference)), query), 20)
     correct = truth.accepts(answers.places)
-    return best_f1(answers.distances, correct).f1, score_at(1.0, answers.distances, correct).precision
+    return best_f1(answers.distances, correct).f1, counts_at(1.0, answers.distances, correct).precision
 
 
 def taken(features, indices):
@@ -375,8 +375,8 @@ def test_the_hallway_is_closed(drives, data_folder):
     assert truth.has_match.sum() == 44
     closer = LoopCloser(RecognizerSettings(1.0, mode='robust'), 20, features.settings)
     answers = [closer.update(features[i : i + 1]) for i in range(84)]
-    answered = frame_answers(window_answers(answers), 20)
-    score = score_at(1.0, answered.distances, truth.accepts(answered.places), truth.has_match)
+    answered = image_matches(answers, 20)
+    score = counts_at(1.0, answered.distances, truth.accepts(answered.places), truth.has_match)
     print(f'hallway: precision {score.precision:.3f}, recall {score.recall:.3f}')
     assert score.precision >= 0.95
     assert score.recall >= 0.8

@@ -8,7 +8,7 @@ from stavpr_ros.evaluation.metrics import best_f1
 from stavpr_ros.evaluation.paper.datasets import open_dataset
 from stavpr_ros.evaluation.seqslam import (
     SeqSlamSettings,
-    describe,
+    preprocess,
     differences,
     enhance_contrast,
     match_differences,
@@ -23,7 +23,7 @@ def test_patches_by_hand():
     """Left patch 0 2 / 2 4: mean 2, deviation sqrt 2. The right one is flat."""
     image = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8)
     root = np.sqrt(2)
-    described = describe([image], SMALL)
+    described = preprocess([image], SMALL)
     assert described.dtype == np.float32
     np.testing.assert_allclose(described.reshape(2, 4), [[-root, 0, 0, 0], [0, root, 0, 0]], atol=1e-6)
 
@@ -32,15 +32,15 @@ def test_images_are_shrunk_by_areas_and_made_gray():
     gray = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8)
     large = np.kron(gray, np.ones((3, 3), np.uint8))
     color = np.stack([large] * 3, axis=2)
-    expected = describe([gray], SMALL)
-    np.testing.assert_array_equal(describe([large], SMALL), expected)
-    np.testing.assert_array_equal(describe([Frame(color, 0, '')], SMALL), expected)
+    expected = preprocess([gray], SMALL)
+    np.testing.assert_array_equal(preprocess([large], SMALL), expected)
+    np.testing.assert_array_equal(preprocess([Frame(color, 0, '')], SMALL), expected)
 
 
 def test_red_counts_more_than_blue():
     gray = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8) * 40
     color = np.stack([gray, gray * 0, 200 - gray], axis=2)  # red as the gray image, blue against it
-    np.testing.assert_allclose(describe([color], SMALL), describe([gray], SMALL), atol=0.05)
+    np.testing.assert_allclose(preprocess([color], SMALL), preprocess([gray], SMALL), atol=0.05)
 
 
 def test_differences_by_hand():
@@ -175,7 +175,7 @@ def test_images_that_are_wrong():
         seqslam([], [])
     for image in (np.zeros((4, 4)), np.zeros((4, 4, 2), np.uint8)):
         with pytest.raises(InputError, match='expected uint8'):
-            describe([image], SMALL)
+            preprocess([image], SMALL)
 
 
 @pytest.mark.parametrize(

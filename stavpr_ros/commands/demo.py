@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from stavpr_ros.demonstration.street import Drive
-    from stavpr_ros.evaluation.drive import DriveResult
+    from stavpr_ros.evaluation.records import TraverseEvaluation
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import PlaceMap
 
@@ -222,7 +222,7 @@ def _choose_threshold(place_map: 'PlaceMap', mode: str, given: float | None) -> 
     return threshold
 
 
-def _tell(result: 'DriveResult', folder: Path) -> None:
+def _tell(result: 'TraverseEvaluation', folder: Path) -> None:
     say('\n4. What came out')
     for line in result.summary().splitlines():
         say(f'   {line}')
@@ -249,7 +249,7 @@ def _run(arguments: argparse.Namespace) -> None:
 def _two_drives(arguments: argparse.Namespace, folder: Path) -> None:
     from stavpr_ros.commands.feature_options import make_extractor
     from stavpr_ros.demonstration.plots import draw_result
-    from stavpr_ros.evaluation.drive import judge
+    from stavpr_ros.evaluation.records import evaluate_records
     from stavpr_ros.mapping import save_map
     from stavpr_ros.ros.live import run_live
 
@@ -273,7 +273,7 @@ def _two_drives(arguments: argparse.Namespace, folder: Path) -> None:
         'keyframe_change': 0.0,  # every image is judged
     }
     records = run_live(parameters, drives.query, len(query), folder, drives.topics[1])
-    result = judge(records, arguments.sequence_length, threshold, drives.truth, arguments.tolerance)
+    result = evaluate_records(records, arguments.sequence_length, threshold, drives.truth, arguments.tolerance)
     draw_result(result, query, place_map, threshold, drives.title, folder)
     _tell(result, folder)
 

@@ -210,7 +210,7 @@ def _settings_told(arguments: argparse.Namespace, drives: 'Drives') -> dict[str,
 
 def _report(arguments: argparse.Namespace) -> 'Report':
     from stavpr_ros.commands.evaluate_sequences import load_drives
-    from stavpr_ros.evaluation.curves import import_sklearn
+    from stavpr_ros.evaluation.metrics import import_sklearn
     from stavpr_ros.evaluation.report import Report
 
     began = time.perf_counter()
@@ -220,7 +220,7 @@ def _report(arguments: argparse.Namespace) -> 'Report':
     loaded = time.perf_counter()
     evaluation = _evaluate(arguments, drives, settings)
     ended = time.perf_counter()
-    milliseconds = evaluation.answers.seconds * 1e3
+    milliseconds = evaluation.results.seconds * 1e3
     times = {
         **drives.times,
         'drives_s': loaded - began,
@@ -250,7 +250,7 @@ def _tell(report: 'Report') -> None:
     rows = ('f1', 'threshold', 'average_precision', 'recall_at_1', 'recall_at_5', 'recall_at_10')
     for row in (*rows, 'recall_at_20', 'recall_at_100_precision'):
         print(f'{row.replace("_", " "):28}' + ''.join(f'{number[row]:12.4f}' for number in numbers))
-    alarms = [report.evaluation.false_alarms(kind) for kind in ('sequence', 'single')]
+    alarms = [report.evaluation.false_alarm_rate(kind) for kind in ('sequence', 'single')]
     if alarms[0] is not None:
         print(f'{"false alarm rate":28}{alarms[0]:12.4f}{"":12}{alarms[1]:12.4f}')
     print(

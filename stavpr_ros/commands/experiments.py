@@ -13,7 +13,7 @@ from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
-    from stavpr_ros.evaluation.curves import Metrics
+    from stavpr_ros.evaluation.metrics import Metrics
     from stavpr_ros.evaluation.paper.datasets import Dataset
     from stavpr_ros.evaluation.paper.experiments import Configuration
 
@@ -197,7 +197,7 @@ def _number(value: float | None) -> str:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from stavpr_ros.evaluation.curves import import_sklearn
+    from stavpr_ros.evaluation.metrics import import_sklearn
     from stavpr_ros.evaluation.report_html import jsonable
 
     import_sklearn()

@@ -10,7 +10,7 @@ import numpy as np
 
 from stavpr_ros.commands.demo import CHECK, EXCLUDE, TOPIC, extract_map, image_records, make_room, say
 from stavpr_ros.errors import SettingsError, SourceError
-from stavpr_ros.evaluation.drive import IN_WINDOW
+from stavpr_ros.evaluation.records import IN_WINDOW
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 
 if TYPE_CHECKING:

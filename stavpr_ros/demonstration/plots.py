@@ -7,19 +7,19 @@ import numpy as np
 
 from stavpr_ros.errors import InputError
 from stavpr_ros.evaluation import plots
-from stavpr_ros.evaluation.drive import DriveResult
 from stavpr_ros.evaluation.plots import MatchPair, Outcome
+from stavpr_ros.evaluation.records import TraverseEvaluation
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
 
-def outcomes_of(result: DriveResult) -> list[Outcome]:
+def outcomes_of(result: TraverseEvaluation) -> list[Outcome]:
     """Return one outcome for each image."""
-    if result.truth is None or result.correct is None:
+    if result.true_places is None or result.correct is None:
         return ['match' if accepted else 'no match' for accepted in result.accepted]
     names: list[Outcome] = []
-    for accepted, correct, truth in zip(result.accepted, result.correct, result.truth, strict=True):
+    for accepted, correct, truth in zip(result.accepted, result.correct, result.true_places, strict=True):
         missed: Outcome = 'unseen' if truth < 0 else 'no match'
         names.append(('right' if correct else 'wrong') if accepted else missed)
     return names
@@ -39,8 +39,8 @@ def worth_seeing(outcomes: list[Outcome], count: int = 6) -> list[int]:
     return sorted(set(chosen))[:count]
 
 
-def _caption(result: DriveResult, image: int) -> str:
-    place, distance = result.matched[image], result.answers.distances[image]
+def _caption(result: TraverseEvaluation, image: int) -> str:
+    place, distance = result.matched[image], result.matches.distances[image]
     if not np.isfinite(distance):
         return f'image {image}: no answer'
     where = f'place {place}' if place >= 0 else 'no match'
@@ -48,7 +48,7 @@ def _caption(result: DriveResult, image: int) -> str:
 
 
 def _pair(
-    result: DriveResult, image: int, outcome: Outcome, query: PlaceMap, place_map: PlaceMap
+    result: TraverseEvaluation, image: int, outcome: Outcome, query: PlaceMap, place_map: PlaceMap
 ) -> MatchPair:
     picture = query.thumbnail(image)
     if picture is None:
@@ -66,7 +66,7 @@ def _matrix(features: LocalFeatures, place_map: PlaceMap) -> np.ndarray:
 
 
 def draw_result(
-    result: DriveResult, query: PlaceMap, place_map: PlaceMap, threshold: float, title: str, folder: Path
+    result: TraverseEvaluation, query: PlaceMap, place_map: PlaceMap, threshold: float, title: str, folder: Path
 ) -> None:
     """
     Draw the page ``demo.png``, and its parts in pictures of their own.
@@ -76,7 +76,7 @@ def draw_result(
     outcomes = outcomes_of(result)
     matrix = _matrix(query.features, place_map)
     pairs = [_pair(result, i, outcomes[i], query, place_map) for i in worth_seeing(outcomes)]
-    truth, best = result.truth, result.answers.distances
+    truth, best = result.true_places, result.matches.distances
     plots.demo_sheet(
         folder / 'demo.png',
         pairs,

@@ -1,8 +1,9 @@
 """
-One evaluation: a drive answered image by image, as the node does it, and judged.
+Evaluation of a traverse, recognized image by image as in the node.
 
-Each image gets two answers: the nearest place to it alone, and the place that the window around it was
-matched with. Only one row of distances exists at a time, so that length is limited by time, not memory.
+Every image has two results: the nearest place to the image alone, and the place that the window
+around it was matched with. Only one row of distances exists at a time, so that the length of a
+traverse is limited by time, not by memory.
 """
 
 import time
@@ -15,45 +16,44 @@ import numpy as np
 from tqdm import tqdm
 
 from stavpr_ros.errors import InputError
-from stavpr_ros.evaluation.curves import (
+from stavpr_ros.evaluation.ground_truth import GroundTruth
+from stavpr_ros.evaluation.metrics import (
     RANKS,
     Metrics,
     Ranking,
     evaluate_ranking,
     false_alarm_rate,
-    nearest_places,
+    image_matches,
+    smallest_indices,
 )
-from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import WindowAnswer, frame_answers
-from stavpr_ros.evaluation.offline import window_answers
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
 
-MARGIN = 8  # places shown beside the path of a window
-MATRIX_SIDE = 900  # cells along a side of the picture of all distances
-WINDOWS = 1500  # windows whose distances are kept, spread over the drive
+MARGIN = 8  # places beside the path of a window whose distances are kept
+MATRIX_SIDE = 900  # cells along a side of the reduced distance matrix
+WINDOWS = 1500  # windows whose distances are kept, spread over the traverse
 
 
-class Online(Protocol):
-    """What answers image by image: a recognizer on a map, or a loop closer."""
+class OnlineRecognizer(Protocol):
+    """A recognizer with a map, or a loop closer: both take image by image."""
 
     def update(self, features: LocalFeatures) -> Match:
-        """Take in the next image and answer for the window that ends with it."""
+        """Append the next image and match the window that ends with it."""
 
     def newest_row(self) -> np.ndarray:
-        """Scores of the newest image against every place there is, shape (n,), small is near."""
+        """Scores of the newest image against every place, shape (n,), small is near."""
 
     def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return up to ``count`` distinct places of the last window, nearest first, and distances."""
 
 
 @dataclass(frozen=True)
-class WindowView:
+class WindowDistances:
     """
     The distances of one window to the stretch of the map that it was matched with.
 
-    :param image: the window's middle image: the query that the window answers for.
+    :param image: the window's middle image, which the window is the match of.
     :param newest: its last image.
     :param first: first place of the stretch.
     :param distances: shape (l, k), float32, NaN where there was no place yet.
@@ -68,9 +68,9 @@ class WindowView:
 
 
 @dataclass(frozen=True)
-class DistancePicture:
+class ReducedDistances:
     """
-    Distances of all images to all places, reduced: each cell is the smallest of a block.
+    Distances of all images to all places; each cell is the smallest distance of a block.
 
     :param values: shape (rows, columns), float32; NaN where there was nothing to compare with.
     :param block: images a row, places a column.
@@ -83,32 +83,36 @@ class DistancePicture:
 @dataclass(frozen=True)
 class TraverseResults:
     """
-    All answers to the N images of a drive.
+    The matches of the N images of a traverse.
 
-    :param sequence: from the windows, each for its middle image; the ends from the outermost windows' paths.
-    :param single: from each image alone.
-    :param seconds: to answer each image, features excluded, shape (N,).
+    :param sequence: of the windows, each for its middle image; the first and last images take
+        theirs from the paths of the outermost windows.
+    :param single: of each image alone.
+    :param seconds: to match each image, features excluded, shape (N,).
+    :param windows: distances of some windows.
+    :param distances: of all images.
     """
 
     sequence: Ranking
     single: Ranking
     seconds: np.ndarray
-    views: tuple[WindowView, ...] = field(repr=False)
-    picture: DistancePicture = field(repr=False)
+    windows: tuple[WindowDistances, ...] = field(repr=False)
+    distances: ReducedDistances = field(repr=False)
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """
-    The judged answers to one drive.
+    Metrics of a traverse.
 
-    :param centered: the images that have a window centered on them: without the first and last l / 2.
-    :param unknown: answers to a drive through places that are not in the map, if there was one.
+    :param sequence_length: images in a window, l.
+    :param sequence_without_ends, single_without_ends: of the images in :attr:`centered`.
+    :param unknown: results of a traverse through places that are not in the map, if there was one.
     """
 
-    answers: TraverseResults
-    truth: GroundTruth
-    length: int
+    results: TraverseResults
+    ground_truth: GroundTruth
+    sequence_length: int
     sequence: Metrics
     sequence_without_ends: Metrics
     single: Metrics
@@ -118,25 +122,25 @@ class Evaluation:
     @property
     def centered(self) -> slice:
         """The images that have a window centered on them."""
-        return centered_images(len(self.answers.single), self.length)
+        return centered_images(len(self.results.single), self.sequence_length)
 
-    def false_alarms(self, kind: str, threshold: float | None = None) -> float | None:
+    def false_alarm_rate(self, kind: str, threshold: float | None = None) -> float | None:
         """
-        Share of unknown images that are accepted; None without any.
+        Return the share of unknown images that are accepted; None without any.
 
         :param kind: ``sequence`` or ``single``.
-        :param threshold: the one of the best F1 if not given.
+        :param threshold: that of the best F1 by default.
         """
         if self.unknown is None:
             return None
-        judged: Metrics = getattr(self, kind)
+        metrics: Metrics = getattr(self, kind)
         scores = getattr(self.unknown, kind).scores
-        return false_alarm_rate(scores, judged.best.threshold if threshold is None else threshold)
+        return false_alarm_rate(scores, metrics.best.threshold if threshold is None else threshold)
 
 
 def centered_images(count: int, length: int) -> slice:
     """
-    Return the images that have a window centered on them, all but the first and last l / 2 (section 6).
+    Return the images that have a window centered on them: all but the first and last l / 2.
 
     :param count: number of images N.
     :param length: images in a window, l.
@@ -148,8 +152,24 @@ def centered_images(count: int, length: int) -> slice:
     return slice(middle, count - (length - 1 - middle))
 
 
+def recognize_all(
+    recognizer: PlaceRecognizer, features: LocalFeatures, progress: bool = False
+) -> list[Match]:
+    """
+    Recognize every image of a sequence, starting with an empty window.
+
+    :param features: of N images.
+    :returns: N matches, one an image.
+    """
+    recognizer.reset()
+    images = tqdm(
+        range(len(features)), desc='recognizing', unit='image', disable=None if progress else True
+    )
+    return [recognizer.update(features[i : i + 1]) for i in images]
+
+
 def recognize_traverse(
-    online: Online,
+    online: OnlineRecognizer,
     features: LocalFeatures,
     places: int,
     settings: RecognizerSettings,
@@ -157,51 +177,53 @@ def recognize_traverse(
     progress: str = '',
 ) -> TraverseResults:
     """
-    Answer every image of a drive.
+    Match every image of a traverse.
 
     :param online: with an empty window.
     :param features: of N images.
-    :param places: number of places n that the rows of distances may reach.
+    :param places: largest number of places n that a row of distances may have.
     :param settings: those of ``online``.
-    :param shown: images around which the window's distances are kept, besides those that are anyway.
-    :param progress: words at the progress bar; none without.
+    :param shown: images whose windows' distances are kept in any case.
+    :param progress: label of the progress bar; none without.
     """
     count, ranks = len(features), max(RANKS)
     length = settings.sequence.length
     middle = (length - 1) // 2
-    single = _empty_ranking(count, ranks)
-    listed = np.full((count, ranks), -1, np.int64)
-    windows: list[WindowAnswer | None] = []
+    single = Ranking(np.full((count, ranks), -1, np.int64), np.full(count, np.inf))
+    candidates = np.full((count, ranks), -1, np.int64)
+    matches: list[Match] = []
     seconds = np.empty(count)
     rows: deque[np.ndarray] = deque(maxlen=length)
-    picture = _PictureBuilder(count, places)
-    views: list[WindowView] = []
+    reduced = _BlockMinimum(count, places)
+    windows: list[WindowDistances] = []
     every = -(-count // WINDOWS)
     for i in tqdm(range(count), desc=progress, unit='image', disable=None if progress else True):
         began = time.perf_counter()
         match = online.update(features[i : i + 1])
         seconds[i] = time.perf_counter() - began
-        row = np.array(online.newest_row())  # it may be written over
+        matches.append(match)
+        row = np.array(online.newest_row())  # a copy: the recognizer overwrites it
         rows.append(row)
-        picture.add(i, row)
-        nearest = nearest_places(row, ranks)
+        reduced.add(i, row)
+        nearest = smallest_indices(row, ranks)
         if len(nearest):
             single.places[i, : len(nearest)], single.scores[i] = nearest, row[nearest[0]]
-        windows += window_answers([match])
         if match.sequence is not None:
-            candidates = np.asarray(online.candidates(ranks)[0])
-            listed[i - (length - 1) + middle, : len(candidates)] = candidates
-            if i % every == 0 or i - (length - 1) + middle in shown:
-                views.append(_view(i, middle, length, rows, match.path))
-    answers = frame_answers(windows, length)
-    ranked = np.stack([_ranked(*pair) for pair in zip(answers.places, listed, strict=True)])
-    return TraverseResults(Ranking(ranked, answers.distances), single, seconds, tuple(views), picture.finished())
+            image = i - (length - 1) + middle
+            found = np.asarray(online.candidates(ranks)[0])
+            candidates[image, : len(found)] = found
+            if i % every == 0 or image in shown:
+                windows.append(_window_distances(image, i, length, rows, match.path))
+    matched = image_matches(matches, length)
+    ranked = np.stack([_ranked(*pair) for pair in zip(matched.places, candidates, strict=True)])
+    sequence = Ranking(ranked, matched.distances)
+    return TraverseResults(sequence, single, seconds, tuple(windows), reduced.result())
 
 
 def evaluate_on_map(
     place_map: PlaceMap,
     query: LocalFeatures,
-    truth: GroundTruth,
+    ground_truth: GroundTruth,
     settings: RecognizerSettings,
     unknown: LocalFeatures | None = None,
     shown: Collection[int] = (),
@@ -210,93 +232,98 @@ def evaluate_on_map(
     progress: bool = False,
 ) -> Evaluation:
     """
-    Recognize a drive on a map and judge it.
+    Recognize a traverse on a map and compute its metrics.
 
     :param query: features of N images.
-    :param truth: of the same images.
-    :param settings: of the recognizer; all answers are judged, whatever its threshold says of them.
-    :param unknown: features of a drive through places that are not in the map.
-    :param shown: images around which the window's distances are kept, besides those that are anyway.
+    :param ground_truth: of the same images.
+    :param settings: of the recognizer; the metrics are of all matches, whatever its threshold.
+    :param unknown: features of a traverse through places that are not in the map.
+    :param shown: images whose windows' distances are kept in any case.
     :param backend, precision: see :class:`stavpr_ros.recognition.PlaceRecognizer`.
+    :raises InputError: fewer images than one window, or ground truth of another length.
     """
 
-    def answers(features: LocalFeatures, name: str) -> TraverseResults:
-        # each drive meets a recognizer that has seen nothing before
+    def results(features: LocalFeatures, label: str) -> TraverseResults:
+        # a new recognizer for each: mode robust keeps statistics of the images so far
         recognizer = PlaceRecognizer(place_map, settings, backend, precision)
-        words = name if progress else ''
-        return recognize_traverse(recognizer, features, len(place_map), settings, shown, words)
+        label = label if progress else ''
+        return recognize_traverse(recognizer, features, len(place_map), settings, shown, label)
 
     centered_images(len(query), settings.sequence.length)
-    known = answers(query, 'recognizing')
-    strangers = None if unknown is None else answers(unknown, 'false alarms')
-    return evaluate_answers(known, truth, settings.sequence.length, strangers)
+    known = results(query, 'recognizing')
+    elsewhere = None if unknown is None else results(unknown, 'false alarms')
+    return evaluate_traverse(known, ground_truth, settings.sequence.length, elsewhere)
 
 
 def evaluate_loop_closures(
     query: LocalFeatures,
-    truth: GroundTruth,
+    ground_truth: GroundTruth,
     settings: RecognizerSettings,
-    exclude: int,
+    exclude_places: int,
     shown: Collection[int] = (),
     progress: bool = False,
 ) -> Evaluation:
     """
-    Recognize a drive on its own past and judge it.
+    Recognize a traverse on its own past and compute its metrics.
 
-    :param truth: of the same images: earlier images that count as right.
-    :param exclude: the latest images that are not part of the map.
+    :param ground_truth: of the same images: the earlier images that are correct.
+    :param exclude_places: the latest images that are not part of the map.
 
     The others are as in :func:`evaluate_on_map`.
     """
     from stavpr_ros.recognition.loop_closer import LoopCloser
 
     centered_images(len(query), settings.sequence.length)
-    closer = LoopCloser(settings, exclude, query.settings)
-    words = 'closing loops' if progress else ''
-    answers = recognize_traverse(closer, query, len(query), settings, shown, words)
-    return evaluate_answers(answers, truth, settings.sequence.length)
+    closer = LoopCloser(settings, exclude_places, query.settings)
+    label = 'closing loops' if progress else ''
+    results = recognize_traverse(closer, query, len(query), settings, shown, label)
+    return evaluate_traverse(results, ground_truth, settings.sequence.length)
 
 
-def evaluate_answers(
-    answers: TraverseResults, truth: GroundTruth, length: int, unknown: TraverseResults | None = None
+def evaluate_traverse(
+    results: TraverseResults,
+    ground_truth: GroundTruth,
+    length: int,
+    unknown: TraverseResults | None = None,
 ) -> Evaluation:
     """
-    Judge the answers to a drive, with and without its ends.
+    Compute the metrics of a traverse, with and without its first and last images.
 
-    :param truth: of the same N images.
+    :param ground_truth: of the same N images.
     :param length: images in a window, l.
-    :raises InputError: fewer images than one window, or a truth of another length.
+    :raises InputError: fewer images than one window, or ground truth of another length.
     """
-    if len(truth.has_match) != len(answers.single):
-        raise InputError(f'the truth is that of {len(truth.has_match)} images: {len(answers.single)} came')
-    centered = centered_images(len(answers.single), length)
+    if ground_truth.N != len(results.single):
+        raise InputError(
+            f'ground truth of {ground_truth.N} images for {len(results.single)} images: '
+            'expected one row an image'
+        )
+    centered = centered_images(len(results.single), length)
     return Evaluation(
-        answers,
-        truth,
+        results,
+        ground_truth,
         length,
-        sequence=evaluate_ranking(answers.sequence, truth),
-        sequence_without_ends=evaluate_ranking(answers.sequence, truth, centered),
-        single=evaluate_ranking(answers.single, truth),
-        single_without_ends=evaluate_ranking(answers.single, truth, centered),
+        sequence=evaluate_ranking(results.sequence, ground_truth),
+        sequence_without_ends=evaluate_ranking(results.sequence, ground_truth, centered),
+        single=evaluate_ranking(results.single, ground_truth),
+        single_without_ends=evaluate_ranking(results.single, ground_truth, centered),
         unknown=unknown,
     )
 
 
-def _empty_ranking(count: int, ranks: int) -> Ranking:
-    return Ranking(np.full((count, ranks), -1, np.int64), np.full(count, np.inf))
-
-
-def _ranked(answer: int, candidates: np.ndarray) -> np.ndarray:
-    """Put the answer first, whatever the candidates say, and the others behind it."""
-    others = candidates[(candidates != answer) & (candidates >= 0)]
+def _ranked(place: int, candidates: np.ndarray) -> np.ndarray:
+    """Return the matched place followed by the other candidates, shape (K,); -1 = no further."""
+    others = candidates[(candidates != place) & (candidates >= 0)]
     ranked = np.full(len(candidates), -1, np.int64)
-    ranked[0] = answer
+    ranked[0] = place
     ranked[1 : 1 + len(others)] = others[: len(candidates) - 1]
     return ranked
 
 
-def _view(newest: int, middle: int, length: int, rows: Sequence[np.ndarray], path: np.ndarray) -> WindowView:
-    """Cut a window's distances to the surroundings of its path."""
+def _window_distances(
+    image: int, newest: int, length: int, rows: Sequence[np.ndarray], path: np.ndarray
+) -> WindowDistances:
+    """Cut a window's rows of distances to the surroundings of its path."""
     low, high = int(path[:, 1].min()), int(path[:, 1].max())
     first = max(0, low - MARGIN)
     width = high + MARGIN + 1 - first
@@ -306,16 +333,17 @@ def _view(newest: int, middle: int, length: int, rows: Sequence[np.ndarray], pat
         line[: len(part)] = part
     distances[~np.isfinite(distances)] = np.nan
     width = int(np.argwhere(np.isfinite(distances))[:, 1].max()) + 1  # the map may end before
-    return WindowView(newest - (length - 1) + middle, newest, first, distances[:, :width], path)
+    return WindowDistances(image, newest, first, distances[:, :width], path)
 
 
-class _PictureBuilder:
-    """Takes rows of distances and keeps the smallest of each block."""
+class _BlockMinimum:
+    """Reduces rows of distances to the smallest one of each block."""
 
     def __init__(self, count: int, places: int) -> None:
         self._block = (-(-count // MATRIX_SIDE), -(-max(1, places) // MATRIX_SIDE))
         self._columns = np.arange(0, max(1, places), self._block[1])
-        self._values = np.full((-(-count // self._block[0]), len(self._columns)), np.inf, np.float32)
+        shape = -(-count // self._block[0]), len(self._columns)
+        self._values = np.full(shape, np.inf, np.float32)
 
     def add(self, image: int, row: np.ndarray) -> None:
         if not len(row):
@@ -324,6 +352,6 @@ class _PictureBuilder:
         line = self._values[image // self._block[0], : len(columns)]
         np.minimum(line, np.fmin.reduceat(row, columns), out=line)
 
-    def finished(self) -> DistancePicture:
+    def result(self) -> ReducedDistances:
         values = np.where(np.isfinite(self._values), self._values, np.nan).astype(np.float32)
-        return DistancePicture(values, self._block)
+        return ReducedDistances(values, self._block)

@@ -1,20 +1,36 @@
-"""Precision, recall and F1 as the paper counts them (section 6 of the method)."""
+"""
+Precision, recall, F1 and the numbers derived from them.
 
+Counts, F1 and recall follow section 6 of the method: a query that is rejected although its place
+is in the map is a false negative. Average precision is scikit-learn's, which counts only rejected
+*correct* matches as false negatives; its F1 and recall at 100 % precision are given beside ours.
+"""
+
+import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from stavpr_ros.alignment import aligned_index
-from stavpr_ros.errors import InputError
+from stavpr_ros.errors import InputError, UnavailableError
+from stavpr_ros.evaluation.ground_truth import GroundTruth
+from stavpr_ros.recognition import Match
+
+RANKS = (1, 5, 10, 20)  # k of recall@k
 
 
 @dataclass(frozen=True)
-class Score:
+class Counts:
     """
-    Counts at one threshold: accepted and right (TP), accepted and wrong (FP), a true match rejected (FN).
+    Counts at one threshold.
 
-    :param threshold: accepted means distance < threshold.
+    :param threshold: a match is accepted if its distance is below.
+    :param true_positives: accepted and correct.
+    :param false_positives: accepted and wrong.
+    :param false_negatives: rejected although the place is in the map.
     """
 
     threshold: float
@@ -36,9 +52,151 @@ class Score:
 
     @property
     def f1(self) -> float:
-        """2 TP / (2 TP + FP + FN)."""
+        """2 TP / (2 TP + FP + FN); 0 when there is nothing to count."""
         total = 2 * self.true_positives + self.false_positives + self.false_negatives
         return 2 * self.true_positives / total if total else 0.0
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """
+    The best places for each of N queries and the distance of the first one.
+
+    :param places: shape (N, K), int64, best first; -1 = no further place.
+    :param scores: distance of the first place, shape (N,), float64; +inf = no match.
+    """
+
+    places: np.ndarray
+    scores: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.places.ndim != 2 or self.scores.shape != self.places.shape[:1]:
+            raise InputError(
+                f'places {self.places.shape} and scores {self.scores.shape}: expected (N, K) and (N,)'
+            )
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    @property
+    def best(self) -> np.ndarray:
+        """The first place of each query, shape (N,); -1 = none."""
+        return self.places[:, 0]
+
+
+@dataclass(frozen=True)
+class ImageMatches:
+    """
+    The matched place of each of N query images.
+
+    :param places: shape (N,), int64; -1 = none.
+    :param distances: shape (N,), float64; +inf = none.
+    """
+
+    places: np.ndarray
+    distances: np.ndarray
+
+    def within(self, true_places: np.ndarray, tolerance: int) -> np.ndarray:
+        """
+        Return which places are at most ``tolerance`` off, shape (N,), bool.
+
+        :param true_places: shape (N,); -1 = not in the map.
+        """
+        true_places = np.asarray(true_places)
+        known = (self.places >= 0) & (true_places >= 0)
+        return known & (np.abs(self.places - true_places) <= tolerance)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """
+    Precision over recall, from rejecting all matches to accepting all.
+
+    :param thresholds, precision, recall: shape (T,), float64.
+    """
+
+    thresholds: np.ndarray
+    precision: np.ndarray
+    recall: np.ndarray
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """
+    Metrics of the matches of some queries.
+
+    :param queries: number of queries.
+    :param with_match: how many of them have a place in the map.
+    :param best: counts at the threshold with the best F1.
+    :param average_precision: scikit-learn's ``average_precision_score``.
+    :param recall_at: share of the queries with a place in the map that have a correct one among
+        the first k; by k.
+    :param recall_at_full_precision: largest recall with precision 1.
+    :param sklearn_f1: best F1 of scikit-learn's curve.
+    :param sklearn_recall_at_full_precision: largest recall with precision 1 of that curve.
+    """
+
+    queries: int
+    with_match: int
+    best: Counts
+    average_precision: float
+    recall_at: dict[int, float]
+    recall_at_full_precision: float
+    sklearn_f1: float
+    sklearn_recall_at_full_precision: float
+    curve: Curve
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the numbers, without the curve, for a JSON file."""
+        return {
+            'f1': self.best.f1,
+            'threshold': self.best.threshold,
+            'precision': self.best.precision,
+            'recall': self.best.recall,
+            'average_precision': self.average_precision,
+            **{f'recall_at_{k}': value for k, value in self.recall_at.items()},
+            'recall_at_100_precision': self.recall_at_full_precision,
+            'true_positives': self.best.true_positives,
+            'false_positives': self.best.false_positives,
+            'false_negatives': self.best.false_negatives,
+            'queries': self.queries,
+            'queries_with_match': self.with_match,
+            'scikit_learn': {
+                'f1': self.sklearn_f1,
+                'recall_at_100_precision': self.sklearn_recall_at_full_precision,
+            },
+        }
+
+
+def counts_at(
+    threshold: float, distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None
+) -> Counts:
+    """
+    Count at one threshold.
+
+    :param distances: of each query's match, shape (N,); +inf or NaN = no match.
+    :param correct: the match is within the tolerance of the ground truth, shape (N,), bool.
+    :param has_match: the query's place is in the map, shape (N,), bool; None = all are.
+    :raises InputError: arrays of different shapes.
+    """
+    return _counts(np.array([threshold]), *_checked(distances, correct, has_match))[0]
+
+
+def sweep(distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None) -> list[Counts]:
+    """
+    Count at every threshold that changes the counts, from rejecting all to accepting all.
+
+    The parameters are those of :func:`counts_at`.
+    """
+    distances, correct, has_match = _checked(distances, correct, has_match)
+    finite = np.unique(distances[np.isfinite(distances)])
+    thresholds = np.append(finite, np.nextafter(finite[-1], np.inf)) if finite.size else np.zeros(1)
+    return _counts(thresholds, distances, correct, has_match)
+
+
+def best_f1(distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None) -> Counts:
+    """Return the counts with the best F1, on a tie those of the lowest threshold; see :func:`sweep`."""
+    return max(sweep(distances, correct, has_match), key=lambda counts: counts.f1)
 
 
 def _checked(
@@ -51,102 +209,134 @@ def _checked(
             f'distances {distances.shape}, correct {correct.shape}, has_match {has_match.shape}: '
             'expected one value a query each'
         )
-    return distances, correct, has_match
+    return np.where(np.isnan(distances), np.inf, distances), correct, has_match
 
 
-def score_at(
-    threshold: float, distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None
-) -> Score:
+def _counts(
+    thresholds: np.ndarray, distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray
+) -> list[Counts]:
+    order = np.argsort(distances)
+    accepted = np.searchsorted(distances[order], thresholds)  # below, not at the threshold
+    true_positives = np.append(0, np.cumsum(correct[order]))[accepted]
+    in_map = np.append(0, np.cumsum(has_match[order]))
+    false_negatives = in_map[-1] - in_map[accepted]
+    columns = (thresholds, true_positives, accepted - true_positives, false_negatives)
+    return [Counts(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+
+
+def image_matches(matches: Sequence[Match], length: int) -> ImageMatches:
     """
-    Count at one threshold.
+    Assign the matches of windows to images: each to the image in the middle of its window.
 
-    :param distances: of each query's answer, shape (N,); +inf or NaN = no answer.
-    :param correct: the answer is within the tolerance of the truth, shape (N,), bool.
-    :param has_match: the query's place is in the map, shape (N,), bool; None = all are.
+    Images before the middle of the first matched window or after that of the last one take their
+    place from that window's warping path, with its distance.
+
+    :param matches: one an image, in order: that of the window that ends with the image.
+    :param length: images in a window, l.
     """
-    distances, correct, has_match = _checked(distances, correct, has_match)
-    accepted = distances < threshold
-    return Score(
-        float(threshold),
-        int(np.count_nonzero(accepted & correct)),
-        int(np.count_nonzero(accepted & ~correct)),
-        int(np.count_nonzero(~accepted & has_match)),
+    places = np.full(len(matches), -1, np.int64)
+    distances = np.full(len(matches), np.inf)
+    middle = (length - 1) // 2
+    ends = [end for end, match in enumerate(matches) if match.sequence is not None]
+
+    def assign(end: int, position: int, place: int) -> None:
+        image = end - (length - 1) + position
+        if image >= 0:
+            places[image], distances[image] = place, matches[end].score
+
+    for end in ends:
+        assign(end, middle, matches[end].sequence.middle)  # type: ignore[union-attr]
+    if ends:
+        for position in range(middle):
+            assign(ends[0], position, aligned_index(matches[ends[0]].path, position))
+        for position in range(middle + 1, length):
+            assign(ends[-1], position, aligned_index(matches[ends[-1]].path, position))
+    return ImageMatches(places, distances)
+
+
+def evaluate_ranking(ranking: Ranking, ground_truth: GroundTruth, images: slice = slice(None)) -> Metrics:
+    """
+    Compare ranked places with the ground truth.
+
+    :param images: the queries that count; all by default.
+    :raises InputError: no queries are left.
+    :raises UnavailableError: scikit-learn is not installed.
+    """
+    correct = ground_truth.accepts(ranking.places)[images]
+    has_match = ground_truth.has_match[images]
+    scores = np.where(np.isnan(ranking.scores), np.inf, ranking.scores)[images]
+    if not len(scores):
+        raise InputError(f'{images} of {len(ranking)} queries leaves no queries to evaluate')
+    counts = sweep(scores, correct[:, 0], has_match)
+    average_precision, sklearn_f1, sklearn_recall = _sklearn_metrics(scores, correct[:, 0])
+    return Metrics(
+        queries=len(scores),
+        with_match=int(np.count_nonzero(has_match)),
+        best=max(counts, key=lambda each: each.f1),
+        average_precision=average_precision,
+        recall_at={k: _recall_at(k, correct, has_match) for k in RANKS},
+        recall_at_full_precision=max(each.recall for each in counts if each.precision == 1),
+        sklearn_f1=sklearn_f1,
+        sklearn_recall_at_full_precision=sklearn_recall,
+        curve=Curve(*np.array([(each.threshold, each.precision, each.recall) for each in counts]).T),
     )
 
 
-def sweep(distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None) -> list[Score]:
-    """Count at every threshold that changes something, from rejecting all to accepting all."""
-    distances, correct, has_match = _checked(distances, correct, has_match)
-    finite = np.unique(distances[np.isfinite(distances)])
-    thresholds = [*finite, np.nextafter(finite[-1], np.inf)] if finite.size else [0.0]
-    return [score_at(threshold, distances, correct, has_match) for threshold in thresholds]
-
-
-def best_f1(distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None) -> Score:
-    """Return the counts at the threshold with the best F1 (the lowest on a tie); see :func:`score_at`."""
-    return max(sweep(distances, correct, has_match), key=lambda score: score.f1)
-
-
-@dataclass(frozen=True)
-class WindowAnswer:
+def false_alarm_rate(scores: np.ndarray, threshold: float) -> float:
     """
-    What was found for one window.
+    Return the share of accepted matches among queries whose places are *not* in the map.
 
-    :param middle: midpoint of the nearest sequence, a place of the map.
-    :param distance: its distance.
-    :param path: its warping path, shape (m, 2): position in the window, place.
+    :param scores: distances, shape (N,); +inf or NaN = no match.
+    :raises InputError: no queries.
     """
+    if not len(scores):
+        raise InputError('the rate of false alarms needs at least one query')
+    return int(np.count_nonzero(scores < threshold)) / len(scores)
 
-    middle: int
-    distance: float
-    path: np.ndarray
 
-
-@dataclass(frozen=True)
-class FrameAnswers:
+def smallest_indices(row: np.ndarray, k: int) -> np.ndarray:
     """
-    The answer to each of N query images.
+    Return the indices of the k smallest finite values, smallest first, the lowest index on a tie.
 
-    :param places: shape (N,), int64; -1 where there is none.
-    :param distances: shape (N,), float64; +inf where there is none.
+    :param row: shape (n,); +inf and NaN are left out.
+    :returns: shape (<= k,), int64.
     """
-
-    places: np.ndarray
-    distances: np.ndarray
-
-    def within(self, truth: np.ndarray, tolerance: int) -> np.ndarray:
-        """Tell which answers are within ``tolerance`` places of the truth (-1 = not in the map)."""
-        truth = np.asarray(truth)
-        return (self.places >= 0) & (truth >= 0) & (np.abs(self.places - truth) <= tolerance)
+    usable = np.flatnonzero(np.isfinite(row))
+    if len(usable) > k:
+        limit = np.partition(row[usable], k - 1)[k - 1]
+        usable = usable[row[usable] <= limit]
+    return usable[np.argsort(row[usable], kind='stable')][:k]
 
 
-def frame_answers(windows: Sequence[WindowAnswer | None], length: int) -> FrameAnswers:
+def import_sklearn() -> ModuleType:
     """
-    Give every image its answer: that of the window whose midpoint it is.
+    Import scikit-learn's metrics.
 
-    Images before the first window's midpoint or after the last one's take theirs from that window's
-    warping path, with its distance.
-
-    :param windows: for each image in order, the answer of the window that ends with it; None without one.
-    :param length: images in a window, l.
+    :raises UnavailableError: the extra ``evaluation`` is not installed.
     """
-    places = np.full(len(windows), -1, np.int64)
-    distances = np.full(len(windows), np.inf)
-    middle = (length - 1) // 2
-    answered = [end for end, window in enumerate(windows) if window is not None]
+    try:
+        return importlib.import_module('sklearn.metrics')
+    except ImportError as error:
+        raise UnavailableError(
+            f'the evaluation needs scikit-learn ({error}): pip install scikit-learn'
+        ) from error
 
-    def fill(end: int, position: int, place: int) -> None:
-        window = windows[end]
-        image = end - (length - 1) + position
-        if window is not None and image >= 0:
-            places[image], distances[image] = place, window.distance
 
-    for end in answered:
-        fill(end, middle, windows[end].middle)  # type: ignore[union-attr]
-    if answered:
-        first, last = answered[0], answered[-1]
-        for position in range(middle):
-            fill(first, position, aligned_index(windows[first].path, position))  # type: ignore[union-attr]
-        for position in range(middle + 1, length):
-            fill(last, position, aligned_index(windows[last].path, position))  # type: ignore[union-attr]
-    return FrameAnswers(places, distances)
+def _recall_at(k: int, correct: np.ndarray, has_match: np.ndarray) -> float:
+    """Return the share of queries with a place in the map; NaN where none has one."""
+    found = correct[has_match, :k].any(axis=1)
+    return float(np.mean(found)) if has_match.any() else float('nan')
+
+
+def _sklearn_metrics(scores: np.ndarray, correct: np.ndarray) -> tuple[float, float, float]:
+    """Return average precision, best F1 and recall at 100 % precision, as scikit-learn counts."""
+    metrics = import_sklearn()
+    if not correct.any():
+        return 0.0, 0.0, 0.0
+    finite = np.isfinite(scores)
+    # scikit-learn takes finite values only: queries without a match come last
+    confidence = -np.where(finite, scores, scores[finite].max(initial=0.0) + 1)
+    precision, recall, _ = metrics.precision_recall_curve(correct, confidence)
+    average = metrics.average_precision_score(correct, confidence)
+    f1 = 2 * precision * recall / np.maximum(precision + recall, np.finfo(float).tiny)
+    return float(average), float(f1.max()), float(recall[precision == 1].max())

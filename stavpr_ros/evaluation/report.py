@@ -11,7 +11,7 @@ import numpy as np
 
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.evaluation import plots
-from stavpr_ros.evaluation.evaluate import Evaluation, WindowView
+from stavpr_ros.evaluation.evaluate import Evaluation, WindowDistances
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.plots import MatchPair
 from stavpr_ros.evaluation.report_html import html_page, jsonable
@@ -56,24 +56,24 @@ class Report:
             numbers['default_threshold'] = self._at_default()
         if evaluation.unknown is not None:
             for kind in ('sequence', 'single'):
-                numbers[kind]['false_alarm_rate'] = evaluation.false_alarms(kind)
-            numbers['false_alarm_rate'] = evaluation.false_alarms('sequence')
+                numbers[kind]['false_alarm_rate'] = evaluation.false_alarm_rate(kind)
+            numbers['false_alarm_rate'] = evaluation.false_alarm_rate('sequence')
             numbers['unknown_images'] = len(evaluation.unknown.single)
         numbers |= {'images': len(self.query), 'places': len(self.reference)}
         numbers |= {'settings': self.settings, 'times': self.times}
         return jsonable(numbers)
 
     def _at_default(self) -> dict[str, Any]:
-        from stavpr_ros.evaluation.metrics import score_at
+        from stavpr_ros.evaluation.metrics import counts_at
 
         evaluation, threshold = self.evaluation, self.default_threshold
         assert threshold is not None
-        answers = evaluation.answers.sequence
-        score = score_at(threshold, answers.scores, self.truth.accepts(answers.best), self.truth.has_match)
+        answers = evaluation.results.sequence
+        score = counts_at(threshold, answers.scores, self.truth.accepts(answers.best), self.truth.has_match)
         found: dict[str, Any] = {'threshold': threshold}
         found |= {'precision': score.precision, 'recall': score.recall, 'f1': score.f1}
         if evaluation.unknown is not None:
-            found['false_alarm_rate'] = evaluation.false_alarms('sequence', threshold)
+            found['false_alarm_rate'] = evaluation.false_alarm_rate('sequence', threshold)
         return found
 
 
@@ -111,7 +111,7 @@ def write_folder(report: Report, folder: Path) -> list[Path]:
 
 def _write_answers(report: Report, path: Path) -> None:
     evaluation = report.evaluation
-    sequence, single, truth = evaluation.answers.sequence, evaluation.answers.single, report.truth
+    sequence, single, truth = evaluation.results.sequence, evaluation.results.single, report.truth
     columns = {
         'image': range(len(report.query)),
         'identifier': report.query.ids,
@@ -148,12 +148,12 @@ def worst_mistakes(evaluation: Evaluation, count: int) -> list[int]:
 
     :returns: up to ``count`` images, the worst first.
     """
-    answers, true = evaluation.answers.sequence, evaluation.truth.middles
-    wrong = ~evaluation.truth.accepts(answers.best) & np.isfinite(answers.scores)
-    near = (true >= 0) & (np.abs(answers.best - true) < evaluation.length)
+    answers, true = evaluation.results.sequence, evaluation.ground_truth.middles
+    wrong = ~evaluation.ground_truth.accepts(answers.best) & np.isfinite(answers.scores)
+    near = (true >= 0) & (np.abs(answers.best - true) < evaluation.sequence_length)
     chosen: list[int] = []
     for image in np.lexsort((answers.scores, near)).tolist():
-        if wrong[image] and all(abs(image - other) > evaluation.length // 2 for other in chosen):
+        if wrong[image] and all(abs(image - other) > evaluation.sequence_length // 2 for other in chosen):
             chosen.append(image)
             if len(chosen) == count:
                 break
@@ -189,13 +189,13 @@ def _draw(report: Report, folder: Path) -> list[Path]:
     return drawn
 
 
-def chosen_view(evaluation: Evaluation, image: int | None) -> WindowView | None:
+def chosen_view(evaluation: Evaluation, image: int | None) -> WindowDistances | None:
     """
     Return the window around an image, or the worst mistake's (else the middle one) if none is named.
 
     :raises SettingsError: no window is centered on that image.
     """
-    views = evaluation.answers.views
+    views = evaluation.results.windows
     if image is not None:
         for view in views:
             if view.image == image:
@@ -213,7 +213,7 @@ def chosen_view(evaluation: Evaluation, image: int | None) -> WindowView | None:
 
 def _mistake(report: Report, image: int) -> MatchPair | None:
     """Return a wrong answer beside its query, with the true place in words."""
-    answers = report.evaluation.answers.sequence
+    answers = report.evaluation.results.sequence
     place, true = int(answers.best[image]), int(report.truth.middles[image])
     query, shown = report.query.thumbnail(image), report.reference.thumbnail(place)
     if query is None or shown is None:

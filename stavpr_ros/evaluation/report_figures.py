@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from stavpr_ros.evaluation.curves import Curve
+from stavpr_ros.evaluation.metrics import Curve
 
 RIGHT, WRONG, UNKNOWN, SINGLE, SEQUENCE, TRUTH = (
     '#2e8b57', '#c8402f', '#d99a1c', '#8a94a6', '#2358a5', '#f0c419',

@@ -13,8 +13,8 @@ import numpy as np
 
 from stavpr_ros.evaluation import report_figures as figures
 from stavpr_ros.evaluation import report_page
-from stavpr_ros.evaluation.curves import Metrics
-from stavpr_ros.evaluation.evaluate import WindowView
+from stavpr_ros.evaluation.metrics import Metrics
+from stavpr_ros.evaluation.evaluate import WindowDistances
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.report_matrix import accepted_answers
 from stavpr_ros.mapping import PlaceMap
@@ -83,14 +83,14 @@ def html_page(report: 'Report', mistakes: list[int]) -> str:
 def _lead(report: 'Report') -> str:
     best, single = report.evaluation.sequence.best, report.evaluation.single.best
     accepted = best.true_positives + best.false_positives
-    count = len(report.evaluation.answers.single)
+    count = len(report.evaluation.results.single)
     text = (
         f'Of {count} images, {accepted} are recognized at the best threshold, {best.threshold:.4g}: '
         f'{best.true_positives} rightly, {best.false_positives} wrongly. Rejected although in the map: '
         f'{best.false_negatives}. Looking at single images only, {single.true_positives} would be right and '
         f'{single.false_positives} wrong.'
     )
-    rate = report.evaluation.false_alarms('sequence')
+    rate = report.evaluation.false_alarm_rate('sequence')
     if rate is not None:
         text += f' Of the images of unknown places, {rate:.1%} are recognized all the same.'
     return ' '.join([text, *map(html.escape, report.notes)])
@@ -115,9 +115,9 @@ def _cards(report: 'Report') -> str:
             figures.SEQUENCE,
         ),
     ]
-    alarms = evaluation.false_alarms('sequence')
+    alarms = evaluation.false_alarm_rate('sequence')
     if alarms is not None:
-        alone = evaluation.false_alarms('single')
+        alone = evaluation.false_alarm_rate('single')
         cards.append(('false alarms', alarms, f'single images: {alone:.3f}', figures.WRONG))
     return ''.join(
         f'<div class="card"><span>{name}</span><b>{value:.3f}</b><span>{note}</span>'
@@ -128,7 +128,7 @@ def _cards(report: 'Report') -> str:
 
 def _scores(report: 'Report') -> dict[str, str]:
     evaluation = report.evaluation
-    answers = evaluation.answers.sequence
+    answers = evaluation.results.sequence
     right = report.truth.accepts(answers.best)
     groups = [
         ('right', figures.RIGHT, answers.scores[right]),
@@ -158,7 +158,7 @@ def _matrix(report: 'Report') -> str:
     colors = {'right': figures.RIGHT, 'wrong': figures.WRONG}
     dots = {colors[name]: pairs for name, pairs in accepted_answers(report.evaluation, truth).items()}
     return figures.matrix_svg(
-        report.evaluation.answers.picture.values, (truth.N, truth.n), accepted_lists(truth), dots
+        report.evaluation.results.distances.values, (truth.N, truth.n), accepted_lists(truth), dots
     )
 
 
@@ -172,7 +172,7 @@ def _mistakes_text(mistakes: list[int]) -> str:
 
 
 def _mistake(report: 'Report', image: int) -> str:
-    answers = report.evaluation.answers.sequence
+    answers = report.evaluation.results.sequence
     place, true = int(answers.best[image]), int(report.truth.middles[image])
     images = [
         (f'image {image}', _picture(report.query, image)),
@@ -214,7 +214,7 @@ def _table(report: 'Report') -> str:
     head = ('', 'sequences', 'without the ends', 'single images', 'without the ends')
     lines = [[name, *(f'{value(j):.4f}' for j in judged)] for name, value in ROWS.items()]
     if evaluation.unknown is not None:
-        rates = [f'{evaluation.false_alarms(kind):.4f}' for kind in ('sequence', 'single')]
+        rates = [f'{evaluation.false_alarm_rate(kind):.4f}' for kind in ('sequence', 'single')]
         lines.append(['false alarms', rates[0], '', rates[1], ''])
     lines.append(['queries', *(str(j.queries) for j in judged)])
     lines.append(['with a place in the map', *(str(j.with_match) for j in judged)])
@@ -238,7 +238,7 @@ def _shown(value: Any) -> str:
 def _data(report: 'Report', mistakes: list[int]) -> dict[str, Any]:
     """Return what the script of the page draws."""
     evaluation = report.evaluation
-    views = _chosen_views(evaluation.answers.views, mistakes)
+    views = _chosen_views(evaluation.results.windows, mistakes)
     accepted = accepted_lists(report.truth)
     shown = [_view(report, view, accepted) for view in views]
     places = {view[name] for view in shown for name in ('answer', 'true')}
@@ -257,14 +257,14 @@ def _data(report: 'Report', mistakes: list[int]) -> dict[str, Any]:
     }
 
 
-def _chosen_views(views: tuple[WindowView, ...], mistakes: list[int]) -> list[WindowView]:
+def _chosen_views(views: tuple[WindowDistances, ...], mistakes: list[int]) -> list[WindowDistances]:
     keep = set(np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int).tolist())
     return [view for i, view in enumerate(views) if i in keep or view.image in mistakes]
 
 
-def _view(report: 'Report', view: WindowView, accepted: list[np.ndarray]) -> dict[str, Any]:
+def _view(report: 'Report', view: WindowDistances, accepted: list[np.ndarray]) -> dict[str, Any]:
     """Return a window for the script, its distances as bytes: 0 near, 254 far, 255 nothing."""
-    answers, single = report.evaluation.answers.sequence, report.evaluation.answers.single
+    answers, single = report.evaluation.results.sequence, report.evaluation.results.single
     rows, columns = view.distances.shape
     low, high = np.nanmin(view.distances), np.nanmax(view.distances)
     share = (view.distances - low) / max(float(high - low), 1e-9)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from stavpr_ros.evaluation import plots
-from stavpr_ros.evaluation.evaluate import DistancePicture, Evaluation
+from stavpr_ros.evaluation.evaluate import ReducedDistances, Evaluation
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 
 
@@ -16,14 +16,14 @@ def accepted_answers(evaluation: Evaluation, truth: GroundTruth) -> dict[str, np
 
     :returns: image and place, shape (count, 2), of the right and of the wrong ones.
     """
-    answers = evaluation.answers.sequence
+    answers = evaluation.results.sequence
     accepted = answers.scores < evaluation.sequence.best.threshold
     right = truth.accepts(answers.best)
     pairs = np.stack([np.arange(len(answers)), answers.best], axis=1)
     return {'right': pairs[accepted & right], 'wrong': pairs[accepted & ~right]}
 
 
-def _true_cells(picture: DistancePicture, truth: GroundTruth) -> np.ndarray:
+def _true_cells(picture: ReducedDistances, truth: GroundTruth) -> np.ndarray:
     """Color the cells with a true place, the others clear: RGBA, shape (rows, columns, 4), uint8."""
     cells = np.zeros((*picture.values.shape, 4), np.uint8)
     rows, columns = (truth.pairs // picture.block).T
@@ -37,7 +37,7 @@ def draw_matrix(path: Path, evaluation: Evaluation, truth: GroundTruth) -> Path:
 
     :returns: the path.
     """
-    picture = evaluation.answers.picture
+    picture = evaluation.results.distances
     side = 7.5
     with plots.page(path, side, float(np.clip(side * truth.N / truth.n, 4, 9))) as figure:
         axes = figure.add_subplot()

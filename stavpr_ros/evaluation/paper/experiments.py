@@ -6,7 +6,7 @@ from typing import Any
 
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.evaluation.curves import Metrics, Ranking, evaluate_ranking
+from stavpr_ros.evaluation.metrics import Metrics, Ranking, evaluate_ranking
 from stavpr_ros.evaluation.evaluate import evaluate_on_map
 from stavpr_ros.evaluation.paper.datasets import Dataset
 from stavpr_ros.evaluation.seqslam import SeqSlamSettings, seqslam
