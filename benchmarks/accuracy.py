@@ -26,7 +26,7 @@ from stavpr_ros.evaluation.evaluate import (
     recognize_traverse,
 )
 from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import score_at
+from stavpr_ros.evaluation.metrics import counts_at
 from stavpr_ros.evaluation.warp import KINDS, cropped, warp_indices
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.features.registry import settings_class
@@ -92,7 +92,9 @@ def short_cases(folder: Path) -> Iterator[Case]:
 
 def long_cases(folder: Path, feature: str) -> Iterator[Case]:
     """Yield the cases of the full form."""
-    summer, winter = (open_source(folder / 'nordland_64x32' / name) for name in ('summer', 'winter'))
+    summer, winter = (
+        open_source(folder / 'nordland_64x32' / name) for name in ('summer', 'winter')
+    )
     yield Case('nordland', summer, winter, identity(3))
     if feature == 'g':
         shifted = cropped(summer, 0, 0.3), cropped(winter, 0.1, 0)
@@ -111,7 +113,12 @@ def extractor(feature: str, folder: Path) -> FeatureExtractor:
     if not model.is_file():
         raise UnavailableError(f'no file {model}')
     settings = settings_class('onnx')(
-        model=str(model), layer='fire6/concat_1', channels='bgr', scale=1.0, mean=(104, 117, 123), std=(1, 1, 1)
+        model=str(model),
+        layer='fire6/concat_1',
+        channels='bgr',
+        scale=1.0,
+        mean=(104, 117, 123),
+        std=(1, 1, 1),
     )
     return FeatureExtractor('onnx', settings)
 
@@ -127,16 +134,18 @@ def numbers(evaluation: Evaluation, threshold: float | None) -> dict[str, Any]:
         for name, metrics in (('sequence', evaluation.sequence), ('single', evaluation.single))
     }
     if threshold is not None:
-        ranking, truth = evaluation.answers.sequence, evaluation.truth
+        ranking, truth = evaluation.results.sequence, evaluation.ground_truth
         correct = truth.accepts(ranking.places)[:, 0]
-        score = score_at(threshold, ranking.scores, correct, truth.has_match)
+        counts = counts_at(threshold, ranking.scores, correct, truth.has_match)
         found['at_default'] = {
-            'threshold': threshold, 'precision': score.precision, 'recall': score.recall
+            'threshold': threshold, 'precision': counts.precision, 'recall': counts.recall
         }  # fmt: skip
     return found
 
 
-def evaluate_case(case: Case, feature: str, making: FeatureExtractor) -> Iterator[tuple[str, dict[str, Any]]]:
+def evaluate_case(
+    case: Case, feature: str, making: FeatureExtractor
+) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield key and numbers of a case in each mode and at each speed."""
     place_map, query = (_map(source, making) for source in (case.places, case.query))
     truth = case.truth(len(query), len(place_map))
@@ -152,7 +161,9 @@ def evaluate_case(case: Case, feature: str, making: FeatureExtractor) -> Iterato
             yield f'{case.name}/{feature}/{mode}/{warp}', numbers(evaluation, threshold)
 
 
-def evaluate_hallway(folder: Path, feature: str, making: FeatureExtractor) -> Iterator[tuple[str, Any]]:
+def evaluate_hallway(
+    folder: Path, feature: str, making: FeatureExtractor
+) -> Iterator[tuple[str, Any]]:
     """Yield key and numbers of the loop closures in each mode."""
     route = _map(open_source(folder / 'rtabmap_hallway_loop/samples'), making)
     file = folder / 'rtabmap_hallway_loop/samples_GT.bmp'
@@ -166,16 +177,18 @@ def evaluate_hallway(folder: Path, feature: str, making: FeatureExtractor) -> It
 
 def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict[str, Any]:
     """Return how many images of floors are matched on maps of other floors, all pairs, mode robust."""
-    floors = [_map(open_source(p), making) for p in sorted((folder / 'tower').iterdir()) if p.is_dir()]
+    floors = [
+        _map(open_source(p), making) for p in sorted((folder / 'tower').iterdir()) if p.is_dir()
+    ]
     settings = RecognizerSettings(THRESHOLD, mode='robust')
     images = matched = 0
     for place_map in floors:
         for query in floors:
             if query is not place_map:
                 recognizer = PlaceRecognizer(place_map, settings)
-                answers = recognize_traverse(recognizer, query.features, len(place_map), settings)
+                found = recognize_traverse(recognizer, query.features, len(place_map), settings)
                 images += len(query)
-                matched += int(np.count_nonzero(answers.sequence.scores < THRESHOLD))
+                matched += int(np.count_nonzero(found.sequence.scores < THRESHOLD))
     return {'images': images, 'matched': matched}
 
 
@@ -268,10 +281,18 @@ def markdown(about: dict[str, Any], results: Results) -> list[str]:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
-    parser.add_argument('--quick', action='store_true', help='gradient features, without Nordland and tower')
-    parser.add_argument('--compare', type=Path, metavar='OLD', help='table to compare with; 1 if worse')
-    parser.add_argument('--commit', default='', help='name of the measured commit, outside a git checkout')
-    parser.add_argument('--output', type=Path, default=RESULTS, help='folder of the table (%(default)s)')
+    parser.add_argument(
+        '--quick', action='store_true', help='gradient features, without Nordland and tower'
+    )
+    parser.add_argument(
+        '--compare', type=Path, metavar='OLD', help='table to compare with; 1 if worse'
+    )
+    parser.add_argument(
+        '--commit', default='', help='name of the measured commit, outside a git checkout'
+    )
+    parser.add_argument(
+        '--output', type=Path, default=RESULTS, help='folder of the table (%(default)s)'
+    )
     options = parser.parse_args(arguments)
     try:
         folder = data_folder()
@@ -290,7 +311,9 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     lines, worse = changes(old, results)
     print(*(lines or ['no value changed']), sep='\n')
-    print(f'compared {len(old.keys() & results.keys())} rows; not measured here: {len(old.keys() - results.keys())}')
+    print(
+        f'compared {len(old.keys() & results.keys())} rows; not measured here: {len(old.keys() - results.keys())}'
+    )
     return 1 if worse else 0
 
 

@@ -76,8 +76,13 @@ def serve(driver: str) -> None:
             n, d, seed = request['n'], request['d'], request['seed']
             weight, count = np.float32(STRIPS**-0.5), 0
             places = random_strips(n, d, seed)
-            queries, shares = random_strips(QUERIES, d, seed + 1), np.full((STRIPS, QUERIES), weight)
-            call = make(places, np.full((STRIPS, n), weight), request['mode'], request['precision'])
+            queries, shares = (
+                random_strips(QUERIES, d, seed + 1),
+                np.full((STRIPS, QUERIES), weight),
+            )
+            call = make(
+                places, np.full((STRIPS, n), weight), request['mode'], request['precision']
+            )
             request['frames'] = LENGTH
         taken, results = [], []
         for _ in range(request['frames']):
@@ -108,7 +113,9 @@ class Checkout:
         self._process.stdin.flush()
         line = self._process.stdout.readline()
         if not line:
-            raise SystemExit(f'compare: the process of a checkout exited with status {self._process.wait()}')
+            raise SystemExit(
+                f'compare: the process of a checkout exited with status {self._process.wait()}'
+            )
         return json.loads(line)
 
     def close(self) -> None:
@@ -118,7 +125,9 @@ class Checkout:
         self._process.wait()
 
 
-def compare(this: Checkout, other: Checkout, case: dict[str, Any], rounds: int, frames: int) -> dict[str, Any]:
+def compare(
+    this: Checkout, other: Checkout, case: dict[str, Any], rounds: int, frames: int
+) -> dict[str, Any]:
     """
     Time frames of both checkouts in turn.
 
@@ -151,7 +160,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('checkout', type=Path, help='folder of the other checkout')
     parser.add_argument('--driver', default='', help='Python file that adapts the other checkout')
-    parser.add_argument('--sizes', type=int, nargs='+', default=[2_000, 20_000], metavar='N', help='places')
+    parser.add_argument(
+        '--sizes', type=int, nargs='+', default=[2_000, 20_000], metavar='N', help='places'
+    )
     parser.add_argument('--dimensions', type=int, default=512, metavar='D')
     parser.add_argument('--precisions', nargs='+', default=['float32', 'float16'], metavar='DTYPE')
     parser.add_argument('--rounds', type=int, default=15, help='pairs of runs (%(default)s)')
@@ -165,14 +176,22 @@ def main(arguments: list[str] | None = None) -> int:
         serve(options.driver)
         return 0
     cases = [
-        {'mode': mode, 'n': n, 'd': options.dimensions, 'precision': precision, 'seed': options.seed}
+        {
+            'mode': mode,
+            'n': n,
+            'd': options.dimensions,
+            'precision': precision,
+            'seed': options.seed,
+        }
         for mode in ('robust', 'paper')
         for n in options.sizes
         for precision in options.precisions
     ]
     this, other = Checkout(ROOT), Checkout(options.checkout.resolve(), options.driver)
     found = []
-    print(f'{"mode":8}{"n":>9} {"precision":10}{"this ms":>9}{"other ms":>10}{"ratio":>7}  quartiles    results')
+    print(
+        f'{"mode":8}{"n":>9} {"precision":10}{"this ms":>9}{"other ms":>10}{"ratio":>7}  quartiles    results'
+    )
     for case in cases:
         result = compare(this, other, case, options.rounds, options.frames)
         low, high = result['ratio_quartiles']

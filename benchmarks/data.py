@@ -24,7 +24,9 @@ def data_folder() -> Path:
     """
     folder = Path(os.environ.get('STAVPR_DATA') or Path(__file__).resolve().parents[1] / 'data')
     if not folder.is_dir():
-        raise NoDataError(f'no data folder {folder}: set STAVPR_DATA to the folder of the data sets')
+        raise NoDataError(
+            f'no data folder {folder}: set STAVPR_DATA to the folder of the data sets'
+        )
     return folder
 
 
@@ -44,23 +46,9 @@ def make_features(n: int, d: int, W: int, device: str, seed: int) -> LocalFeatur
     return LocalFeatures(strips, weights, SETTINGS)
 
 
-def make_window(kind: str, l: int, n: int, seed: int) -> np.ndarray:
-    """
-    Make a window of image distances, shape (l, n), float32.
-
-    :param kind: ``random``, independent values; ``walk``, values that change slowly along the map and
-        fall towards a diagonal, as those of a recorded sequence.
-    """
-    rng = np.random.default_rng(seed)
-    if kind == 'random':
-        return rng.uniform(0.3, 1.0, (l, n)).astype(np.float32)
-    if kind != 'walk':
-        raise ValueError(f'window {kind!r} is unknown: expected random or walk')
-    walk = np.cumsum(rng.standard_normal((l, n)) * 0.01, axis=1)
-    walk = 0.7 + 0.2 * np.sin(walk)
-    place = n // 2 + np.arange(l)[:, None]
-    valley = 0.5 * np.exp(-(((np.arange(n) - place) / 3.0) ** 2))
-    return np.clip(walk - valley, 0.05, 1.0).astype(np.float32)
+def make_window(l: int, n: int, seed: int) -> np.ndarray:
+    """Draw a window of image distances, shape (l, n), float32; the kernels' times depend on the shape only."""
+    return np.random.default_rng(seed).uniform(0.3, 1.0, (l, n)).astype(np.float32)
 
 
 def free_bytes(device: str) -> int:

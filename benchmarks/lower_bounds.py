@@ -63,11 +63,6 @@ class Peaks:
     operations_per_s: dict[str, float]
     sources: dict[str, str] = field(default_factory=dict)
 
-    def best(self, other: 'Peaks') -> 'Peaks':
-        """Return the higher of two measurements of each peak."""
-        rates = {k: max(v, other.operations_per_s[k]) for k, v in self.operations_per_s.items()}
-        return Peaks(max(self.bytes_per_s, other.bytes_per_s), rates, other.sources | self.sources)
-
     def raised(self, work: Work, seconds: float, source: str) -> 'Peaks':
         """
         Return the peaks, raised to the rates that a stage has shown.
@@ -82,7 +77,9 @@ class Peaks:
         operations, read = work.operations / seconds, work.bytes / seconds
         if operations > self.operations_per_s[work.dtype]:
             rates = self.operations_per_s | {work.dtype: operations}
-            raised = replace(raised, operations_per_s=rates, sources=raised.sources | {work.dtype: source})
+            raised = replace(
+                raised, operations_per_s=rates, sources=raised.sources | {work.dtype: source}
+            )
         if work.bytes >= BEYOND_CACHES and read > self.bytes_per_s:
             raised = replace(raised, bytes_per_s=read, sources=raised.sources | {'read': source})
         return raised.widened()

@@ -29,19 +29,36 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('--device', choices=('cpu', 'cuda'), default='cpu')
-    parser.add_argument('--quick', action='store_true', help=f'up to {QUICK_LIMIT:,} places, fewer runs')
+    parser.add_argument(
+        '--quick', action='store_true', help=f'up to {QUICK_LIMIT:,} places, fewer runs'
+    )
     parser.add_argument('--sizes', type=int, nargs='+', default=SIZES, metavar='N', help='places')
     parser.add_argument(
-        '--dimensions', type=int, nargs='+', default=DIMENSIONS, metavar='D', help='of a local feature'
+        '--dimensions',
+        type=int,
+        nargs='+',
+        default=DIMENSIONS,
+        metavar='D',
+        help='of a local feature',
     )
     parser.add_argument('--precisions', nargs='+', metavar='DTYPE', help='of the map (all)')
-    parser.add_argument('--seconds', type=float, help='duration of one measurement (0.5; quick: 0.15)')
+    parser.add_argument(
+        '--seconds', type=float, help='duration of one measurement (0.5; quick: 0.15)'
+    )
     parser.add_argument('--memory', type=float, default=12, help='most GB to use (%(default)s)')
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--no-peers', action='store_true', help='without librosa and tslearn (.venv-peers)')
-    parser.add_argument('--no-memory', action='store_true', help='without the memory of the pipeline')
-    parser.add_argument('--commit', default='', help='name of the measured commit, outside a git checkout')
-    parser.add_argument('--output', type=Path, default=RESULTS, help='folder of the results (%(default)s)')
+    parser.add_argument(
+        '--no-peers', action='store_true', help='without librosa and tslearn (.venv-peers)'
+    )
+    parser.add_argument(
+        '--no-memory', action='store_true', help='without the memory of the pipeline'
+    )
+    parser.add_argument(
+        '--commit', default='', help='name of the measured commit, outside a git checkout'
+    )
+    parser.add_argument(
+        '--output', type=Path, default=RESULTS, help='folder of the results (%(default)s)'
+    )
     options = parser.parse_args(arguments)
     if options.quick:
         options.sizes = [n for n in options.sizes if n <= QUICK_LIMIT]
@@ -67,7 +84,13 @@ def open_peers(stack: ExitStack, run: 'Run', refused: bool) -> 'Peers | None':
 def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
     """Measure all stages of all sizes."""
     import torch
-    from stages import device_retrieval, feature_stages, memory_problem, paper_stages, robust_stages
+    from stages import (
+        device_retrieval,
+        feature_stages,
+        memory_problem,
+        paper_stages,
+        robust_stages,
+    )
 
     for n in options.sizes:
         robust_stages(run, n, options.seed)
@@ -103,11 +126,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     from memory import CASES, measure_memory
-    from peaks import SIDE, measure_peaks
+    from peaks import measure_peaks
     from report import report, target_section
     from results import environment, file_name, write
     from run import Run
-    from targets import evaluate
 
     from stavpr_ros.recognition.matcher import PRECISIONS
 
@@ -115,25 +137,24 @@ def main(arguments: list[str] | None = None) -> int:
     about = environment(options.device, options.commit)
     began = time.perf_counter()
     if about['machine']['load_before'] > BUSY:
-        print(f'The machine is busy (load {about["machine"]["load_before"]}): the results will not repeat.')
-    # memory first: its processes run beside nothing else, and the peaks beside none of them
-    memory = [] if options.no_memory or options.device != 'cpu' else [measure_memory(*case) for case in CASES]
+        print(
+            f'The machine is busy (load {about["machine"]["load_before"]}): results will not repeat.'
+        )
+    with_memory = options.device == 'cpu' and not options.no_memory
+    memory = [measure_memory(*case) for case in CASES if with_memory]
     peaks = measure_peaks(options.device, options.seconds)
     run = Run(options.device, options.seconds)
     measure_stages(run, options)
-    rows, peaks = run.finish(peaks.best(measure_peaks(options.device, options.seconds, SIDE // 2)))
-    targets = evaluate(rows, options.device)
+    rows, peaks = run.finish(peaks)
     name = f'matching-{file_name(about["machine"])}{"-quick" if options.quick else ""}.json'
     document = about | {
         'peaks': asdict(peaks),
         'rows': [row.to_json() for row in rows],
         'memory': [measured.to_json() for measured in memory],
-        'targets': targets,
         'skipped': [asdict(skipped) for skipped in run.skipped],
     }
-    lines = report(about, rows, memory, targets, peaks, run.skipped)
-    write(options.output / name, document, lines)
-    print('\n'.join(target_section(targets)))
+    write(options.output / name, document, report(about, rows, memory, peaks, run.skipped))
+    print('\n'.join(target_section(rows, options.device)))
     print(f'took {time.perf_counter() - began:.0f} s\nwrote {options.output / name} and its .md')
     return 0
 

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 TARGET = 1.1
 STRIPS = 7
 SMALL = 100  # places of the tiny pipeline
-# places and dimensions: more than 100 MB of features, so that everything else is small beside them
-SIZES = {'localization': (20_000, 512), 'loop_closure': (1_250, 4_096)}
+# places and dimensions: about 100 MB of features or more, so that everything else is small beside them
+SIZES = {'localization': (20_000, 512), 'loop_closure': (800, 4_096)}
 CASES = (
     ('localization', 'robust', 'float32'),
     ('localization', 'robust', 'float16'),
@@ -87,7 +87,9 @@ class Synthetic:
         """Return Gaussian feature maps, shape (n, d, 1, W); the image's first bytes are the seed."""
         import torch
 
-        generators = [np.random.default_rng(int.from_bytes(i.tobytes()[:8], 'little')) for i in images]
+        generators = [
+            np.random.default_rng(int.from_bytes(i.tobytes()[:8], 'little')) for i in images
+        ]
         drawn = [g.standard_normal((self.settings.d, 1, STRIPS), np.float32) for g in generators]
         return torch.from_numpy(np.stack(drawn))
 
@@ -128,7 +130,9 @@ def _save_map(path: Path, n: int, d: int) -> None:
     from stavpr_ros.mapping import PlaceMap, save_map
 
     features = make_features(n, d, STRIPS, 'cpu', seed=0)
-    features = replace(features, settings=FeatureSettings('synthetic', SyntheticSettings(d)), cells=(1, 1))
+    features = replace(
+        features, settings=FeatureSettings('synthetic', SyntheticSettings(d)), cells=(1, 1)
+    )
     save_map(PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n), path)
 
 
@@ -141,17 +145,19 @@ def resident_bytes() -> int:
     return pages * os.sysconf('SC_PAGE_SIZE')
 
 
-def run_pipeline(operation: str, mode: str, precision: str, n: int, d: int, folder: Path) -> 'Pipeline':
+def run_pipeline(
+    operation: str, mode: str, precision: str, n: int, d: int, folder: Path
+) -> 'Pipeline':
     """Return a pipeline that holds n places and has processed images."""
     from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
 
     settings = PipelineSettings(
-        threshold=0.5, mode=mode, precision=precision, features='synthetic', feature_settings=f'{{"d": {d}}}',
+        threshold=0.5, mode=mode, backend='cpu', precision=precision, features='synthetic', feature_settings=f'{{"d": {d}}}',
         max_places=max(n, 1000), thumbnail_width=0,
     )  # fmt: skip
     pipeline = Pipeline(settings, operation)
     if operation == 'localization':
-        pipeline.use(read_map(str(folder / f'{n}.stavpr'), settings))
+        pipeline.change(loaded=read_map(str(folder / f'{n}.stavpr'), settings))
     for i in range(n if operation == 'loop_closure' else IMAGES):
         pixels = np.frombuffer(i.to_bytes(8, 'little') * 24, np.uint8)
         message = SimpleNamespace(

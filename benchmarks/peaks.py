@@ -52,7 +52,9 @@ def matrix_rate(device: str, dtype: str, side: int, seconds: float) -> float:
     """Return the operations per second of torch's product of two random square matrices."""
     import torch
 
-    left, right = (torch.randn(side, side, device=device).to(getattr(torch, dtype)) for _ in range(2))
+    left, right = (
+        torch.randn(side, side, device=device).to(getattr(torch, dtype)) for _ in range(2)
+    )
     call = partial(torch.mm, left, right, out=torch.empty_like(left))
     return 2 * side**3 / best_seconds(call, device, seconds)
 
@@ -67,31 +69,36 @@ def slower_than_float32(device: str, dtype: str) -> str:
         return ''
     from results import instruction_sets
 
-    native = [name for name in instruction_sets() if name.startswith(('avx512_bf16', 'avx512_fp16', 'amx'))]
+    native = [
+        name
+        for name in instruction_sets()
+        if name.startswith(('avx512_bf16', 'avx512_fp16', 'amx'))
+    ]
     return (
         f'torch product in {dtype}: {rate / 1e9:.1f} G operations/s, slower than float32 ({wide / 1e9:.1f}); '
         f'native half-precision instructions of this processor: {", ".join(native) or "none"}'
     )
 
 
-def measure_peaks(device: str, seconds: float = 1.0, side: int = SIDE, megabytes: int = 0) -> Peaks:
+def measure_peaks(
+    device: str, seconds: float = 1.0, side: int = SIDE, megabytes: int = 0
+) -> Peaks:
     """
     Measure all peaks of a device; the best run counts, since a bound must lie below every measurement.
 
     :param seconds: duration of each measurement.
     """
     megabytes = megabytes or READ_MB[device]
-    rates = {
-        # not every library is at its best with the larger matrix
-        dtype: max(matrix_rate(device, dtype, size, seconds / 2) for size in (side, side // 2))
-        for dtype in ITEM_BYTES
-        if not slower_than_float32(device, dtype)
-    }
-    peaks = Peaks(0, dict.fromkeys(ITEM_BYTES, 0.0) | rates)
+    rates = dict.fromkeys(ITEM_BYTES, 0.0)
+    for dtype in ITEM_BYTES:
+        if not slower_than_float32(device, dtype):
+            # not every library is at its best with the larger matrix
+            rates[dtype] = max(
+                matrix_rate(device, dtype, size, seconds) for size in (side, side // 2)
+            )
     if device == 'cuda':
-        read = device_read_bandwidth(megabytes, seconds)
-    else:
-        import numba as nb
+        return Peaks(device_read_bandwidth(megabytes, seconds), rates).widened()
+    import numba as nb
 
-        read = max(read_bandwidth(megabytes, n, seconds) for n in {1, nb.get_num_threads()})
-    return Peaks(read, peaks.operations_per_s).widened()
+    read = max(read_bandwidth(megabytes, n, seconds) for n in {1, nb.get_num_threads()})
+    return Peaks(read, rates).widened()

@@ -42,10 +42,21 @@ def make_environment(folder: Path = ENVIRONMENT) -> Path:
         return python
     print(f'Creating {folder.name} with the peers (once) ...', flush=True)
     base = getattr(sys, '_base_executable', '') or sys.executable
-    pip = [str(python), '-I', '-m', 'pip', 'install', '--quiet', '--no-input', '--disable-pip-version-check']
+    pip = [
+        str(python),
+        '-I',
+        '-m',
+        'pip',
+        'install',
+        '--quiet',
+        '--no-input',
+        '--disable-pip-version-check',
+    ]
     for command in ([base, '-m', 'venv', '--clear', str(folder)], [*pip, '-r', str(requirements)]):
         try:
-            done = subprocess.run(command, env=_clean(), capture_output=True, text=True, check=False)
+            done = subprocess.run(
+                command, env=_clean(), capture_output=True, text=True, check=False
+            )
         except OSError as error:
             raise PeersMissingError(str(error)) from error
         if done.returncode:
@@ -75,7 +86,10 @@ class Peers:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         assert self._process.stdin
         self._process.stdin.close()
@@ -86,7 +100,9 @@ class Peers:
         assert self._process.stdout
         line = self._process.stdout.readline()
         if not line:
-            raise PeersMissingError(f'the peers exited with status {self._process.wait()}: see the output above')
+            raise PeersMissingError(
+                f'the peers exited with status {self._process.wait()}: see the output above'
+            )
         return json.loads(line)
 
     def put(self, window: np.ndarray) -> Path:

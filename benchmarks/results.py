@@ -45,11 +45,10 @@ class Row:
     One measurement.
 
     :param stage: name, see benchmarks/README.md.
-    :param mode: ``robust``, ``paper``, or empty for a stage that both modes run.
+    :param mode: ``robust``, ``paper``, or empty for a stage of both modes.
     :param n: places.
     :param d: dimensions of a local feature; 0 for a stage that reads no features.
     :param precision: of the map, or of the arithmetic.
-    :param device: ``cpu`` or ``cuda``.
     :param median_s, spread_s: median and interquartile range, seconds.
     :param runs: number of runs.
     :param lower_bound_s: least time on this machine; 0 = none known.
@@ -61,7 +60,6 @@ class Row:
     n: int
     d: int
     precision: str
-    device: str
     median_s: float
     spread_s: float
     runs: int
@@ -79,9 +77,21 @@ class Row:
         return asdict(self) | {'ratio_to_lower_bound': self.ratio}
 
 
+@dataclass(frozen=True)
+class Skipped:
+    """A stage or a peer that is left out, and the reason."""
+
+    name: str
+    n: int
+    d: int
+    reason: str
+
+
 def _output(*command: str) -> str:
     try:
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(
+            command, cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return ''
 
@@ -153,13 +163,19 @@ def environment(device: str = 'cpu', named_commit: str = '') -> dict[str, Any]:
 
 def heading(title: str, about: dict[str, Any]) -> list[str]:
     """Return the lines that open a report."""
-    machine = about['machine'] | {'instruction_sets': ' '.join(about['machine']['instruction_sets'])}
+    machine = about['machine'] | {
+        'instruction_sets': ' '.join(about['machine']['instruction_sets'])
+    }
     return [
         f'# {title}',
         '',
         f'Commit {about["commit"]}, {about["date"]}.',
-        'Machine: ' + ', '.join(f'{k.replace("_", " ")} {v}' for k, v in machine.items() if v != '') + '.',
-        'Versions: ' + ', '.join(f'{name} {version}' for name, version in about['versions'].items()) + '.',
+        'Machine: '
+        + ', '.join(f'{k.replace("_", " ")} {v}' for k, v in machine.items() if v != '')
+        + '.',
+        'Versions: '
+        + ', '.join(f'{name} {version}' for name, version in about['versions'].items())
+        + '.',
         'Method: benchmarks/README.md.',
         '',
     ]
@@ -193,9 +209,7 @@ def seconds_text(seconds: float | None) -> str:
 
 
 def number_text(value: float | None) -> str:
-    """Return a number with three digits, without an exponent where that is readable."""
+    """Return a number with three digits, without an exponent above 1."""
     if value is None:
         return '-'
-    if not 0.1 <= abs(value) < 1e6:
-        return f'{value:.3g}'
-    return f'{value:,.{2 if abs(value) < 10 else 1 if abs(value) < 100 else 0}f}'
+    return f'{value:,.0f}' if value >= 100 else f'{value:.3g}'

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from lower_bounds import Peaks, Work, bound_seconds
-from results import PeerTime, Row
+from results import PeerTime, Row, Skipped
 from timing import Job, measure, synchronizer, timed
 from tqdm import tqdm
 
@@ -26,16 +26,6 @@ class Peer:
     partial: bool = False
 
 
-@dataclass(frozen=True)
-class Skipped:
-    """A stage, or a peer of it, that is left out, and the reason."""
-
-    stage: str
-    n: int
-    d: int
-    reason: str
-
-
 @dataclass
 class Run:
     """
@@ -43,7 +33,7 @@ class Run:
 
     :param device: ``cpu`` or ``cuda``.
     :param seconds: duration of the measurement of one stage and its peers.
-    :param rows, skipped: as measured so far; the rows without lower bounds.
+    :param rows: as measured so far, without lower bounds, and their work.
     """
 
     device: str
@@ -64,44 +54,40 @@ class Run:
         precision: str = 'float32',
         mode: str = '',
         extra: Mapping[str, Any] | None = None,
-    ) -> Row:
+    ) -> None:
         """
         Measure a stage, interleaved with its peers.
 
         :param size: places n, dimensions d (0 for a stage that reads no features).
         :param works: for its lower bound.
-        :param extra: further values of the row; a function is called with the median.
+        :param extra: further values of the row.
         """
         n, d = size
         self._bar.set_description(f'{stage} {mode} n={n:,} d={d} {precision}')
-        jobs = {'': timed(call, synchronizer(self.device))} | {peer.name: peer.job for peer in peers}
+        jobs = {'': timed(call, synchronizer(self.device))} | {p.name: p.job for p in peers}
         timings = measure(jobs, self.seconds)
         own = timings['']
-        values = {k: v(own.median_s) if callable(v) else v for k, v in (extra or {}).items()}
         times = tuple(
             PeerTime(p.name, t.median_s, t.spread_s, t.median_s / own.median_s, p.note, p.partial)
             for p, t in ((peer, timings[peer.name]) for peer in peers)
         )
-        row = Row(
-            stage, mode, n, d, precision, self.device, own.median_s, own.spread_s, own.runs,
-            peers=times, extra=values,
-        )  # fmt: skip
-        self.rows.append((row, works))
+        row = Row(stage, mode, n, d, precision, own.median_s, own.spread_s, own.runs)
+        self.rows.append((replace(row, peers=times, extra=dict(extra or {})), works))
         self._bar.update()
-        return row
 
-    def skip(self, stage: str, n: int, d: int, reason: str) -> None:
-        """Record that something is left out, and print why."""
-        self._bar.write(f'left out: {stage}, n = {n:,}, d = {d}: {reason}', file=sys.stderr)
-        self.skipped.append(Skipped(stage, n, d, reason))
+    def skip(self, name: str, n: int, d: int, reason: str) -> None:
+        """Record that a stage or peer is left out, and print why."""
+        self._bar.write(f'left out: {name}, n = {n:,}, d = {d}: {reason}', file=sys.stderr)
+        self.skipped.append(Skipped(name, n, d, reason))
 
     def finish(self, peaks: Peaks) -> tuple[list[Row], Peaks]:
-        """Return the rows with their lower bounds, and the peaks that a stage may have raised."""
+        """Return the rows with their lower bounds, and the peaks, which a stage may have raised."""
         self._bar.close()
         for row, works in self.rows:
-            if row.d and row.stage != 'frame' and works:
+            if row.stage in ('image_distances', 'distance_matrix'):
                 # product and alignment are one pass
                 whole = replace(works[0], operations=sum(work.operations for work in works))
                 peaks = peaks.raised(whole, row.median_s, f'{row.stage}, n = {row.n:,}')
-        bounded = [replace(row, lower_bound_s=bound_seconds(works, peaks)) for row, works in self.rows]
-        return bounded, peaks
+        bounds = [bound_seconds(works, peaks) for _, works in self.rows]
+        rows = [row for row, _ in self.rows]
+        return [replace(row, lower_bound_s=b) for row, b in zip(rows, bounds, strict=True)], peaks

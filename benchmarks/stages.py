@@ -2,7 +2,6 @@
 
 import gc
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
 from typing import Any
@@ -16,11 +15,16 @@ from lower_bounds import Sizes
 from peaks import slower_than_float32
 from peer_process import Peers
 from run import Peer, Run
-from timing import synchronizer, timed
+from timing import measure, synchronizer, timed
 
-from stavpr_ros.alignment.lm_dtw import SequenceDistances, best_match, match_padded, padded_width, trace_sequence
+from stavpr_ros.alignment.lm_dtw import (
+    SequenceDistances,
+    best_match,
+    match_padded,
+    padded_width,
+    trace_sequence,
+)
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings, VelocitySettings
-from stavpr_ros.alignment.spatial import image_distances
 from stavpr_ros.alignment.velocity import best_velocity_match, match_scaled, trace_velocity
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
@@ -31,11 +35,15 @@ from stavpr_ros.recognition.robust.znorm import ZNormalization
 from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
 
 MODES = ('robust', 'paper')  # the default first
-SEQUENCE, SPATIAL, VELOCITY, NMS_RADIUS = SequenceSettings(), SpatialSettings(), VelocitySettings(), 20
+SEQUENCE, SPATIAL, VELOCITY, NMS_RADIUS = (
+    SequenceSettings(),
+    SpatialSettings(),
+    VelocitySettings(),
+    20,
+)
 STRIPS = 7
 FRAMES = 20  # of the distance matrix
 MATRIX_PLACES = 20_000  # most places of the distance matrix
-CHECKED = 200  # places whose image distances are compared with float64
 ORACLE_STARTS, ENDS_CHECKED = 3, 3
 PEER_STARTS = {'librosa': 500, 'tslearn': 20}
 PEER_NOTES = {
@@ -45,33 +53,14 @@ PEER_NOTES = {
 Call = Callable[[], Any]
 
 
-@dataclass(frozen=True)
-class Features:
-    """A synthetic map and the images that are matched with it."""
-
-    places: LocalFeatures
-    queries: LocalFeatures
-
-    @classmethod
-    def make(cls, n: int, d: int, device: str, seed: int) -> 'Features':
-        """Draw n places and FRAMES images."""
-        places = make_features(n, d, STRIPS, device, seed)
-        return cls(places, make_features(FRAMES, d, STRIPS, 'cpu', seed + 1))
-
-
 def memory_problem(n: int, d: int, device: str, limit: float) -> str:
     """Return why a map does not fit into memory; empty if it fits."""
     # features, the recognizer's own, torch's product in both precisions, blocks of strip distances
     needed = 4 * n * d * STRIPS * 3.5 + 2 * 4 * FRAMES * STRIPS**2 * min(n, MATRIX_PLACES)
     limit = min(limit, 0.9 * free_bytes(device))
-    return '' if needed <= limit else f'needs {needed / 1e9:.1f} GB, {limit / 1e9:.1f} GB may be used'
-
-
-def release(device: str) -> None:
-    """Free the memory of deleted objects."""
-    gc.collect()
-    if device == 'cuda':
-        torch.cuda.empty_cache()
+    return (
+        '' if needed <= limit else f'needs {needed / 1e9:.1f} GB, {limit / 1e9:.1f} GB may be used'
+    )
 
 
 # ------------------------------------------------ on windows of distances, mode robust
@@ -79,38 +68,37 @@ def release(device: str) -> None:
 
 def robust_stages(run: Run, n: int, seed: int) -> None:
     """Measure the stages of mode robust that follow the image distances."""
-    measure = partial(run.measure, size=(n, 0), mode='robust')
-    rows = make_window('random', SEQUENCE.length, n, seed)
+    add = partial(run.measure, size=(n, 0), mode='robust')
+    rows = make_window(SEQUENCE.length, n, seed)
     znorm, buffer = ZNormalization(n), SequenceBuffer(SEQUENCE.length, n, SEQUENCE.k)
     for row in rows:
         normalized = znorm.normalized(row)
         znorm.observe(normalized)
         buffer.push(torch.from_numpy(normalized))
     sizes = Sizes(n, 0, l=SEQUENCE.length)
-    measure('query_znorm', call=lambda: znorm.normalized(rows[-1]), works=[bounds.query_znorm(sizes)])
+    add('query_znorm', call=lambda: znorm.normalized(rows[-1]), works=[bounds.query_znorm(sizes)])
     newest = torch.from_numpy(normalized)
-    measure('window_push', call=lambda: buffer.push(newest), works=[bounds.window_push(sizes)])
+    add('window_push', call=lambda: buffer.push(newest), works=[bounds.window_push(sizes)])
 
     def reference_znorm() -> None:
         znorm.observe(normalized)
         znorm.shift_and_scale(n)
 
-    measure('reference_znorm', call=reference_znorm, works=[bounds.reference_znorm(sizes)])
+    add('reference_znorm', call=reference_znorm, works=[bounds.reference_znorm(sizes)])
     shift, scale = znorm.shift_and_scale(n)
     window = buffer.rows().numpy()
     search = partial(match_scaled, window, shift, scale, VELOCITY)
     matches = search()
     steps = VELOCITY.steps(SEQUENCE.length)
-    cells = n * steps.size
-    measure(
+    add(
         'velocity_search',
         call=search,
         works=[bounds.velocity_search(sizes, VELOCITY)],
         peers=[_prange_velocities((window[:, :n] - shift) * scale, steps, matches.distances)],
-        extra={'cells_per_s': lambda median_s: cells / median_s},
+        extra={'cells': n * steps.size},
     )
     select = partial(best_velocity_match, matches, NMS_RADIUS)
-    measure('selection', call=select, works=[bounds.selection(sizes)])
+    add('selection', call=select, works=[bounds.selection(sizes)])
     nearest = select()
     speed = int(matches.speeds[nearest.last])
     reach = int(steps.sum(axis=1).max()) + SEQUENCE.length
@@ -121,14 +109,16 @@ def robust_stages(run: Run, n: int, seed: int) -> None:
         return trace_velocity(costs, nearest.last - near.start, speed, VELOCITY)
 
     width = min(nearest.last + 1, int(steps[speed].sum()) + SEQUENCE.length)
-    measure('path_trace', call=trace, works=[bounds.path_trace(SEQUENCE.length, width)])
+    add('path_trace', call=trace, works=[bounds.path_trace(SEQUENCE.length, width)])
 
 
 def _prange_velocities(costs: np.ndarray, steps: np.ndarray, expected: np.ndarray) -> Peer:
     """Return the plain program of the velocity search as a peer; its distances must be ours."""
     kernel, penalty = prange_velocities(), np.float32(VELOCITY.penalty)
     np.testing.assert_array_equal(kernel(costs, steps, penalty), expected)
-    note = 'plain numba, all cores; the same distances bit for bit, without the places of the paths'
+    note = (
+        'plain numba, all cores; the same distances bit for bit, without the places of the paths'
+    )
     return Peer('prange', timed(lambda: kernel(costs, steps, penalty)), note)
 
 
@@ -137,34 +127,33 @@ def _prange_velocities(costs: np.ndarray, steps: np.ndarray, expected: np.ndarra
 
 def paper_stages(run: Run, n: int, seed: int, processes: Peers | None) -> None:
     """Measure the stages of mode paper that follow the image distances."""
-    measure = partial(run.measure, size=(n, 0), mode='paper')
-    window = make_window('random', SEQUENCE.length, n, seed)
+    add = partial(run.measure, size=(n, 0), mode='paper')
+    window = make_window(SEQUENCE.length, n, seed)
     padded = np.full((SEQUENCE.length, padded_width(n, SEQUENCE.k)), np.inf, np.float32)
     padded[:, :n] = window
     sizes = Sizes(n, 0, l=SEQUENCE.length, k=SEQUENCE.k)
     kernel = partial(match_padded, padded, n, SEQUENCE.k)
     matches = kernel()
-    cells = n * SEQUENCE.length * SEQUENCE.k
-    measure(
+    add(
         'lm_dtw',
         call=kernel,
         works=[bounds.lm_dtw(sizes)],
         peers=sequence_peers(window, matches, processes),
-        extra={'cells_per_s': lambda median_s: cells / median_s},
+        extra={'cells': n * SEQUENCE.length * SEQUENCE.k},
     )
     select = partial(best_match, matches, NMS_RADIUS)
-    measure('selection', call=select, works=[bounds.selection(sizes)])
+    add('selection', call=select, works=[bounds.selection(sizes)])
     nearest = select()
     trace = partial(trace_sequence, padded[:, :n], nearest.first, SEQUENCE.k)
     width = min(n - nearest.first, SEQUENCE.k)
-    measure('path_trace', call=trace, works=[bounds.path_trace(SEQUENCE.length, width)])
+    add('path_trace', call=trace, works=[bounds.path_trace(SEQUENCE.length, width)])
 
 
 def device_retrieval(run: Run, n: int, seed: int) -> None:
     """Measure LM-DTW, selection and path on a GPU: one launch, one copy back."""
     from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
-    window = make_window('random', SEQUENCE.length, n, seed)
+    window = make_window(SEQUENCE.length, n, seed)
     search = CudaLmDtwSearch(n, SEQUENCE)
     for row in window:
         search.buffer.push(torch.from_numpy(row).to(run.device))
@@ -172,7 +161,9 @@ def device_retrieval(run: Run, n: int, seed: int) -> None:
     run.measure('retrieval', (n, 0), partial(search, NMS_RADIUS), works, mode='paper')
 
 
-def sequence_peers(window: np.ndarray, ours: SequenceDistances, processes: Peers | None) -> list[Peer]:
+def sequence_peers(
+    window: np.ndarray, ours: SequenceDistances, processes: Peers | None
+) -> list[Peer]:
     """Return all peers of LM-DTW on the same window; their results must be ours."""
     found = [_prange_peer(window, ours), _oracle_peer(window, ours)]
     for name in PEER_STARTS if processes else ():
@@ -209,7 +200,9 @@ def _process_peer(peers: Peers, name: str, window: np.ndarray) -> Peer:
     starts = sample(n, k, PEER_STARTS[name])
     few = starts[:ENDS_CHECKED]
     for start, end in zip(few, peers.run(name, path, few, k)['ends'], strict=True):
-        expected = float(oracle().accumulate(window[:, start : start + k], 1, np.float64).S[-1][-1])
+        expected = float(
+            oracle().accumulate(window[:, start : start + k], 1, np.float64).S[-1][-1]
+        )
         np.testing.assert_allclose(end, expected, rtol=1e-6, err_msg=f'{name}, start {start}')
     note = f'version {peers.versions[name]}, {PEER_NOTES[name]}; {len(starts)} starts, scaled'
     return Peer(name, lambda: peers.run(name, path, starts, k)['seconds'] * n / len(starts), note)
@@ -220,79 +213,72 @@ def _process_peer(peers: Peers, name: str, window: np.ndarray) -> Peer:
 
 def feature_stages(run: Run, n: int, d: int, precisions: Sequence[str], seed: int) -> None:
     """Measure the stages that read features, and whole frames in both modes."""
-    features = Features.make(n, d, run.device, seed)
-    centering = MeanCentering(features.places)
-    query = features.queries.strips[:, 0]
-    centered = partial(centering.next_query, query)
-    run.measure(
-        'mean_centering', (n, d), centered, [bounds.mean_centering(Sizes(n, d, STRIPS))], mode='robust'
-    )
+    places = make_features(n, d, STRIPS, run.device, seed)
+    queries = make_features(FRAMES, d, STRIPS, 'cpu', seed + 1)
+    sizes, size = Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k), (n, d)
+    centered = partial(MeanCentering(places).next_query, queries.strips[:, 0])
+    run.measure('mean_centering', size, centered, [bounds.mean_centering(sizes)], mode='robust')
     for precision in precisions:
-        sizes = Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k)
-        peers = products(run, features, precision, frames=1)
-        _matcher_stages(run, features, sizes, precision, peers)
+        peers = products(run, places, queries[:1], precision)
+        matcher, batch = (
+            make_matcher(places, SPATIAL, run.device, precision),
+            queries.to(run.device),
+        )
+        call = partial(matcher.distances, batch.strips[:, 0].contiguous(), batch.weights[:, 0])
+        works = [bounds.product(sizes, precision), bounds.spatial_alignment(sizes)]
+        run.measure('image_distances', size, call, works, peers, precision)
+        if n <= MATRIX_PLACES:
+            call = partial(matcher.distance_matrix, batch.strips, batch.weights)
+            works = [
+                bounds.product(sizes, precision, FRAMES),
+                bounds.spatial_alignment(sizes, FRAMES),
+            ]
+            many = products(run, places, queries, precision)
+            run.measure('distance_matrix', size, call, works, many, precision)
+        del matcher, call
         for mode in MODES:
-            call = frame(features, mode, precision, run.device)
+            call = frame(places, queries, mode, precision, run.device)
             works = frame_works(sizes, mode, precision)
-            run.measure('frame', (n, d), call, works, peers, precision, mode)
+            run.measure('frame', size, call, works, peers, precision, mode)
             del call
-            release(run.device)
-
-
-def _matcher_stages(
-    run: Run, features: Features, sizes: Sizes, precision: str, peers: Sequence[Peer]
-) -> None:
-    """Measure the distances of one image, and of FRAMES images at once."""
-    size, device = (sizes.n, sizes.d), run.device
-    matcher = make_matcher(features.places, SPATIAL, device, precision)
-    batch = features.queries.to(device)
-    strips, weights = batch.strips[:, 0].contiguous(), batch.weights[:, 0].contiguous()
-    call = partial(matcher.distances, strips, weights)
-    error = {'largest_error': largest_error(call(), features.places, strips)}
-    works = [bounds.product(sizes, precision), bounds.spatial_alignment(sizes)]
-    run.measure('image_distances', size, call, works, peers, precision, extra=error)
-    if sizes.n > MATRIX_PLACES:
-        return
-    call = partial(matcher.distance_matrix, batch.strips, batch.weights)
-    error = {'largest_error': largest_error(call()[0], features.places, strips)}
-    works = [bounds.product(sizes, precision, FRAMES), bounds.spatial_alignment(sizes, FRAMES)]
-    many = products(run, features, precision, FRAMES)
-    run.measure('distance_matrix', size, call, works, many, precision, extra=error)
+            gc.collect()
 
 
 def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
     """Return the work of a whole frame; the trace of one path is too short to matter."""
     works = [bounds.product(sizes, precision), bounds.spatial_alignment(sizes)]
+    works += [bounds.window_push(sizes), bounds.selection(sizes)]
     if mode == 'paper':
-        return [*works, bounds.window_push(sizes), bounds.lm_dtw(sizes), bounds.selection(sizes)]
-    znorms = [bounds.query_znorm(sizes), bounds.window_push(sizes), bounds.reference_znorm(sizes)]
-    search = [bounds.velocity_search(sizes, VELOCITY), bounds.selection(sizes)]
-    return [bounds.mean_centering(sizes), *works, *znorms, *search]
+        return [*works, bounds.lm_dtw(sizes)]
+    znorms = [bounds.query_znorm(sizes), bounds.reference_znorm(sizes)]
+    return [bounds.mean_centering(sizes), *works, *znorms, bounds.velocity_search(sizes, VELOCITY)]
 
 
-def products(run: Run, features: Features, precision: str, frames: int) -> list[Peer]:
-    """Return torch's product of the strips in float32, and in the map's precision where it is no slower."""
-    peers = []
+def products(
+    run: Run, places: LocalFeatures, queries: LocalFeatures, precision: str
+) -> list[Peer]:
+    """Return torch's product of the strips in float32, and in the map's precision unless slower."""
+    peers, (_, n, d) = [], places.strips.shape
     for dtype in dict.fromkeys((precision, 'float32')):
-        n, d = len(features.places), features.places.strips.shape[2]
         if reason := slower_than_float32(run.device, dtype):
-            if frames == 1:
-                run.skip(f'torch {dtype}', n, d, reason)
+            run.skip(f'torch {dtype}, {len(queries)} images', n, d, reason)
             continue
-        kind, device = getattr(torch, dtype), run.device
-        rows = features.queries.strips[:, :frames].transpose(0, 1).reshape(-1, d).to(device, kind)
-        call, form = bare_product(rows, features.places.strips.to(kind), synchronizer(device))
+        kind, wait = getattr(torch, dtype), synchronizer(run.device)
+        rows = queries.strips.transpose(0, 1).reshape(-1, d).to(run.device, kind)
+        call, form = bare_product(rows, places.strips.to(kind), wait)
         note = f'{form}, all pairs of strips, no alignment'
-        peers.append(Peer(f'torch {dtype}', timed(call, synchronizer(device)), note, partial=True))
+        peers.append(Peer(f'torch {dtype}', timed(call, wait), note, partial=True))
     return peers
 
 
-def bare_product(rows: torch.Tensor, places: torch.Tensor, synchronize: Callable[[], None]) -> tuple[Call, str]:
+def bare_product(
+    rows: torch.Tensor, places: torch.Tensor, synchronize: Callable[[], None]
+) -> tuple[Call, str]:
     """
     Return torch's product of queries with the map in its faster orientation, and the name of that.
 
-    The faster orientation of a skinny product depends on the machine and the precision. The result's
-    memory is allocated beforehand.
+    The faster orientation of a skinny product depends on the machine and the precision. The memory of
+    the result is allocated beforehand.
 
     :param rows: shape (queries, d).
     :param places: shape (W, n, d), of the same type and device.
@@ -304,36 +290,23 @@ def bare_product(rows: torch.Tensor, places: torch.Tensor, synchronize: Callable
         'queries @ map.T': lambda: torch.mm(rows, strips.T, out=wide),
         'map @ queries.T': lambda: torch.mm(strips, rows.T, out=tall),
     }
-    taken = {}
-    for form, call in forms.items():
-        job = timed(call, synchronize)
-        job()
-        taken[form] = min(job() for _ in range(3))
-    best = min(forms, key=taken.__getitem__)
+    taken = {
+        form: measure({'': timed(call, synchronize)}, 0)[''].median_s
+        for form, call in forms.items()
+    }
+    best = min(taken, key=taken.__getitem__)
     return forms[best], best
 
 
-def frame(features: Features, mode: str, precision: str, device: str) -> Call:
+def frame(
+    places: LocalFeatures, queries: LocalFeatures, mode: str, precision: str, device: str
+) -> Call:
     """Return a call that updates a recognizer, its window full, with the next image."""
-    n = len(features.places)
-    place_map = PlaceMap(features.places, None, np.zeros(n, np.int64), ('',) * n)
+    n = len(places)
+    place_map = PlaceMap(places, None, np.zeros(n, np.int64), ('',) * n)
     settings = RecognizerSettings(1.0, SPATIAL, SEQUENCE, NMS_RADIUS, mode)
     recognizer = PlaceRecognizer(place_map, settings, device, precision)
-    images = [features.queries[i : i + 1] for i in range(len(features.queries))]
-    for i in range(SEQUENCE.length):
-        recognizer.update(images[i % len(images)])
-    following = cycle(images)
+    following = cycle([queries[i : i + 1] for i in range(len(queries))])
+    for _ in range(SEQUENCE.length):
+        recognizer.update(next(following))
     return lambda: recognizer.update(next(following))
-
-
-def largest_error(found: torch.Tensor, places: LocalFeatures, query: torch.Tensor) -> float:
-    """
-    Return the largest error of image distances against float64.
-
-    :param found: shape (n,); the first places are compared.
-    :param query: strips of the image, shape (W, d).
-    """
-    references = places.strips[:, :CHECKED].cpu().double()
-    d = 1 - torch.einsum('id,jnd->ijn', query.cpu().double(), references)
-    exact = image_distances(d.contiguous().numpy(), SPATIAL)
-    return float(np.abs(found[:CHECKED].cpu().numpy() - exact).max())
