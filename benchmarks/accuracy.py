@@ -1,8 +1,8 @@
 """
-Accuracy table: precision, recall and F1 of both modes on the data sets, and the comparison with another table.
+Accuracy table: precision, recall and F1 of both modes on the data sets, and its comparison.
 
-``make accuracy``, ``make accuracy ARGS=--quick``; ``--compare OLD.json`` exits with 1 if a value is worse.
-Data sets and columns: benchmarks/README.md.
+``make accuracy``, ``make accuracy ARGS=--quick``; ``--compare OLD.json`` exits with 1 if a value
+is worse. Data sets and columns: benchmarks/README.md.
 """
 
 import argparse
@@ -176,7 +176,7 @@ def evaluate_hallway(
 
 
 def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict[str, Any]:
-    """Return how many images of floors are matched on maps of other floors, all pairs, mode robust."""
+    """Return the images of floors that match maps of other floors, all pairs, mode robust."""
     floors = [
         _map(open_source(p), making) for p in sorted((folder / 'tower').iterdir()) if p.is_dir()
     ]
@@ -311,9 +311,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     lines, worse = changes(old, results)
     print(*(lines or ['no value changed']), sep='\n')
-    print(
-        f'compared {len(old.keys() & results.keys())} rows; not measured here: {len(old.keys() - results.keys())}'
-    )
+    missing = len(old.keys() - results.keys())
+    print(f'compared {len(old) - missing} rows; {missing} were not measured here')
     return 1 if worse else 0
 
 

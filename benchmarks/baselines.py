@@ -1,4 +1,4 @@
-"""Plain programs of the same mathematics: LM-DTW and velocity search with prange, the oracle's loops."""
+"""Plain programs of the same mathematics: LM-DTW and velocity search with prange, the oracle."""
 
 import importlib.util
 import sys
@@ -15,8 +15,9 @@ def prange() -> Callable[[np.ndarray, int, np.ndarray, np.ndarray], None]:
     """
     Compile the textbook's loops of LM-DTW, parallel over the starts.
 
-    The function takes D (l, n) float32, k, and writes distances (n,) float32 and lengths (n,) int32: the same
-    arithmetic, tie rule and results as the package's kernel. Each start keeps one row of S and C.
+    The function takes D (l, n) float32, k, and writes distances (n,) float32 and lengths (n,)
+    int32: the same arithmetic, tie rule and results as the package's kernel. Each start keeps one
+    row.
     """
     import numba as nb
 
@@ -58,8 +59,9 @@ def prange_velocities() -> Callable[[np.ndarray, np.ndarray, np.float32], np.nda
     """
     Compile the recursion of the velocity search row by row, parallel over the places.
 
-    The function takes costs (l, n) float32, steps (V, l) int32 and the penalty, and returns the distances
-    (n,) float32, bit for bit those of the package's kernel. It does not track the paths' places.
+    The function takes costs (l, n) float32, steps (V, l) int32 and the penalty, and returns
+    distances (n,) float32, bit for bit those of the package's kernel. It does not track the paths'
+    places.
     """
     import numba as nb
 
@@ -99,6 +101,6 @@ def oracle() -> ModuleType:
 
 
 def sample(n: int, k: int, count: int) -> list[int]:
-    """Return ``count`` starts, spread evenly over those that see k whole columns, or all of these."""
+    """Return ``count`` starts, spread evenly over those that see k columns, or all of these."""
     whole = max(1, n - k + 1)
     return sorted({int(start) for start in np.linspace(0, whole - 1, min(count, whole))})

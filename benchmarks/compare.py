@@ -1,14 +1,15 @@
 """
 Speed of two checkouts: the same frames in turn, A B A B, and the ratio pair by pair.
 
-``python benchmarks/compare.py CHECKOUT [--driver FILE]`` compares this checkout (A) with another one (B). Each
-runs in a process of its own that imports the package from its checkout and sleeps while the other is timed.
-A driver adapts a checkout with other names: a Python file with a function
+``python benchmarks/compare.py CHECKOUT [--driver FILE]`` compares this checkout (A) with another
+one (B). Each runs in a process of its own that imports the package from its checkout and sleeps
+while the other is timed. A driver adapts a checkout with other names: a Python file with a
+function
 
     make_frame(strips, weights, mode, precision) -> call
 
-of a map's strips (W, n, d) and weights (W, n), numpy arrays; ``call(strips, weights)`` updates the recognizer
-with one image, strips (W, 1, d), and returns place and distance.
+of a map's strips (W, n, d) and weights (W, n), numpy arrays; ``call(strips, weights)`` updates the
+recognizer with one image, strips (W, 1, d), and returns place and distance.
 """
 
 import argparse
@@ -58,7 +59,7 @@ def random_strips(n: int, d: int, seed: int) -> np.ndarray:
 
 
 def serve(driver: str) -> None:
-    """Serve one checkout: read requests, one JSON line each, and write the seconds of each frame."""
+    """Serve one checkout: read requests, one JSON line each; write the seconds of the frames."""
     from stavpr_ros.threads import wait_passively
 
     wait_passively()
@@ -131,7 +132,7 @@ def compare(
     """
     Time frames of both checkouts in turn.
 
-    :returns: medians in seconds, the median of the pairs' ratios (this over other) and their quartiles, and
+    :returns: medians in seconds, median and quartiles of the pairs' ratios (this over other), and
         whether all places and distances were equal.
     """
     for checkout in (this, other):
@@ -156,7 +157,7 @@ def compare(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; 1 if a frame of this checkout is slower than allowed, or a result differs."""
+    """Run the command; 1 if this checkout is slower than allowed, or a result differs."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('checkout', type=Path, help='folder of the other checkout')
     parser.add_argument('--driver', default='', help='Python file that adapts the other checkout')
@@ -189,9 +190,8 @@ def main(arguments: list[str] | None = None) -> int:
     ]
     this, other = Checkout(ROOT), Checkout(options.checkout.resolve(), options.driver)
     found = []
-    print(
-        f'{"mode":8}{"n":>9} {"precision":10}{"this ms":>9}{"other ms":>10}{"ratio":>7}  quartiles    results'
-    )
+    head = ('mode', 'n', 'precision', 'this ms', 'other ms', 'ratio')
+    print('{:8}{:>9} {:10}{:>9}{:>10}{:>7}  quartiles    results'.format(*head))
     for case in cases:
         result = compare(this, other, case, options.rounds, options.frames)
         low, high = result['ratio_quartiles']

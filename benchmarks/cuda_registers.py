@@ -1,7 +1,8 @@
 """
-Resources of the compiled CUDA kernels: registers, stack, spills and shared memory of each, as JSON.
+Resources of the compiled CUDA kernels: registers, stack, spills and shared memory, as JSON.
 
-No GPU is needed: numba-cuda compiles each kernel to PTX, and NVIDIA's assembler reports on the machine code.
+No GPU is needed: numba-cuda compiles each kernel to PTX, and NVIDIA's assembler reports on the
+code.
 
     pip install 'numba-cuda[cu13]'      # and ptxas, a part of the CUDA toolkit, on the PATH
     python benchmarks/cuda_registers.py [--arch 90] [--out FILE]
@@ -20,7 +21,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-# W and its band: the default, restricted alignment, more strips. l and k: the default, beta = 1.5, others.
+# W and its band: the default, restricted alignment, more strips. l and k: the default and others.
 SPATIAL = [(7, 7), (7, 3), (14, 14)]
 SEQUENCES = [(5, 10), (20, 40), (20, 30), (33, 66), (50, 100), (76, 152), (77, 154), (1000, 2000)]
 

@@ -1,4 +1,4 @@
-"""Data of the benchmarks: the folder of recorded data sets, and synthetic maps, queries and windows."""
+"""Data of the benchmarks: the folder of data sets, and synthetic maps, queries and windows."""
 
 import os
 from pathlib import Path
@@ -47,7 +47,7 @@ def make_features(n: int, d: int, W: int, device: str, seed: int) -> LocalFeatur
 
 
 def make_window(l: int, n: int, seed: int) -> np.ndarray:
-    """Draw a window of image distances, shape (l, n), float32; the kernels' times depend on the shape only."""
+    """Draw a window of image distances, shape (l, n), float32; times depend on the shape only."""
     return np.random.default_rng(seed).uniform(0.3, 1.0, (l, n)).astype(np.float32)
 
 

@@ -1,9 +1,10 @@
 """
-Gradient features: one image on one core and on all, batches, every raw encoding; JPEG decoding apart.
+Gradient features: one image on one core and on all, batches, raw encodings; JPEG decoding apart.
 
-``python benchmarks/features.py --output FILE``. The images are synthetic and, as a camera's, come in turn from
-more memory than a cache holds. The lower bound of a stage is reading its bytes once; the peer computes the same
-with OpenCV's area averages and torch's operators, the implementation on a GPU.
+``python benchmarks/features.py --output FILE``. The images are synthetic and, as a camera's, come
+in turn from more memory than a cache holds. The lower bound of a stage is reading its bytes once;
+the peer computes the same with OpenCV's area averages and torch's operators, the implementation on
+a GPU.
 """
 
 import argparse
@@ -154,8 +155,8 @@ def report(about: dict[str, Any], rows: Sequence[Row]) -> list[str]:
     lines = [
         [
             row.stage, row.extra['image'], str(row.extra['threads']), str(row.n),
-            seconds_text(row.median_s / row.n), seconds_text(row.spread_s / row.n), number_text(row.ratio),
-            number_text(row.peers[0].ratio if row.peers else None),
+            seconds_text(row.median_s / row.n), seconds_text(row.spread_s / row.n),
+            number_text(row.ratio), number_text(row.peers[0].ratio if row.peers else None),
         ]
         for row in rows
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Lower bounds: the least time of a stage, from its bytes, its operations and the machine's peaks."""
+"""Lower bounds: the least time of a stage, from its bytes, operations and the machine's peaks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -8,9 +8,9 @@ from stavpr_ros.alignment.settings import VelocitySettings
 ITEM_BYTES = {'float32': 4, 'bfloat16': 2, 'float16': 2}
 BEYOND_CACHES = 2**28  # bytes; below, a stage may read faster than memory
 
-# Operations of one inner cell. LM-DTW: three sums x + S, two minima, two selections of the path's length,
-# its increment. Image distance: the factor of the diagonal besides. A comparison that also selects counts
-# once, index arithmetic does not count: fewer operations make a stricter bound.
+# Operations of one inner cell. LM-DTW: three sums x + S, two minima, two selections of the path's
+# length, its increment. Image distance: the factor of the diagonal besides. A comparison that also
+# selects counts once, index arithmetic does not count: fewer operations make a stricter bound.
 SEQUENCE_CELL, SPATIAL_CELL = 8, 9
 BORDER_CELL = 2  # one predecessor: S + x, C + 1
 
@@ -56,7 +56,7 @@ class Peaks:
 
     :param bytes_per_s: read bandwidth.
     :param operations_per_s: rate of the large matrix product, by precision.
-    :param sources: of ``read`` or a precision: the stage that showed more than the peak's own measurement.
+    :param sources: of ``read`` or a precision: the stage that showed more than its measurement.
     """
 
     bytes_per_s: float
@@ -67,8 +67,8 @@ class Peaks:
         """
         Return the peaks, raised to the rates that a stage has shown.
 
-        A shared machine may be busier while a peak is measured than later. Bytes count only where they
-        exceed the caches.
+        A shared machine may be busier while a peak is measured than later. Bytes count only beyond
+        the caches.
 
         :param seconds: duration of the stage.
         :param source: its name.
@@ -93,7 +93,7 @@ class Peaks:
 
 
 def bound_seconds(works: Sequence[Work], peaks: Peaks) -> float:
-    """Return the sum over the works of the longer of reading the bytes and doing the operations."""
+    """Return the sum, over the works, of the longer of reading bytes and doing operations."""
     return sum(
         max(work.bytes / peaks.bytes_per_s, work.operations / peaks.operations_per_s[work.dtype])
         for work in works
@@ -137,8 +137,9 @@ def velocity_search(sizes: Sizes, settings: VelocitySettings) -> Work:
     """
     Search at several velocities: window, shift and scale are read once.
 
-    A cell adds its cost to the best of its predecessors; each of the one or two besides the first costs a
-    sum, a minimum and a selection of the path's first place, from the middle row on also of its middle place.
+    A cell adds its cost to the best of its predecessors; each of the one or two besides the first
+    costs a sum, a minimum and a selection of the path's first place, after the middle row also of
+    its middle.
     """
     operations = 2 * sizes.l  # cost (D - shift) * scale
     for steps in settings.steps(sizes.l):
@@ -157,10 +158,10 @@ def lm_dtw(sizes: Sizes) -> Work:
 
 
 def selection(sizes: Sizes) -> Work:
-    """Best and second best: distance and middle place (or length) of each sequence are read once."""
+    """Best and second best: distance and middle (or length) of each sequence are read once."""
     return Work(8 * sizes.n, 6 * sizes.n)
 
 
 def path_trace(l: int, width: int) -> Work:
-    """Recursion on the columns that one path can reach: a cost and two more predecessors a cell."""
+    """Recursion on the columns that a path can reach: a cost, two more predecessors a cell."""
     return Work(4 * l * width, 7 * l * width)

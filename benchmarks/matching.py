@@ -1,8 +1,8 @@
 """
 Benchmark of matching: every stage and whole frames beside lower bounds and peers, and memory.
 
-``make bench``, ``make bench-quick``; or, without building, ``PYTHONPATH=. python benchmarks/matching.py``.
-Method and tables: benchmarks/README.md.
+``make bench``, ``make bench-quick``; without building, ``PYTHONPATH=. python
+benchmarks/matching.py``. Method and tables: benchmarks/README.md.
 """
 
 import argparse
@@ -67,7 +67,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def open_peers(stack: ExitStack, run: 'Run', refused: bool) -> 'Peers | None':
-    """Start the peers of the other environment; None, and a row that names the reason, where that fails."""
+    """Start the peers of the other environment; None, and recorded reasons, where that fails."""
     from peer_process import Peers, PeersMissingError
 
     reason = '--no-peers'
@@ -137,9 +137,7 @@ def main(arguments: list[str] | None = None) -> int:
     about = environment(options.device, options.commit)
     began = time.perf_counter()
     if about['machine']['load_before'] > BUSY:
-        print(
-            f'The machine is busy (load {about["machine"]["load_before"]}): results will not repeat.'
-        )
+        print(f'busy machine, load {about["machine"]["load_before"]}: do not quote the times')
     with_memory = options.device == 'cpu' and not options.no_memory
     memory = [measure_memory(*case) for case in CASES if with_memory]
     peaks = measure_peaks(options.device, options.seconds)

@@ -1,9 +1,10 @@
 """
-Resident memory of the node's pipeline over the bytes of its features, each in a process of its own.
+Resident memory of the pipeline over the bytes of its features, in a process of its own.
 
-The process builds the pipeline as the node does, with a map from a file or with a route of so many images,
-and processes images. It runs a tiny pipeline first, so that compiled kernels, thread pools and libraries are
-resident before. The resident set is read after garbage collection and malloc_trim, before and after.
+The process builds the pipeline as the node does, with a map from a file or with a route of images,
+and processes images. It runs a tiny pipeline first, so that compiled kernels, thread pools and
+libraries are resident before. The resident set is read after garbage collection and malloc_trim,
+both times.
 """
 
 import ctypes
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 TARGET = 1.1
 STRIPS = 7
 SMALL = 100  # places of the tiny pipeline
-# places and dimensions: about 100 MB of features or more, so that everything else is small beside them
+# places and dimensions: 90 MB of features or more, so that everything else is small beside them
 SIZES = {'localization': (20_000, 512), 'loop_closure': (800, 4_096)}
 CASES = (
     ('localization', 'robust', 'float32'),
@@ -84,7 +85,7 @@ class Synthetic:
         self.settings = settings
 
     def feature_maps(self, images: list[np.ndarray]) -> 'torch.Tensor':
-        """Return Gaussian feature maps, shape (n, d, 1, W); the image's first bytes are the seed."""
+        """Return Gaussian feature maps, shape (n, d, 1, W), seeded by the image's first bytes."""
         import torch
 
         generators = [
@@ -152,8 +153,8 @@ def run_pipeline(
     from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
 
     settings = PipelineSettings(
-        threshold=0.5, mode=mode, backend='cpu', precision=precision, features='synthetic', feature_settings=f'{{"d": {d}}}',
-        max_places=max(n, 1000), thumbnail_width=0,
+        threshold=0.5, mode=mode, backend='cpu', precision=precision, features='synthetic',
+        feature_settings=f'{{"d": {d}}}', max_places=max(n, 1000), thumbnail_width=0,
     )  # fmt: skip
     pipeline = Pipeline(settings, operation)
     if operation == 'localization':

@@ -1,4 +1,4 @@
-"""Measurement of the machine's peaks: read bandwidth, and the large matrix product in each precision."""
+"""The machine's peaks: read bandwidth, and the large matrix product in each precision."""
 
 from collections.abc import Callable
 from functools import cache, partial
@@ -61,7 +61,7 @@ def matrix_rate(device: str, dtype: str, side: int, seconds: float) -> float:
 
 @cache
 def slower_than_float32(device: str, dtype: str) -> str:
-    """Return the reason why torch's product in a precision is no reference here; empty if it is one."""
+    """Return why torch's product in a precision is no reference here; empty if it is one."""
     if dtype == 'float32':
         return ''
     rate, wide = (matrix_rate(device, name, PROBE_SIDE, 0.02) for name in (dtype, 'float32'))
@@ -75,8 +75,8 @@ def slower_than_float32(device: str, dtype: str) -> str:
         if name.startswith(('avx512_bf16', 'avx512_fp16', 'amx'))
     ]
     return (
-        f'torch product in {dtype}: {rate / 1e9:.1f} G operations/s, slower than float32 ({wide / 1e9:.1f}); '
-        f'native half-precision instructions of this processor: {", ".join(native) or "none"}'
+        f'torch product in {dtype}: {rate / 1e9:.1f} G operations/s, slower than float32 '
+        f'({wide / 1e9:.1f}); half-precision instructions here: {", ".join(native) or "none"}'
     )
 
 
@@ -84,7 +84,7 @@ def measure_peaks(
     device: str, seconds: float = 1.0, side: int = SIDE, megabytes: int = 0
 ) -> Peaks:
     """
-    Measure all peaks of a device; the best run counts, since a bound must lie below every measurement.
+    Measure all peaks of a device; the best run counts: a bound must lie below every measurement.
 
     :param seconds: duration of each measurement.
     """

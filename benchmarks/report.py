@@ -183,7 +183,7 @@ def report(
 ) -> list[str]:
     """Return the lines of the report."""
     machine = about['machine']
-    left_out = [[s.name, f'{s.n:,}', str(s.d or '-'), s.reason] for s in skipped]
+    left_out = [[s.name, f'{s.n:,}' if s.n else 'all', str(s.d or '-'), s.reason] for s in skipped]
     return [
         *heading(f'Matching on {machine.get("gpu") or machine["cpu"]}', about),
         *frame_section(rows),

@@ -1,4 +1,4 @@
-"""Results of a run: rows, the machine that they were measured on, JSON file and Markdown tables."""
+"""Results of a run: rows, the machine that they were measured on, JSON and Markdown."""
 
 import datetime
 import importlib.metadata
@@ -97,7 +97,7 @@ def _output(*command: str) -> str:
 
 
 def commit() -> str:
-    """Return the commit of the checkout, followed by ``+`` if files were changed; or ``unknown``."""
+    """Return the commit of the checkout, followed by ``+`` after changes; or ``unknown``."""
     short = _output('git', 'rev-parse', '--short', 'HEAD')
     # the results themselves change nothing that is measured
     changed = _output('git', 'status', '--porcelain', '--', '.', ':!benchmarks/results')
@@ -137,7 +137,7 @@ def versions() -> dict[str, str]:
 
 
 def environment(device: str = 'cpu', named_commit: str = '') -> dict[str, Any]:
-    """Return the machine, versions, commit and date of a run; call it before the first measurement."""
+    """Return machine, versions, commit and date of a run, for a call before it begins."""
     import numba
     import torch
 

@@ -76,12 +76,15 @@ class Run:
         self._bar.update()
 
     def skip(self, name: str, n: int, d: int, reason: str) -> None:
-        """Record that a stage or peer is left out, and print why."""
-        self._bar.write(f'left out: {name}, n = {n:,}, d = {d}: {reason}', file=sys.stderr)
-        self.skipped.append(Skipped(name, n, d, reason))
+        """Record once that a stage or peer is left out, and print why; n = d = 0 for all sizes."""
+        skipped = Skipped(name, n, d, reason)
+        if skipped not in self.skipped:
+            size = f', n = {n:,}, d = {d}' if n else ''
+            self._bar.write(f'left out: {name}{size}: {reason}', file=sys.stderr)
+            self.skipped.append(skipped)
 
     def finish(self, peaks: Peaks) -> tuple[list[Row], Peaks]:
-        """Return the rows with their lower bounds, and the peaks, which a stage may have raised."""
+        """Return the rows with their lower bounds, and the peaks as raised by stages."""
         self._bar.close()
         for row, works in self.rows:
             if row.stage in ('image_distances', 'distance_matrix'):

@@ -1,7 +1,7 @@
 """
 Soak test: images at a steady rate to a node in a process of its own: losses, latency, memory.
 
-Run it where the package is built and sourced: ``make shell``, ``python benchmarks/soak.py --help``.
+Run it where the package is built and sourced: ``make shell``, then ``python benchmarks/soak.py``.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""The stages of matching, ready to be measured: on windows of distances, and on maps of features."""
+"""The stages of matching, measured on windows of distances and on maps of features."""
 
 import gc
 from collections.abc import Callable, Sequence
@@ -48,7 +48,7 @@ ORACLE_STARTS, ENDS_CHECKED = 3, 3
 PEER_STARTS = {'librosa': 500, 'tslearn': 20}
 PEER_NOTES = {
     'librosa': 'one core; S of every cell in float64, no path length C, so neither q_m nor m',
-    'tslearn': 'one core; S of every cell in float64 and the path to (l, k); no free end on the last row',
+    'tslearn': 'one core; S of every cell in float64, path to (l, k); no free end on the last row',
 }
 Call = Callable[[], Any]
 
@@ -195,7 +195,7 @@ def _oracle_peer(window: np.ndarray, ours: SequenceDistances) -> Peer:
 
 
 def _process_peer(peers: Peers, name: str, window: np.ndarray) -> Peer:
-    """Return a peer of the other environment on a sample of starts; it must accumulate the oracle's sums."""
+    """Return a peer of the other environment; it must accumulate the oracle's sums."""
     path, n, k = peers.put(window), window.shape[1], SEQUENCE.k
     starts = sample(n, k, PEER_STARTS[name])
     few = starts[:ENDS_CHECKED]
@@ -257,11 +257,11 @@ def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
 def products(
     run: Run, places: LocalFeatures, queries: LocalFeatures, precision: str
 ) -> list[Peer]:
-    """Return torch's product of the strips in float32, and in the map's precision unless slower."""
-    peers, (_, n, d) = [], places.strips.shape
+    """Return torch's product in float32, and in the map's precision unless that is slower."""
+    peers, d = [], places.strips.shape[2]
     for dtype in dict.fromkeys((precision, 'float32')):
         if reason := slower_than_float32(run.device, dtype):
-            run.skip(f'torch {dtype}, {len(queries)} images', n, d, reason)
+            run.skip(f'torch {dtype}', 0, 0, reason)
             continue
         kind, wait = getattr(torch, dtype), synchronizer(run.device)
         rows = queries.strips.transpose(0, 1).reshape(-1, d).to(run.device, kind)
@@ -277,8 +277,8 @@ def bare_product(
     """
     Return torch's product of queries with the map in its faster orientation, and the name of that.
 
-    The faster orientation of a skinny product depends on the machine and the precision. The memory of
-    the result is allocated beforehand.
+    The faster orientation of a skinny product depends on the machine and the precision. The memory
+    of the result is allocated beforehand.
 
     :param rows: shape (queries, d).
     :param places: shape (W, n, d), of the same type and device.

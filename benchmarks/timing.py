@@ -72,8 +72,8 @@ def measure(jobs: Mapping[str, Job], seconds: float = 0.5) -> dict[str, Timing]:
     """
     Run jobs in turn, A B C A B C, so that a slower machine slows all of them.
 
-    Every job runs once to compile, and once more unless that took long, before any run counts. A job
-    shorter than 10 ms runs once more, uncounted, directly before each counted run: the caches and the
+    Every job runs once to compile, and once more unless that took long, before any run counts. A
+    job under 10 ms runs once more, uncounted, directly before each counted run: the caches and the
     sleeping threads that another job left behind are not a property of this one.
 
     :param jobs: by name.

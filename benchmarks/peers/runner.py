@@ -2,8 +2,9 @@
 Runner in the peers' own environment: aligns a sample of starts with one peer on request.
 
 Standard input: a line of JSON for each run, ``{"peer": NAME, "window": FILE.npy, "starts": [...],
-"columns": k}``. Standard output: a line of JSON for each, ``{"seconds": ..., "ends": [...]}``, where
-``ends`` is the accumulated distance in cell (l, k) of each start. The first line holds the versions.
+"columns": k}``. Standard output: a line of JSON for each, ``{"seconds": ..., "ends": [...]}``:
+``ends`` is the accumulated distance in cell (l, k) of each start. The first line holds the
+versions.
 """
 
 import importlib.metadata
