@@ -106,7 +106,7 @@ class Localization:
 
     def update(self, observed: Observed) -> Match:
         """Recognize the window that ends with an image."""
-        return self._recognizer.update(observed.features)
+        return self._recognizer.update(observed.features, observed.stamp)
 
     def ranked(self, count: int) -> list[Candidate]:
         """Return the nearest places of the window answered last."""
@@ -185,7 +185,12 @@ class LoopClosure:
     def __init__(self, extractor: FeatureExtractor, settings: PipelineSettings, threshold: float) -> None:
         self.extractor = extractor
         self._closer = settings.loop_closer(extractor, threshold)
-        self._route = GrowingMap(extractor.settings, extractor.projection, settings.max_places)
+        self._route = GrowingMap(
+            extractor.settings,
+            extractor.projection,
+            settings.max_places,
+            held_features=self._closer.features,
+        )
 
     @property
     def places(self) -> GrowingMap:

@@ -2,7 +2,6 @@
 
 import math
 import os
-from collections import deque
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -55,7 +54,6 @@ class Pipeline:
         self._name = operation
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
-        self._window: deque[int] = deque(maxlen=settings.sequence.length)
         self._last: Match | None = None
         self.save_state = SaveState()  # of the places in use
         self._map_save_state = self.save_state  # of the map, where loop closure uses places of its own
@@ -229,7 +227,6 @@ class Pipeline:
 
     def reset(self) -> None:
         """Empty the window: the images that come now have nothing to do with those before."""
-        self._window.clear()
         self._keyframes.reset()
         self._last = None
         if self._operation is not None:
@@ -246,7 +243,7 @@ class Pipeline:
         if self._name == 'mapping':
             raise InputError('operation mapping recognizes nothing: set_operation localization first')
         if self._operation is None or self._last is None or self._last.status is Status.WARMING_UP:
-            raise InputError(f'{len(self._window)} of {self._settings.sequence.length} images in the window')
+            raise InputError(f'{self.window_fill} of {self._settings.sequence.length} images in the window')
         return self._last, self._operation.ranked(count)
 
     # what is done with an image
@@ -291,7 +288,6 @@ class Pipeline:
             observed = Observed(features, image, stamp, pose, self._settings.thumbnail_width)
             match = operation.update(observed)
         self._keyframes.accept(stamp, pose, image)
-        self._window.append(stamp)
         self.save_state.grown += operation.newest_place >= 0
         match = replace(match, image_index=operation.newest_place, image=image)
         if match.status is Status.MAPPED:
@@ -301,7 +297,6 @@ class Pipeline:
         listed = self.ranking and match.sequence is not None
         self._last = replace(
             match,
-            window_stamps=tuple(self._window),
             candidates=tuple(operation.ranked(self._settings.candidates)) if listed else (),
         )
         return self._last

@@ -96,4 +96,6 @@ class PipelineSettings:
             extractor.settings,
             limit=self.max_places,
             exclude_seconds=self.exclude_seconds,
+            backend=self.backend,
+            precision=self.precision,
         )

@@ -6,7 +6,7 @@ import numpy as np
 
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, PlaceMap, load_map
+from stavpr_ros.mapping import GrowingMap, PlaceMap, open_map
 from stavpr_ros.pipeline.operations import Localization, LoopClosure, Mapping, Observed, Operation
 from stavpr_ros.pipeline.settings import OPERATIONS, PipelineSettings
 
@@ -24,11 +24,11 @@ class LoadedMap:
 
 def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
     """
-    Read a map, on any thread.
+    Read a map, on any thread; its features stay in the file until an operation takes them.
 
     :raises StavprError: the file or the model does not do.
     """
-    place_map = load_map(path)
+    place_map = open_map(path)
     return LoadedMap(path, place_map, place_map.extractor(settings.backend, settings.model_path))
 
 

@@ -208,10 +208,10 @@ class Runtime:
                 self.on_loading()
 
     def _tell(self, loaded: LoadedMap) -> None:
-        places, features = loaded.places, loaded.places.features
+        places = loaded.places
         self._node.get_logger().info(
             f'map {loaded.path}: {len(places)} places, features {places.settings.kind}, '
-            f'{places.settings.strips} strips of {features.strips.shape[2]} dimensions'
+            f'{places.settings.strips} strips of {places.dimension} dimensions'
         )
 
     def save(self, path: str, overwrite: bool) -> int:
