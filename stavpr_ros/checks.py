@@ -23,7 +23,7 @@ def no_nan(array: np.ndarray, name: str) -> np.ndarray:
     """
     Return ``array``, whose values may be finite or +inf (a pair that may not be used).
 
-    :raises InputError: NaN or -inf among the values; says how many.
+    :raises InputError: NaN or -inf among the values; with their number.
     """
     bad = np.count_nonzero(~(array > -np.inf))
     if bad:

@@ -7,41 +7,41 @@ from stavpr_ros.errors import SettingsError, UnavailableError
 DEVICES = BACKENDS = ('auto', 'cpu', 'cuda')
 
 
-def choose_device(wish: str) -> str:
+def choose_device(requested: str) -> str:
     """
     Turn ``auto`` into ``cuda`` or ``cpu``.
 
     :raises SettingsError: no such device.
-    :raises UnavailableError: ``cuda`` was asked for and is not there.
+    :raises UnavailableError: ``cuda`` was requested and is not available.
     """
     import torch
 
-    if wish not in DEVICES:
-        raise SettingsError(f'device {wish!r} is unknown: take one of {", ".join(DEVICES)}')
+    if requested not in DEVICES:
+        raise SettingsError(f'device {requested!r} is unknown: take one of {", ".join(DEVICES)}')
     available = torch.cuda.is_available()
-    if wish == 'cuda' and not available:
+    if requested == 'cuda' and not available:
         raise UnavailableError("device 'cuda': torch sees no CUDA device here; take 'cpu' or 'auto'")
-    return ('cuda' if available else 'cpu') if wish == 'auto' else wish
+    return ('cuda' if available else 'cpu') if requested == 'auto' else requested
 
 
-def choose_backend(wish: str) -> str:
+def choose_backend(requested: str) -> str:
     """
     Turn ``auto`` into the backend of the matching, ``cuda`` or ``cpu``.
 
     :raises SettingsError: no such backend.
-    :raises UnavailableError: ``cuda`` was asked for and its device or the package numba-cuda is not there.
+    :raises UnavailableError: ``cuda`` was requested, and its device or the package numba-cuda is not available.
     """
-    if wish == 'auto':
+    if requested == 'auto':
         return 'cpu' if why_no_cuda() else 'cuda'
-    if wish not in BACKENDS:
-        raise SettingsError(f'backend {wish!r} is unknown: take one of {", ".join(BACKENDS)}')
-    if wish == 'cuda' and why_no_cuda():
+    if requested not in BACKENDS:
+        raise SettingsError(f'backend {requested!r} is unknown: take one of {", ".join(BACKENDS)}')
+    if requested == 'cuda' and why_no_cuda():
         raise UnavailableError(f"backend 'cuda': {why_no_cuda()}; take 'cpu' or 'auto'")
-    return wish
+    return requested
 
 
 def why_no_cuda() -> str:
-    """Say what the ``cuda`` backend lacks here; empty when it has everything."""
+    """Return the reason why the ``cuda`` backend is not available; empty when it is."""
     import torch
 
     if not torch.cuda.is_available():

@@ -18,7 +18,7 @@ class SettingsError(StavprError, ValueError):
 
 
 class UnavailableError(StavprError):
-    """Something that was asked for by name is not here: a device, an extra, a file of weights."""
+    """Something that was requested by name is not available: a device, an extra, a file of weights."""
 
 
 class ImageError(StavprError):
@@ -27,7 +27,7 @@ class ImageError(StavprError):
 
     :param text: what came, what was expected and what to do.
     :param kind: what is wrong in a word or two, to count by and to explain each kind only once: ``encoding``
-        (not read), ``depth`` (no picture at all), ``size``, ``step``, ``cut off``, ``damaged``,
+        (not read), ``depth`` (not a color or gray image), ``size``, ``step``, ``cut off``, ``damaged``,
         ``too large``, ``unreadable`` (a file), ``features`` (not finite), or just ``image``.
     """
 

@@ -26,14 +26,33 @@ MAY_IMPORT = {
 }
 
 
+MODULES = {
+    '.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts).removesuffix('.__init__'): path
+    for path in sorted(PACKAGE.rglob('*.py'))
+}
+
+
 def imported_modules(path: Path) -> set[str]:
+    """Modules that a file imports, at its top or in a function."""
     modules = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            modules.add(node.module or '')
+            names = {f'{node.module}.{alias.name}' for alias in node.names}
+            modules |= (names & MODULES.keys()) or {node.module or ''}
     return modules
+
+
+def on_a_cycle(arrows: dict[str, set[str]]) -> list[str]:
+    """Nodes left when those without an arrow out, or without one in, are taken away again and again."""
+    left = set(arrows)
+    while True:
+        targets = {target for node in left for target in arrows[node] if target != node}
+        kept = {node for node in left if (arrows[node] - {node}) & left and node in targets}
+        if kept == left:
+            return sorted(left)
+        left = kept
 
 
 @pytest.mark.parametrize('folder', list(MAY_IMPORT))
@@ -58,3 +77,26 @@ def test_importing_the_package_is_light():
     code = 'import sys, stavpr_ros; print(*sys.modules)'
     loaded = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
     assert not {'torch', 'numba', 'numpy', 'cv2', 'rclpy', 'rosbags'} & set(loaded.split())
+
+
+def test_cycles_are_found():
+    assert on_a_cycle({'a': {'b'}, 'b': {'c'}, 'c': set()}) == []
+    assert on_a_cycle({'a': {'b'}, 'b': {'c', 'd'}, 'c': {'b'}, 'd': set()}) == ['b', 'c']
+
+
+def test_modules_import_each_other_in_no_circle():
+    """Also by imports within functions; what a package's __init__ passes on counts as its module's."""
+    arrows = {
+        module: {other for other in imported_modules(path) if other in MODULES and other != module}
+        for module, path in MODULES.items()
+    }
+    assert on_a_cycle(arrows) == []
+
+
+def test_no_two_classes_share_a_name():
+    found: dict[str, list[str]] = {}
+    for module, path in MODULES.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                found.setdefault(node.name, []).append(module)
+    assert {name: modules for name, modules in found.items() if len(modules) > 1} == {}

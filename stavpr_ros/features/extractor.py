@@ -74,6 +74,11 @@ class LocalFeatures:
     def __len__(self) -> int:
         return self.strips.shape[1]
 
+    @property
+    def dimension(self) -> int:
+        """Number d of dimensions of a strip."""
+        return self.strips.shape[2]
+
     def __getitem__(self, images: slice) -> 'LocalFeatures':
         strips, weights = self.strips[:, images], self.weights[:, images]
         return dataclasses.replace(self, strips=strips, weights=weights)

@@ -1,7 +1,7 @@
 """A map that grows by one place at a time, while the robot drives."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -26,6 +26,8 @@ class GrowingMap:
     :param projection: the random projection of the features, if they have one.
     :param limit: most places held at a time, at least 1.
     :param cells: see :class:`LocalFeatures`; taken from the first place if not given.
+    :param held_features: returns the features of the places held, in memory of their own, where another
+        object is their owner; None = they are held here.
     :raises SettingsError: no room for a place.
     :raises InputError: the projection is not that of the settings.
     """
@@ -36,12 +38,14 @@ class GrowingMap:
         projection: Projection | None,
         limit: int,
         cells: tuple[int, int] | None = None,
+        held_features: Callable[[], LocalFeatures] | None = None,
     ) -> None:
         if limit < 1:
             raise SettingsError(f'limit = {limit} must be at least 1 place')
         require_projection(projection, settings)
         self.settings, self.projection, self.limit = settings, projection, limit
-        self._cells = cells
+        self._cells, self._held_features = cells, held_features
+        self.dimension = 0  # d of a strip, once there is a place
         self._first = self._count = 0
         self._strips = np.empty((settings.strips, 0, 0), np.float32)
         self._weights = np.empty((settings.strips, 0), np.float32)
@@ -62,7 +66,8 @@ class GrowingMap:
             raise InputError(f'a map of {n} places does not fit into a limit of {limit}: raise the limit')
         features = place_map.features.to('cpu')
         growing = cls(place_map.settings, place_map.projection, limit, features.cells)
-        growing._make_room(max(n, min(ROOM, limit)), features.strips.shape[2])
+        growing.dimension = features.dimension
+        growing._make_room(max(n, min(ROOM, limit)))
         growing._strips[:, :n], growing._weights[:, :n] = features.strips.numpy(), features.weights.numpy()
         growing._stamps[:n] = place_map.stamps
         growing._poses[:n] = np.nan if place_map.poses is None else place_map.poses
@@ -86,8 +91,14 @@ class GrowingMap:
 
     @property
     def features(self) -> LocalFeatures:
-        """The features of all places: a view, valid until the map changes; strips (W, n, d)."""
+        """
+        The features of all places, strips (W, n, d): a view, valid until the map changes.
+
+        Where another object holds the features, a copy.
+        """
         n = self._count
+        if self._held_features is not None:
+            return self._held_features()
         strips, weights = torch.from_numpy(self._strips[:, :n]), torch.from_numpy(self._weights[:, :n])
         return LocalFeatures(strips, weights, self.settings, self._cells)
 
@@ -156,9 +167,11 @@ class GrowingMap:
         strips, weights = self._checked(features)
         row = np.full(7, np.nan) if pose is None else checked_pose(pose)
         n = self._count
-        if n == self._strips.shape[1]:
-            self._make_room(min(max(2 * n, ROOM), self.limit), strips.shape[1])
-        self._strips[:, n], self._weights[:, n] = strips, weights
+        self.dimension = self.dimension or strips.shape[1]
+        if n == len(self._stamps):
+            self._make_room(min(max(2 * n, ROOM), self.limit))
+        if self._held_features is None:
+            self._strips[:, n], self._weights[:, n] = strips, weights
         self._stamps[n], self._poses[n] = stamp, row
         if not n and not self._first and self._cells is None:
             self._cells = features.cells
@@ -176,7 +189,8 @@ class GrowingMap:
         n = self._count
         if not 0 <= count <= n:
             raise InputError(f'{count} places cannot be forgotten: expected 0 to {n}')
-        for array in (*self._strips, *self._weights, self._stamps, self._poses):
+        features = (*self._strips, *self._weights) if self._held_features is None else ()
+        for array in (*features, self._stamps, self._poses):
             array[: n - count] = array[count:n]
         del self._ids[:count], self._thumbnails[:count]
         self._first, self._count = self._first + count, n - count
@@ -184,9 +198,11 @@ class GrowingMap:
     def snapshot(self) -> PlaceMap:
         """Return the map as it is now, in memory of its own."""
         features = self.features
-        strips, weights = features.strips.clone(), features.weights.clone()
+        if self._held_features is None:
+            strips, weights = features.strips.clone(), features.weights.clone()
+            features = dataclasses.replace(features, strips=strips, weights=weights)
         return PlaceMap(
-            features=dataclasses.replace(features, strips=strips, weights=weights),
+            features=features,
             projection=self.projection,
             stamps=self.stamps.copy(),
             ids=tuple(self._ids),
@@ -205,19 +221,22 @@ class GrowingMap:
                 'save it and begin another'
             )
         strips, weights = features.strips[:, 0].cpu().numpy(), features.weights[:, 0].cpu().numpy()
-        d = self._strips.shape[2]
+        d = self.dimension
         if d and strips.shape[1] != d:
             raise InputError(f'strips of {strips.shape[1]} dimensions came: the map has {d}')
         if not np.isfinite(strips).all() or not np.isfinite(weights).all():
             raise InputError('the features are not finite: check the network and its input')
         return strips, weights
 
-    def _make_room(self, room: int, d: int) -> None:
+    def _make_room(self, room: int) -> None:
         """Give every array room for so many places; all or none."""
         n, W = self._count, self.settings.strips
-        strips, weights = np.empty((W, room, d), np.float32), np.empty((W, room), np.float32)
         stamps, poses = np.empty(room, np.int64), np.empty((room, 7))
-        if n:
-            strips[:, :n], weights[:, :n] = self._strips[:, :n], self._weights[:, :n]
-            stamps[:n], poses[:n] = self._stamps[:n], self._poses[:n]
-        self._strips, self._weights, self._stamps, self._poses = strips, weights, stamps, poses
+        stamps[:n], poses[:n] = self._stamps[:n], self._poses[:n]
+        if self._held_features is None:
+            strips = np.empty((W, room, self.dimension), np.float32)
+            weights = np.empty((W, room), np.float32)
+            if n:
+                strips[:, :n], weights[:, :n] = self._strips[:, :n], self._weights[:, :n]
+            self._strips, self._weights = strips, weights
+        self._stamps, self._poses = stamps, poses

@@ -11,9 +11,14 @@ import io
 import json
 import os
 import tempfile
+import weakref
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from threading import Lock
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -25,6 +30,8 @@ from stavpr_ros.mapping.place_map import PlaceMap
 FORMAT = 'stavpr-map'
 VERSION = 1
 MANIFEST = 'manifest.json'
+PIECE = 2**20  # bytes read at a time
+HEADER = 2**12  # bytes that hold the header of an array
 _TYPES = {
     'strips': np.float32,
     'weights': np.float32,
@@ -104,14 +111,91 @@ def load_map(path: str | Path) -> PlaceMap:
 
     :raises MapFileError: no such file, or one that is damaged, truncated, foreign or from a newer version.
     """
-    path = Path(path)
+    with _readable(Path(path)), open(path, 'rb') as file:
+        return _read_map(file, Path(path))
+
+
+def open_map(path: str | Path) -> PlaceMap:
+    """
+    Read and check a map, but leave its features in the file: they are read again whenever they are used.
+
+    :raises MapFileError: see :func:`load_map`.
+    """
+    with _readable(Path(path)):
+        file = open(path, 'rb')  # noqa: SIM115 for as long as the features are used
+        try:
+            place_map = _read_map(file, Path(path))
+        except BaseException:
+            file.close()
+            raise
+        return replace(place_map, features=StoredFeatures(place_map.features, file, Path(path)))
+
+
+class StoredFeatures(LocalFeatures):
+    """
+    Features of a map in its file: in memory only while they are used, and only where they are used.
+
+    ``strips`` and ``weights`` are read anew each time; ``features[:]`` reads both. The file stays open, so that
+    it may be replaced or deleted meanwhile; its content is checked at every reading. May be used from any
+    thread.
+
+    :param features: those that the file holds.
+    :param file: the map file.
+    :param path: its name, for error messages.
+    """
+
+    def __init__(self, features: LocalFeatures, file: IO[bytes], path: Path) -> None:
+        self._shape = tuple(features.strips.shape)
+        self._file, self._path, self._lock = file, path, Lock()
+        object.__setattr__(self, 'settings', features.settings)
+        object.__setattr__(self, 'cells', features.cells)
+        weakref.finalize(self, file.close)
+
+    def __len__(self) -> int:
+        return self._shape[1]
+
+    def __repr__(self) -> str:
+        return f'StoredFeatures({str(self._path)!r}, shape {self._shape}, {self.settings})'
+
+    def __getitem__(self, images: slice) -> LocalFeatures:
+        return LocalFeatures(self.strips[:, images], self.weights[:, images], self.settings, self.cells)
+
+    @property
+    def dimension(self) -> int:
+        """Number d of dimensions of a strip."""
+        return self._shape[2]
+
+    @property
+    def strips(self) -> torch.Tensor:
+        """The features, read from the file; shape (W, n, d), float32."""
+        return torch.from_numpy(self._read('strips'))
+
+    @property
+    def weights(self) -> torch.Tensor:
+        """The norm of each strip over that of all, read from the file; shape (W, n), float32."""
+        return torch.from_numpy(self._read('weights'))
+
+    def to(self, device: str | torch.device) -> LocalFeatures:
+        """Read the features to a device."""
+        return self[:].to(device)
+
+    def _read(self, name: str) -> np.ndarray:
+        with self._lock, _readable(self._path), zipfile.ZipFile(self._file) as archive:
+            return _read_array(archive, name, _read_manifest(archive, self._path)['members'][name])
+
+
+def _read_map(file: IO[bytes], path: Path) -> PlaceMap:
+    with zipfile.ZipFile(file) as archive:
+        manifest = _read_manifest(archive, path)
+        members = manifest['members'].items()
+        return _assemble(manifest, {name: _read_array(archive, name, digest) for name, digest in members})
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Name the file, and the remedy, in the errors of its reading."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            manifest = _read_manifest(archive, path)
-            arrays = {
-                name: _read_array(archive, name, digest) for name, digest in manifest['members'].items()
-            }
-        return _assemble(manifest, arrays)
+        yield
     except MapFileError:
         raise
     except FileNotFoundError as error:
@@ -136,17 +220,24 @@ def load_map(path: str | Path) -> PlaceMap:
         ) from error
 
 
-def _read(archive: zipfile.ZipFile, member: str) -> bytes:
+def _read(archive: zipfile.ZipFile, member: str) -> np.ndarray:
+    """Return the bytes of a member, uint8, in memory that begins with a cache line."""
     info = archive.getinfo(member)
     if info.compress_type != zipfile.ZIP_STORED:  # ours never is; a bomb would be
         raise ValueError(f'{member} is compressed')
-    return archive.read(info)
+    content = torch.empty(info.file_size, dtype=torch.uint8).numpy()
+    at = 0
+    with archive.open(info) as file:
+        while piece := file.read(PIECE):
+            content[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
+            at += len(piece)
+    return content
 
 
 def _read_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
     if MANIFEST not in archive.namelist():
         raise MapFileError(f'{path} is no map of this program: it is a ZIP file without {MANIFEST}')
-    manifest = json.loads(_read(archive, MANIFEST))
+    manifest = json.loads(_read(archive, MANIFEST).tobytes())
     if not isinstance(manifest, dict) or manifest.get('format') != FORMAT:
         raise MapFileError(f'{path} is no map of this program: its manifest does not say {FORMAT!r}')
     if manifest['version'] > VERSION:
@@ -158,12 +249,16 @@ def _read_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
 
 def _read_array(archive: zipfile.ZipFile, name: str, digest: str) -> np.ndarray:
     content = _read(archive, f'{name}.npy')
-    if hashlib.sha256(content).hexdigest() != digest:
+    if hashlib.sha256(content.data).hexdigest() != digest:
         raise ValueError(f'{name} does not match its hash')
-    array = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
-    if array.dtype != _TYPES[name]:
-        raise ValueError(f'{name} is {array.dtype}')
-    return array
+    header = io.BytesIO(content[:HEADER].tobytes())
+    if np.lib.format.read_magic(header) != (1, 0):
+        raise ValueError(f'{name} has a header of another version')
+    shape, columns_first, dtype = np.lib.format.read_array_header_1_0(header)
+    if dtype != _TYPES[name] or columns_first:
+        raise ValueError(f'{name} is {dtype}, columns first {columns_first}')
+    # not a copy, and aligned: NumPy's headers end at a multiple of 64 bytes
+    return content[header.tell() :].view(dtype).reshape(shape)
 
 
 def _assemble(manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> PlaceMap:
@@ -172,7 +267,8 @@ def _assemble(manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> PlaceM
         strips, weights = arrays['strips'], arrays['weights']
         if strips.ndim != 3 or strips.shape[0] != settings.strips or weights.shape != strips.shape[:2]:
             raise ValueError(f'strips {strips.shape} and weights {weights.shape} for W = {settings.strips}')
-        if not np.isfinite(strips).all() or not np.isfinite(weights).all():
+        extremes = [extreme(initial=0) for array in (strips, weights) for extreme in (array.min, array.max)]
+        if not np.isfinite(extremes).all():  # NaN among the values is their minimum
             raise ValueError('features are not finite')
         cells = manifest.get('cells')
         if cells is not None:

@@ -17,7 +17,8 @@ class PlaceMap:
     """
     Places in the order in which they were passed; place i is column i of everything.
 
-    :param features: local features of n places, strips (W, n, d).
+    :param features: local features of n places, strips (W, n, d); in memory, or in the map's file
+        (:func:`stavpr_ros.mapping.open_map`).
     :param projection: the random projection of the features, if they have one.
     :param stamps: when each place was seen, ns, shape (n,), int64; 0 = unknown.
     :param ids: external identifiers, n strings; '' = none.
@@ -55,6 +56,11 @@ class PlaceMap:
     def settings(self) -> FeatureSettings:
         """How the features were made."""
         return self.features.settings
+
+    @property
+    def dimension(self) -> int:
+        """Number d of dimensions of a strip."""
+        return self.features.dimension
 
     @cached_property
     def has_stamps(self) -> bool:

@@ -39,7 +39,7 @@ class Localization:
 
     def update(self, observation: Observation) -> Match:
         """Match the window that ends with an image."""
-        return self.recognizer.update(observation.features)
+        return self.recognizer.update(observation.features, observation.stamp)
 
 
 @dataclass(eq=False)

@@ -3,7 +3,6 @@
 import math
 import os
 import time
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -51,7 +50,6 @@ class Pipeline:
         self._name = operation
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
-        self._window: deque[int] = deque(maxlen=settings.sequence.length)  # stamps
         self._last: Match | None = None
         self.save_state = SaveState()  # of the places in use
         self._map_save_state = (
@@ -170,7 +168,6 @@ class Pipeline:
 
     def reset(self) -> None:
         """Empty the window: the next images do not continue those before."""
-        self._window.clear()
         self._keyframes.reset()
         self._last = None
         if self._operation is not None and self._operation.recognizer:
@@ -191,7 +188,7 @@ class Pipeline:
         recognizer = self._operation.recognizer if self._operation else None
         if recognizer is None or self._last is None or self._last.status is Status.WARMING_UP:
             raise InputError(
-                f'{len(self._window)} of {self._settings.sequence.length} images in the window'
+                f'{self.window_fill} of {self._settings.sequence.length} images in the window'
             )
         return replace(self._last, candidates=tuple(recognizer.ranked(count)))
 
@@ -241,7 +238,6 @@ class Pipeline:
         with _timed(stages, 'matching'):
             match = operation.update(Observation(features, image, stamp, pose))
         self._keyframes.accept(stamp, pose, image)
-        self._window.append(stamp)
         self.save_state.recorded += match.image_index >= 0
         if operation.recognizer is None:
             return replace(match, image=image)
@@ -251,7 +247,6 @@ class Pipeline:
         self._last = replace(
             match,
             image=image,
-            window_stamps=tuple(self._window),
             candidates=tuple(operation.recognizer.ranked(self._settings.candidates))
             if listed
             else (),

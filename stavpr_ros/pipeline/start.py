@@ -6,7 +6,7 @@ import numpy as np
 
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, PlaceMap, load_map
+from stavpr_ros.mapping import GrowingMap, PlaceMap, open_map
 from stavpr_ros.pipeline.operations import Localization, LoopClosing, Mapping, Operation
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.recognition import PlaceRecognizer
@@ -26,11 +26,11 @@ class LoadedMap:
 
 def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
     """
-    Read a map, on any thread.
+    Read a map, on any thread; its features stay in the file until an operation takes them.
 
     :raises StavprError: an invalid file, or a missing model.
     """
-    place_map = load_map(path)
+    place_map = open_map(path)
     extractor = place_map.extractor(choose_backend(settings.backend), settings.model_path)
     return LoadedMap(path, place_map, extractor)
 
@@ -69,9 +69,13 @@ def start_operation(
     closer = _loop_closer(settings, settings.exclude_places, extractor)
     # a closer that excludes next to nothing needs few images to warm up
     _warm_up(_loop_closer(settings, 1, extractor), extractor, settings.sequence.length + 8)
-    return LoopClosing(
-        extractor, _growing(settings, None, extractor), closer, settings.thumbnail_width
+    route = GrowingMap(
+        extractor.settings,
+        extractor.projection,
+        settings.max_places,
+        held_features=closer.features,
     )
+    return LoopClosing(extractor, route, closer, settings.thumbnail_width)
 
 
 def _growing(
@@ -91,6 +95,8 @@ def _loop_closer(
         extractor.settings,
         limit=settings.max_places,
         exclude_seconds=settings.exclude_seconds,
+        backend=settings.backend,
+        precision=settings.precision,
     )
 
 

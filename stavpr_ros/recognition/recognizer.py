@@ -241,13 +241,13 @@ class PlaceRecognizer(SequenceRecognizer):
 
     def _distances_to_itself(self, features: LocalFeatures) -> np.ndarray:
         """Return the distances of some places to all but their neighbors, which are NaN, shape (m, n)."""
-        n = len(features)
+        n, radius = len(features), self._settings.nms_radius
         some = np.unique(np.linspace(0, max(n - 1, 0), min(n, PLACES_TO_START_FROM)).astype(int))
-        if not n:
-            return np.empty((0, 0), np.float32)
-        rows = self._matcher.distance_matrix(features.strips[:, some], features.weights[:, some])
-        near = np.abs(np.arange(n) - some[:, None]) <= self._settings.nms_radius
-        return np.where(near, np.float32(np.nan), rows.cpu().numpy())
+        matrix = self._matcher.distance_matrix(features.strips[:, some], features.weights[:, some])
+        rows = matrix.cpu().numpy()
+        for row, place in zip(rows, some.tolist(), strict=True):
+            row[max(0, place - radius) : place + radius + 1] = np.nan
+        return rows
 
     @property
     def places(self) -> int:

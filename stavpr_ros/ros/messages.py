@@ -224,7 +224,7 @@ def map_info_message(
     if places is not None:
         message.places = len(places)
         if len(places):
-            message.dimension = places.features.strips.shape[2]
+            message.dimension = places.dimension
         message.has_stamps, message.has_ids = places.has_stamps, places.has_ids
         message.has_poses = places.has_poses
         message.has_thumbnails = any(places.thumbnails)

@@ -173,10 +173,10 @@ class Runtime:
         with self._loading(path):
             loaded = read_map(path, self._settings.pipeline)
             self.worker.run(lambda: self.pipeline.change(loaded=loaded))
-        places, features = loaded.places, loaded.places.features
+        places = loaded.places
         self._node.get_logger().info(
             f'map {path}: {len(places)} places, features {places.settings.kind}, '
-            f'{places.settings.strips} strips of {features.strips.shape[2]} dimensions'
+            f'{places.settings.strips} strips of {places.dimension} dimensions'
         )
 
     @contextmanager

@@ -7,6 +7,7 @@ import torch
 from stavpr_ros.features import LocalFeatures
 
 PRIOR = 20  # images that the map's mean counts for in the running mean of the query
+PIECE = 8192  # images centered at a time
 
 
 class MeanCentering:
@@ -42,10 +43,11 @@ class MeanCentering:
 
 
 def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
-    """Return unit-norm (W, n, d) less (W, d); one strip after the other, for little memory."""
+    """Return unit-norm (W, n, d) less (W, d); a piece of one strip after the other, for little memory."""
     out = torch.empty_like(strips, memory_format=torch.contiguous_format)
     for j in range(len(strips)):
-        torch.sub(strips[j], mean[j], out=out[j])
-        out[j] *= strips[j].any(dim=1, keepdim=True)
-        out[j] /= out[j].norm(dim=1, keepdim=True).clamp_(min=1e-12)
+        for whole, piece in zip(strips[j].split(PIECE), out[j].split(PIECE), strict=True):
+            torch.sub(whole, mean[j], out=piece)
+            piece *= whole.any(dim=1, keepdim=True)
+            piece /= piece.norm(dim=1, keepdim=True).clamp_(min=1e-12)
     return out

@@ -35,18 +35,27 @@ class ZNormalization:
         Start from the distances of the map to itself.
 
         :param rows: distances of some places to all, shape (m, n), float32; NaN where they are neighbors.
+            Written over: copies of all of them would stay in the heap of the process.
         """
-        known = np.isfinite(rows)
-        rows = np.stack([self.normalized(row) for row in rows]) if len(rows) else rows
-        count = known.sum(axis=0)
+        n = len(self._mean)
+        count, total, squares = np.zeros(n, np.int64), np.zeros(n, np.float32), np.zeros(n)
+        for row in rows:
+            row[:] = self.normalized(row)
+            count += np.isfinite(row)
+            total += np.nan_to_num(row, posinf=0, neginf=0)
         usable = count > 1
         if not usable.any():
             return
-        total = np.where(known, rows, 0).sum(axis=0)
-        mean = np.where(usable, total / np.maximum(count, 1), rows[known].mean())
-        squares = np.where(known, (rows - mean) ** 2, 0).sum(axis=0)
-        variance = np.where(usable, squares / np.maximum(count, 1), rows[known].var())
-        variance = np.where(variance > 0, variance, 1)
+        mean = total / np.maximum(count, 1)
+        if not usable.all():
+            known = rows[np.isfinite(rows)]
+            mean[~usable] = known.mean()
+        for row in rows:
+            squares += np.where(np.isfinite(row), (row - mean) ** 2, 0)
+        variance = squares / np.maximum(count, 1)
+        if not usable.all():
+            variance[~usable] = known.var()
+        variance[variance <= 0] = 1
         self._start = mean.astype(np.float32), variance.astype(np.float32)
         self.reset()
 

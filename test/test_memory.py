@@ -1,0 +1,176 @@
+"""Features are in memory once: the owner is the matcher, or the loop closer."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from stavpr_ros.errors import MapFileError
+from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.features.gradient import GradientSettings
+from stavpr_ros.mapping import GrowingMap, PlaceMap, load_map, open_map, save_map
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.cpu_matcher import CACHE_LINE
+
+LARGEST = 1.15  # of resident bytes over bytes of the features; the heap and the window take their part
+
+
+@pytest.fixture
+def path(small_map, tmp_path):
+    save_map(small_map, tmp_path / 'map')
+    return tmp_path / 'map'
+
+
+def test_open_map_holds_the_same_map_as_load_map(path, small_map):
+    opened, loaded = open_map(path), load_map(path)
+    assert len(opened) == len(loaded.features) == len(small_map)
+    assert (opened.settings, opened.ids, opened.dimension) == (loaded.settings, loaded.ids, loaded.dimension)
+    for features in (opened.features, opened.features[:], opened.features.to('cpu')):
+        assert torch.equal(features.strips, small_map.features.strips)
+        assert torch.equal(features.weights, small_map.features.weights)
+    assert torch.equal(opened.features[3:7].strips, small_map.features.strips[:, 3:7])
+    assert 'tensor' not in repr(opened.features)
+
+
+def test_features_read_from_a_file_begin_with_a_cache_line(path):
+    """So that a matcher in float32 shares them instead of making a copy."""
+    assert load_map(path).features.strips.data_ptr() % CACHE_LINE == 0
+    assert open_map(path).features.strips.data_ptr() % CACHE_LINE == 0
+
+
+@pytest.mark.parametrize('mode', ['paper', 'robust'])
+@pytest.mark.parametrize('precision', ['float32', 'float16'])
+def test_a_recognizer_on_an_opened_map_matches_as_on_a_loaded_one(path, mode, precision):
+    settings = RecognizerSettings(1.0, mode=mode)
+    opened, loaded = (
+        PlaceRecognizer(read(path), settings, 'cpu', precision) for read in (open_map, load_map)
+    )
+    features = load_map(path).features
+    for i in range(25):
+        image = features[i : i + 1]
+        assert repr(opened.update(image).sequence) == repr(loaded.update(image).sequence)
+
+
+def test_an_opened_map_saves_and_grows_bit_for_bit(path, small_map, tmp_path):
+    opened = open_map(path)
+    PlaceRecognizer(opened, RecognizerSettings(1.0, mode='robust'), precision='float16')
+    save_map(opened, tmp_path / 'copy')
+    assert torch.equal(load_map(tmp_path / 'copy').features.strips, small_map.features.strips)
+    grown = GrowingMap.from_map(opened, 100).snapshot()
+    assert torch.equal(grown.features.strips, small_map.features.strips)
+
+
+@pytest.mark.parametrize('change', ['replace', 'delete'])
+def test_an_opened_map_outlives_its_name(path, small_map, change):
+    opened = open_map(path)
+    if change == 'delete':
+        path.unlink()
+    else:
+        save_map(replace(small_map, ids=('other',) * len(small_map)), path)
+    assert torch.equal(opened.features.strips, small_map.features.strips)
+
+
+def test_an_opened_map_that_is_overwritten_is_an_error(path, small_map):
+    opened = open_map(path)
+    path.write_bytes(path.read_bytes().replace(small_map.features.strips.numpy().tobytes()[:64], bytes(64)))
+    with pytest.raises(MapFileError, match='damaged'):
+        _ = opened.features.strips
+
+
+def test_a_growing_map_may_leave_the_features_to_another_owner(small_map):
+    kept = small_map.features
+    growing = GrowingMap(
+        small_map.settings, small_map.projection, 50, held_features=lambda: kept[2 : 2 + len(growing)]
+    )
+    for i in range(40):
+        growing.add(kept[i : i + 1], i + 1)
+    growing.forget(2)
+    snapshot = growing.snapshot()
+    assert growing.memory < 50 * 1000 < snapshot.features.strips.nbytes
+    assert torch.equal(snapshot.features.strips, kept.strips[:, 2:40])
+    assert snapshot.stamps.tolist() == list(range(3, 41))
+    assert growing.dimension == kept.dimension
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+import torch
+from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.features.gradient import GradientSettings
+from stavpr_ros.mapping import GrowingMap, open_map
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.loop_closer import LoopCloser
+
+owner, mode, precision, large, small = sys.argv[1:]
+settings = RecognizerSettings(1.0, mode=mode)
+
+def resident():
+    pages = int(Path('/proc/self/statm').read_text().split()[1])
+    return pages * 4096
+
+def held(path):
+    place_map = open_map(path)
+    if owner == 'recognizer':
+        one = PlaceRecognizer(place_map, settings, 'cpu', precision)
+    else:
+        one = LoopCloser(settings, 20, place_map.settings, limit=len(place_map))
+        route = GrowingMap(place_map.settings, None, len(place_map), held_features=one.features)
+    features = place_map.features[:]
+    for i in range(21 if owner == 'recognizer' else len(features)):
+        one.update(features[i : i + 1])
+        if owner == 'closer':
+            route.add(features[i : i + 1])
+    return place_map, one
+
+held(small)  # loads libraries and kernels
+before = resident()
+place_map, one = held(large)
+size = 7 * len(place_map) * place_map.dimension * (2 if precision == 'float16' else 4)
+print((resident() - before) / size)
+"""
+
+
+def random_map(path, places, dimension):
+    rng = np.random.default_rng(0)
+    strips = rng.standard_normal((7, places, dimension), np.float32)
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+    weights = torch.full((7, places), 7**-0.5)
+    settings = FeatureSettings('gradient', GradientSettings())
+    features = LocalFeatures(torch.from_numpy(strips), weights, settings)
+    save_map(PlaceMap(features, None, np.zeros(places, np.int64), ('',) * places), path)
+    return str(path)
+
+
+@pytest.fixture(scope='module')
+def maps(tmp_path_factory):
+    """Maps of 143 MB and 86 MB, and a small one."""
+    folder = tmp_path_factory.mktemp('maps')
+    return {
+        'recognizer': random_map(folder / 'places', 5000, 1024),
+        'closer': random_map(folder / 'route', 1500, 2048),
+        'small': random_map(folder / 'small', 300, 64),
+    }
+
+
+@pytest.mark.skipif(not Path('/proc/self/statm').exists(), reason='resident memory is read from /proc')
+@pytest.mark.parametrize(
+    ('owner', 'mode', 'precision'),
+    [
+        ('recognizer', 'robust', 'float32'),
+        ('recognizer', 'robust', 'float16'),
+        ('recognizer', 'paper', 'float32'),
+        ('closer', 'robust', 'float32'),
+    ],
+)
+def test_resident_memory_is_that_of_the_features(maps, owner, mode, precision):
+    command = [sys.executable, '-c', PROGRAM, owner, mode, precision, maps[owner], maps['small']]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    ratio = float(done.stdout)
+    print(f'{owner}, {mode}, {precision}: resident bytes / bytes of the features = {ratio:.3f}')
+    assert 0.9 < ratio < LARGEST
