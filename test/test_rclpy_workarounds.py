@@ -73,6 +73,8 @@ def test_multi_threaded_executor_of_upstream_submits_a_waiting_callback_again(
     for _ in range(20):
         executor.spin_once(timeout_sec=0.05)
     assert len(submitted) > len({id(task) for task in submitted})
+    for task in submitted:
+        task()
     executor.shutdown()
 
 

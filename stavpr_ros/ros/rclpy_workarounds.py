@@ -37,10 +37,11 @@ class PromptExecutor(Executor):
 
     Waits for ros2/rclpy#1547 (merged for later distributions): ``MultiThreadedExecutor`` submits a
     callback again and again until a thread has begun it, and does not wait for events meanwhile.
-    Measured with images at the pace of their results on two cores: maximum latency 55 to 71 ms and
-    twice the processor time with ``MultiThreadedExecutor``, 13 ms here and with a single thread.
-    With the node itself 100 to 900 ms were seen. A node needs threads all the same, or a service
-    that loads a map stops the images.
+    Measured on two cores, images of 230 KB at the pace of their results, 2 ms of work: at most 55
+    and 71 ms per result and 0.6 to 1.0 s of processor time with ``MultiThreadedExecutor``, 12 and
+    13 ms and 0.4 s here, 9 ms and 0.3 s with a single thread. With the node itself 100 to 900 ms
+    were observed. The node needs threads all the same, or a service that loads a map stops the
+    images.
 
     Waits also for ros2/rclpy#1590, see ros2/rclpy#1355: what is destroyed on another thread while
     the executor collects its entities raises ``InvalidHandle`` out of ``spin_once``.
