@@ -1,20 +1,19 @@
 """The pipeline: from one image message to one match; the map and the operation."""
 
-import math
-import os
-import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+import math
+import os
 from pathlib import Path
+import time
 from typing import Any
 
 import numpy as np
-
 from stavpr_ros.errors import ImageError, InputError, MapFileError, StavprError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, PlaceMap, place_thumbnail
+from stavpr_ros.mapping import GrowingMap, place_thumbnail, PlaceMap
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.pipeline.operations import Mapping, Observation, Operation
@@ -54,9 +53,8 @@ class Pipeline:
         self._window: deque[int] = deque(maxlen=settings.sequence.length)  # stamps
         self._last: Match | None = None
         self.save_state = SaveState()  # of the places in use
-        self._map_save_state = (
-            self.save_state
-        )  # of the map, where loop closure has places of its own
+        # of the map, where loop closure has places of its own
+        self._map_save_state = self.save_state
         self.list_candidates = True  # with every match
         self._start(operation, settings, None)
 
@@ -288,9 +286,8 @@ class Pipeline:
                 SaveState(loaded.path),
             )
         operation = start_operation(name, settings, place_map, extractor)
-        self._map = (
-            None if name == 'mapping' else place_map
-        )  # in mapping, the growing map holds it
+        # in mapping, the growing map holds it
+        self._map = None if name == 'mapping' else place_map
         self._operation, self._name = operation, name
         self._extractor = operation.extractor if operation is not None else extractor
         self._map_save_state = save_state
