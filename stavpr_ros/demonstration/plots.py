@@ -5,9 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from stavpr_ros.demonstration.sheet import demo_sheet, distance_matrix, distance_over_time
 from stavpr_ros.errors import InputError
-from stavpr_ros.evaluation import plots
-from stavpr_ros.evaluation.plots import MatchPair, Outcome
+from stavpr_ros.evaluation.plots import MatchPair, Outcome, match_overview
 from stavpr_ros.evaluation.records import TraverseEvaluation
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
@@ -77,7 +77,7 @@ def draw_result(
     matrix = _matrix(query.features, place_map)
     pairs = [_pair(result, i, outcomes[i], query, place_map) for i in worth_seeing(outcomes)]
     truth, best = result.true_places, result.matches.distances
-    plots.demo_sheet(
+    demo_sheet(
         folder / 'demo.png',
         pairs,
         matrix,
@@ -90,7 +90,7 @@ def draw_result(
         title,
         result.headline,
     )
-    plots.match_overview(folder / 'matches.png', pairs)
-    plots.distance_matrix(folder / 'distance_matrix.png', matrix, result.matched, truth, result.tolerance)
+    match_overview(folder / 'matches.png', pairs)
+    distance_matrix(folder / 'distance_matrix.png', matrix, result.matched, truth, result.tolerance)
     unseen = np.zeros(len(outcomes), bool) if truth is None else truth < 0
-    plots.distance_over_time(folder / 'distance_over_time.png', best, threshold, outcomes, unseen)
+    distance_over_time(folder / 'distance_over_time.png', best, threshold, outcomes, unseen)
