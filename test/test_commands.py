@@ -13,7 +13,7 @@ from conftest import route_images
 from processes import TIMEOUT, Process, executable
 from test_trajectory import write_odometry
 
-from stavpr_msgs.msg import AlignedImages, LoopClosure, PlaceMatch
+from stavpr_msgs.msg import AlignedPlaces, LoopClosure, PlaceMatch
 from stavpr_ros.commands import build_map as build_map_command
 from stavpr_ros.commands import record as record_command
 from stavpr_ros.commands.demo import TOPIC, make_room
@@ -338,7 +338,7 @@ def test_loop_closures_as_json():
     message = LoopClosure(query_index=9, distance=math.nan, inliers=-1)
     message.header.stamp.sec = 3
     message.place_stamp.nanosec = 7
-    message.pairs = [AlignedImages(query_index=8, place_index=1)]
+    message.pairs = [AlignedPlaces(query_index=8, place_index=1)]
     message.pairs[0].query_stamp.sec = 2
     record = loop_closure_record(message)
     assert json.loads(json.dumps(record)) == record
