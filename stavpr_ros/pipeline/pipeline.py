@@ -295,7 +295,7 @@ class Pipeline:
         self.reset()
 
     def _require_no_loss(self, name: str, loaded: LoadedMap | None) -> None:
-        """Refuse to lose unsaved places; loading a map in localization discards them."""
+        """Reject the loss of unsaved places; loading a map in localization discards them."""
         leaves = name == 'loop_closure' != self._name  # its route replaces the recorded map
         replaces = loaded is not None and self._name == 'mapping'
         if self.unsaved and (leaves or replaces):

@@ -84,7 +84,7 @@ class PipelineSettings:
 
     def require_operation(self, operation: str) -> None:
         """
-        Refuse an operation that these settings exclude.
+        Reject an operation that these settings exclude.
 
         :raises SettingsError: names the settings.
         """

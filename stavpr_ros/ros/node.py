@@ -391,7 +391,7 @@ class PlaceRecognitionNode(ManagedNode):
 
 
 def _require_writable(save_path: str) -> None:
-    """Refuse a file that cannot be written before a recorded map would be lost."""
+    """Reject a file that cannot be written before a recorded map would be lost."""
     try:
         if save_path:
             require_room(save_path)
