@@ -5,10 +5,9 @@ With map_path, a map is extended. The service save_map saves the map at any time
 end.
 """
 
+from launch import LaunchDescription
 from launch.actions import LogInfo
 from launch.substitutions import LaunchConfiguration
-
-from launch import LaunchDescription
 from stavpr_ros.ros.launching import node_launch
 
 

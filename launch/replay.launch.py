@@ -4,12 +4,11 @@ Replay a bag, or a folder of images, into the node.
 ros2 launch stavpr_ros replay.launch.py bag:=drive.bag map_path:=route.stavpr
 """
 
+from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-
-from launch import LaunchContext, LaunchDescription
-from stavpr_ros.ros.launching import PACKAGE, node_launch, remappings
+from stavpr_ros.ros.launching import node_launch, PACKAGE, remappings
 
 
 def _replay(context: LaunchContext) -> list[Node]:

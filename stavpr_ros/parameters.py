@@ -6,9 +6,9 @@ The parameters of the node: one table for validation, launch arguments and docum
 library.
 """
 
-import textwrap
 from dataclasses import dataclass
 from pathlib import Path
+import textwrap
 from typing import Any, Literal
 
 WHEN = {

@@ -1,19 +1,18 @@
 """A node and one camera: how the node is started, and images with their matches."""
 
-import time
 from pathlib import Path
+import time
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from image_messages import image_message
+import numpy as np
 from processes import Bench, Process
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
+from stavpr_msgs.msg import PlaceMatch
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
-
-from stavpr_msgs.msg import PlaceMatch
 
 LENGTH = 5
 SECOND = 10**9
@@ -25,7 +24,12 @@ def start_node(folder: Path, *options: str) -> Process:
 
     :param folder: holds ``route.stavpr``, the map; the log goes there.
     """
-    values = {'map_path': folder / 'route.stavpr', 'threshold': 0.2, 'mode': 'paper', 'nms_radius': 5}
+    values = {
+        'map_path': folder / 'route.stavpr',
+        'threshold': 0.2,
+        'mode': 'paper',
+        'nms_radius': 5,
+    }
     values |= {'sequence_length': LENGTH, 'diagnostics_period': 0.2}
     words = [word for name, value in values.items() for word in ('-p', f'{name}:={value}')]
     return Process(folder / 'node.log', 'node', '--ros-args', *words, *options)
@@ -56,7 +60,9 @@ class Camera:
             assert sent < 100
             self.publisher.publish(self.kind(header=Header(stamp=Time(nanosec=sent))))
             self.bench.executor.spin_once(timeout_sec=0.5)
-        self.bench.until(lambda: self.bench.answers[-1].header.stamp.nanosec == sent, 'the last match')
+        self.bench.until(
+            lambda: self.bench.answers[-1].header.stamp.nanosec == sent, 'the last match'
+        )
 
     def show(self, image: np.ndarray | Image | CompressedImage, later: int = SECOND) -> PlaceMatch:
         """Publish an image, or a message, stamped later than the last one by so many ns."""
@@ -78,7 +84,9 @@ class Camera:
     def counts(self, part: str) -> dict[str, str]:
         """Return the values of the diagnostics of a part, newer than this call."""
         now, arrays = time.time_ns(), self.diagnostics
-        self.bench.until(lambda: bool(arrays) and nanoseconds(arrays[-1].header.stamp) > now, 'diagnostics')
+        self.bench.until(
+            lambda: bool(arrays) and nanoseconds(arrays[-1].header.stamp) > now, 'diagnostics'
+        )
         found = [status for status in arrays[-1].status if status.name.endswith(part)]
         return {pair.key: pair.value for pair in found[0].values}
 

@@ -7,8 +7,10 @@ import numpy as np
 from sensor_msgs.msg import CompressedImage, Image
 
 
-def image_message(image: np.ndarray, stamp: int, encoding: str = 'rgb8', padding: int = 0) -> Image:
-    """An image message in one of the encodings, its rows padded by some bytes."""
+def image_message(
+    image: np.ndarray, stamp: int, encoding: str = 'rgb8', padding: int = 0
+) -> Image:
+    """Return an image message in an encoding, with padded rows."""
     if encoding == 'bgr8':
         image = image[:, :, ::-1]
     elif encoding in ('rgba8', 'bgra8'):
@@ -21,7 +23,9 @@ def image_message(image: np.ndarray, stamp: int, encoding: str = 'rgb8', padding
             image = image.astype('>u2')
     rows = np.ascontiguousarray(image).view(np.uint8).reshape(image.shape[0], -1)
     rows = np.hstack([rows, np.full((len(rows), padding), 99, np.uint8)])
-    message = Image(height=image.shape[0], width=image.shape[1], encoding=encoding, step=rows.shape[1])
+    message = Image(
+        height=image.shape[0], width=image.shape[1], encoding=encoding, step=rows.shape[1]
+    )
     message.is_bigendian = int(encoding == 'mono16')
     message.header.frame_id = 'camera'
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
@@ -30,7 +34,7 @@ def image_message(image: np.ndarray, stamp: int, encoding: str = 'rgb8', padding
 
 
 def compressed_message(image: np.ndarray, stamp: int, suffix: str = '.png') -> CompressedImage:
-    """An image message as image_transport compresses it."""
+    """Return an image message as image_transport compresses it."""
     name = suffix.lstrip('.')
     message = CompressedImage(format=f'rgb8; {name} compressed bgr8')
     message.header.frame_id = 'camera'

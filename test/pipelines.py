@@ -3,7 +3,6 @@
 from contextlib import contextmanager
 
 import numpy as np
-
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
 from stavpr_ros.pipeline.saving import write_map
@@ -36,7 +35,7 @@ def process(pipeline, images, first=0, poses=False):
 
 
 def recorded(route, operation='mapping', count=30, **changes):
-    """A pipeline in an operation, on a saved map of the route; in loop_closure, on the route itself."""
+    """Return a pipeline on a saved map of the route; in loop_closure, on the route itself."""
     pipeline = Pipeline(settings_of(**changes), 'mapping')
     process(pipeline, route[:count], poses=True)
     mark_saved(pipeline)
@@ -48,7 +47,7 @@ def recorded(route, operation='mapping', count=30, **changes):
 
 
 def localizing(map_file, **changes):
-    """A pipeline that localizes on a map file."""
+    """Return a pipeline that localizes on a map file."""
     pipeline = Pipeline(settings_of(**changes))
     pipeline.change(loaded=read_map(map_file, pipeline.settings))
     return pipeline
@@ -73,7 +72,7 @@ def stamps_of(places):
 
 @contextmanager
 def one_thread():
-    """Threads that wait for each other spin, 100 ms an image where others want the cores as well."""
+    """Limit the threads: waiting ones spin, 100 ms an image on a busy machine."""
     limit_threads(1)
     try:
         yield

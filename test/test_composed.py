@@ -1,20 +1,18 @@
-"""The node in a process of somebody else's: their executor, their context, their end."""
+"""The node in a process of another program: its executor, its context, its end."""
 
 import threading
-import time
 
 import cv2
+from image_messages import image_message
+from processes import DOMAIN
 import pytest
 import rclpy
-import torch
-from image_messages import image_message
-from processes import DOMAIN, TIMEOUT
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
-
-from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.mapping import load_map
 from stavpr_ros.ros.node import PlaceRecognitionNode
 from stavpr_ros.threads import limit_threads
+import torch
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
 
@@ -33,8 +31,8 @@ def make(context):
     made = []
 
     def make(**parameters):
-        values = {'autostart': False, 'threads': 1, 'sequence_length': 5, 'nms_radius': 5} | parameters
-        overrides = [Parameter(name, value=value) for name, value in values.items()]
+        values = {'autostart': False, 'threads': 1, 'sequence_length': 5, 'nms_radius': 5}
+        overrides = [Parameter(name, value=value) for name, value in (values | parameters).items()]
         made.append(PlaceRecognitionNode(context=context, parameter_overrides=overrides))
         return made[-1]
 
@@ -43,72 +41,135 @@ def make(context):
         node.destroy_node()
 
 
-def test_ros_may_be_shut_down_before_the_node_is_destroyed(make, context, route, tmp_path):
-    """As with plain `rclpy.spin` and Ctrl-C: what has grown is written, and nothing is left running."""
+def set_parameter(node, name, value):
+    return node.set_parameters([Parameter(name, value=value)])[0]
+
+
+def test_shutdown_of_ros_before_the_node_saves_the_map(make, context, route, tmp_path):
+    """As with plain `rclpy.spin` and an interrupt; no thread is left."""
     path = tmp_path / 'route.stavpr'
     node = make(operation='mapping', save_path=str(path), queue_size=100, keyframe_change=0.0)
     assert node.trigger_configure() == node.trigger_activate() == SUCCESS
     for i, image in enumerate(route[:20]):
-        node.configured.images._on_image(image_message(image, i + 1))
-    end = time.monotonic() + TIMEOUT
-    while not len(node.configured.pipeline.places) and time.monotonic() < end:
-        time.sleep(0.001)
+        node.runtime.images.on_image(image_message(image, i + 1))
+    while not len(node.runtime.pipeline.places):
+        node.runtime.worker.run(lambda: None)
     rclpy.shutdown(context=context)
     node.destroy_node()
-    assert path.exists()
     assert 0 < len(load_map(path)) <= 20
     assert not [thread for thread in threading.enumerate() if thread.name == 'recognition']
 
 
-def test_nobody_sees_the_services_of_a_node_that_is_destroyed(make, bench):
+def test_destroyed_node_leaves_no_services(make, bench):
     node = make()
 
-    def seen():
+    def found():
         return '/stavpr/get_state' in dict(bench.node.get_service_names_and_types())
 
-    bench.until(seen, 'the node')
+    bench.until(found, 'the node')
     node.destroy_node()
-    bench.until(lambda: not seen(), 'the node to be gone')
+    bench.until(lambda: not found(), 'the end of the node')
 
 
-def test_a_parameter_that_is_set_while_the_start_fails_starts_it_again(make, small_map, tmp_path):
-    path = tmp_path / 'route.stavpr'
-    save_map(small_map, path)
+def test_parameters_that_are_rejected_change_nothing(make, map_file):
+    node = make(map_path=map_file)
+    assert node.trigger_configure() == SUCCESS
+    before = node.settings
+    for name, value, words in (
+        ('map_path', 'other.stavpr', 'call the service ~/load_map'),
+        ('operation', 'mapping', 'call the service ~/set_operation'),
+        ('beta', 3.0, 'while the node is unconfigured'),
+        ('threshold', 1.5, 'chance'),
+        ('save_path', '/missing/route.stavpr', 'save_path'),
+        ('geometric_check', 'eye', 'take one of none'),
+    ):
+        result = set_parameter(node, name, value)
+        assert (result.successful, words in result.reason) == (False, True)
+        assert node.get_parameter(name).value != value
+        assert node.settings is before
+    assert set_parameter(node, 'map_path', map_file).successful  # the current value
+    together = [Parameter('candidates', value=3), Parameter('threshold', value=1.5)]
+    assert not node.set_parameters_atomically(together).successful
+    assert node.settings.pipeline.candidates == 10
+    assert set_parameter(node, 'candidates', 3).successful
+    assert node.runtime.pipeline.settings.candidates == 3
+
+
+def test_operation_of_the_service_lasts_until_the_next_configuration(make, map_file):
+    node = make(map_path=map_file)
+    assert node.trigger_configure() == SUCCESS
+    node.set_operation('mapping')
+    assert set_parameter(node, 'candidates', 3).successful
+    assert node.settings.operation == node.runtime.pipeline.operation == 'mapping'
+    assert node.trigger_cleanup() == node.trigger_configure() == SUCCESS
+    assert node.settings.operation == node.runtime.pipeline.operation == 'localization'
+
+
+def test_failed_odometry_subscription_is_the_problem(make, map_file):
+    """Live parameters are applied; the error is logged and in the diagnostics."""
+    topic = {'qos_overrides./odom.subscription.reliability': 'certain'}
+    node = make(map_path=map_file, **topic)
+    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+    assert set_parameter(node, 'keyframe_distance', 1.0).successful
+    assert 'correct qos_overrides./odom.subscription' in node.runtime.problem
+    assert node.runtime.pipeline.settings.keyframes.meters == 1
+
+
+def test_odometry_is_subscribed_while_it_is_needed(make, map_file):
+    node = make(map_path=map_file)
+    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+    for distance, count in ((1.0, 1), (2.0, 1), (0.0, 0)):
+        assert set_parameter(node, 'keyframe_distance', distance).successful
+        assert node.count_subscribers('/odom') == count
+    node.set_operation('mapping')
+    assert node.count_subscribers('/odom') == 1
+
+
+def test_a_parameter_that_is_set_while_the_start_fails_starts_it_again(
+    make, map_file, tmp_path, monkeypatch
+):
     node = make(autostart=True, map_path=str(tmp_path / 'missing.stavpr'))
-    fail = node.on_configure
+    trigger = node.trigger_configure
 
-    def fails(state):
-        result = fail(state)
-        assert node.set_parameters([Parameter('map_path', value=str(path))])[0].successful
+    def fail_and_set():
+        result = trigger()
+        assert set_parameter(node, 'map_path', map_file).successful
         return result
 
-    node._callbacks = {key: fails if value == fail else value for key, value in node._callbacks.items()}
-    node._on_start()
-    assert node.state == 'unconfigured'
-    assert not node._start.is_canceled()
-    node._callbacks = {key: fail if value == fails else value for key, value in node._callbacks.items()}
-    node._on_start()
-    assert (node.state, len(node.configured.pipeline.places)) == ('active', 60)
+    monkeypatch.setattr(node, 'trigger_configure', fail_and_set)
+    executor = rclpy.executors.SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    while node.state == 'unconfigured' and not node.problem:
+        executor.spin_once(timeout_sec=1)
+    monkeypatch.setattr(node, 'trigger_configure', trigger)
+    while node.state != 'active':
+        executor.spin_once(timeout_sec=1)
+    assert len(node.runtime.pipeline.places) == 60
+    executor.shutdown()
 
 
-def test_a_file_that_cannot_be_written_is_refused_before_the_drive(make, tmp_path):
+def test_save_path_that_cannot_be_written_is_rejected(make, tmp_path):
     node = make(operation='mapping', save_path=str(tmp_path / 'missing' / 'route.stavpr'))
     assert node.trigger_configure() != SUCCESS
     assert (node.state, 'save_path' in node.problem) == ('unconfigured', True)
-    for path, good in ((tmp_path, False), (tmp_path / 'missing' / 'x', False), (tmp_path / 'x', True)):
-        result = node.set_parameters([Parameter('save_path', value=str(path))])[0]
-        assert (result.successful, 'save_path' in result.reason) == (good, not good)
+    for path, valid in (
+        (tmp_path, False),
+        (tmp_path / 'missing' / 'x', False),
+        (tmp_path / 'x', True),
+    ):
+        result = set_parameter(node, 'save_path', str(path))
+        assert (result.successful, 'save_path' in result.reason) == (valid, not valid)
     assert node.trigger_configure() == SUCCESS
 
 
-def test_the_limit_of_threads_can_be_taken_away_again(make):
-    """OpenCV's is that of the process, torch's that of the worker."""
+def test_limit_of_threads_can_be_removed(make):
+    """The limit of OpenCV holds for the process, that of torch for the worker."""
     limit_threads(0)
     before = torch.get_num_threads(), cv2.getNumThreads()
     node = make(threads=1)
-    for threads, expected in ((1, (1, 1)), (0, before), (1, (1, 1)), (0, before)):
-        assert node.set_parameters([Parameter('threads', value=threads)])[0].successful
+    for threads, expected in ((1, (1, 1)), (0, before)):
+        assert set_parameter(node, 'threads', threads).successful
         assert node.trigger_configure() == SUCCESS
-        on_worker = node.configured._on_worker
-        assert on_worker(lambda: (torch.get_num_threads(), cv2.getNumThreads())) == expected
+        counts = node.runtime.worker.run(lambda: (torch.get_num_threads(), cv2.getNumThreads()))
+        assert counts == expected
         assert node.trigger_cleanup() == SUCCESS

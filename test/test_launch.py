@@ -1,24 +1,23 @@
 """
 The launch files: their arguments, and the node that they start.
 
-``launch`` cannot be installed by pip, so a recording stand-in replaces it; where it is installed, it
-runs one of the files as well.
+``launch`` cannot be installed by pip, so a recording stand-in replaces it; where it is installed,
+it runs one of the files as well.
 """
 
 import ast
 import importlib.util
 import os
+from pathlib import Path
 import subprocess
 import sys
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
-import cv2
-import pytest
 from ament_index_python.packages import get_package_share_directory
 from conftest import route_images
+import cv2
 from processes import DOMAIN, executable
-
+import pytest
 from stavpr_ros.parameters import BY_NAME
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -169,7 +168,11 @@ def test_empty_arguments_are_left_to_the_parameter_file(load, name):
     assert words(node.parameters[0]) == '${params_file}'
     assert node.parameters[1:] == [fixed]
     assert Path(executable(node.executable)).exists()
-    assert (node.package, node.name, words(node.namespace)) == ('stavpr_ros', 'stavpr', '${namespace}')
+    assert (node.package, node.name, words(node.namespace)) == (
+        'stavpr_ros',
+        'stavpr',
+        '${namespace}',
+    )
     topics = {topic: words(to) for topic, to in node.remappings}
     expected = {'image': '${image}', 'image/compressed': '${image}/compressed', 'odom': '${odom}'}
     assert topics == expected
@@ -189,7 +192,12 @@ def test_replay_gets_its_options(load):
     assert dict(replay.remappings)['image'].positional == ('image',)
     assert Path(executable(replay.executable)).exists()
     _, replay = launch.start(bag='drive', topic='/camera', lossless='true', shutdown='true')
-    assert [words(word) for word in replay.arguments] == ['${bag}', '--topic', '${topic}', '--lossless']
+    assert [words(word) for word in replay.arguments] == [
+        '${bag}',
+        '--topic',
+        '${topic}',
+        '--lossless',
+    ]
     assert type(replay.on_exit[0]).__name__ == 'Shutdown'
     _, replay = launch.start(bag='drive', rate='2')
     assert [words(word) for word in replay.arguments] == ['${bag}', '--rate', '${rate}']
@@ -202,7 +210,8 @@ from launch.actions import IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 
 arguments = [word.split(':=') for word in sys.argv[2:]]
-included = IncludeLaunchDescription(PythonLaunchDescriptionSource(sys.argv[1]), launch_arguments=arguments)
+source = PythonLaunchDescriptionSource(sys.argv[1])
+included = IncludeLaunchDescription(source, launch_arguments=arguments)
 service = LaunchService()
 service.include_launch_description(LaunchDescription([included]))
 sys.exit(service.run())
@@ -214,11 +223,31 @@ def test_launch_replays_a_folder_in_a_namespace(tmp_path):
     pytest.importorskip('launch_ros', reason='launch is not installed')
     for i, image in enumerate(route_images(24)):
         cv2.imwrite(str(tmp_path / f'{i}.png'), image)
-    given = ['namespace:=robot', 'image:=/camera', 'lossless:=true', 'shutdown:=true', 'operation:=mapping']
-    command = [sys.executable, '-c', RUN, str(ROOT / 'launch' / 'replay.launch.py'), f'bag:={tmp_path}']
-    environment = os.environ | {'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    given = [
+        'namespace:=robot',
+        'image:=/camera',
+        'lossless:=true',
+        'shutdown:=true',
+        'operation:=mapping',
+    ]
+    command = [
+        sys.executable,
+        '-c',
+        RUN,
+        str(ROOT / 'launch' / 'replay.launch.py'),
+        f'bag:={tmp_path}',
+    ]
+    environment = os.environ | {
+        'ROS_DOMAIN_ID': str(DOMAIN),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+    }
     done = subprocess.run(
-        [*command, *given], env=environment, capture_output=True, text=True, timeout=120, check=False
+        [*command, *given],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     output = done.stdout + done.stderr
     assert done.returncode == 0, output

@@ -342,7 +342,7 @@ def test_node_without_its_map_frees_the_memory(bench, node, map_file, small_map,
     assert bench.set_parameter('xi', 0)[0]
     assert bench.transition('configure')
     full = resident(node)
-    assert bench.set_parameter('map_path', map_file) == (True, '')
+    assert bench.call(LoadMap, 'load_map', path=map_file).success
     assert full - resident(node) > 70 * MEGABYTE
 
 

@@ -2,22 +2,20 @@
 
 import math
 
-import numpy as np
-import pytest
-import rclpy
 from builtin_interfaces.msg import Time
 from conftest import route_images
 from nav_msgs.msg import Odometry
-from processes import DOMAIN, Bench
+import numpy as np
+from processes import Bench, DOMAIN
+import pytest
+import rclpy
 from rclpy.lifecycle import LifecycleNode
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
-from std_msgs.msg import Header
-
 from stavpr_msgs.msg import LoopClosure, PlaceMatch
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, encode_thumbnail
+from stavpr_ros.mapping import encode_thumbnail, GrowingMap
 from stavpr_ros.recognition import Candidate, Match, Status
 from stavpr_ros.ros import output
 from stavpr_ros.ros.messages import (
@@ -32,6 +30,7 @@ from stavpr_ros.ros.messages import (
     pose_message,
     time_message,
 )
+from std_msgs.msg import Header
 
 SECOND = 10**9
 HEADER = Header(stamp=Time(sec=20, nanosec=7), frame_id='camera')
@@ -62,7 +61,7 @@ def features(extractor):
 
 @pytest.fixture(scope='module')
 def places(extractor, features):
-    """A route of places 10 to 59, those before evicted; place i: i + 1 s, at x = i, y = i squared."""
+    """Return a route of places 10 to 59; place i: i + 1 s, at x = i, y = i squared."""
     route = GrowingMap(extractor.settings, extractor.projection, 100)
     for i in range(60):
         pose = None if i in (33, 41) else np.array([i, i * i, 0, 0, 0, 0, 1.0])
@@ -218,7 +217,9 @@ def test_matched_pose_message_rotates_about_the_axes_of_the_map(extractor, featu
     route = GrowingMap(extractor.settings, extractor.projection, 10)
     degrees = [-20, -5, 0, 15, 20]
     for i, turn in enumerate(degrees):
-        orientation = (Rotation.from_euler(axis, turn, degrees=True) * camera).as_quat() * (-1) ** i
+        orientation = (Rotation.from_euler(axis, turn, degrees=True) * camera).as_quat() * (
+            -1
+        ) ** i
         route.add(features, pose=np.array([0, 0, 0, *orientation]))
     match = accepted(np.array([[4, 2]], np.int32))
     message = matched_pose_message(HEADER, match, route, 'map')
@@ -254,12 +255,19 @@ def test_image_message_of_a_strided_image():
 def test_map_info_message_of_a_map(small_map):
     extractor = small_map.extractor()
     info = map_info_message('mapping', 'full', 'a', small_map, extractor, Time(sec=3))
-    assert (info.operation, info.state, info.path, info.header.stamp.sec) == ('mapping', 'full', 'a', 3)
+    assert (info.operation, info.state, info.path, info.header.stamp.sec) == (
+        'mapping',
+        'full',
+        'a',
+        3,
+    )
     assert (info.places, info.features, info.strips, info.dimension, info.format_version) == (
         60, 'gradient', 7, 64, 1
     )  # fmt: skip
     assert info.settings == small_map.settings.to_json()
-    assert all((info.projected, info.has_stamps, info.has_ids, info.has_poses, info.has_thumbnails))
+    assert all(
+        (info.projected, info.has_stamps, info.has_ids, info.has_poses, info.has_thumbnails)
+    )
 
 
 def test_map_info_message_of_a_growing_map_and_of_none(extractor, features):

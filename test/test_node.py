@@ -2,19 +2,18 @@
 
 import signal
 
-import numpy as np
-import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from image_messages import image_message
+import numpy as np
 from processes import node_process
+import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
-from std_msgs.msg import Float32, Int32
-
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_msgs.srv import LoadMap, SetOperation
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from std_msgs.msg import Float32, Int32
 
 LENGTH, THRESHOLD = 5, 0.2
 PAPER = {'mode': 'paper', 'threshold': THRESHOLD}
@@ -44,7 +43,7 @@ def node(run, map_file):
 
 
 def recognize(place_map, images, threshold, mode):
-    """The matches of the library."""
+    """Return the matches of the library."""
     settings = RecognizerSettings(
         threshold, sequence=SequenceSettings(LENGTH), nms_radius=5, mode=mode
     )
@@ -90,7 +89,10 @@ def test_node_publishes_the_matches_of_the_library(bench, node, small_map, route
     matches = []
     for i, image in enumerate(images):
         message, core = bench.ask(image_message(image, stamps[i])), cores[i]
-        assert (nanoseconds(message.header.stamp), message.header.frame_id) == (stamps[i], 'camera')
+        assert (nanoseconds(message.header.stamp), message.header.frame_id) == (
+            stamps[i],
+            'camera',
+        )
         same_match(message, core)
         assert message.threshold == pytest.approx(THRESHOLD)
         if core.sequence is not None:
@@ -146,7 +148,9 @@ def test_node_decodes_encodings_with_padded_rows(bench, node, route):
 def test_a_burst_of_images_gets_one_match_each(bench, node, route):
     """Every image that reached the node is processed or dropped, once; then all is well."""
     before = len(bench.answers)
-    big = [image_message(np.kron(route[i], np.ones((5, 5, 1), np.uint8)), 2000 + i) for i in range(40)]
+    big = [
+        image_message(np.kron(route[i], np.ones((5, 5, 1), np.uint8)), 2000 + i) for i in range(40)
+    ]
     for image in big:
         bench.publisher.publish(image)
     for i in range(40, 46):
@@ -202,7 +206,9 @@ def test_mode_robust_has_a_default_threshold(bench, run, map_file, small_map, ro
         assert message.threshold == pytest.approx(applied)
 
 
-def test_parameter_change_after_failed_start_starts_the_node(bench, run, map_file, route, tmp_path):
+def test_parameter_change_after_failed_start_starts_the_node(
+    bench, run, map_file, route, tmp_path
+):
     bad = tmp_path / 'bad.stavpr'
     bad.write_bytes(b'no map')
     process = run(wait=False, map_path=bad, **PAPER)

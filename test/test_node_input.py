@@ -2,21 +2,20 @@
 
 import array
 
-import numpy as np
-import pytest
 from builtin_interfaces.msg import Time
-from camera import LENGTH, SECOND, Camera
+from camera import Camera, LENGTH, SECOND
 from diagnostic_msgs.msg import DiagnosticStatus
 from image_messages import compressed_message, image_message
 from nav_msgs.msg import Odometry
-from raw_images import BAYER, CHANNELS, YUV, is_deep, mosaic, packed_yuv
+import numpy as np
+import pytest
+from raw_images import BAYER, CHANNELS, is_deep, mosaic, packed_yuv, YUV
 from rcl_interfaces.srv import GetParameters
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
-from std_msgs.msg import Header
-
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.parameters import BY_NAME
+from std_msgs.msg import Header
 
 WARN, ERROR = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 WARMING_UP, MATCH = PlaceMatch.WARMING_UP, PlaceMatch.MATCH
@@ -24,7 +23,7 @@ INVALID, SKIPPED = PlaceMatch.INVALID_IMAGE, PlaceMatch.SKIPPED
 
 
 def encoded(image, encoding):
-    """An image in a raw encoding, byte by byte as the encoding is defined; 16 bits little-endian."""
+    """Return an image in a raw encoding, byte by byte; 16 bits are little-endian."""
     height, width = image.shape[:2]
     if encoding in BAYER:
         rows = mosaic(encoding, image)
@@ -49,7 +48,9 @@ def encoded(image, encoding):
 
 def invalid_images(image):
     """One invalid image for each cause."""
-    kinds = {kind: image_message(image, 0) for kind in ('cut off', 'encoding', 'depth', 'size', 'step')}
+    kinds = {
+        kind: image_message(image, 0) for kind in ('cut off', 'encoding', 'depth', 'size', 'step')
+    }
     kinds['cut off'].height = kinds['cut off'].step = 2**32 - 1
     kinds['encoding'].encoding = 'teleport8'
     kinds['depth'].encoding = '32FC1'
@@ -77,7 +78,9 @@ class TestImages:
             match = stream.show(encoded(image, encoding))
         assert (match.status, match.newest_index) == (MATCH, 34)
 
-    def test_invalid_images_are_counted_and_explained_once_a_kind(self, bench, process, camera, route):
+    def test_invalid_images_are_counted_and_explained_once_a_kind(
+        self, bench, process, camera, route
+    ):
         before = camera.counts('input')
         good = iter(range(20))
         for _ in range(2):
@@ -94,7 +97,9 @@ class TestImages:
         for kind in invalid_images(route[0]):
             key = f'dropped_invalid_{kind.replace(" ", "_")}'
             assert int(after[key]) == int(before.get(key, 0)) + 2, kind
-            assert process.output().count(f'logged once; /diagnostics counts "invalid: {kind}"') == 1, kind
+            assert (
+                process.output().count(f'logged once; /diagnostics counts "invalid: {kind}"') == 1
+            ), kind
         bench.until_diagnosed('input', WARN, 'cut off 2')
         assert 'Traceback' not in process.output()
 
@@ -127,12 +132,15 @@ class TestImages:
         bench.until(lambda: wheels.get_subscription_count() > 0, 'the subscriber of odometry')
 
         def moved(meters, degrees=0.0):
-            """Publish the next image of the route with that pose, which is valid for half a second."""
+            """Publish the next image with a pose, which is valid for half a second."""
             camera.stamp += SECOND
             odometry, half = Odometry(), np.radians(degrees) / 2
             odometry.header.stamp = Time(sec=camera.stamp // SECOND, nanosec=camera.stamp % SECOND)
             odometry.pose.pose.position.x = meters
-            odometry.pose.pose.orientation.z, odometry.pose.pose.orientation.w = np.sin(half), np.cos(half)
+            odometry.pose.pose.orientation.z, odometry.pose.pose.orientation.w = (
+                np.sin(half),
+                np.cos(half),
+            )
             image = next(images)
 
             def known():  # the image may be faster, or the publisher not be matched yet
@@ -150,14 +158,17 @@ class TestImages:
         camera.set(keyframe_angle=30.0)
         assert moved(6.1, degrees=40).status == WARMING_UP
         match = moved(6.1, degrees=50)
-        assert match.reason == 'moved 0.000 m of 1 m and turned 10.00 of 30 degrees since the last keyframe'
+        assert (
+            match.reason
+            == 'moved 0.000 m of 1 m and turned 10.00 of 30 degrees since the last keyframe'
+        )
         assert camera.counts('recognition')['window'] == '3'
         assert 'no odometry' in camera.show(next(images), 3600 * SECOND).reason  # another clock
 
         def compared():
             wheels.publish(Odometry(header=Header(stamp=Time(sec=1))))
             message = bench.diagnostics['input'].message
-            return 'had no odometry of their time: compare the stamps' in message
+            return 'without odometry at their stamps' in message
 
         bench.until(compared, 'a word on the stamps')
         bench.until_diagnosed('input', WARN, 'has stopped')
@@ -198,13 +209,15 @@ def compressed_process(start):
 
 @pytest.fixture(scope='class')
 def packed(bench, compressed_process):
-    """The diagnostics without a publisher, with one of raw images, and with a silent one."""
+    """Check the diagnostics without, with a raw, and with a silent publisher."""
     topic = '/front/image/compressed'  # below what `image` is remapped to
     message = bench.until_diagnosed('input', WARN, 'no publisher').message
     assert topic in message
     assert 'image:=TOPIC' in message
     raw = bench.node.create_publisher(Image, topic, qos_profile_sensor_data)
-    bench.until_diagnosed('input', ERROR, 'sensor_msgs/msg/Image is published there: compare image_transport')
+    bench.until_diagnosed(
+        'input', ERROR, 'sensor_msgs/msg/Image is published there: compare image_transport'
+    )
     bench.node.destroy_publisher(raw)
     publisher = bench.node.create_publisher(CompressedImage, topic, qos_profile_sensor_data)
     bench.until_diagnosed('input', WARN, 'there, but silent')
@@ -248,12 +261,15 @@ def reliable_process(start):
 
 @pytest.fixture(scope='class')
 def reliable(bench, reliable_process):
-    """A reliable camera; the publisher of the bench is not, which the node reports."""
+    """Return a reliable camera; the publisher of the bench is rejected."""
     message = bench.until_diagnosed('input', ERROR, 'refused for QoS').message
-    remedy = 'set qos_overrides./image.subscription.reliability to best_effort, or make the publisher'
+    remedy = (
+        'set qos_overrides./image.subscription.reliability to best_effort, or make the publisher'
+    )
     assert remedy in message
-    assert f'images are not received: a publisher of /image offers another reliability: {remedy}' in (
-        reliable_process.output()
+    assert (
+        f'images are not received: a publisher of /image offers another reliability: {remedy}'
+        in (reliable_process.output())
     )
     camera = Camera(bench, bench.node.create_publisher(Image, 'image', QoSProfile(depth=10)))
     camera.connect()
@@ -262,30 +278,42 @@ def reliable(bench, reliable_process):
 
 
 class TestQualityOfService:
-    def test_incompatible_publisher_beside_a_compatible_one_is_reported(self, bench, reliable, route):
+    def test_incompatible_publisher_beside_a_compatible_one_is_reported(
+        self, bench, reliable, route
+    ):
         for image in route[:LENGTH]:
-            bench.publisher.publish(image_message(route[50], 1))  # not received: there is one match only
+            # not received: there is one match only
+            bench.publisher.publish(image_message(route[50], 1))
             match = reliable.show(image)
         assert (match.status, match.newest_index) == (MATCH, LENGTH - 1)
 
         def reported():
             reliable.show(route[LENGTH])
             status = bench.diagnostics['input']
-            return status.level == WARN and '1 publisher refused for QoS, while images of' in status.message
+            return (
+                status.level == WARN
+                and '1 publisher refused for QoS, while images of' in status.message
+            )
 
         bench.until(reported, 'a warning')
         counts = reliable.counts('input')
         assert (counts['publishers'], counts['publishers_refused']) == ('2', '1')
         bench.node.destroy_publisher(bench.publisher)
-        bench.until_diagnosed('input', WARN, '1 publisher there, but silent')  # the refused one is gone
+        # the refused one is gone
+        bench.until_diagnosed('input', WARN, '1 publisher there, but silent')
         assert reliable.counts('input')['publishers_refused'] == '0'
         bench.publish_anew()
-        depth = bench.call(GetParameters, 'get_parameters', names=['qos_overrides./image.subscription.depth'])
+        depth = bench.call(
+            GetParameters, 'get_parameters', names=['qos_overrides./image.subscription.depth']
+        )
         assert depth.values[0].integer_value == 7
 
     def test_qos_overrides_apply_to_one_topic_and_after_a_pause(self, bench, reliable, route):
         def offered(topic):
-            return [s.qos_profile.reliability for s in bench.node.get_subscriptions_info_by_topic(topic)]
+            return [
+                s.qos_profile.reliability
+                for s in bench.node.get_subscriptions_info_by_topic(topic)
+            ]
 
         assert bench.transition('deactivate')
         assert bench.transition('activate')
@@ -300,7 +328,9 @@ class TestQualityOfService:
 def test_durability_override_excludes_volatile_publishers(bench, start):
     process = start('-p', 'qos_overrides./image.subscription.durability:=transient_local')
     try:
-        bench.until_diagnosed('input', ERROR, 'qos_overrides./image.subscription.durability to volatile, or')
+        bench.until_diagnosed(
+            'input', ERROR, 'qos_overrides./image.subscription.durability to volatile, or'
+        )
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         camera = Camera(bench, bench.node.create_publisher(Image, 'image', latched))
         camera.connect()

@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-import pytest
 from conftest import route_images
 from image_messages import image_message
 from nav_msgs.msg import Odometry
-from processes import RELIABLE, TAKEN_RELIABLY, Bench, node_process
-
+import numpy as np
+from processes import Bench, node_process, RELIABLE, TAKEN_RELIABLY
+import pytest
 from stavpr_msgs.msg import LoopClosure, PlaceMatch
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.alignment import SequenceSettings
@@ -73,7 +72,7 @@ def pose(x):
 
 def process(bench, images, settings, exclude, x_of=None):
     """
-    Publish image i at i + 1 seconds, with odometry, if any, at x_of(i); None = none for that image.
+    Publish image i at i + 1 seconds, with odometry at x_of(i) if that is not None.
 
     With the rule of motion, an image without a pose yet is skipped: both are published once more.
     """
@@ -148,7 +147,7 @@ def test_hallway_loop_closures_are_correct(bench, start, data_folder):
 
 @pytest.fixture(scope='module')
 def loop(bench, start):
-    """A synthetic loop, two laps and a half; odometry drifts, without poses for places 10 to 14."""
+    """Process a loop, two laps and a half, with drift, without poses for places 10 to 14."""
     start(sequence_length=LENGTH, exclude_places=10, nms_radius=5, candidates=2)
     sequence = SequenceSettings(LENGTH)
     settings = RecognizerSettings(0.8, sequence=sequence, nms_radius=5, mode='robust')

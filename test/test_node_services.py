@@ -1,30 +1,29 @@
 """Services of the node, and its topics besides ~/match: valid and invalid requests."""
 
-import os
 from contextlib import contextmanager
 from dataclasses import replace
+import os
 
 import cv2
-import numpy as np
-import pytest
-import torch
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from image_messages import image_message
 from nav_msgs.msg import Odometry
-from processes import RELIABLE, TAKEN_RELIABLY, Bench, node_process
+import numpy as np
+from processes import Bench, node_process, RELIABLE, TAKEN_RELIABLY
+import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
-from std_srvs.srv import Trigger
-
 from stavpr_msgs.msg import MapInfo, PlaceCandidates, PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.mapping import load_map, save_map
+from std_srvs.srv import Trigger
+import torch
 
 LENGTH, SECOND = 5, 10**9
 LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-SHORT = {'sequence_length': LENGTH, 'nms_radius': 5, 'candidates': 3, 'threads': 1, 'max_places': 100,
-         'queue_size': 1000, 'keyframe_change': 0.0, 'diagnostics_period': 0.2}  # fmt: skip
+SHORT = {'sequence_length': LENGTH, 'nms_radius': 5, 'candidates': 3, 'threads': 1}
+SHORT |= {'max_places': 100, 'queue_size': 1000, 'keyframe_change': 0.0, 'diagnostics_period': 0.2}
 
 
 class Robot(Bench):
@@ -128,7 +127,9 @@ def nodes(robot, folder):
     def node(name, **parameters):
         if name not in kept:
             end()
-            kept[name] = node_process(folder / f'{name}.log', **SHORT | TAKEN_RELIABLY | parameters)
+            kept[name] = node_process(
+                folder / f'{name}.log', **SHORT | TAKEN_RELIABLY | parameters
+            )
             robot.wait_for_node()
         return kept[name]
 
@@ -146,13 +147,13 @@ def nodes(robot, folder):
 
 @pytest.fixture
 def bare(nodes):
-    """A node without a map; tests leave it so."""
+    """Return a node without a map; tests leave it so."""
     return nodes('bare')
 
 
 @pytest.fixture
 def mapped(nodes, robot, map_file):
-    """A node that localizes on the route, with an empty window."""
+    """Return a node that localizes on the route, with an empty window."""
     # ~/map_info must not wait for the diagnostics
     process = nodes('mapped', map_path=map_file, diagnostics_period=60.0)
     robot.begin('localization', map_file)
@@ -260,7 +261,7 @@ def test_a_full_map_stops_mapping(mapped, robot, route, map_file, folder):
 
 
 def test_load_map_during_a_stream_processes_every_image(mapped, robot, small_map, route, folder):
-    """At 20 Hz: matches with the old map, then a window that fills, then matches with the new map."""
+    """At 20 Hz: matches with the old map, a window that fills, matches with the new map."""
     n = 5060
     rng = torch.Generator().manual_seed(0)
     strips = torch.randn((7, n, 64), generator=rng)
@@ -268,8 +269,14 @@ def test_load_map_during_a_stream_processes_every_image(mapped, robot, small_map
     strips[:, 5000:] = small_map.features.strips
     weights = torch.full((7, n), 7**-0.5)
     features = replace(small_map.features, strips=strips, weights=weights)
-    large = replace(small_map, features=features, stamps=np.arange(1, n + 1), poses=None, thumbnails=(),
-                    ids=tuple(f'new {i - 5000}' for i in range(n)))  # fmt: skip
+    large = replace(
+        small_map,
+        features=features,
+        stamps=np.arange(1, n + 1),
+        poses=None,
+        thumbnails=(),
+        ids=tuple(f'new {i - 5000}' for i in range(n)),
+    )
     save_map(large, folder / 'large.stavpr')
     robot.until_map(state='loaded', places=60)
     robot.drive(route[20:28])
@@ -294,8 +301,12 @@ def test_load_map_during_a_stream_processes_every_image(mapped, robot, small_map
     assert warming == list(range(warming[0], warming[0] + LENGTH - 1))
     assert 4 <= warming[0] <= during
     old, new = matches[: warming[0]], matches[warming[-1] + 1 :]
-    assert {match.newest_id.split()[0] for match in old if match.status == PlaceMatch.MATCH} == {'place'}
-    assert {match.newest_id.split()[0] for match in new if match.status == PlaceMatch.MATCH} == {'new'}
+    assert {match.newest_id.split()[0] for match in old if match.status == PlaceMatch.MATCH} == {
+        'place'
+    }
+    assert {match.newest_id.split()[0] for match in new if match.status == PlaceMatch.MATCH} == {
+        'new'
+    }
     assert max(match.sequence_last for match in old) < 60
     robot.until_map(state='loaded', places=n, has_poses=False, has_ids=True)
     shown = [(info.state, info.places) for info in robot.infos[infos:]]
@@ -337,7 +348,9 @@ def test_relocalize_returns_the_last_match_and_candidates(mapped, robot, route):
         assert expected == 1 or np.diff(np.sort(indices)).min() > 5
         distances = [candidate.distance for candidate in response.candidates]
         assert distances == sorted(distances)
-    strange = robot.drive([np.random.default_rng(1).integers(0, 256, (96, 128, 3), np.uint8)] * LENGTH)[-1]
+    strange = robot.drive(
+        [np.random.default_rng(1).integers(0, 256, (96, 128, 3), np.uint8)] * LENGTH
+    )[-1]
     assert strange.status == PlaceMatch.NO_MATCH
     response = robot.does(Relocalize, 'relocalize')  # though there is no match
     assert (response.match, response.message) == (strange, strange.reason)

@@ -1,12 +1,11 @@
 """Time: rates, gaps and jumps of stamps, simulated time, bags that loop or pause."""
 
-import pytest
 from builtin_interfaces.msg import Time
 from camera import LENGTH, SECOND
 from image_messages import image_message
+import pytest
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
-
 from stavpr_msgs.msg import PlaceMatch
 
 WARMING_UP, MATCH, SKIPPED = PlaceMatch.WARMING_UP, PlaceMatch.MATCH, PlaceMatch.SKIPPED
@@ -14,7 +13,7 @@ WARMING_UP, MATCH, SKIPPED = PlaceMatch.WARMING_UP, PlaceMatch.MATCH, PlaceMatch
 
 @pytest.fixture(scope='class')
 def process(bench, start, request):
-    """A node; a class may have options for it."""
+    """Run a node, with the options of the class."""
     process = start(*getattr(request.cls, 'OPTIONS', ()))
     bench.wait_for_node()
     yield process
@@ -45,7 +44,9 @@ class TestRates:
         camera.set(max_rate=5.0)
         before = camera.counts('processing')
         statuses = camera.statuses((route[i % 60] for i in range(60)), SECOND // 30)
-        assert [i for i, status in enumerate(statuses) if status != SKIPPED] == list(range(0, 60, 6))
+        assert [i for i, status in enumerate(statuses) if status != SKIPPED] == list(
+            range(0, 60, 6)
+        )
         assert 'exceeds max_rate = 5 Hz' in bench.answers[-1].reason
         dropped = int(camera.counts('processing')['dropped_max_rate'])
         assert dropped == int(before.get('dropped_max_rate', 0)) + 50
@@ -70,7 +71,10 @@ class TestRates:
         camera.set(keyframe_interval=1.0)
         statuses = camera.statuses(route[:9], SECOND // 4)
         assert [i for i, status in enumerate(statuses) if status == WARMING_UP] == [0, 4, 8]
-        assert camera.show(route[9], SECOND // 2).reason == '0.500 s after the last keyframe: less than 1 s'
+        assert (
+            camera.show(route[9], SECOND // 2).reason
+            == '0.500 s after the last keyframe: less than 1 s'
+        )
         camera.set(keyframe_interval=0.0)
         assert camera.show(route[10], 1).status == WARMING_UP
         assert camera.counts('recognition')['window'] == '4'
@@ -140,7 +144,9 @@ class TestSimulatedTime:
 
     OPTIONS = ('-p', 'use_sim_time:=true')
 
-    def test_diagnostics_continue_without_a_clock_and_while_it_stands_still(self, bench, process, camera):
+    def test_diagnostics_continue_without_a_clock_and_while_it_stands_still(
+        self, bench, process, camera
+    ):
         arrays = camera.diagnostics
         bench.until(lambda: len(arrays) >= 3, 'diagnostics without a clock')
         assert [array.header.stamp for array in arrays[:3]] == 3 * [Time()]

@@ -1,13 +1,11 @@
 """The table of parameters: files generated from it, and the settings built from it."""
 
-import subprocess
-import sys
 from dataclasses import fields
 from pathlib import Path
+import subprocess
+import sys
 
 import pytest
-import yaml
-
 from stavpr_ros.alignment.settings import STRATEGIES
 from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import SettingsError
@@ -15,15 +13,16 @@ from stavpr_ros.features.registry import KINDS
 from stavpr_ros.parameters import (
     BASIC,
     BY_NAME,
-    GROUPS,
-    PARAMETERS,
     configuration_yaml,
     documentation_markdown,
+    GROUPS,
+    PARAMETERS,
 )
-from stavpr_ros.pipeline import OPERATIONS, NodeSettings, PipelineSettings, node_settings
+from stavpr_ros.pipeline import node_settings, NodeSettings, OPERATIONS, PipelineSettings
 from stavpr_ros.recognition.matcher import PRECISIONS
 from stavpr_ros.recognition.robust.options import MODES
 from stavpr_ros.recognition.verification import METHODS
+import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 REMEDY = 'generate it: python3 -m stavpr_ros.parameters'
@@ -74,7 +73,9 @@ def test_default_values_give_default_settings():
     assert settings.pipeline.keyframes.change == DEFAULTS['keyframe_change']
     for field in fields(PipelineSettings):
         if field.name != 'keyframes':  # the library takes every image by default
-            assert getattr(settings.pipeline, field.name) == getattr(expected, field.name), field.name
+            assert getattr(settings.pipeline, field.name) == getattr(expected, field.name), (
+                field.name
+            )
     for field in fields(NodeSettings):
         if field.name != 'pipeline':
             assert getattr(settings, field.name) == DEFAULTS[field.name]
@@ -108,7 +109,10 @@ def test_a_value_reaches_its_setting(name, value, attribute, expected):
     [
         ({'strategy': 'teleport'}, "strategy = 'teleport' is unknown: take one of adaptive"),
         ({'threshold': 0.0}, 'threshold = 0 would match nothing'),
-        ({'operation': 'loop_closure', 'backend': 'cuda'}, 'backend cuda, precision float32: loop'),
+        (
+            {'operation': 'loop_closure', 'backend': 'cuda'},
+            'backend cuda, precision float32: loop',
+        ),
         ({'operation': 'loop_closure', 'precision': 'float16'}, 'precision float16: loop closure'),
         ({'operation': 'loop_closure', 'strategy': 'none'}, 'take strategy adaptive or vanilla'),
         ({'operation': 'loop_closure', 'vertical': True}, 'without vertical alignment'),
@@ -126,24 +130,31 @@ def test_invalid_values_are_rejected_by_name(values, words, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ('mode', 'operation', 'backend', 'available', 'expected'),
+    ('mode', 'operation', 'backend', 'available', 'stages'),
     [
-        ('robust', 'localization', 'auto', 'cuda', 'extraction on cuda, image distances on cuda (float32), '
-         'sequences on cpu'),
-        ('paper', 'localization', 'auto', 'cuda', 'extraction on cuda, image distances on cuda (float32), '
-         'sequences on cuda'),
-        ('robust', 'loop_closure', 'auto', 'cuda', 'extraction on cuda, image distances on cpu (float32), '
-         'sequences on cpu'),
-        ('robust', 'localization', 'cpu', 'cuda', 'backend cpu: extraction on cpu, image distances on cpu'),
-        ('robust', 'mapping', 'auto', '', 'backend auto (no device): extraction on cpu'),
+        ('robust', 'localization', 'auto', 'cuda', ('cuda', 'cuda', 'cpu')),
+        ('paper', 'localization', 'auto', 'cuda', ('cuda', 'cuda', 'cuda')),
+        ('robust', 'loop_closure', 'auto', 'cuda', ('cuda', 'cpu', 'cpu')),
+        ('robust', 'localization', 'cpu', 'cuda', ('cpu', 'cpu', 'cpu')),
+        ('robust', 'localization', 'auto', 'cpu', ('cpu', 'cpu', 'cpu')),
     ],
-)  # fmt: skip
+)
 def test_backend_summary_names_the_device_of_each_stage(
-    monkeypatch, mode, operation, backend, available, expected
+    monkeypatch, mode, operation, backend, available, stages
 ):
     module = 'stavpr_ros.pipeline.settings'
-    chosen = available or 'cpu'
-    monkeypatch.setattr(f'{module}.choose_backend', lambda wish: chosen if wish == 'auto' else wish)
-    monkeypatch.setattr(f'{module}.why_no_cuda', lambda: '' if available else 'no device')
-    summary = PipelineSettings(mode=mode, backend=backend).backend_summary(operation)
-    assert expected in summary
+    monkeypatch.setattr(
+        f'{module}.choose_backend', lambda wish: available if wish == 'auto' else wish
+    )
+    monkeypatch.setattr(
+        f'{module}.why_no_cuda', lambda: '' if available == 'cuda' else 'no device'
+    )
+    why = {'cuda': ' (CUDA is available)', 'cpu': ' (no device)'}[available] * (backend == 'auto')
+    settings = PipelineSettings(mode=mode, backend=backend)
+    extraction, distances, sequences = stages
+    assert settings.backend_summary(operation) == (
+        f'backend {backend}{why}: extraction on {extraction}, image distances on {distances} '
+        f'(float32), sequences on {sequences}'
+    )
+    extraction_only = settings.backend_summary('mapping')
+    assert extraction_only == f'backend {backend}{why}: extraction on {extraction}'

@@ -1,29 +1,27 @@
 """The operations of the pipeline, and the changes between them; without ROS."""
 
-import itertools
 from dataclasses import replace
+import itertools
 
+from conftest import route_images
 import cv2
 import numpy as np
-import pytest
-import torch
-from conftest import route_images
 from pipelines import (
+    at,
     EXCLUDED,
     LENGTH,
-    SECOND,
-    at,
     localizing,
     mark_saved,
     one_thread,
     process,
     recorded,
     save,
+    SECOND,
     settings_of,
     stamps_of,
     statuses,
 )
-
+import pytest
 from stavpr_ros.alignment import SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor
@@ -31,6 +29,7 @@ from stavpr_ros.mapping import load_map, place_at, place_thumbnail, save_map
 from stavpr_ros.pipeline import OPERATIONS, Pipeline, read_map
 from stavpr_ros.recognition import PlaceRecognizer, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
+import torch
 
 
 @pytest.fixture(scope='module', autouse=True)
@@ -80,7 +79,8 @@ def test_missing_map_or_threshold_is_the_reason(map_file, route):
     assert statuses(process(pipeline, route[:LENGTH]))[-1] is Status.MATCH
     pipeline.change(replace(pipeline.settings, threshold=None))
     assert statuses(process(pipeline, route[:1])) == [Status.NOT_READY]
-    pipeline.change(replace(pipeline.settings, threshold=0.2))  # images are missing from the window
+    # images are missing from the window
+    pipeline.change(replace(pipeline.settings, threshold=0.2))
     assert statuses(process(pipeline, route[:1])) == [Status.WARMING_UP]
 
 
@@ -137,7 +137,9 @@ def test_loop_closure_returns_the_matches_of_the_loop_closer(route, exclude_seco
         exclude_seconds=exclude_seconds,
     )
     for i, match in enumerate(process(pipeline, images, poses=True)):
-        same_recognition(match, core.update(pipeline.extractor.extract([images[i]]), (i + 1) * SECOND))
+        same_recognition(
+            match, core.update(pipeline.extractor.extract([images[i]]), (i + 1) * SECOND)
+        )
         assert (match.image_index, len(match.window_stamps)) == (i, min(i + 1, LENGTH))
         assert match.first_image_index == max(0, i - LENGTH + 1)
         if match.sequence is not None:
@@ -192,13 +194,17 @@ def test_every_change_of_operation_keeps_the_places(route, images):
                 mark_saved(pipeline)
                 pipeline.change(operation=name)
             assert pipeline.operation == name
-            matches = process(pipeline, route[count_before : count_before + count], first=count_before)
+            matches = process(
+                pipeline, route[count_before : count_before + count], first=count_before
+            )
             new = list(range(count_before + 1, count_before + count + 1))
             count_before += count
             if name == 'mapping':
                 held = held + new
                 assert set(statuses(matches)) <= {Status.MAPPED}
-                assert [match.image_index for match in matches] == [held.index(stamp) for stamp in new]
+                assert [match.image_index for match in matches] == [
+                    held.index(stamp) for stamp in new
+                ]
             elif name == 'loop_closure':
                 new_route = new_route + new
                 assert set(statuses(matches)) <= {Status.WARMING_UP, Status.NO_MATCH}
@@ -208,7 +214,9 @@ def test_every_change_of_operation_keeps_the_places(route, images):
                 warming = min(count, max(0, LENGTH - 1 - fill))
                 assert statuses(matches)[: warming + 1].count(Status.WARMING_UP) == warming
                 fill += count
-            assert stamps_of(pipeline.places) == (new_route if name == 'loop_closure' else held), names
+            assert stamps_of(pipeline.places) == (new_route if name == 'loop_closure' else held), (
+                names
+            )
             if new_route or held:
                 assert stamps_of(pipeline.snapshot('x', True).places) == (new_route or held)
             state = 'growing' if name != 'localization' else 'loaded' if held else 'none'
@@ -287,9 +295,7 @@ def test_loop_closure_rejects_cuda_and_float16(changes, words):
 
 
 @pytest.mark.parametrize('operation', OPERATIONS)
-def test_a_map_that_does_not_fit_changes_nothing(
-    operation, small_map, map_file, route, tmp_path
-):
+def test_a_map_that_does_not_fit_changes_nothing(operation, small_map, map_file, route, tmp_path):
     """Three strips with xi = 5 (localization, loop closure); more than max_places (mapping)."""
     pipeline = Pipeline(settings_of(spatial=SpatialSettings(xi=5), max_places=100), operation)
     pipeline.change(loaded=read_map(map_file, pipeline.settings))
@@ -322,7 +328,8 @@ def test_a_map_that_does_not_fit_changes_nothing(
 def test_loop_closure_takes_the_kind_of_features_of_the_map(map_file, route):
     pipeline = Pipeline(settings_of(), 'loop_closure')
     pipeline.change(loaded=read_map(map_file, pipeline.settings))
-    assert (len(pipeline.places), pipeline.path) == (0, '')  # the map file is not that of the route
+    # the map file is not that of the route
+    assert (len(pipeline.places), pipeline.path) == (0, '')
     assert pipeline.extractor.settings.projection is not None
     pipeline.change(operation='localization')
     assert (len(pipeline.places), pipeline.path) == (60, map_file)

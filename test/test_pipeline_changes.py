@@ -1,25 +1,24 @@
-"""The pipeline in operation: live settings, keyframes, invalid images, resets, relocalization, saving."""
+"""The pipeline in operation: live settings, keyframes, invalid images, resets, saving."""
 
+from dataclasses import replace
 import itertools
 import os
-from dataclasses import replace
 
 import numpy as np
-import pytest
 from pipelines import (
     LENGTH,
-    SECOND,
     localizing,
     message,
     one_thread,
     process,
     recorded,
     save,
+    SECOND,
     settings_of,
     stamps_of,
     statuses,
 )
-
+import pytest
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, MapFileError
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.mapping.keyframes import KeyframeSettings
@@ -156,7 +155,7 @@ class Failing:
 
 @pytest.mark.parametrize('operation', OPERATIONS)
 def test_an_invalid_image_changes_nothing(operation, route, monkeypatch):
-    """Another pipeline does not get the invalid images: both return the same for the valid ones."""
+    """Another pipeline gets the valid images only: both return the same for these."""
     keyframes = KeyframeSettings(change=0.01)
     pipeline, other = (recorded(route, operation, keyframes=keyframes) for _ in range(2))
     extract = Failing(pipeline.extractor.extract)
@@ -198,7 +197,8 @@ def test_reset_empties_the_window_and_keeps_the_places(operation, route):
     places = len(pipeline.places)
     pipeline.reset()
     assert (pipeline.window_fill, len(pipeline.places)) == (0, places)
-    matches = process(pipeline, route[4 : 4 + LENGTH], first=100)  # the first equals the last keyframe
+    # the first equals the last keyframe
+    matches = process(pipeline, route[4 : 4 + LENGTH], first=100)
     assert statuses(matches) == [Status.WARMING_UP] * 4 + [Status.MATCH]
     assert matches[-1].window_stamps == tuple((101 + i) * SECOND for i in range(LENGTH))
     if operation == 'loop_closure':
@@ -242,7 +242,9 @@ def test_relocalize_returns_the_match_of_the_window(map_file, route):
 )
 def test_saving_nothing_is_an_error(operation, words, tmp_path):
     with pytest.raises(InputError, match=words):
-        save(Pipeline(settings_of(mode='paper'), operation), tmp_path / 'map.stavpr', overwrite=True)
+        save(
+            Pipeline(settings_of(mode='paper'), operation), tmp_path / 'map.stavpr', overwrite=True
+        )
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,8 +1,7 @@
 """A recorded map is saved at the end, and no file of another map is overwritten."""
 
-import pytest
 from pipelines import localizing, process, save, settings_of
-
+import pytest
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.pipeline.saving import save_recorded_map, write_map

@@ -1,10 +1,9 @@
 """The worker: newest items kept, oldest dropped, nothing ends the thread."""
 
-import threading
 from concurrent.futures import ThreadPoolExecutor
+import threading
 
 import pytest
-
 from stavpr_ros.errors import StavprError
 from stavpr_ros.ros.worker import Worker
 

@@ -58,7 +58,6 @@ def main(args: list[str] | None = None) -> int:
 def _run(args: list[str] | None) -> int:
     from rclpy.exceptions import ParameterException
     from rclpy.logging import get_logger
-
     from stavpr_ros.ros.node import PlaceRecognitionNode
     from stavpr_ros.ros.process import ros_node, spin_until
 

@@ -4,9 +4,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import GrowingMap, PlaceMap, encode_thumbnail
+from stavpr_ros.mapping import encode_thumbnail, GrowingMap, PlaceMap
 from stavpr_ros.recognition import Match, PlaceRecognizer, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 

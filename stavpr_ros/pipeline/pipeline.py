@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from stavpr_ros.errors import ImageError, InputError, MapFileError, StavprError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, PlaceMap, place_thumbnail
+from stavpr_ros.mapping import GrowingMap, place_thumbnail, PlaceMap
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.pipeline.operations import Mapping, Observation, Operation
@@ -52,9 +51,8 @@ class Pipeline:
         self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
         self._last: Match | None = None
         self.save_state = SaveState()  # of the places in use
-        self._map_save_state = (
-            self.save_state
-        )  # of the map, where loop closure has places of its own
+        # of the map, where loop closure has places of its own
+        self._map_save_state = self.save_state
         self.list_candidates = True  # with every match
         self._start(operation, settings, None)
 
@@ -283,9 +281,8 @@ class Pipeline:
                 SaveState(loaded.path),
             )
         operation = start_operation(name, settings, place_map, extractor)
-        self._map = (
-            None if name == 'mapping' else place_map
-        )  # in mapping, the growing map holds it
+        # in mapping, the growing map holds it
+        self._map = None if name == 'mapping' else place_map
         self._operation, self._name = operation, name
         self._extractor = operation.extractor if operation is not None else extractor
         self._map_save_state = save_state
@@ -293,7 +290,7 @@ class Pipeline:
         self.reset()
 
     def _require_no_loss(self, name: str, loaded: LoadedMap | None) -> None:
-        """Refuse to lose unsaved places; loading a map in localization discards them."""
+        """Reject the loss of unsaved places; loading a map in localization discards them."""
         leaves = name == 'loop_closure' != self._name  # its route replaces the recorded map
         replaces = loaded is not None and self._name == 'mapping'
         if self.unsaved and (leaves or replaces):

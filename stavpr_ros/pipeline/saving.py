@@ -1,12 +1,12 @@
 """Saving a recorded map while images are processed; files of other maps are never overwritten."""
 
-import itertools
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
+import itertools
 from logging import Logger
+import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.errors import StavprError
 from stavpr_ros.mapping import PlaceMap, save_map

@@ -13,7 +13,7 @@ from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.loop_closer import least_limit
-from stavpr_ros.recognition.robust.options import LOOP_THRESHOLD, THRESHOLD, options_of
+from stavpr_ros.recognition.robust.options import LOOP_THRESHOLD, options_of, THRESHOLD
 from stavpr_ros.recognition.verification import GeometricSettings
 
 OPERATIONS = ('localization', 'mapping', 'loop_closure')
@@ -84,7 +84,7 @@ class PipelineSettings:
 
     def require_operation(self, operation: str) -> None:
         """
-        Refuse an operation that these settings exclude.
+        Reject an operation that these settings exclude.
 
         :raises SettingsError: names the settings.
         """

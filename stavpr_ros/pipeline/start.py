@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap, open_map

@@ -1,8 +1,8 @@
 """The subscriptions: images, raw or compressed, and odometry."""
 
+from collections.abc import Callable
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 from nav_msgs.msg import Odometry
@@ -11,17 +11,16 @@ from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventType
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.qos import (
+    qos_check_compatible,
+    qos_policy_name_from_kind,
     QoSCompatibility,
     QoSPolicyKind,
     QoSProfile,
     ReliabilityPolicy,
-    qos_check_compatible,
-    qos_policy_name_from_kind,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
-
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.mapping.trajectory import Trajectory
 from stavpr_ros.pipeline import NodeSettings

@@ -3,14 +3,12 @@
 import array
 import math
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+import numpy as np
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
-from std_msgs.msg import Header
-
 from stavpr_msgs.msg import (
     AlignedPair,
     AlignedPlaces,
@@ -21,9 +19,10 @@ from stavpr_msgs.msg import (
     PlaceMatch,
 )
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, PlaceMap, place_at
+from stavpr_ros.mapping import GrowingMap, place_at, PlaceMap
 from stavpr_ros.mapping.map_file import VERSION
 from stavpr_ros.recognition import Match, Status
+from std_msgs.msg import Header
 
 SECOND = 1_000_000_000
 MIN_VARIANCE = 0.01  # of a pose: (0.1 m)^2 and (0.1 rad)^2

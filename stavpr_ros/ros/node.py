@@ -1,9 +1,9 @@
 """The place-recognition node: its life cycle and its parameters."""
 
+from collections.abc import Callable, Mapping
 import gc
 import threading
 import traceback
-from collections.abc import Callable, Mapping
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
@@ -15,12 +15,11 @@ from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.timer import Timer
-
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.errors import SettingsError, SourceError, StavprError
 from stavpr_ros.output_file import require_room
 from stavpr_ros.parameters import BY_NAME
-from stavpr_ros.pipeline import NodeSettings, node_settings
+from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
 from stavpr_ros.ros.health import Health, node_health
@@ -48,12 +47,12 @@ class PlaceRecognitionNode(ManagedNode):
     :raises StavprError: parameters that exclude each other, or a backend that is not available.
     """
 
-    THREADS = 4  # a transition, a service and parameters may each take long; images take the fourth
+    # a transition, a service and parameters may each take long; images take the fourth
+    THREADS = 4
 
     def __init__(self, **options: Any) -> None:
-        self._lock = (
-            threading.RLock()
-        )  # one change at a time: transitions, parameters, map, operation
+        # one change at a time: transitions, parameters, map, operation
+        self._lock = threading.RLock()
         super().__init__('stavpr', **options)
         for warning in unknown_parameters(self._parameter_overrides):
             self.get_logger().warning(warning)
@@ -65,9 +64,8 @@ class PlaceRecognitionNode(ManagedNode):
         self.problem = ''  # why the last transition failed
         self._map_info = self.create_publisher(MapInfo, '~/map_info', LATCHED)
         self._last_map_info: MapInfo | None = None
-        self._map_info_lock = (
-            threading.RLock()
-        )  # messages are published in the order of the changes
+        # messages are published in the order of the changes
+        self._map_info_lock = threading.RLock()
         self._served = Services(self)
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
@@ -185,9 +183,8 @@ class PlaceRecognitionNode(ManagedNode):
         return TransitionCallbackReturn.ERROR
 
     def _configure(self) -> None:
-        self._settings = settings = self._settings_with(
-            {}
-        )  # a service may have changed the operation
+        # a service may have changed the operation
+        self._settings = settings = self._settings_with({})
         self._log_backend()
         _require_writable(settings.save_path)
         if settings.map_path:
@@ -394,7 +391,7 @@ class PlaceRecognitionNode(ManagedNode):
 
 
 def _require_writable(save_path: str) -> None:
-    """Refuse a file that cannot be written before a recorded map would be lost."""
+    """Reject a file that cannot be written before a recorded map would be lost."""
     try:
         if save_path:
             require_room(save_path)

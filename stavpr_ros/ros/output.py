@@ -3,16 +3,14 @@
 import math
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from rclpy.qos import qos_policy_name_from_kind, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
-from std_msgs.msg import Float32, Header, Int32
-
 from stavpr_msgs.msg import LoopClosure, PlaceCandidates, PlaceMatch
-from stavpr_ros.mapping import GrowingMap, PlaceMap, place_thumbnail
+from stavpr_ros.mapping import GrowingMap, place_thumbnail, PlaceMap
 from stavpr_ros.pipeline.overlay import match_image
 from stavpr_ros.recognition import Match
 from stavpr_ros.ros.messages import (
@@ -23,6 +21,7 @@ from stavpr_ros.ros.messages import (
     matched_pose_message,
 )
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
+from std_msgs.msg import Float32, Header, Int32
 
 DEPTH = 50  # matches kept for slower subscribers
 IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)

@@ -1,13 +1,12 @@
 """Declaration of the parameters on a node."""
 
-import difflib
 from collections.abc import Iterable
+import difflib
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
-
-from stavpr_ros.parameters import BY_NAME, PARAMETERS, NodeParameter
+from stavpr_ros.parameters import BY_NAME, NodeParameter, PARAMETERS
 
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 

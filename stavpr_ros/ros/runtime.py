@@ -1,21 +1,19 @@
 """The configured node: the pipeline on its worker, the subscriptions and the publishers."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 import math
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from typing import Any
 
-from std_msgs.msg import Header
-
 from stavpr_msgs.msg import MapInfo
-from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.saving import save_recorded_map
-from stavpr_ros.pipeline.statistics import WAITING, Statistics
+from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.input import ImageInput, OdometryInput
 from stavpr_ros.ros.messages import map_info_message, nanoseconds
@@ -23,6 +21,7 @@ from stavpr_ros.ros.output import Output
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.worker import STOP_TIMEOUT, Worker
 from stavpr_ros.threads import limit_threads
+from std_msgs.msg import Header
 
 REPORT_PERIOD = 10.0  # seconds between repeated warnings
 

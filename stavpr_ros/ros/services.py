@@ -1,16 +1,15 @@
 """The services of the node; each returns the error as its message."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from std_srvs.srv import Trigger
-
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
 from stavpr_ros.pipeline.saving import write_map
 from stavpr_ros.ros.messages import candidates_message, match_message
 from stavpr_ros.ros.rclpy_workarounds import repeat_responses
+from std_srvs.srv import Trigger
 
 if TYPE_CHECKING:
     from stavpr_ros.ros.node import PlaceRecognitionNode

@@ -1,14 +1,13 @@
 """One thread does the heavy work; callbacks only enqueue."""
 
-import threading
-import traceback
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, wait
+import threading
+import traceback
 from typing import Any, TypeVar
 
 from rclpy.logging import get_logger
-
 from stavpr_ros.errors import StavprError
 
 STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end: `ros2 launch` kills after 5
