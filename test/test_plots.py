@@ -107,18 +107,24 @@ def test_distance_matrix_without_contrast_or_match_is_written(path, fill):
 
 
 def test_reduced_matrix_returns_where_its_axes_are(path):
-    values = np.random.default_rng(0).random((20, 30)).astype(np.float32)
+    values = np.random.default_rng(0).random((20, 30)).astype(np.float32) / 9 + 0.5
     truth = np.eye(20, 30, dtype=bool)
     matches = {'right': np.array([[100, 200]]), 'wrong': np.array([[300, 50]])}
     left, top, width, height = reduced_matrix(path, values, (400, 600), truth, matches)
     assert all(colors_of(path, BRIGHT_GREEN, BRIGHT_RED, YELLOW))
     plot = cv2.imread(str(path))[:, :, ::-1].astype(int)
-    rows, columns = plot.shape[:2]
-    for (query, place), color in (((100, 200), BRIGHT_GREEN), ((300, 50), BRIGHT_RED)):
-        row = round(rows * (top + height * (query + 0.5) / 400))
-        column = round(columns * (left + width * (place + 0.5) / 600))
-        around = plot[row - 2 : row + 3, column - 2 : column + 3]
-        assert np.abs(around - color).max(axis=2).min() < 12
+
+    def around(query, place):
+        row = round(plot.shape[0] * (top + height * (query + 0.5) / 400))
+        column = round(plot.shape[1] * (left + width * (place + 0.5) / 600))
+        return plot[row - 2 : row + 3, column - 2 : column + 3]
+
+    assert np.abs(around(100, 200) - BRIGHT_GREEN).max(axis=2).min() < 12
+    assert np.abs(around(300, 50) - BRIGHT_RED).max(axis=2).min() < 12
+    red_over_blue = [
+        np.ptp(around(*cell)[..., [0, 2]], axis=2).max() for cell in ((190, 190), (190, 390))
+    ]
+    assert red_over_blue[0] > 60 > red_over_blue[1]  # the diagonal is yellow
 
 
 def test_plots_of_arrays_that_do_not_fit_raise(path, results):

@@ -76,7 +76,7 @@ def test_match_differences_of_a_fast_query_by_hand():
     """
     Three queries, six places; the query is twice as fast and begins at place 1.
 
-    In every row one difference is 0 and five are 6: mean 5, deviation sqrt 5 over the whole map, so 0
+    In every row one difference is 0 and five are 6: mean 5, deviation sqrt 5 over the map, so 0
     becomes -sqrt 5 and 6 becomes 1 / sqrt 5. The line 1, 3, 5 has -sqrt 5 on the mean.
     """
     settings = SeqSlamSettings(length=3, slowest=1, fastest=2, speed_step=1, contrast_window=12)

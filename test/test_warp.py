@@ -35,7 +35,7 @@ def test_warp_indices_at_a_rate_are_floors():
 
 def test_warp_indices_vary_between_half_and_double_speed():
     indices = warp_indices(2000, 'vary')
-    # position += 2 ** sin(2 pi i / 60): steps of 1, 1.08, 1.16, ...; 2 near i = 15, 1/2 near i = 45
+    # steps of 2 ** sin(2 pi i / 60): 1, 1.08, 1.16, ...; 2 near i = 15, 1/2 near i = 45
     assert indices[:5].tolist() == [0, 1, 2, 3, 4]
     assert indices[16] - indices[13] == 6
     assert indices[49] - indices[41] == 4
@@ -61,7 +61,7 @@ def test_warp_indices_of_unknown_kind_or_no_image_raise():
         warp_indices(0, '2x')
 
 
-# ------------------------------------------------------------------------------------------ cropping
+# ---------------------------------------------------------------------------------- cropping
 
 
 def columns(width):

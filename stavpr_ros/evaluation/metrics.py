@@ -218,13 +218,13 @@ def _checked(
             f'distances {distances.shape}, correct {correct.shape}, has_match {has_match.shape}: '
             'expected one value a query each'
         )
-    return np.where(np.isnan(distances), np.inf, distances), correct, has_match
+    return distances, correct, has_match
 
 
 def _counts(
     thresholds: np.ndarray, distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray
 ) -> list[Counts]:
-    order = np.argsort(distances)
+    order = np.argsort(distances)  # NaN last, as +inf
     accepted = np.searchsorted(distances[order], thresholds)  # below, not at the threshold
     true_positives = np.append(0, np.cumsum(correct[order]))[accepted]
     in_map = np.append(0, np.cumsum(has_match[order]))
@@ -275,7 +275,7 @@ def evaluate_ranking(
     """
     correct = ground_truth.accepts(ranking.places)[images]
     has_match = ground_truth.has_match[images]
-    scores = np.where(np.isnan(ranking.scores), np.inf, ranking.scores)[images]
+    scores = ranking.scores[images]
     if not len(scores):
         raise InputError(f'{images} of {len(ranking)} queries leaves no queries to evaluate')
     counts = sweep(scores, correct[:, 0], has_match)

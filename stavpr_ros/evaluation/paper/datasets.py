@@ -15,7 +15,7 @@ CROP_MAP, CROP_QUERY = 0.3, 0.1  # right of every map image, left of every query
 GROUND_TRUTHS = ('groundtruth', 'gt', 'truth', 'groundtruthnew')
 HOLDERS = ('images', 'data', 'datasets', 'test')  # folders that only hold others
 # Parts of folder names besides the traverse: sizes, rates, kinds of files.
-NOISE = re.compile(r'\d+x\d+|\dfps|images|image|imgs|frames|grayscale|greyscale|jpg|png|test')
+NOISE = re.compile(r'\d+x\d+|\dfps|images|image|imgs|frames|gr[ae]yscale|jpg|png|test')
 
 
 @dataclass(frozen=True)
