@@ -1,4 +1,4 @@
-"""Raw image messages made by hand: how the bytes of each encoding lie, written from its definition."""
+"""Raw image messages: the bytes of each encoding, written from its definition."""
 
 import numpy as np
 
@@ -24,7 +24,12 @@ CHANNELS = {
 PATTERNS = ('rggb', 'bggr', 'gbrg', 'grbg')
 BAYER = {f'bayer_{pattern}{bits}': pattern for pattern in PATTERNS for bits in (8, 16)}
 # where the two Y, U and V of a pair of pixels lie
-PAIRS = {'uyvy': (1, 3, 0, 2), 'yuv422': (1, 3, 0, 2), 'yuyv': (0, 2, 1, 3), 'yuv422_yuy2': (0, 2, 1, 3)}
+PAIRS = {
+    'uyvy': (1, 3, 0, 2),
+    'yuv422': (1, 3, 0, 2),
+    'yuyv': (0, 2, 1, 3),
+    'yuv422_yuy2': (0, 2, 1, 3),
+}
 PLANES = {'nv12': (0, 1), 'nv21': (1, 0), 'nv24': (0, 1)}  # where U and V lie in the second plane
 YUV = [*PAIRS, *PLANES]
 
@@ -41,18 +46,22 @@ def padded(rows, padding):
 
 def message(encoding, height, width, big=False, padding=0):
     """Random pixels as a message's (step, bytes), and the RGB that must come out."""
-    channels = max(4 if 'a' in encoding or encoding.endswith('4') else 0, max(CHANNELS[encoding]) + 1)
+    channels = max(
+        4 if 'a' in encoding or encoding.endswith('4') else 0, max(CHANNELS[encoding]) + 1
+    )
     deep = is_deep(encoding)
     dtype = np.dtype(np.uint16 if deep else np.uint8).newbyteorder('>' if big else '<')
     values = (
-        np.random.default_rng(1).integers(0, np.iinfo(dtype).max + 1, (height, width, channels)).astype(dtype)
+        np.random.default_rng(1)
+        .integers(0, np.iinfo(dtype).max + 1, (height, width, channels))
+        .astype(dtype)
     )
     expected = (values >> 8 if deep else values)[..., CHANNELS[encoding]].astype(np.uint8)
     return *padded(values.reshape(height, -1).view(np.uint8), padding), expected
 
 
 def mosaic(encoding, scene, big=False):
-    """What a sensor behind the filter sees of an RGB scene: rows of bytes."""
+    """Return the rows of bytes of a sensor behind the filter."""
     height, width = scene.shape[:2]
     seen = np.zeros((height, width), np.uint8)
     for y in range(height):
@@ -66,7 +75,7 @@ def mosaic(encoding, scene, big=False):
 
 
 def packed_yuv(encoding, yuv, padding=0):
-    """YUV (height, width, 3) as a message's (step, bytes); shared colors are those of the first pixel."""
+    """Return YUV (height, width, 3) as (step, bytes); the first pixel sets shared colors."""
     height, width = yuv.shape[:2]
     if encoding in PAIRS:
         y0, y1, u, v = PAIRS[encoding]
