@@ -1,11 +1,10 @@
-"""The paper's data sets: found under the names that people give them, or not, and what was looked for."""
+"""The paper's data sets: found under their usual names, or not found with the reason."""
 
 import cv2
 import numpy as np
 import pytest
-
 from stavpr_ros.errors import InputError, SettingsError, SourceError
-from stavpr_ros.evaluation.paper.datasets import NAMES, open_dataset
+from stavpr_ros.evaluation.paper.datasets import open_dataset
 
 
 def fill(folder, count, value=0):
@@ -36,19 +35,21 @@ def values(source):
         ('ua', 'UA_day', 'ua_evening_images', 3),
     ],
 )
-def test_same_index(tmp_path, name, map_folder, query_folder, tolerance):
+def test_open_dataset_of_equally_many_images_accepts_the_same_index(
+    tmp_path, name, map_folder, query_folder, tolerance
+):
     fill(tmp_path / map_folder, 12, 0)
     fill(tmp_path / query_folder, 12, 100)
     (tmp_path / 'notes').mkdir()
     dataset = open_dataset(name, tmp_path)
-    assert values(dataset.map) == list(range(12))  # in natural order
+    assert values(dataset.map) == list(range(12))  # natural order
     assert values(dataset.query) == list(range(100, 112))
     assert dataset.tolerance == tolerance
     around = np.abs(np.subtract.outer(np.arange(12), np.arange(12)))
-    np.testing.assert_array_equal(dataset.truth.matrix(), around <= tolerance)
+    np.testing.assert_array_equal(dataset.ground_truth.matrix(), around <= tolerance)
     narrow = open_dataset(name, tmp_path, tolerance=0)
     assert narrow.tolerance == 0
-    np.testing.assert_array_equal(narrow.truth.matrix(), around == 0)
+    np.testing.assert_array_equal(narrow.ground_truth.matrix(), around == 0)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +60,9 @@ def test_same_index(tmp_path, name, map_folder, query_folder, tolerance):
         ('ref', 'query', 'ground_truth.csv'),
     ],
 )
-def test_berlin_has_a_file(tmp_path, map_folder, query_folder, truth):
+def test_open_dataset_berlin_reads_its_ground_truth_file(
+    tmp_path, map_folder, query_folder, truth
+):
     fill(tmp_path / map_folder, 5)
     fill(tmp_path / query_folder, 3, 100)
     with pytest.raises(
@@ -69,18 +72,18 @@ def test_berlin_has_a_file(tmp_path, map_folder, query_folder, truth):
     (tmp_path / truth).write_text('Live,Reference\n0,0\n1,4\n')
     dataset = open_dataset('berlin_a100', tmp_path, tolerance=1)
     assert (values(dataset.map)[0], values(dataset.query)[0]) == (0, 100)
-    assert dataset.truth.pairs.tolist() == [[0, 0], [0, 1], [1, 3], [1, 4]]
+    assert dataset.ground_truth.pairs.tolist() == [[0, 0], [0, 1], [1, 3], [1, 4]]
     assert open_dataset('berlin_a100', tmp_path).tolerance == 2
 
 
-def test_berlin_needs_its_file_even_with_equally_many_images(tmp_path):
+def test_open_dataset_berlin_without_a_file_raises(tmp_path):
     fill(tmp_path / 'Reference', 3)
     fill(tmp_path / 'Live', 3)
     with pytest.raises(SourceError, match='no ground truth'):
         open_dataset('berlin_a100', tmp_path)
 
 
-def test_text_before_arrays_and_objects_refused(tmp_path):
+def test_open_dataset_with_text_and_array_reads_the_text(tmp_path):
     fill(tmp_path / 'ref', 3)
     fill(tmp_path / 'query', 2)
     rows = np.empty((1, 2), object)
@@ -89,13 +92,13 @@ def test_text_before_arrays_and_objects_refused(tmp_path):
     with pytest.raises(SourceError, match='holds Python objects'):
         open_dataset('berlin_a100', tmp_path)
     (tmp_path / 'ground_truth.csv').write_text('0,1\n1,2\n')
-    assert open_dataset('berlin_a100', tmp_path, 0).truth.pairs.tolist() == [[0, 1], [1, 2]]
+    assert open_dataset('berlin_a100', tmp_path, 0).ground_truth.pairs.tolist() == [[0, 1], [1, 2]]
     (tmp_path / 'gt.csv').write_text('0,1\n')
     with pytest.raises(SourceError, match=r'several ground truths: ground_truth\.csv, gt\.csv'):
         open_dataset('berlin_a100', tmp_path)
 
 
-def test_unequal_drives_need_a_file(tmp_path):
+def test_open_dataset_of_different_lengths_needs_a_file(tmp_path):
     fill(tmp_path / 'summer', 5)
     fill(tmp_path / 'winter', 4)
     with pytest.raises(SourceError, match='4 query images for 5 places'):
@@ -105,7 +108,7 @@ def test_unequal_drives_need_a_file(tmp_path):
         open_dataset('nordland', tmp_path)
 
 
-def test_synth_crops_both(tmp_path):
+def test_open_dataset_synth_crops_both_traverses(tmp_path):
     fill(tmp_path / 'summer', 5)
     fill(tmp_path / 'winter', 5, 100)
     for folder, first in (('summer', 0), ('winter', 100)):
@@ -115,14 +118,16 @@ def test_synth_crops_both(tmp_path):
     first_place, first_query = next(iter(dataset.map)), next(iter(dataset.query))
     assert first_place.image[0, :, 0].tolist() == list(range(7))
     assert first_query.image[0, :, 0].tolist() == list(range(101, 110))
-    assert len(dataset.map) == len(dataset.query) == dataset.truth.N == 5
+    assert len(dataset.map) == len(dataset.query) == dataset.ground_truth.N == 5
     assert dataset.tolerance == 3
 
 
-def test_not_there(tmp_path):
+def test_open_dataset_not_found_names_the_searched_folders(tmp_path):
     (tmp_path / 'Nordland' / 'spring').mkdir(parents=True)
     (tmp_path / 'Nordland' / 'summer').mkdir()
-    with pytest.raises(SourceError, match=r"not in .*'summer', and the query, 'winter', and found .*spring"):
+    with pytest.raises(
+        SourceError, match=r"not in .*'summer', and the query, 'winter', and found .*spring"
+    ):
         open_dataset('nordland', tmp_path)
     with pytest.raises(SourceError, match='cannot be listed'):
         open_dataset('nordland', tmp_path / 'missing')
@@ -133,33 +138,36 @@ def test_not_there(tmp_path):
         open_dataset('alderley', tmp_path)
 
 
-def test_what_is_there_twice(tmp_path):
+def test_open_dataset_found_twice_raises(tmp_path):
     for folder in ('nordland', 'Nordland3584'):
         fill(tmp_path / folder / 'summer', 1)
         fill(tmp_path / folder / 'winter', 1)
-    with pytest.raises(SourceError, match=r'more than once.*name the one'):
+    with pytest.raises(SourceError, match=r'more than once.*name one'):
         open_dataset('nordland', tmp_path)
     fill(tmp_path / 'nordland' / 'Winter_images', 1)
-    with pytest.raises(SourceError, match='several folders for one drive: Winter_images, winter'):
+    with pytest.raises(
+        SourceError, match='several folders for one traverse: Winter_images, winter'
+    ):
         open_dataset('nordland', tmp_path / 'nordland')
 
 
-def test_short_names_only_as_they_stand(tmp_path):
-    """Many a folder begins with ua or gp."""
+def test_open_dataset_short_name_as_a_prefix_is_not_found(tmp_path):
     fill(tmp_path / 'uart' / 'day', 1)
     fill(tmp_path / 'uart' / 'evening', 1)
     with pytest.raises(SourceError, match='ua is not in'):
         open_dataset('ua', tmp_path)
 
 
-def test_names():
-    assert {'nordland', 'synth_nordland', 'gardens_point_night', 'ua', 'berlin_a100'} <= set(NAMES)
-
-
 @pytest.mark.parametrize(('name', 'count'), [('gardens_point', 200), ('nordland', 1788)])
-def test_real_data(data_folder, name, count):
+def test_open_dataset_of_real_data_has_the_known_length(data_folder, name, count):
     dataset = open_dataset(name, data_folder)
-    assert len(dataset.map) == len(dataset.query) == dataset.truth.N == dataset.truth.n == count
-    assert dataset.truth.accepts(np.arange(count)).all()
+    assert (
+        len(dataset.map)
+        == len(dataset.query)
+        == dataset.ground_truth.N
+        == dataset.ground_truth.n
+        == count
+    )
+    assert dataset.ground_truth.accepts(np.arange(count)).all()
     with pytest.raises(SourceError, match='nightright'):
         open_dataset('gardens_point_night', data_folder)

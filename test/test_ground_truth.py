@@ -1,13 +1,13 @@
-"""Ground truth: what is accepted, by hand, and every kind of file it comes in."""
+"""Ground truth: accepted places by hand, and every kind of file."""
 
 import pickle
 
 import cv2
 import numpy as np
 import pytest
-
 from stavpr_ros.errors import InputError, SourceError
 from stavpr_ros.evaluation.ground_truth import GroundTruth
+from stavpr_ros.evaluation.ground_truth_files import read_poses
 
 # three queries in five places: 0 -> 1, 2; 1 -> nothing; 2 -> 4
 PAIRS = [(0, 1), (0, 2), (2, 4)]
@@ -34,19 +34,20 @@ def test_accepts_by_hand():
         [False, False, True],
     ]
     assert by_hand([(0, 1)]).accepts(np.array([1, 4, 4])).tolist() == [True, False, False]
+    assert [truth.accepted(query).tolist() for query in range(3)] == [[1, 2], [], [4]]
     assert truth.has_match.tolist() == [True, False, True]
     assert truth.middles.tolist() == [1, -1, 4]
     assert truth.pairs.tolist() == [[0, 1], [0, 2], [2, 4]]
     np.testing.assert_array_equal(truth.matrix(), MATRIX.astype(bool))
 
 
-def test_no_answer_is_never_the_last_place_of_the_query_before():
-    """Query 1 with -1 has the key of query 0 with the last place, which is accepted here."""
+def test_accepts_minus_one_is_false_after_an_accepted_last_place():
+    """Query 1 with -1 has the key of query 0 with the last place, which is accepted."""
     truth = by_hand([(0, 4), (1, 0)], 2, 5)
     assert truth.accepts(np.array([4, -1])).tolist() == [True, False]
 
 
-def test_nothing_accepted():
+def test_from_pairs_without_pairs_accepts_nothing():
     truth = by_hand([], 2, 3)
     assert truth.accepts(np.array([0, -1])).tolist() == [False, False]
     assert truth.has_match.tolist() == [False, False]
@@ -56,14 +57,20 @@ def test_nothing_accepted():
 
 @pytest.mark.parametrize(
     'places',
-    [np.array([0, 1]), np.array([0.0, 1, 2]), np.array([0, 1, 5]), np.array([0, 1, -2]), np.array(1)],
+    [
+        np.array([0, 1]),
+        np.array([0.0, 1, 2]),
+        np.array([0, 1, 5]),
+        np.array([0, 1, -2]),
+        np.array(1),
+    ],
 )
-def test_answers_that_do_not_fit(places):
-    with pytest.raises(InputError, match='answers'):
+def test_accepts_of_invalid_places_raises(places):
+    with pytest.raises(InputError, match='places'):
         by_hand().accepts(places)
 
 
-def test_identity_with_tolerance():
+def test_identity_accepts_the_same_index_within_the_tolerance():
     truth = GroundTruth.identity(4, 4, 1)
     expected = np.abs(np.subtract.outer(np.arange(4), np.arange(4))) <= 1
     np.testing.assert_array_equal(truth.matrix(), expected)
@@ -73,7 +80,7 @@ def test_identity_with_tolerance():
         GroundTruth.identity(5, 4)
 
 
-def test_widened_stays_within_the_query_and_the_map():
+def test_widened_stays_within_query_and_map():
     truth = by_hand().widened(1)
     assert truth.pairs.tolist() == [[0, 0], [0, 1], [0, 2], [0, 3], [2, 3], [2, 4]]
     assert by_hand(tolerance=1).pairs.tolist() == truth.pairs.tolist()
@@ -82,7 +89,7 @@ def test_widened_stays_within_the_query_and_the_map():
             by_hand().widened(wrong)
 
 
-def test_select():
+def test_select_by_hand():
     truth = by_hand().select(np.array([2, 0, 1, 0]))
     assert (truth.N, truth.n) == (4, 5)
     assert truth.pairs.tolist() == [[0, 4], [1, 1], [1, 2], [3, 1], [3, 2]]
@@ -91,18 +98,18 @@ def test_select():
             by_hand().select(np.array(wrong))
 
 
-def test_select_equals_rows_of_the_matrix():
+def test_select_equals_the_rows_of_the_matrix():
     rng = np.random.default_rng(0)
     matrix = rng.random((40, 30)) < 0.1
     truth = GroundTruth.from_pairs(*np.nonzero(matrix), 40, 30)
     indices = rng.integers(0, 40, 100)
     np.testing.assert_array_equal(truth.select(indices).matrix(), matrix[indices])
-    answers = rng.integers(-1, 30, 40)
-    expected = [bool(answer >= 0 and matrix[query, answer]) for query, answer in enumerate(answers)]
-    assert truth.accepts(answers).tolist() == expected
+    places = rng.integers(-1, 30, 40)
+    expected = [bool(place >= 0 and matrix[query, place]) for query, place in enumerate(places)]
+    assert truth.accepts(places).tolist() == expected
 
 
-def test_loop_closures_whichever_triangle():
+def test_loop_closures_of_either_triangle_are_the_same():
     lower = np.zeros((5, 5), bool)
     lower[3, 0] = lower[4, 1] = lower[4, 3] = True
     expected = [[3, 0], [4, 1], [4, 3]]
@@ -110,15 +117,21 @@ def test_loop_closures_whichever_triangle():
         truth = GroundTruth.from_pairs(*np.nonzero(matrix), 5, 5)
         assert truth.loop_closures().pairs.tolist() == expected
         assert truth.loop_closures(exclude=1).pairs.tolist() == expected[:2]
-        assert truth.loop_closures(exclude=1).has_match.tolist() == [False, False, False, True, True]
+        assert truth.loop_closures(exclude=1).has_match.tolist() == [
+            False,
+            False,
+            False,
+            True,
+            True,
+        ]
         assert truth.loop_closures(exclude=3).pairs.tolist() == []
-    with pytest.raises(InputError, match='one drive'):
+    with pytest.raises(InputError, match='one traverse'):
         by_hand().loop_closures()
     with pytest.raises(InputError, match='excluded'):
         GroundTruth.identity(3, 3).loop_closures(-1)
 
 
-def test_pairs_outside():
+def test_from_pairs_outside_the_range_raises():
     for pair in [(3, 0), (-1, 0), (0, 5), (0, -1)]:
         with pytest.raises(InputError, match=rf'query {pair[0]} with place {pair[1]}'):
             by_hand([*PAIRS, pair])
@@ -126,7 +139,7 @@ def test_pairs_outside():
         by_hand([], 0, 5)
 
 
-# ------------------------------------------------------------------------------------------ files
+# ---------------------------------------------------------------------------------- files
 
 
 @pytest.mark.parametrize(
@@ -141,14 +154,16 @@ def test_pairs_outside():
         '\ufeff"0","1"\n"0","2"\n"2","4"\n',
     ],
 )
-def test_text(tmp_path, text):
+def test_from_file_reads_text(tmp_path, text):
     path = tmp_path / 'truth.csv'
     path.write_text(text, encoding='utf-8')
     assert GroundTruth.from_file(path, 3, 5).pairs.tolist() == [list(pair) for pair in PAIRS]
-    assert GroundTruth.from_file(path, 3, 5, 1).pairs.tolist() == by_hand(tolerance=1).pairs.tolist()
+    assert (
+        GroundTruth.from_file(path, 3, 5, 1).pairs.tolist() == by_hand(tolerance=1).pairs.tolist()
+    )
 
 
-def test_a_place_a_line(tmp_path):
+def test_from_file_reads_a_place_a_line(tmp_path):
     path = tmp_path / 'truth.txt'
     path.write_text('Reference\n1\n-1\n4\n')
     assert GroundTruth.from_file(path, 3, 5).pairs.tolist() == [[0, 1], [2, 4]]
@@ -171,7 +186,7 @@ def test_a_place_a_line(tmp_path):
         ('query,place\n3,0\n', 'query 3 with place 0'),
     ],
 )
-def test_text_that_is_wrong(tmp_path, text, message):
+def test_from_file_of_invalid_text_raises(tmp_path, text, message):
     path = tmp_path / 'truth.csv'
     path.write_text(text)
     with pytest.raises((InputError, SourceError), match=message):
@@ -189,15 +204,17 @@ def test_text_that_is_wrong(tmp_path, text, message):
         np.array([*PAIRS, (1, -1)], float),
     ],
 )
-def test_arrays(tmp_path, array):
+def test_from_file_reads_arrays(tmp_path, array):
     np.save(tmp_path / 'truth.npy', array)
     np.savez(tmp_path / 'one.npz', anything=array)
     np.savez_compressed(tmp_path / 'several.npz', truth=array, other=np.zeros(2))
     for name in ('truth.npy', 'one.npz', 'several.npz'):
-        assert GroundTruth.from_file(tmp_path / name, 3, 5).pairs.tolist() == [list(pair) for pair in PAIRS]
+        assert GroundTruth.from_file(tmp_path / name, 3, 5).pairs.tolist() == [
+            list(pair) for pair in PAIRS
+        ]
 
 
-def test_array_with_a_place_a_query(tmp_path):
+def test_from_file_reads_an_array_with_a_place_a_query(tmp_path):
     np.save(tmp_path / 'truth.npy', np.array([1, -1, 4]))
     assert GroundTruth.from_file(tmp_path / 'truth.npy', 3, 5).pairs.tolist() == [[0, 1], [2, 4]]
 
@@ -216,14 +233,14 @@ def test_array_with_a_place_a_query(tmp_path):
         (np.array([1, 2]), r'shape \(2,\)'),
     ],
 )
-def test_arrays_that_are_wrong(tmp_path, array, message):
+def test_from_file_of_an_invalid_array_raises(tmp_path, array, message):
     np.save(tmp_path / 'truth.npy', array)
     with pytest.raises(InputError, match=message):
         GroundTruth.from_file(tmp_path / 'truth.npy', 3, 5)
 
 
-def test_objects_are_refused_with_the_reason(tmp_path):
-    """As VPR-Bench keeps its truth: rows of a number and a list."""
+def test_from_file_of_pickled_objects_raises(tmp_path):
+    """The ground truth of VPR-Bench: rows of a number and a list."""
     rows = np.empty((1, 2), object)
     rows[0] = [0, [1, 2]]
     np.save(tmp_path / 'objects.npy', rows, allow_pickle=True)
@@ -235,16 +252,20 @@ def test_objects_are_refused_with_the_reason(tmp_path):
 
 
 @pytest.mark.parametrize('white', [1, 255])
-def test_images(tmp_path, white):
+def test_from_file_reads_black_and_white_images(tmp_path, white):
     for name in ('truth.png', 'truth.bmp'):
         cv2.imwrite(str(tmp_path / name), (MATRIX * white).astype(np.uint8))
-        assert GroundTruth.from_file(tmp_path / name, 3, 5).pairs.tolist() == [list(pair) for pair in PAIRS]
+        assert GroundTruth.from_file(tmp_path / name, 3, 5).pairs.tolist() == [
+            list(pair) for pair in PAIRS
+        ]
 
 
-def test_images_that_are_wrong(tmp_path):
+def test_from_file_of_an_invalid_image_raises(tmp_path):
     path = tmp_path / 'truth.png'
     cv2.imwrite(str(path), (MATRIX * 255).astype(np.uint8))
-    with pytest.raises(InputError, match='3 high and 5 wide: expected 5 rows, one a query, and 3 columns'):
+    with pytest.raises(
+        InputError, match='3 high and 5 wide: expected 5 rows, one a query, and 3 columns'
+    ):
         GroundTruth.from_file(path, 5, 3)
     cv2.imwrite(str(path), (MATRIX * 128).astype(np.uint8))
     with pytest.raises(InputError, match='3 gray pixels'):
@@ -255,7 +276,7 @@ def test_images_that_are_wrong(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['truth.csv', 'truth.npy', 'truth.npz', 'truth.png', 'truth.pkl'])
-def test_files_that_cannot_be_read(tmp_path, name):
+def test_from_file_of_a_missing_or_damaged_file_raises(tmp_path, name):
     with pytest.raises(SourceError, match=name):
         GroundTruth.from_file(tmp_path / name, 3, 5)
     (tmp_path / name).write_bytes(b'PK\x03\x04\xff damaged')
@@ -263,16 +284,18 @@ def test_files_that_cannot_be_read(tmp_path, name):
         GroundTruth.from_file(tmp_path / name, 3, 5)
 
 
-def test_an_archive_with_several_arrays(tmp_path):
+def test_from_file_of_several_arrays_raises(tmp_path):
     np.savez(tmp_path / 'truth.npz', hard=MATRIX, soft=MATRIX)
-    with pytest.raises(SourceError, match='holds hard, soft: expected one array, or one called truth'):
+    with pytest.raises(
+        SourceError, match='holds hard, soft: expected one array, or one called truth'
+    ):
         GroundTruth.from_file(tmp_path / 'truth.npz', 3, 5)
 
 
-# ------------------------------------------------------------------------------------------ poses
+# ---------------------------------------------------------------------------------- poses
 
 
-def test_poses_by_hand():
+def test_from_poses_by_hand():
     places = np.array([pose(0), pose(3, 4), pose(0, yaw=90), pose(0, yaw=-30)])
     queries = np.array([pose(0), pose(0, yaw=180), pose(3, 4, 0.5)])
     near = GroundTruth.from_poses(queries, places, 0.5)
@@ -287,31 +310,43 @@ def test_poses_by_hand():
         assert of_mirrored == GroundTruth.from_poses(queries, places, 0.4, degrees).pairs.tolist()
 
 
-def test_poses_in_parts(monkeypatch):
+def test_from_poses_in_chunks_equals_all_at_once(monkeypatch):
     monkeypatch.setattr('stavpr_ros.evaluation.ground_truth.CHUNK', 7)
     poses = np.array([pose(float(i)) for i in range(5)])
-    assert (
-        GroundTruth.from_poses(poses, poses, 1).pairs.tolist() == GroundTruth.identity(5, 5, 1).pairs.tolist()
-    )
+    expected = GroundTruth.identity(5, 5, 1).pairs
+    np.testing.assert_array_equal(GroundTruth.from_poses(poses, poses, 1).pairs, expected)
 
 
-def test_pose_files(tmp_path):
-    (tmp_path / 'query.csv').write_text('# x,y,z\n0,0,0\n10,0,0\n')
-    (tmp_path / 'map.csv').write_text('0,1,0,0,0,0,1\n9,0,0,0,0,0,1\n30,0,0,0,0,0,1\n')
-    paths = tmp_path / 'query.csv', tmp_path / 'map.csv'
-    assert GroundTruth.from_pose_files(*paths, 2, 3, 1.0).pairs.tolist() == [[0, 0], [1, 1]]
-    with pytest.raises(InputError, match='no orientations'):
-        GroundTruth.from_pose_files(*paths, 2, 3, 1.0, 30)
-    with pytest.raises(InputError, match='3 poses for 4 images'):
-        GroundTruth.from_pose_files(*paths, 2, 4, 1.0)
-    (tmp_path / 'map.csv').write_text('0,1\n')
-    with pytest.raises(SourceError, match='3 or 7 numbers'):
-        GroundTruth.from_pose_files(*paths, 2, 1, 1.0)
-    with pytest.raises(SourceError, match='cannot be read'):
-        GroundTruth.from_pose_files(tmp_path / 'none.csv', paths[1], 2, 1, 1.0)
+def test_read_poses_of_three_or_seven_numbers(tmp_path):
+    path = tmp_path / 'poses.csv'
+    path.write_text('# x,y,z\n0,0,0\n10,0,0\n')
+    poses, oriented = read_poses(path)
+    assert (poses.tolist(), oriented) == ([pose(0), pose(10)], False)
+    path.write_text('0,1,0,0,0,0,1\n')
+    poses, oriented = read_poses(path)
+    assert (poses.tolist(), oriented) == ([pose(0, 1)], True)
 
 
-def test_places_whose_pose_is_not_known_are_nobodys_truth():
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('0,1\n', '3 or 7 numbers'),
+        ('0,0,0\n0,0,0,0,0,0,1\n', '3 or 7 numbers'),
+        ('', '3 or 7 numbers'),
+        ('a,b,c\n', 'cannot be read'),
+        ('0,nan,0\n', 'finite numbers'),
+        (None, 'cannot be read'),
+    ],
+)
+def test_read_poses_of_an_invalid_file_raises(tmp_path, text, message):
+    path = tmp_path / 'poses.csv'
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(SourceError, match=message):
+        read_poses(path)
+
+
+def test_from_poses_never_accepts_places_with_unknown_pose():
     unknown = [np.nan] * 7
     places, queries = np.array([pose(0), unknown, pose(5)]), np.array([pose(0), pose(5), pose(9)])
     for degrees in (None, 90):
@@ -323,22 +358,22 @@ def test_places_whose_pose_is_not_known_are_nobodys_truth():
 
 
 @pytest.mark.parametrize('wrong', [np.zeros((2, 3)), np.zeros((2, 7)), np.full((2, 7), np.nan)])
-def test_poses_that_are_wrong(wrong):
+def test_from_poses_of_invalid_poses_raises(wrong):
     with pytest.raises(InputError, match='map poses'):
         GroundTruth.from_poses(np.array([pose()]), wrong, 1)
 
 
-def test_thresholds_that_are_wrong():
+def test_from_poses_with_invalid_limits_raises():
     for meters, degrees in [(-1, None), (1, -1), (float('nan'), None)]:
         with pytest.raises(InputError, match='meters'):
             GroundTruth.from_poses(np.array([pose()]), np.array([pose()]), meters, degrees)
 
 
-# ------------------------------------------------------------------------------------------ real files
+# ---------------------------------------------------------------------------------- real files
 
 
-def test_loop_closures_of_the_hallway(data_folder):
-    """RTAB-Map's sample: white below the diagonal, row = query, column = the earlier image."""
+def test_from_file_of_rtabmap_holds_the_loop_closures(data_folder):
+    """White below the diagonal: row = query, column = the earlier image."""
     truth = GroundTruth.from_file(data_folder / 'rtabmap_hallway_loop' / 'samples_GT.bmp', 84, 84)
     queries, places = truth.pairs.T
     assert len(queries) == 228
@@ -348,6 +383,6 @@ def test_loop_closures_of_the_hallway(data_folder):
     assert truth.loop_closures(exclude=60).has_match.nonzero()[0].min() > 60
 
 
-def test_pairs_of_the_corridor(data_folder):
+def test_from_file_of_the_corridor_is_the_identity_within_two(data_folder):
     truth = GroundTruth.from_file(data_folder / 'corridor' / 'ground_truth.csv', 111, 111)
     np.testing.assert_array_equal(truth.matrix(), GroundTruth.identity(111, 111, 2).matrix())

@@ -1,93 +1,207 @@
-"""F1 and the answer of every frame, by hand and against the oracle's plain loops."""
+"""Metrics: by hand, against scikit-learn and against the oracle's plain loops."""
+
+import sys
 
 import numpy as np
+import oracle
 import pytest
-
 from stavpr_ros.alignment import SequenceMatch
-from stavpr_ros.errors import InputError
-from stavpr_ros.evaluation.metrics import best_f1, counts_at, image_matches, sweep
+from stavpr_ros.errors import InputError, UnavailableError
+from stavpr_ros.evaluation.ground_truth import GroundTruth
+from stavpr_ros.evaluation.metrics import (
+    best_f1,
+    counts_at,
+    evaluate_ranking,
+    image_matches,
+    Ranking,
+    smallest_indices,
+    sweep,
+)
 from stavpr_ros.recognition import Match, Status
 
-
-def test_counts_by_hand():
-    """Four queries: accepted right, accepted wrong, rejected, and one not in the map, rejected."""
-    distances = np.array([0.1, 0.2, 0.5, 0.6])
-    correct = np.array([True, False, True, False])
-    has_match = np.array([True, True, True, False])
-    score = counts_at(0.3, distances, correct, has_match)
-    assert (score.true_positives, score.false_positives, score.false_negatives) == (1, 1, 1)
-    assert score.precision == 0.5
-    assert score.recall == 0.5
-    assert score.f1 == 0.5
-    assert counts_at(0.2, distances, correct).false_positives == 0  # accepted means below, not at
-
-
-def test_best_f1_by_hand():
-    """Accepting .1 and .2: 2 TP, 1 FN, F1 .8; accepting all: 2 TP, 1 FP, F1 .8 too; the lower wins."""
-    best = best_f1(np.array([0.1, 0.2, 0.3]), np.array([True, True, False]))
-    assert best.f1 == pytest.approx(0.8)
-    assert best.threshold == 0.3
-
-
-def test_accepting_nothing():
-    scores = sweep(np.array([np.inf, np.nan]), np.array([False, False]))
-    assert len(scores) == 1
-    assert scores[0].f1 == 0
-    assert scores[0].precision == 1
-
-
-def test_shapes_must_agree():
-    with pytest.raises(InputError, match='one value a query'):
-        best_f1(np.zeros(3), np.zeros(2, bool))
-
-
-def window(middle, path, distance=0.1):
-    nearest = SequenceMatch(path[0][1], path[-1][1], middle, distance, -1, float('nan'))
-    return Match(Status.NO_MATCH, sequence=nearest, path=np.array(path, np.int32))
-
+pytest.importorskip('sklearn', reason='the extra evaluation is not installed')
 
 NONE = Match(Status.WARMING_UP)
 
 
-def test_frame_answers_by_hand():
+def ranking(places, scores):
+    places = np.asarray(places)
+    return Ranking(places if places.ndim == 2 else places[:, None], np.asarray(scores, float))
+
+
+def window(middle, path, distance):
+    nearest = SequenceMatch(path[0][1], path[-1][1], middle, distance, -1, float('nan'))
+    return Match(Status.NO_MATCH, sequence=nearest, path=np.array(path, np.int32))
+
+
+# ---------------------------------------------------------------------------------- counts
+
+
+def test_counts_at_four_queries_by_hand():
+    """Accepted and correct, accepted and wrong, rejected, rejected and not in the map."""
+    distances = np.array([0.1, 0.2, 0.5, 0.6])
+    correct = np.array([True, False, True, False])
+    counts = counts_at(0.3, distances, correct, np.array([True, True, True, False]))
+    assert (counts.true_positives, counts.false_positives, counts.false_negatives) == (1, 1, 1)
+    assert (counts.precision, counts.recall, counts.f1) == (0.5, 0.5, 0.5)
+    assert counts_at(0.2, distances, correct).false_positives == 0  # below, not at the threshold
+
+
+def test_best_f1_on_a_tie_is_that_of_the_lowest_threshold():
+    """Below .3: 2 TP, 1 FN; accepting all: 2 TP, 1 FP; F1 is .8 both times."""
+    best = best_f1(np.array([0.1, 0.2, 0.3]), np.array([True, True, False]))
+    assert (best.f1, best.threshold) == (pytest.approx(0.8), 0.3)
+
+
+def test_sweep_without_matches_accepts_nothing():
+    counts = sweep(np.array([np.inf, np.nan]), np.array([False, False]))
+    assert [(each.f1, each.recall, each.precision) for each in counts] == [(0, 0, 1)]
+
+
+def test_best_f1_with_different_shapes_raises():
+    with pytest.raises(InputError, match='one value a query'):
+        best_f1(np.zeros(3), np.zeros(2, bool))
+
+
+def test_best_f1_and_average_precision_equal_oracle_and_scikit_learn():
+    from sklearn.metrics import average_precision_score
+
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        scores, places, true = (
+            rng.integers(0, 9, 15) / 8,
+            rng.integers(0, 6, 15),
+            rng.integers(0, 6, 15),
+        )
+        truth = GroundTruth.from_pairs(np.arange(15), true, N=15, n=6, tolerance=1)
+        metrics = evaluate_ranking(ranking(places, scores), truth)
+        answers = list(zip(places.tolist(), scores.tolist(), strict=True))
+        assert metrics.best.f1 == pytest.approx(
+            oracle.best_f1(answers, [[place] for place in true.tolist()], 1)
+        )
+        correct = np.abs(places - true) <= 1
+        assert metrics.average_precision == pytest.approx(
+            average_precision_score(correct, -scores)
+        )
+
+
+# ---------------------------------------------------------------------------------- windows
+
+
+def test_image_matches_of_windows_of_four_by_hand():
     """
-    Six images, windows of 4: midpoint floor(3 / 2) = 1. Windows end at images 3, 4, 5; their midpoints
-    are images 1, 2, 3. Image 0 is read off the first path, images 4 and 5 off the last one's.
+    Six images; the middle of a window of 4 is position floor(3 / 2) = 1.
+
+    Windows end at images 3, 4, 5, their middles are images 1, 2, 3. Image 0 is read from the first
+    path, images 4 and 5 from the last one.
     """
     windows = [
-        NONE,
-        NONE,
-        NONE,
+        *(NONE, NONE, NONE),
         window(11, [(0, 10), (0, 11), (0, 12), (1, 12), (2, 12), (3, 12)], 0.3),
         window(12, [(0, 11), (1, 12), (2, 13), (3, 14)], 0.2),
         window(14, [(0, 12), (1, 13), (2, 15), (3, 16), (3, 17)], 0.4),
     ]
-    answers = image_matches(windows, 4)
-    assert answers.places.tolist() == [11, 11, 12, 14, 15, 16]
-    assert answers.distances.tolist() == [0.3, 0.3, 0.2, 0.4, 0.4, 0.4]
-    assert answers.within(np.array([11, 14, -1, 14, 12, 19]), 2).tolist() == [
-        True,
-        False,
-        False,
-        True,
-        False,
-        False,
-    ]
+    matches = image_matches(windows, 4)
+    assert matches.places.tolist() == [11, 11, 12, 14, 15, 16]
+    assert matches.distances.tolist() == [0.3, 0.3, 0.2, 0.4, 0.4, 0.4]
+    within = matches.within(np.array([11, 14, -1, 14, 12, 19]), 2)
+    assert within.tolist() == [True, False, False, True, False, False]
 
 
-def test_no_window_no_answer():
-    answers = image_matches([NONE, NONE], 4)
-    assert answers.places.tolist() == [-1, -1]
-    assert np.isinf(answers.distances).all()
+def test_image_matches_without_a_window_are_none():
+    matches = image_matches([NONE, NONE], 4)
+    assert matches.places.tolist() == [-1, -1]
+    assert np.isinf(matches.distances).all()
 
 
-def test_f1_equals_the_oracle():
-    import oracle
+# ---------------------------------------------------------------------------------- rankings
 
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        distances = rng.integers(0, 6, 12) / 4
-        places, truth = rng.integers(0, 5, 12), rng.integers(0, 5, 12)
-        answers = list(zip(places.tolist(), distances.tolist(), strict=True))
-        expected = oracle.best_f1(answers, [[place] for place in truth.tolist()], 1)
-        assert best_f1(distances, np.abs(places - truth) <= 1).f1 == pytest.approx(expected)
+
+def test_evaluate_ranking_of_five_queries_by_hand():
+    """
+    The fifth query is not in the map, the fourth has no match.
+
+    Distances: correct .1, wrong .2, correct .3, wrong (of the fifth) .4.
+
+    below   accepted  TP FP FN  precision  recall
+    .1      -          0  0  4  1          0
+    .2      1          1  0  3  1          1/4
+    .3      2          1  1  2  1/2        1/3
+    .4      3          2  1  1  2/3        2/3
+    more    4          2  2  1  1/2        2/3
+    """
+    truth = GroundTruth.from_pairs([0, 1, 2, 3], [0, 1, 2, 3], N=5, n=9)
+    metrics = evaluate_ranking(ranking([0, 8, 2, -1, 4], [0.1, 0.2, 0.3, np.inf, 0.4]), truth)
+    np.testing.assert_allclose(metrics.curve.precision, [1, 1, 1 / 2, 2 / 3, 1 / 2])
+    np.testing.assert_allclose(metrics.curve.recall, [0, 1 / 4, 1 / 3, 2 / 3, 2 / 3])
+    np.testing.assert_allclose(metrics.curve.thresholds, [0.1, 0.2, 0.3, 0.4, 0.4])
+    assert (metrics.best.threshold, metrics.best.f1) == (0.4, pytest.approx(2 / 3))
+    assert (metrics.queries, metrics.with_match) == (5, 4)
+    assert metrics.recall_at_full_precision == 1 / 4
+    assert metrics.recall_at == {1: 1 / 2, 5: 1 / 2, 10: 1 / 2, 20: 1 / 2}
+    # scikit-learn: two correct matches in all: 1/2 * 1 + 1/2 * 2/3
+    assert metrics.average_precision == pytest.approx(5 / 6)
+    assert metrics.sklearn_recall_at_full_precision == 1 / 2
+    assert metrics.sklearn_f1 == pytest.approx(0.8)  # precision 2/3, recall 1
+
+
+def test_evaluate_ranking_recall_at_k_counts_any_of_the_first_k():
+    truth = GroundTruth.from_pairs([0, 1, 2], [3, 3, 3], N=4, n=30)
+    places = np.full((4, 20), -1)
+    places[0, :2] = 9, 3
+    places[1, :7] = 1, 2, 4, 5, 6, 7, 3
+    places[2, :1] = 8
+    places[3, :1] = 3  # not in the map: not counted
+    found = evaluate_ranking(ranking(places, np.arange(4)), truth).recall_at
+    assert found == {
+        1: 0,
+        5: pytest.approx(1 / 3),
+        10: pytest.approx(2 / 3),
+        20: pytest.approx(2 / 3),
+    }
+
+
+def test_evaluate_ranking_of_a_slice_counts_only_these_queries():
+    truth, places = GroundTruth.identity(6, 6), ranking([3, 1, 2, 3, 0, 0], np.arange(6))
+    inner = evaluate_ranking(places, truth, slice(1, 4))
+    assert (inner.best.f1, inner.queries) == (1, 3)
+    assert evaluate_ranking(places, truth).best.f1 < 1
+    with pytest.raises(InputError, match='no queries'):
+        evaluate_ranking(places, truth, slice(6, 6))
+
+
+def test_evaluate_ranking_takes_nan_and_infinity_as_no_match():
+    truth = GroundTruth.identity(3, 3)
+    metrics = evaluate_ranking(ranking([0, 1, 2], [np.nan, np.inf, 0.5]), truth)
+    assert (metrics.best.true_positives, metrics.best.false_negatives) == (1, 2)
+    assert metrics.average_precision > 0.5
+    none = evaluate_ranking(ranking([-1, -1, -1], [np.inf] * 3), truth)
+    assert (none.best.f1, none.average_precision, none.recall_at_full_precision) == (0, 0, 0)
+
+
+def test_evaluate_ranking_takes_negative_scores():
+    """-3 and -2 are correct, -1 is wrong, the last query has no match."""
+    scores = [-3.0, -2.0, -1.0, np.inf]
+    metrics = evaluate_ranking(ranking([0, 1, 0, 3], scores), GroundTruth.identity(4, 4))
+    assert metrics.best.f1 == pytest.approx(2 * 2 / (2 * 2 + 2))
+    assert metrics.average_precision == pytest.approx(1 / 3 + 1 / 3 + 1 / 3 * 3 / 4)
+
+
+def test_ranking_without_a_score_a_query_raises():
+    with pytest.raises(InputError, match=r'expected \(N, K\) and \(N,\)'):
+        Ranking(np.zeros((3, 2), int), np.zeros(2))
+
+
+def test_evaluate_ranking_without_scikit_learn_raises(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'sklearn.metrics', None)
+    with pytest.raises(UnavailableError, match='pip install scikit-learn'):
+        evaluate_ranking(ranking([0], [0.1]), GroundTruth.identity(1, 1))
+
+
+def test_smallest_indices_are_ordered_by_value_then_index():
+    row = np.array([3, 1, np.inf, 1, 2, np.nan, 1], np.float32)
+    assert smallest_indices(row, 2).tolist() == [1, 3]
+    assert smallest_indices(row, 20).tolist() == [1, 3, 6, 4, 0]
+    assert smallest_indices(np.array([]), 3).tolist() == []
+    many = np.random.default_rng(1).integers(0, 9, 200).astype(np.float32)
+    assert smallest_indices(many, 20).tolist() == np.argsort(many, kind='stable')[:20].tolist()

@@ -1,34 +1,35 @@
-"""SeqSLAM: every step by hand, the whole against plain loops, and what it is worth on real drives."""
+"""SeqSLAM: every step by hand, the whole against plain loops, F1 on real traverses."""
 
 import numpy as np
 import pytest
-
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.evaluation.metrics import best_f1
 from stavpr_ros.evaluation.paper.datasets import open_dataset
 from stavpr_ros.evaluation.seqslam import (
-    SeqSlamSettings,
-    preprocess,
     differences,
     enhance_contrast,
     match_differences,
+    preprocess,
     seqslam,
+    SeqSlamSettings,
 )
 from stavpr_ros.sources.frame import Frame
 
 SMALL = SeqSlamSettings(width=4, height=2, patch=2)
 
 
-def test_patches_by_hand():
+def test_preprocess_patches_by_hand():
     """Left patch 0 2 / 2 4: mean 2, deviation sqrt 2. The right one is flat."""
     image = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8)
     root = np.sqrt(2)
-    described = preprocess([image], SMALL)
-    assert described.dtype == np.float32
-    np.testing.assert_allclose(described.reshape(2, 4), [[-root, 0, 0, 0], [0, root, 0, 0]], atol=1e-6)
+    patches = preprocess([image], SMALL)
+    assert patches.dtype == np.float32
+    np.testing.assert_allclose(
+        patches.reshape(2, 4), [[-root, 0, 0, 0], [0, root, 0, 0]], atol=1e-6
+    )
 
 
-def test_images_are_shrunk_by_areas_and_made_gray():
+def test_preprocess_shrinks_by_area_and_converts_to_gray():
     gray = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8)
     large = np.kron(gray, np.ones((3, 3), np.uint8))
     color = np.stack([large] * 3, axis=2)
@@ -37,19 +38,21 @@ def test_images_are_shrunk_by_areas_and_made_gray():
     np.testing.assert_array_equal(preprocess([Frame(color, 0, '')], SMALL), expected)
 
 
-def test_red_counts_more_than_blue():
+def test_preprocess_weights_red_more_than_blue():
     gray = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8) * 40
-    color = np.stack([gray, gray * 0, 200 - gray], axis=2)  # red as the gray image, blue against it
+    color = np.stack(
+        [gray, gray * 0, 200 - gray], axis=2
+    )  # red as the gray image, blue against it
     np.testing.assert_allclose(preprocess([color], SMALL), preprocess([gray], SMALL), atol=0.05)
 
 
-def test_differences_by_hand():
+def test_differences_are_mean_absolute_differences():
     queries = np.array([[0, 0, 0, 0], [1, 2, 3, 4]], np.float32)
     places = np.array([[1, -1, 1, -1], [1, 2, 3, 4], [0, 0, 0, 2]], np.float32)
     np.testing.assert_allclose(differences(queries, places), [[1, 2.5, 0.5], [2.5, 0, 2]])
 
 
-def test_contrast_by_hand():
+def test_enhance_contrast_by_hand():
     """
     Window 2, one place before and one after: 1 3 | 1 3 5 | 3 5 3 | 5 3.
 
@@ -61,7 +64,7 @@ def test_contrast_by_hand():
     assert enhance_contrast(D.astype(np.float32), 2).dtype == np.float32
 
 
-def test_lines_by_hand():
+def test_lines_at_three_speeds_by_hand():
     """Speeds 0.5, 1 and 1.5 over five images, halves rounded up."""
     settings = SeqSlamSettings(length=5, slowest=0.5, fastest=1.5, speed_step=0.5)
     assert settings.lines.tolist() == [[0, 1, 1, 2, 2], [0, 1, 2, 3, 4], [0, 2, 3, 5, 6]]
@@ -69,9 +72,9 @@ def test_lines_by_hand():
     assert SeqSlamSettings().lines[:, -1].tolist() == [15, 17, 19, 21, 23]
 
 
-def test_search_by_hand():
+def test_match_differences_of_a_fast_query_by_hand():
     """
-    Three queries, six places; the query drives twice as fast and begins at place 1.
+    Three queries, six places; the query is twice as fast and begins at place 1.
 
     In every row one difference is 0 and five are 6: mean 5, deviation sqrt 5 over the whole map, so 0
     becomes -sqrt 5 and 6 becomes 1 / sqrt 5. The line 1, 3, 5 has -sqrt 5 on the mean.
@@ -84,8 +87,8 @@ def test_search_by_hand():
     np.testing.assert_allclose(scores, -np.sqrt(5))
 
 
-def test_ends_take_their_places_from_the_outer_windows():
-    """Seven queries, windows of 4: midpoint 1, so query 0 and queries 5 and 6 are in nobody's middle."""
+def test_match_differences_ends_come_from_the_outer_windows():
+    """Seven queries, windows of 4: midpoint 1, so queries 0, 5 and 6 are in the middle of none."""
     settings = SeqSlamSettings(length=4, slowest=1, fastest=1)
     D = np.ones((7, 20))
     D[np.arange(7), np.arange(7) + 9] = 0
@@ -98,7 +101,7 @@ def test_ends_take_their_places_from_the_outer_windows():
 
 
 def naive(D, settings):
-    """The paper in plain loops."""
+    """Compute the paper's method in plain loops."""
     N, n = D.shape
     half, middle = settings.contrast_window // 2, (settings.length - 1) // 2
     enhanced = np.zeros((N, n))
@@ -127,10 +130,17 @@ def naive(D, settings):
 
 
 @pytest.mark.parametrize('score', ['sum', 'uniqueness'])
-@pytest.mark.parametrize(('length', 'window', 'n'), [(2, 2, 9), (5, 4, 25), (6, 10, 40), (7, 60, 12)])
-def test_equals_plain_loops(score, length, window, n):
+@pytest.mark.parametrize(
+    ('length', 'window', 'n'), [(2, 2, 9), (5, 4, 25), (6, 10, 40), (7, 60, 12)]
+)
+def test_match_differences_equals_plain_loops(score, length, window, n):
     settings = SeqSlamSettings(
-        length=length, contrast_window=window, slowest=0.6, fastest=1.4, speed_step=0.2, score=score
+        length=length,
+        contrast_window=window,
+        slowest=0.6,
+        fastest=1.4,
+        speed_step=0.2,
+        score=score,
     )
     D = np.random.default_rng(length).random((15, n))
     expected_places, expected_scores = naive(D, settings)
@@ -142,22 +152,26 @@ def test_equals_plain_loops(score, length, window, n):
         np.testing.assert_allclose(scores[inner], expected_scores[inner], atol=tolerance)
 
 
-def test_a_drive_finds_itself(route):
+def test_seqslam_of_a_part_of_the_map_finds_it(route):
     for score in ('sum', 'uniqueness'):
         places, scores = seqslam(route, route[10:50], SeqSlamSettings(score=score))
         assert places.tolist() == list(range(10, 50))
         assert scores.max() < -0.5
 
 
-def test_without_a_window_or_a_line():
+def test_match_differences_without_a_window_or_line_is_none():
     for D in (np.ones((19, 50)), np.ones((50, 15))):
         places, scores = match_differences(D, SeqSlamSettings())
         assert places.tolist() == [-1] * len(D)
         assert np.isinf(scores).all()
     rng = np.random.default_rng(0)
-    places, _ = match_differences(rng.random((20, 16)), SeqSlamSettings())  # the slowest line just fits
+    places, _ = match_differences(
+        rng.random((20, 16)), SeqSlamSettings()
+    )  # the slowest line just fits
     assert places.tolist() == SeqSlamSettings().lines[0].tolist()
-    places, scores = match_differences(np.ones((20, 40)), SeqSlamSettings())  # all lines alike: the first one
+    places, scores = match_differences(
+        np.ones((20, 40)), SeqSlamSettings()
+    )  # all lines alike: the first one
     assert places.tolist() == SeqSlamSettings().lines[0].tolist()
     assert scores.tolist() == [0] * 20
 
@@ -165,12 +179,12 @@ def test_without_a_window_or_a_line():
 @pytest.mark.parametrize(
     'D', [np.zeros(3), np.zeros((2, 2), int), np.array([[np.nan]]), np.array([[np.inf]])]
 )
-def test_differences_that_are_wrong(D):
+def test_match_differences_of_invalid_arrays_raises(D):
     with pytest.raises(InputError, match='differences'):
         match_differences(D, SeqSlamSettings())
 
 
-def test_images_that_are_wrong():
+def test_seqslam_of_invalid_images_raises():
     with pytest.raises(InputError, match='no images'):
         seqslam([], [])
     for image in (np.zeros((4, 4)), np.zeros((4, 4, 2), np.uint8)):
@@ -181,29 +195,18 @@ def test_images_that_are_wrong():
 @pytest.mark.parametrize(
     'wrong',
     [
-        {'width': 60},
-        {'height': 30},
-        {'patch': 0},
-        {'contrast_window': 1},
-        {'length': 1},
-        {'slowest': 0},
-        {'fastest': 0.5},
-        {'speed_step': 0},
-        {'fastest': float('inf')},
+        *({'width': 60}, {'height': 30}, {'patch': 0}, {'contrast_window': 1}, {'length': 1}),
+        *({'slowest': 0}, {'fastest': 0.5}, {'speed_step': 0}, {'fastest': float('inf')}),
         {'score': 'ratio'},
     ],
 )
-def test_settings_that_are_wrong(wrong):
+def test_settings_out_of_range_raise(wrong):
     with pytest.raises(SettingsError):
         SeqSlamSettings(**wrong)
 
 
 @pytest.mark.parametrize(('name', 'known_f1'), [('gardens_point', 0.79), ('nordland', 0.95)])
-def test_real_drives(data_folder, name, known_f1, record_property):
-    """The F1 that is asserted is the one measured, a little below."""
+def test_seqslam_on_real_traverses_gives_the_measured_f1(data_folder, name, known_f1):
     dataset = open_dataset(name, data_folder)
     places, scores = seqslam(dataset.map, dataset.query)
-    f1 = best_f1(scores, dataset.truth.accepts(places)).f1
-    record_property('f1', f1)
-    print(f'SeqSLAM, {name}: F1 {f1:.4f}')
-    assert f1 > known_f1
+    assert best_f1(scores, dataset.ground_truth.accepts(places)).f1 > known_f1

@@ -1,10 +1,10 @@
-"""``ros2 run stavpr_ros evaluate``: how well a second drive is recognized on the map of a first one."""
+"""``ros2 run stavpr_ros evaluate``: metrics of recognizing one traverse on the map of another."""
 
 import argparse
+from pathlib import Path
 import sys
 import time
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.errors import SettingsError, SourceError, StavprError
 from stavpr_ros.output_file import require_room
@@ -12,37 +12,39 @@ from stavpr_ros.signals import obey_signals
 from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
-    from stavpr_ros.commands.evaluate_sequences import Drives
+    from stavpr_ros.commands.evaluate_sequences import Sequences
     from stavpr_ros.evaluation.evaluate import Evaluation
     from stavpr_ros.evaluation.report import Report
     from stavpr_ros.recognition import RecognizerSettings
 
 OUTPUT = 'evaluation_output'
 WARPS = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')
+EXCLUDE_PLACES = 50  # as the node's parameter
 
 DESCRIPTION = """
-Recognizes a second drive on the map of a first one, image by image as the node does it, and compares the
-answers with the truth: precision over recall, F1, average precision, recall@k, recall at 100 % precision,
-false alarms; for sequences and for single images. Writes JSON, CSV, pictures and a page of HTML.
+Recognizes a second traverse on the map of a first one, image by image as the node does, and
+compares the matches with the ground truth: precision and recall, F1, average precision, recall@k,
+recall at 100 % precision, false alarms; for sequences and for single images. Writes JSON, CSV,
+plots and an HTML page.
 """
 
 EPILOG = """
-the truth:
-  identity     image i of the query was taken at image i of the map (the default); --tolerance is 3 then
+ground truth (--truth):
+  identity     image i of the query shows place i of the map (the default); --tolerance is 3 then
   poses        places within --meters and --degrees of the query's pose
-  FILE         .csv: accepted pairs, query,place, from 0; .npy, .npz: a square array of loop closures, pairs,
-               or a place a query; an image: white at row i, column j accepts place j for query i;
-               --tolerance is 0 then
+  FILE         .csv: accepted pairs, query,place, from 0; .npy, .npz: a matrix, queries by places,
+               pairs, or a place a query; an image: white at row i, column j accepts place j for
+               query i; --tolerance is 0 then
 
 examples:
   evaluate --map summer/ --query winter/
-  evaluate --map route.stavpr --query tuesday.bag --truth pairs.csv --mode robust --json result.json
+  evaluate --map route.stavpr --query tuesday.bag --truth pairs.csv --mode paper --json result.json
   evaluate --map summer/ --query winter/ --crop-map 0.3 --crop-query 0.1 --warp vary
   evaluate --map monday/ --query tuesday/ --unknown another_town/ --output report/
-  evaluate --query loop/ --loop-closure 50 --truth closures.png
-  evaluate --dataset gardens_point=data/gardens_point --spatial vanilla
+  evaluate --query loop/ --loop-closure --exclude-places 50 --truth closures.png
+  evaluate --dataset gardens_point=data/gardens_point --strategy vanilla
 
-exit codes: 0 done, 1 something failed (the reason is printed), 2 usage, 130 interrupted
+exit codes: 0 done, 1 failed (the reason is printed), 2 usage, 130 interrupted
 """
 
 
@@ -55,101 +57,137 @@ def _parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    drives = parser.add_argument_group('drives')
-    drives.add_argument('--map', metavar='FOLDER|BAG|MAP', help='first drive: images, a bag or a saved map')
-    drives.add_argument('--query', metavar='FOLDER|BAG|MAP', help='second drive: the same')
-    drives.add_argument('--dataset', metavar='NAME=FOLDER', help='map, query, truth of a known data set')
-    drives.add_argument('--topic', help='image topic of the bags, if they have several')
-    drives.add_argument('--unknown', metavar='FOLDER|BAG|MAP', help='a drive elsewhere: for false alarms')
-    drives.add_argument(
-        '--loop-closure', type=int, metavar='N', help="the map is the query's past without its last N images"
+    add = parser.add_argument_group('sequences').add_argument
+    add('--map', metavar='FOLDER|BAG|MAP', help='first traverse: images, a bag or a saved map')
+    add('--query', metavar='FOLDER|BAG|MAP', help='second traverse: the same')
+    add('--dataset', metavar='NAME=FOLDER', help='map, query and ground truth of a known data set')
+    add('--topic', help='image topic of the bags, if they have several')
+    add(
+        '--unknown',
+        metavar='FOLDER|BAG|MAP',
+        help='a traverse of places that are not in the map, for the rate of false alarms',
     )
-    drives.add_argument('--warp', choices=WARPS, help="change the query's speed")
+    add('--loop-closure', action='store_true', help="the map is the query's own past: no --map")
+    add(
+        '--exclude-places',
+        type=int,
+        metavar='N',
+        help=f'the latest N images are not part of that map ({EXCLUDE_PLACES})',
+    )
+    add('--warp', choices=WARPS, help='change the speed of the query')
     for name, side in (('map', 'right'), ('query', 'left')):
-        drives.add_argument(
-            f'--crop-{name}', type=float, default=0.0, metavar='X',
-            help=f'cut this share off the {side} of every image of the {name} (%(default)g)',
-        )  # fmt: skip
-    _add_truth_options(parser)
+        add(
+            f'--crop-{name}',
+            type=float,
+            default=0.0,
+            metavar='X',
+            help=f'crop this share of the {side} of every image of the {name} (%(default)g)',
+        )
+    _add_ground_truth_options(parser)
     _add_method_options(parser)
-    output = parser.add_argument_group('output')
-    output.add_argument('--json', metavar='FILE', help='write the numbers')
-    output.add_argument(
-        '--output', metavar='FOLDER', help=f'write everything ({OUTPUT} if there is no --json either)'
-    )
-    output.add_argument('--window', type=int, metavar='I', help='draw the warping path around query image I')
+    add = parser.add_argument_group('output').add_argument
+    add('--json', metavar='FILE', help='write the numbers')
+    add('--output', metavar='FOLDER', help=f'write a report ({OUTPUT} without --json)')
+    add('--window', type=int, metavar='I', help='plot the warping path around query image I')
     add_feature_options(parser)
     return parser
 
 
-def _add_truth_options(parser: argparse.ArgumentParser) -> None:
-    truth = parser.add_argument_group('truth')
-    truth.add_argument('--truth', default='identity', metavar='identity|poses|FILE', help='see below')
-    truth.add_argument('--tolerance', type=int, metavar='T', help='places that a right match may be off')
-    truth.add_argument('--query-poses', metavar='CSV', help='x,y,z[,qx,qy,qz,qw] of every query image')
-    truth.add_argument('--map-poses', metavar='CSV', help="the same of every place (those of the map's file)")
-    truth.add_argument('--meters', type=float, default=5.0, help='with poses (%(default)g)')
-    truth.add_argument('--degrees', type=float, help='with poses that have orientations (any)')
+def _add_ground_truth_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group('ground truth').add_argument
+    add('--truth', default='identity', metavar='identity|poses|FILE', help='see below')
+    add('--tolerance', type=int, metavar='T', help='places that a correct match may be off')
+    add('--query-poses', metavar='CSV', help='x,y,z[,qx,qy,qz,qw] of every query image')
+    add('--map-poses', metavar='CSV', help='the same of every place (those of the saved map)')
+    add('--meters', type=float, default=5.0, help='with poses: largest distance (%(default)g)')
+    add('--degrees', type=float, help='with poses that have orientations: largest angle (any)')
 
 
 def _add_method_options(parser: argparse.ArgumentParser) -> None:
     from stavpr_ros.alignment.settings import STRATEGIES
 
-    method = parser.add_argument_group('method')
-    method.add_argument(
-        '--mode', choices=('paper', 'robust'), default='paper',
-        help='paper: as published; robust: also against hub places and other speeds (%(default)s)',
-    )  # fmt: skip
-    method.add_argument(
-        '--length', type=int, default=20, metavar='L', help='images in a window (%(default)s)'
+    add = parser.add_argument_group('method').add_argument
+    add(
+        '--mode',
+        choices=('paper', 'robust'),
+        default='robust',
+        help='paper: as published; robust: with mitigations of failure modes (%(default)s)',
     )
-    method.add_argument('--beta', type=float, default=2.0, help='places per image of a window (%(default)g)')
-    method.add_argument(
-        '--spatial', choices=STRATEGIES, default='adaptive', help='how two images are compared (%(default)s)'
+    add(
+        '--sequence-length',
+        type=int,
+        default=20,
+        metavar='L',
+        help='images in a window (%(default)s)',
     )
-    method.add_argument('--sigma', type=float, default=1.0, help='of the adaptive weight (%(default)g)')
-    method.add_argument('--xi', type=int, help='restricted alignment of strips (none)')
-    method.add_argument(
-        '--vertical', action='store_true', help='align the cells of two strips from top to bottom first'
+    add('--beta', type=float, default=2.0, help='places per image of a window (%(default)g)')
+    add(
+        '--strategy',
+        choices=STRATEGIES,
+        default='adaptive',
+        help='spatial alignment (%(default)s)',
     )
-    method.add_argument('--backend', choices=('auto', 'cpu', 'cuda'), default='cpu', help='(%(default)s)')
-    method.add_argument(
-        '--precision', choices=('float32', 'float16'), default='float32', help='of the map (%(default)s)'
+    add('--sigma', type=float, default=1.0, help='of the adaptive weight (%(default)g)')
+    add('--xi', type=int, help='restricted alignment: largest shift in strips (none)')
+    add('--vertical', action='store_true', help='align the cells of two strips vertically first')
+    add(
+        '--nms-radius',
+        type=int,
+        default=20,
+        metavar='PLACES',
+        help='other candidates are farther from the match than this (%(default)s)',
+    )
+    add('--backend', choices=('auto', 'cpu', 'cuda'), default='cpu', help='(%(default)s)')
+    add(
+        '--precision',
+        choices=('float32', 'float16'),
+        default='float32',
+        help='of the map (%(default)s)',
     )
 
 
 def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    """Refuse options that do not go together."""
-    loop, dataset = arguments.loop_closure is not None, arguments.dataset is not None
+    """Reject options that contradict each other."""
+    loop, dataset = arguments.loop_closure, arguments.dataset is not None
     if dataset and (arguments.map or arguments.query or arguments.truth != 'identity' or loop):
         parser.error(
-            '--dataset brings map, query and truth: leave --map, --query, --truth, --loop-closure out'
+            '--dataset has map, query and ground truth: leave --map, --query, --truth and '
+            '--loop-closure out'
         )
     if not dataset and arguments.query is None:
-        parser.error('--query is needed')
+        parser.error('--query is required')
     if not dataset and (arguments.map is None) != loop:
         parser.error('give --map or, for the query on its own past, --loop-closure')
-    if loop and (arguments.warp or arguments.unknown):
-        parser.error('--loop-closure: --warp and --unknown need a --map')
-    cuda = arguments.backend != 'cpu' or arguments.precision != 'float32'
-    if loop and (cuda or arguments.crop_map or arguments.map_poses):
-        parser.error(
-            '--loop-closure is computed on the CPU, in float32, on the query alone: leave --backend, '
-            '--precision, --crop-map and --map-poses out'
-        )
-    if loop and arguments.truth == 'identity':
-        parser.error('--loop-closure needs --truth FILE or poses')
-    if loop and arguments.loop_closure < 1:
-        parser.error(f'--loop-closure {arguments.loop_closure} must be at least 1')
+    if arguments.exclude_places is not None and not loop:
+        parser.error('--exclude-places goes with --loop-closure')
+    if loop:
+        _check_loop_closure(parser, arguments)
     if arguments.tolerance is not None and arguments.tolerance < 0:
         parser.error(f'--tolerance {arguments.tolerance} must be at least 0')
     if arguments.truth != 'poses' and (arguments.query_poses or arguments.map_poses):
         parser.error('--query-poses and --map-poses go with --truth poses')
 
 
-def recognition_settings(arguments: argparse.Namespace) -> 'RecognizerSettings':
+def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    if arguments.exclude_places is None:
+        arguments.exclude_places = EXCLUDE_PLACES
+    if arguments.warp or arguments.unknown:
+        parser.error('--loop-closure: --warp and --unknown need a --map')
+    cuda = arguments.backend != 'cpu' or arguments.precision != 'float32'
+    if cuda or arguments.crop_map or arguments.map_poses:
+        parser.error(
+            '--loop-closure is computed on the CPU, in float32, on the query alone: leave '
+            '--backend, --precision, --crop-map and --map-poses out'
+        )
+    if arguments.truth == 'identity':
+        parser.error('--loop-closure needs --truth FILE or poses')
+    if arguments.exclude_places < 1:
+        parser.error(f'--exclude-places {arguments.exclude_places} must be at least 1')
+
+
+def recognizer_settings(arguments: argparse.Namespace) -> 'RecognizerSettings':
     """
-    Return the settings that the parsed options ask for; the threshold decides nothing here.
+    Return the settings of the parsed options; the metrics do not depend on their threshold.
 
     :raises SettingsError: one is out of its range.
     """
@@ -158,35 +196,39 @@ def recognition_settings(arguments: argparse.Namespace) -> 'RecognizerSettings':
 
     return RecognizerSettings(
         threshold=1.0,
-        spatial=SpatialSettings(arguments.spatial, arguments.sigma, arguments.xi, arguments.vertical),
-        sequence=SequenceSettings(arguments.length, arguments.beta),
+        spatial=SpatialSettings(
+            arguments.strategy, arguments.sigma, arguments.xi, arguments.vertical
+        ),
+        sequence=SequenceSettings(arguments.sequence_length, arguments.beta),
+        nms_radius=arguments.nms_radius,
         mode=arguments.mode,
     )
 
 
 def _default_threshold(mode: str) -> float | None:
-    """Return the threshold that a mode has of its own; the paper publishes none."""
+    """Return the default threshold of a mode; the paper publishes none."""
     from stavpr_ros.recognition.robust.options import THRESHOLD
 
     return THRESHOLD if mode == 'robust' else None
 
 
 def _evaluate(
-    arguments: argparse.Namespace, drives: 'Drives', settings: 'RecognizerSettings'
+    arguments: argparse.Namespace, sequences: 'Sequences', settings: 'RecognizerSettings'
 ) -> 'Evaluation':
     from stavpr_ros.evaluation.evaluate import evaluate_loop_closures, evaluate_on_map
 
     shown = () if arguments.window is None else (arguments.window,)
-    if drives.reference is None:
+    query, ground_truth = sequences.query.features, sequences.ground_truth
+    if sequences.reference is None:
         return evaluate_loop_closures(
-            drives.query.features, drives.truth, settings, arguments.loop_closure, shown, progress=True
+            query, ground_truth, settings, arguments.exclude_places, shown, progress=True
         )
     return evaluate_on_map(
-        drives.reference,
-        drives.query.features,
-        drives.truth,
+        sequences.reference,
+        query,
+        ground_truth,
         settings,
-        drives.unknown.features if drives.unknown else None,
+        sequences.unknown.features if sequences.unknown else None,
         shown,
         arguments.backend,
         arguments.precision,
@@ -194,35 +236,40 @@ def _evaluate(
     )
 
 
-def _settings_told(arguments: argparse.Namespace, drives: 'Drives') -> dict[str, Any]:
+def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dict[str, Any]:
     """Return everything that decides the numbers."""
     from stavpr_ros.sources.folder import text_of
 
+    poses = ('query_poses', 'map_poses', 'meters', 'degrees') if sequences.posed else ()
     names = [
-        *('map', 'query', 'dataset', 'topic', 'unknown', 'loop_closure', 'warp', 'crop_map', 'crop_query'),
-        *(('truth', 'query_poses', 'map_poses', 'meters', 'degrees') if drives.posed else ('truth',)),
-        *('mode', 'length', 'beta', 'spatial', 'sigma', 'xi', 'vertical', 'backend', 'precision'),
+        *('map', 'query', 'dataset', 'topic', 'unknown', 'loop_closure', 'exclude_places', 'warp'),
+        *('crop_map', 'crop_query', 'truth', *poses),
+        *('mode', 'sequence_length', 'beta', 'strategy', 'sigma', 'xi', 'vertical', 'nms_radius'),
+        *('backend', 'precision'),
     ]
-    told: dict[str, Any] = {name: getattr(arguments, name) for name in names}
-    told |= {name: text_of(value) for name, value in told.items() if isinstance(value, str)}
-    return {**told, 'tolerance': drives.tolerance, 'features': drives.query.settings.to_json()}
+    settings: dict[str, Any] = {}
+    for name in names:
+        value = getattr(arguments, name)
+        settings[name] = text_of(value) if isinstance(value, str) else value
+    features = sequences.query.settings.to_json()
+    return {**settings, 'tolerance': sequences.tolerance, 'features': features}
 
 
 def _report(arguments: argparse.Namespace) -> 'Report':
-    from stavpr_ros.commands.evaluate_sequences import load_drives
+    from stavpr_ros.commands.evaluate_sequences import load_sequences
     from stavpr_ros.evaluation.metrics import import_sklearn
     from stavpr_ros.evaluation.report import Report
 
     began = time.perf_counter()
-    import_sklearn()  # before the work, not after it
-    settings = recognition_settings(arguments)
-    drives = load_drives(arguments)
+    import_sklearn()  # an error before the work, not after it
+    settings = recognizer_settings(arguments)
+    sequences = load_sequences(arguments)
     loaded = time.perf_counter()
-    evaluation = _evaluate(arguments, drives, settings)
+    evaluation = _evaluate(arguments, sequences, settings)
     ended = time.perf_counter()
     milliseconds = evaluation.results.seconds * 1e3
     times = {
-        **drives.times,
+        **sequences.times,
         'drives_s': loaded - began,
         'recognition_s': ended - loaded,
         'recognition_median_ms': float(sorted(milliseconds)[len(milliseconds) // 2]),
@@ -230,26 +277,27 @@ def _report(arguments: argparse.Namespace) -> 'Report':
     }
     return Report(
         evaluation=evaluation,
-        query=drives.query,
-        reference=drives.reference or drives.query,
-        truth=drives.truth,
-        title=drives.title,
-        settings=_settings_told(arguments, drives),
+        query=sequences.query,
+        reference=sequences.reference or sequences.query,
+        title=sequences.title,
+        settings=_settings_json(arguments, sequences),
         times=times,
         default_threshold=_default_threshold(arguments.mode),
         window=arguments.window,
     )
 
 
-def _tell(report: 'Report') -> None:
-    """Print the numbers as a table."""
-    names = ('sequence', 'sequence_without_ends', 'single', 'single_without_ends')
+def _print_metrics(report: 'Report') -> None:
+    from stavpr_ros.evaluation.report import METRICS
+
     print(report.title)
     print(f'{"":28}{"sequences":>12}{"no ends":>12}{"single":>12}{"no ends":>12}')
-    numbers = [getattr(report.evaluation, name).to_json() for name in names]
+    numbers = [getattr(report.evaluation, name).to_json() for name in METRICS]
     rows = ('f1', 'threshold', 'average_precision', 'recall_at_1', 'recall_at_5', 'recall_at_10')
     for row in (*rows, 'recall_at_20', 'recall_at_100_precision'):
-        print(f'{row.replace("_", " "):28}' + ''.join(f'{number[row]:12.4f}' for number in numbers))
+        print(
+            f'{row.replace("_", " "):28}' + ''.join(f'{number[row]:12.4f}' for number in numbers)
+        )
     alarms = [report.evaluation.false_alarm_rate(kind) for kind in ('sequence', 'single')]
     if alarms[0] is not None:
         print(f'{"false alarm rate":28}{alarms[0]:12.4f}{"":12}{alarms[1]:12.4f}')
@@ -260,21 +308,25 @@ def _tell(report: 'Report') -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from stavpr_ros.evaluation.report import chosen_view, write_folder, write_json
+    from stavpr_ros.evaluation.report import chosen_window
+    from stavpr_ros.evaluation.report_files import write_folder, write_json
+    from stavpr_ros.evaluation.report_page import import_jinja2
 
     folder = arguments.output or (None if arguments.json else OUTPUT)
     if arguments.json:
         require_room(arguments.json)
-    if folder and Path(folder).is_file():
-        raise SourceError(f'{folder} is a file: --output takes a folder')
+    if folder:
+        import_jinja2()
+        if Path(folder).is_file():
+            raise SourceError(f'{folder} is a file: --output takes a folder')
     report = _report(arguments)
-    chosen_view(report.evaluation, arguments.window)  # an image without a window is refused before writing
-    _tell(report)
+    chosen_window(report.evaluation, arguments.window)  # an invalid image fails before writing
+    _print_metrics(report)
     if arguments.json:
         write_json(report, Path(arguments.json))
         print(f'numbers: {arguments.json}')
     if folder:
-        print(f'report: {write_folder(report, Path(folder))[0]}')
+        print(f'report: {write_folder(report, Path(folder))}')
 
 
 def main(args: list[str] | None = None) -> int:
@@ -283,7 +335,7 @@ def main(args: list[str] | None = None) -> int:
     wait_passively()
     try:
         parser = _parser()
-        # what decides a saved map's features must not be mistaken for a wish: None = not given
+        # None = not given: a saved map decides these then
         given = argparse.Namespace(features=None, strips=None, seed=None)
         arguments = parser.parse_args(args, given)
         _check(parser, arguments)

@@ -1,11 +1,11 @@
-"""``ros2 run stavpr_ros experiments``: the paper's tables, on data sets that you have, beside its numbers."""
+"""``ros2 run stavpr_ros experiments``: the paper's tables, computed and published."""
 
 import argparse
 import json
+from pathlib import Path
 import shlex
 import sys
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.errors import SettingsError, SourceError, StavprError
 from stavpr_ros.output_file import require_room
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from stavpr_ros.evaluation.paper.datasets import Dataset
     from stavpr_ros.evaluation.paper.experiments import Configuration
 
-METRICS = ('f1', 'average_precision', 'recall_at_1', 'recall_at_5', 'recall_at_100_precision')
+COLUMNS = ('f1', 'average_precision', 'recall_at_1', 'recall_at_5', 'recall_at_100_precision')
 EMPTY = '-'
 
 DESCRIPTION = """
-Runs one of the paper's experiments on several data sets with several kinds of features and prints the table
-beside the published numbers (F1; the paper has no others).
+Runs one of the paper's experiments on several data sets with several kinds of features and prints
+the table beside the published numbers (F1; the paper has no others).
 """
 
 EPILOG = """
@@ -31,20 +31,21 @@ experiments:
   ablation     no alignment, only spatial, only temporal, both
   strategies   sliding window, vanilla DTW, adaptive DTW
   fast         random projection (GRP) and restricted alignment (RA), off and on
-  robust_options        the paper, mode robust, and robust without each of its robust_options
+  robust_options  the paper, mode robust, and robust without each of its options
   sweep        one of l, beta, xi, sigma, W (--parameter), all others at their defaults
 
-data sets: nordland gardens_point gardens_point_night ua berlin_a100; synth_ before a name crops the images as
-synth-Nord is cropped
+data sets: nordland gardens_point gardens_point_night ua berlin_a100; synth_ before a name crops
+the images as synth-Nord
 
 examples:
   experiments paper --data folder_of_all --datasets nordland synth_nordland gardens_point
-  experiments strategies --datasets gardens_point=data/gp --features onnx --onnx-model m.onnx --onnx-layer x
+  experiments strategies --datasets gardens_point=data/gp --features onnx --onnx-model m.onnx \\
+      --onnx-layer x
   experiments ablation --data all --backbone 'small=--features gradient --gradient-cell 32' \\
       --backbone 'net=--features onnx --onnx-model m.onnx --onnx-layer x'
   experiments sweep --parameter sigma --values 0 0.5 1 2 --data all
 
-exit codes: 0 done, 1 something failed (the reason is printed), 2 usage, 130 interrupted
+exit codes: 0 done, 1 failed (the reason is printed), 2 usage, 130 interrupted
 """
 
 
@@ -61,16 +62,25 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('experiment', choices=(*PRESETS, 'sweep'), help='see below')
     parser.add_argument('--data', metavar='FOLDER', help='the folder that holds the data sets')
     parser.add_argument(
-        '--datasets', nargs='+', metavar='NAME[=FOLDER]', help="those to run (the paper's that are in --data)"
+        '--datasets',
+        nargs='+',
+        metavar='NAME[=FOLDER]',
+        help='data sets to run (those of the paper in --data)',
     )
     parser.add_argument(
         '--backbone', action='append', metavar='LABEL=OPTIONS',
-        help='features options, in quotes; may be given several times (those below)',
+        help='options of the features, in quotes; may be repeated (the options below)',
     )  # fmt: skip
-    parser.add_argument('--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)')
-    parser.add_argument('--metric', choices=METRICS, default='f1', help='what is printed (%(default)s)')
+    parser.add_argument(
+        '--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)'
+    )
+    parser.add_argument(
+        '--metric', choices=COLUMNS, default='f1', help='number to print (%(default)s)'
+    )
     parser.add_argument('--parameter', choices=tuple(SWEEPS), help='of sweep (l)')
-    parser.add_argument('--values', nargs='+', type=float, default=(), metavar='X', help='of sweep')
+    parser.add_argument(
+        '--values', nargs='+', type=float, default=(), metavar='X', help='of sweep'
+    )
     parser.add_argument('--json', metavar='FILE', help='write all numbers')
     add_feature_options(parser)
     return parser
@@ -87,7 +97,7 @@ def _columns(arguments: argparse.Namespace) -> 'tuple[Configuration, ...]':
 
 
 def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset]':
-    """Open the data sets that are named, or all that are there."""
+    """Open the requested data sets, or all that are found."""
     from stavpr_ros.evaluation.paper.datasets import open_dataset
     from stavpr_ros.evaluation.paper.published import F1
 
@@ -112,7 +122,7 @@ def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset]':
 
 
 def _backbones(arguments: argparse.Namespace) -> dict[str, argparse.Namespace]:
-    """Return the features options of each row's backbone, by its label."""
+    """Return the options of each row's features, by label."""
     from stavpr_ros.commands.feature_options import add_feature_options
 
     if not arguments.backbone:
@@ -122,7 +132,9 @@ def _backbones(arguments: argparse.Namespace) -> dict[str, argparse.Namespace]:
     add_feature_options(parser)
     untouched = vars(parser.parse_args([], argparse.Namespace(features=None)))
     if any(getattr(arguments, name) != value for name, value in untouched.items()):
-        raise SettingsError('features options beside --backbone: write them into those of each backbone')
+        raise SettingsError(
+            'options of features beside --backbone: write them into each --backbone'
+        )
     found = {}
     for entry in arguments.backbone:
         label, separator, options = entry.partition('=')
@@ -137,11 +149,13 @@ def _backbones(arguments: argparse.Namespace) -> dict[str, argparse.Namespace]:
 
 
 def _checked(options: argparse.Namespace) -> argparse.Namespace:
-    """Refuse features options that the experiment decides."""
+    """Reject options of features that the experiment sets itself."""
     from stavpr_ros.evaluation.paper.experiments import W
 
     if options.strips != W or options.projection is not None or options.seed:
-        raise SettingsError('--strips, --projection, --seed: the experiment decides them; leave them out')
+        raise SettingsError(
+            '--strips, --projection, --seed: the experiment sets them; leave them out'
+        )
     return options
 
 
@@ -153,34 +167,38 @@ def _run_row(
     name: str,
 ) -> 'dict[str, Metrics | None]':
     """Run all columns of a row; None where the data set is too short for one."""
-    from tqdm import tqdm
-
     from stavpr_ros.commands.feature_options import make_extractor
     from stavpr_ros.devices import choose_device
-    from stavpr_ros.evaluation.paper.experiments import Bench
+    from stavpr_ros.evaluation.paper.experiments import DatasetExperiment
+    from tqdm import tqdm
 
     features = make_extractor(options).settings
-    bench = Bench(dataset, features.kind, features.backbone, mode, choose_device(options.device))
+    device = choose_device(options.device)
+    experiment = DatasetExperiment(dataset, features.kind, features.backbone, mode, device)
     found: dict[str, Metrics | None] = {}
     for column in tqdm(columns, desc=name, unit='column', disable=None):
         too_short = len(dataset.query) < column.sequence.length
-        found[column.name] = None if too_short else bench.judge(column)
+        found[column.name] = None if too_short else experiment.evaluate(column)
     return found
 
 
-def _published(dataset: str, columns: 'tuple[Configuration, ...]') -> dict[str, list[float | None]]:
-    """Return the published F1 for the columns, by backbone; none where the paper has nothing."""
-    from stavpr_ros.evaluation.paper.published import DENSENET, VGG, published_f1
+def _published(
+    dataset: str, columns: 'tuple[Configuration, ...]'
+) -> dict[str, list[float | None]]:
+    """Return the published F1 of the columns, by backbone; None where the paper has none."""
+    from stavpr_ros.evaluation.paper.published import DENSENET, published_f1, VGG
 
     rows = {
         backbone: [published_f1(dataset, backbone, column.name) for column in columns]
         for backbone in (DENSENET, VGG)
     }
-    return {backbone: row for backbone, row in rows.items() if any(value is not None for value in row)}
+    return {
+        backbone: row for backbone, row in rows.items() if any(value is not None for value in row)
+    }
 
 
 def _table(rows: list[list[str]]) -> str:
-    """Align the cells of a table: text left, numbers right, a rule below the head."""
+    """Format a table: text left-aligned, numbers right-aligned, a rule below the head."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = [
         '  '.join(
@@ -198,7 +216,7 @@ def _number(value: float | None) -> str:
 
 def _run(arguments: argparse.Namespace) -> None:
     from stavpr_ros.evaluation.metrics import import_sklearn
-    from stavpr_ros.evaluation.report_html import jsonable
+    from stavpr_ros.evaluation.report import jsonable
 
     import_sklearn()
     if arguments.json:
@@ -208,8 +226,10 @@ def _run(arguments: argparse.Namespace) -> None:
     results: list[dict[str, Any]] = []
     for name, dataset in datasets.items():
         for label, options in backbones.items():
-            judged = _run_row(dataset, options, columns, arguments.mode, f'{name}, {label}')
-            numbers = {key: None if found is None else found.to_json() for key, found in judged.items()}
+            metrics = _run_row(dataset, options, columns, arguments.mode, f'{name}, {label}')
+            numbers = {
+                key: None if found is None else found.to_json() for key, found in metrics.items()
+            }
             cells = [None if row is None else row[arguments.metric] for row in numbers.values()]
             rows.append([name, label, *map(_number, cells)])
             results.append({'dataset': name, 'features': label, 'results': numbers})
@@ -222,7 +242,9 @@ def _run(arguments: argparse.Namespace) -> None:
     print(_table(rows))
     if arguments.json:
         try:
-            Path(arguments.json).write_text(json.dumps(jsonable(results), indent=2) + '\n', encoding='utf-8')
+            Path(arguments.json).write_text(
+                json.dumps(jsonable(results), indent=2) + '\n', encoding='utf-8'
+            )
         except OSError as error:
             raise SourceError(f'{arguments.json} cannot be written: {error}') from error
 

@@ -1,10 +1,10 @@
-"""Command-line options of the features, made from each kind's settings."""
+"""Command-line options of the features, generated from each kind's settings."""
 
 import argparse
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
-from stavpr_ros.devices import DEVICES, choose_device
+from stavpr_ros.devices import choose_device, DEVICES
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features.registry import KINDS, settings_class
 
@@ -29,19 +29,33 @@ def _converter(example: Any) -> Any:
 
 
 def add_feature_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--features``, the general options, and ``--KIND-NAME`` for each setting of each kind."""
+    """Add ``--features``, the general options and ``--KIND-NAME`` for each setting of a kind."""
     group = parser.add_argument_group('features')
     group.add_argument(
-        '--features', choices=list(KINDS), default='gradient', help='kind of features (%(default)s)'
+        '--features',
+        choices=list(KINDS),
+        default='gradient',
+        help='kind of features (%(default)s)',
     )
     group.add_argument(
-        '--strips', type=int, default=7, metavar='W', help='vertical strips of an image (%(default)s)'
+        '--strips',
+        type=int,
+        default=7,
+        metavar='W',
+        help='vertical strips of an image (%(default)s)',
     )
     group.add_argument(
-        '--projection', type=int, metavar='D', help='random projection of each strip to D dimensions (none)'
+        '--projection',
+        type=int,
+        metavar='D',
+        help='random projection of each strip to D dimensions (none)',
     )
-    group.add_argument('--seed', type=int, default=0, help='of the random projection (%(default)s)')
-    group.add_argument('--device', default='auto', choices=DEVICES, help='where features are computed')
+    group.add_argument(
+        '--seed', type=int, default=0, help='of the random projection (%(default)s)'
+    )
+    group.add_argument(
+        '--device', default='auto', choices=DEVICES, help='where features are computed'
+    )
     for kind in KINDS:
         group = parser.add_argument_group(f'features {kind}')
         for row in dataclasses.fields(settings_class(kind)):
@@ -58,9 +72,9 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
 
 def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':
     """
-    Make the extractor that the parsed options ask for.
+    Return the extractor of the parsed options.
 
-    :raises SettingsError: options that are missing, out of range or of another kind.
+    :raises SettingsError: an option is missing, out of range or of another kind.
     """
     from stavpr_ros.features import FeatureExtractor
 
@@ -75,9 +89,12 @@ def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':
 
 
 def kind_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return what was given as ``--KIND-NAME``, by that name; None = not given."""
+    """Return the values of the options ``--KIND-NAME``, by option; None = not given."""
     rows = [(kind, row.name) for kind in KINDS for row in dataclasses.fields(settings_class(kind))]
-    return {f'--{kind}-{name.replace("_", "-")}': getattr(arguments, f'{kind}_{name}') for kind, name in rows}
+    return {
+        f'--{kind}-{name.replace("_", "-")}': getattr(arguments, f'{kind}_{name}')
+        for kind, name in rows
+    }
 
 
 def _backbone_settings(arguments: argparse.Namespace) -> Any:
@@ -98,12 +115,12 @@ def _backbone_settings(arguments: argparse.Namespace) -> Any:
             raise SettingsError(
                 f'{name} was given with --features {arguments.features}: give --features {kind}'
             )
-    wanted = settings_class(arguments.features)
+    chosen = settings_class(arguments.features)
     missing = [
         f'--{arguments.features}-{row.name.replace("_", "-")}'
-        for row in dataclasses.fields(wanted)
+        for row in dataclasses.fields(chosen)
         if row.default is dataclasses.MISSING and row.name not in given[arguments.features]
     ]
     if missing:
         raise SettingsError(f'--features {arguments.features} needs {" and ".join(missing)}')
-    return wanted(**given[arguments.features])
+    return chosen(**given[arguments.features])

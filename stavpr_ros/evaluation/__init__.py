@@ -1,1 +1,1 @@
-"""Evaluation: metrics, thresholds, the demonstration world, pictures."""
+"""Evaluation: ground truth, metrics, reports, baselines."""

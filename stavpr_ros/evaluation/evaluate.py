@@ -2,33 +2,30 @@
 Evaluation of a traverse, recognized image by image as in the node.
 
 Every image has two results: the nearest place to the image alone, and the place that the window
-around it was matched with. Only one row of distances exists at a time, so that the length of a
-traverse is limited by time, not by memory.
+around it was matched with. The rows of distances are not kept: memory does not limit the length.
 """
 
-import time
 from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+import time
 from typing import Protocol
 
 import numpy as np
-from tqdm import tqdm
-
 from stavpr_ros.errors import InputError
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.metrics import (
-    RANKS,
+    evaluate_ranking,
+    image_matches,
     Metrics,
     Ranking,
-    evaluate_ranking,
-    false_alarm_rate,
-    image_matches,
+    RANKS,
     smallest_indices,
 )
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
+from tqdm import tqdm
 
 MARGIN = 8  # places beside the path of a window whose distances are kept
 MATRIX_SIDE = 900  # cells along a side of the reduced distance matrix
@@ -45,7 +42,7 @@ class OnlineRecognizer(Protocol):
         """Scores of the newest image against every place, shape (n,), small is near."""
 
     def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return up to ``count`` distinct places of the last window, nearest first, and distances."""
+        """Return up to ``count`` places of the last window, nearest first, and their distances."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +104,7 @@ class Evaluation:
 
     :param sequence_length: images in a window, l.
     :param sequence_without_ends, single_without_ends: of the images in :attr:`centered`.
-    :param unknown: results of a traverse through places that are not in the map, if there was one.
+    :param unknown: results of a traverse of places that are not in the map, if there was one.
     """
 
     results: TraverseResults
@@ -135,7 +132,8 @@ class Evaluation:
             return None
         metrics: Metrics = getattr(self, kind)
         scores = getattr(self.unknown, kind).scores
-        return false_alarm_rate(scores, metrics.best.threshold if threshold is None else threshold)
+        limit = metrics.best.threshold if threshold is None else threshold
+        return int(np.count_nonzero(scores < limit)) / len(scores)
 
 
 def centered_images(count: int, length: int) -> slice:
@@ -152,9 +150,7 @@ def centered_images(count: int, length: int) -> slice:
     return slice(middle, count - (length - 1 - middle))
 
 
-def recognize_all(
-    recognizer: PlaceRecognizer, features: LocalFeatures, progress: bool = False
-) -> list[Match]:
+def recognize_all(recognizer: PlaceRecognizer, features: LocalFeatures) -> list[Match]:
     """
     Recognize every image of a sequence, starting with an empty window.
 
@@ -162,10 +158,7 @@ def recognize_all(
     :returns: N matches, one an image.
     """
     recognizer.reset()
-    images = tqdm(
-        range(len(features)), desc='recognizing', unit='image', disable=None if progress else True
-    )
-    return [recognizer.update(features[i : i + 1]) for i in images]
+    return [recognizer.update(features[i : i + 1]) for i in range(len(features))]
 
 
 def recognize_traverse(
@@ -245,9 +238,9 @@ def evaluate_on_map(
 
     def results(features: LocalFeatures, label: str) -> TraverseResults:
         # a new recognizer for each: mode robust keeps statistics of the images so far
-        recognizer = PlaceRecognizer(place_map, settings, backend, precision)
-        label = label if progress else ''
-        return recognize_traverse(recognizer, features, len(place_map), settings, shown, label)
+        one = PlaceRecognizer(place_map, settings, backend, precision)
+        bar = label if progress else ''
+        return recognize_traverse(one, features, len(place_map), settings, shown, bar)
 
     centered_images(len(query), settings.sequence.length)
     known = results(query, 'recognizing')
@@ -293,12 +286,12 @@ def evaluate_traverse(
     :param length: images in a window, l.
     :raises InputError: fewer images than one window, or ground truth of another length.
     """
-    if ground_truth.N != len(results.single):
+    count = len(results.single)
+    if count != ground_truth.N:
         raise InputError(
-            f'ground truth of {ground_truth.N} images for {len(results.single)} images: '
-            'expected one row an image'
+            f'ground truth of {ground_truth.N} images for {count} images: expected a row each'
         )
-    centered = centered_images(len(results.single), length)
+    centered = centered_images(count, length)
     return Evaluation(
         results,
         ground_truth,

@@ -1,4 +1,4 @@
-"""Ground truth: which places of the map are right for each query image."""
+"""Ground truth: which places of the map are correct for each query image."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,20 +6,19 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-
 from stavpr_ros.errors import InputError
-from stavpr_ros.evaluation.ground_truth_files import read_pairs, read_poses
+from stavpr_ros.evaluation.ground_truth_files import read_pairs
 
 CHUNK = 1_000_000  # pairs of poses compared at a time
-LISTED = 10  # images that an error names, of however many
+LISTED = 10  # images that an error names
 
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
     """
-    The accepted places of each query; make it with one of the constructors.
+    The accepted places of each query; made by one of the constructors.
 
-    Tolerances are part of it: every place that counts as right is an accepted one.
+    Tolerances are part of it: every place that counts as correct is an accepted one.
 
     :param N: number of query images.
     :param n: number of places of the map.
@@ -31,18 +30,22 @@ class GroundTruth:
     keys: np.ndarray
 
     @classmethod
-    def from_pairs(cls, queries: np.ndarray, places: np.ndarray, N: int, n: int, tolerance: int = 0) -> Self:
+    def from_pairs(
+        cls, queries: np.ndarray, places: np.ndarray, N: int, n: int, tolerance: int = 0
+    ) -> Self:
         """
         Accept the given pairs.
 
         :param queries: shape (M,), integers 0 .. N - 1, in any order.
         :param places: shape (M,), integers 0 .. n - 1.
-        :param tolerance: so many places before and after an accepted one are accepted too.
+        :param tolerance: places before and after an accepted one that are accepted as well.
         :raises InputError: a pair outside N queries and n places.
         """
         queries, places = np.asarray(queries, np.int64), np.asarray(places, np.int64)
         if N < 1 or n < 1:
-            raise InputError(f'ground truth of {N} queries in {n} places: expected at least one of each')
+            raise InputError(
+                f'ground truth of {N} queries in {n} places: expected at least one of each'
+            )
         if queries.shape != places.shape or queries.ndim != 1:
             raise InputError(
                 f'{queries.shape} queries and {places.shape} places: expected one of each a pair'
@@ -51,22 +54,23 @@ class GroundTruth:
         if outside.any():
             first = int(np.argmax(outside))
             raise InputError(
-                f'ground truth pairs query {queries[first]} with place {places[first]}: expected queries '
-                f'0 .. {N - 1} and places 0 .. {n - 1}; is it that of other images, or counted from 1?'
+                f'ground truth pairs query {queries[first]} with place {places[first]}: expected '
+                f'queries 0 .. {N - 1} and places 0 .. {n - 1}; is it that of other images, or '
+                'counted from 1?'
             )
         return cls(N, n, np.unique(queries * n + places)).widened(tolerance)
 
     @classmethod
     def identity(cls, N: int, n: int, tolerance: int = 0) -> Self:
         """
-        Accept the same index: both drives have equally many images, image for image of the same places.
+        Accept the same index: image i of both traverses shows the same place.
 
         :raises InputError: N and n differ.
         """
         if n != N:
             raise InputError(
-                f'{N} query images and {n} places: the same index is the truth only where both are equally '
-                'many; give a file of accepted pairs'
+                f'{N} query images and {n} places: the same index is the ground truth only of '
+                'equally many; give a file of accepted pairs'
             )
         return cls.from_pairs(np.arange(N), np.arange(n), N, n, tolerance)
 
@@ -75,12 +79,12 @@ class GroundTruth:
         """
         Read accepted pairs; queries and places are counted from 0.
 
-        * Text (.csv, .tsv, .txt): a line a pair, query and place, after a header or without one. A column
-          alone holds the place of query 0, 1, 2 and so on. A place of -1 = none in the map.
-        * Array (.npy, .npz with one array or one called ``truth``): shape (N, n), 0 or 1; else shape (M, 2),
-          pairs; or shape (N,), the place of each query, -1 = none.
-        * Black and white image, N high and n wide: white at row i, column j accepts place j for query i.
-          For loop closures, where both are one drive, see :meth:`loop_closures`.
+        * Text (.csv, .tsv, .txt): a line a pair, query and place, with or without a header. A
+          single column holds the place of query 0, 1, 2 and so on. A place of -1 = not in the map.
+        * Array (.npy, .npz with one array or one called ``truth``): shape (N, n), 0 or 1; else
+          shape (M, 2), pairs; or shape (N,), the place of each query, -1 = none.
+        * Black and white image, N high and n wide: white at row i, column j accepts place j for
+          query i. For loop closures, where both are one traverse, see :meth:`loop_closures`.
 
         :raises SourceError: the file cannot be read, or holds objects (pickles).
         :raises InputError: it is that of other images: wrong size, or indices outside.
@@ -96,21 +100,23 @@ class GroundTruth:
         cls, queries: np.ndarray, places: np.ndarray, meters: float, degrees: float | None = None
     ) -> Self:
         """
-        Accept places that are near and look the same way.
+        Accept places that are near and have a similar orientation.
 
         :param queries: x y z (meters), quaternion x y z w of each query, shape (N, 7).
-        :param places: the same of each place, shape (n, 7); a row of NaN = unknown, which accepts nothing.
+        :param places: of each place, shape (n, 7); a row of NaN = unknown, never accepted.
         :param meters: largest distance, >= 0.
         :param degrees: largest angle between the two orientations, >= 0; None = any.
-        :raises InputError: a query whose pose is not known, or no place whose pose is; poses that are none.
+        :raises InputError: a query without a pose, no place with one, or values that are no poses.
         """
         query, place = _checked_poses(queries, 'query'), _checked_poses(places, 'map')
         unknown = np.flatnonzero(np.isnan(query[:, 0]))
         if len(unknown):
-            listed = ', '.join(map(str, unknown[:LISTED])) + (' ...' if len(unknown) > LISTED else '')
+            listed = ', '.join(map(str, unknown[:LISTED])) + (
+                ' ...' if len(unknown) > LISTED else ''
+            )
             raise InputError(
-                f'{len(unknown)} of {len(query)} query images have no pose ({listed}): give poses of all, or '
-                'leave these images out'
+                f'{len(unknown)} of {len(query)} query images have no pose ({listed}): give poses '
+                'of all, or leave these images out'
             )
         if not meters >= 0 or (degrees is not None and not degrees >= 0):
             raise InputError(f'{meters} meters and {degrees} degrees: expected numbers >= 0')
@@ -124,35 +130,10 @@ class GroundTruth:
                 # a quaternion and its negative are the same rotation: the angle is 2 acos |<p, q>|
                 cosines = np.abs(np.sum(part[found[:, 0], 3:] * place[found[:, 1], 3:], axis=1))
                 angles = 2 * np.degrees(np.arccos(np.minimum(cosines, 1)))
-                found = found[angles <= degrees + 1e-5]  # acos is coarse near 1
+                found = found[angles <= degrees + 1e-5]  # acos is inexact near 1
             pairs.append(found + np.array([first, 0]))
         accepted = np.concatenate(pairs)
         return cls.from_pairs(accepted[:, 0], accepted[:, 1], len(query), len(place))
-
-    @classmethod
-    def from_pose_files(
-        cls,
-        queries: str | Path,
-        places: str | Path,
-        N: int,
-        n: int,
-        meters: float,
-        degrees: float | None = None,
-    ) -> Self:
-        """
-        Read poses, a line an image, as ``build_map --poses`` does, and compare them: :meth:`from_poses`.
-
-        :raises InputError: not one pose an image; degrees asked of poses that have no orientation.
-        """
-        poses = []
-        for path, count in ((queries, N), (places, n)):
-            found, oriented = read_poses(Path(path))
-            if len(found) != count:
-                raise InputError(f'{path} has {len(found)} poses for {count} images: give one each')
-            if degrees is not None and not oriented:
-                raise InputError(f'{path} has no orientations: leave degrees = {degrees} out')
-            poses.append(found)
-        return cls.from_poses(poses[0], poses[1], meters, degrees)
 
     @property
     def pairs(self) -> np.ndarray:
@@ -161,12 +142,12 @@ class GroundTruth:
 
     @cached_property
     def has_match(self) -> np.ndarray:
-        """Tell which queries are in the map at all, shape (N,), bool."""
+        """Whether a query has an accepted place, shape (N,), bool."""
         return self._counts > 0
 
     @cached_property
     def middles(self) -> np.ndarray:
-        """Return the middle one of each query's accepted places, shape (N,), int64; -1 = none."""
+        """The middle one of each query's accepted places, shape (N,), int64; -1 = none."""
         found = np.full(self.N, -1, np.int64)
         ends = np.cumsum(self._counts)
         at = (2 * ends - self._counts - 1) // 2
@@ -177,30 +158,39 @@ class GroundTruth:
     def _counts(self) -> np.ndarray:
         return np.bincount(self.keys // self.n, minlength=self.N)
 
+    def accepted(self, query: int) -> np.ndarray:
+        """Return the accepted places of one query, sorted, shape (k,), int64."""
+        first, end = np.searchsorted(self.keys, [query * self.n, (query + 1) * self.n])
+        return self.keys[first:end] % self.n
+
     def matrix(self) -> np.ndarray:
-        """Return all of it as an array for drawing, shape (N, n), bool: a byte a pair."""
+        """Return the accepted pairs as a matrix, shape (N, n), bool: a byte a pair."""
         matrix = np.zeros(self.N * self.n, bool)
         matrix[self.keys] = True
         return matrix.reshape(self.N, self.n)
 
     def accepts(self, places: np.ndarray) -> np.ndarray:
         """
-        Tell which answers are right.
+        Return which places are correct.
 
-        :param places: the answer to each query, shape (N,), or several, shape (N, k); integers, -1 = none,
-            which is never right.
+        :param places: the place of each query, shape (N,), or several, shape (N, k); integers,
+            -1 = none, which is never correct.
         :returns: bool, of the same shape.
         :raises InputError: another shape or type, or a place that the map does not have.
         """
         places = np.asarray(places)
-        if places.ndim not in (1, 2) or len(places) != self.N or not np.issubdtype(places.dtype, np.integer):
+        if (
+            places.ndim not in (1, 2)
+            or len(places) != self.N
+            or not np.issubdtype(places.dtype, np.integer)
+        ):
             raise InputError(
-                f'answers are {places.dtype} of shape {places.shape}: expected integers, a row a query, '
-                f'({self.N},) or ({self.N}, k)'
+                f'places are {places.dtype} of shape {places.shape}: expected integers, a row a '
+                f'query, ({self.N},) or ({self.N}, k)'
             )
         if places.size and not (places.min() >= -1 and places.max() < self.n):
             raise InputError(
-                f'answers {places.min()} .. {places.max()}: expected places 0 .. {self.n - 1}, or -1'
+                f'places {places.min()} .. {places.max()}: expected 0 .. {self.n - 1}, -1 = none'
             )
         if not self.keys.size:
             return np.zeros(places.shape, bool)
@@ -210,7 +200,11 @@ class GroundTruth:
         return (self.keys[at] == wanted) & (places >= 0)
 
     def widened(self, tolerance: int) -> Self:
-        """Accept so many places before and after each accepted one as well."""
+        """
+        Accept ``tolerance`` places before and after each accepted one as well.
+
+        :raises InputError: no whole number >= 0.
+        """
         if not tolerance >= 0 or not float(tolerance).is_integer():
             raise InputError(f'tolerance {tolerance}: expected a whole number of places >= 0')
         if tolerance == 0:
@@ -223,35 +217,41 @@ class GroundTruth:
 
     def select(self, indices: np.ndarray) -> Self:
         """
-        Return the truth of a changed drive.
+        Return the ground truth of some of the queries.
 
-        :param indices: which query is each image of it, shape (K,); may repeat and leave out.
+        :param indices: query of each row of the result, shape (K,), in any order, repeated or not.
+        :raises InputError: another shape or type, or a query that does not exist.
         """
         indices = np.asarray(indices)
         if indices.ndim != 1 or not indices.size or not np.issubdtype(indices.dtype, np.integer):
-            raise InputError(f'indices are {indices.dtype} of shape {indices.shape}: expected integers (K,)')
+            raise InputError(
+                f'indices are {indices.dtype} of shape {indices.shape}: expected integers (K,)'
+            )
         if indices.min() < 0 or indices.max() >= self.N:
-            raise InputError(f'indices {indices.min()} .. {indices.max()}: expected 0 .. {self.N - 1}')
+            raise InputError(
+                f'indices {indices.min()} .. {indices.max()}: expected 0 .. {self.N - 1}'
+            )
         counts = self._counts[indices]
         firsts = np.searchsorted(self.keys, indices.astype(np.int64) * self.n)
-        # position of each pair in keys: its run's first, plus how far it is into the run
+        # position of each pair in keys: that of its query's first pair, plus its rank in the query
         at = np.repeat(firsts - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
         rows = np.repeat(np.arange(len(indices)), counts)
         return type(self)(len(indices), self.n, rows * self.n + self.keys[at] % self.n)
 
     def loop_closures(self, exclude: int = 0) -> Self:
         """
-        Return the truth for one drive that is its own map: of each pair, the later image is the query.
+        Return the ground truth of one traverse on its own past: the later image is the query.
 
-        It does not matter which triangle of a square image is white, the lower one (row = query, as
+        Either triangle of a square matrix may hold the pairs, the lower one (row = query, as
         RTAB-Map writes it), the upper one or both.
 
-        :param exclude: the newest so many images before the query are no places yet.
+        :param exclude: the latest images before the query that are not part of the map.
         :raises InputError: N and n differ.
         """
         if self.n != self.N:
             raise InputError(
-                f'{self.N} queries, {self.n} places: loop closures need one drive, as many of both'
+                f'{self.N} queries, {self.n} places: loop closures need one traverse, as many of '
+                'both'
             )
         if exclude < 0:
             raise InputError(f'{exclude} excluded images: expected 0 or more')
@@ -262,7 +262,7 @@ class GroundTruth:
 
 
 def _checked_poses(poses: np.ndarray, name: str) -> np.ndarray:
-    """Return poses with quaternions of norm 1; rows of NaN, which are unknown, stay so."""
+    """Return poses with quaternions of norm 1; unknown poses stay rows of NaN."""
     poses = np.array(poses, np.float64)
     if poses.ndim != 2 or poses.shape[1] != 7 or not len(poses):
         raise InputError(f'{name} poses have shape {poses.shape}: expected (images, 7)')
@@ -271,6 +271,6 @@ def _checked_poses(poses: np.ndarray, name: str) -> np.ndarray:
     if not np.isfinite(poses[known]).all() or not lengths.all():
         raise InputError(f'{name} poses: expected finite numbers and quaternions other than 0')
     if not known.any():
-        raise InputError(f'{name} poses: not one of {len(poses)} is known; give others')
+        raise InputError(f'{name} poses: none of {len(poses)} is known; give others')
     poses[:, 3:] /= lengths
     return poses

@@ -1,18 +1,17 @@
-"""The files in which people keep ground truth: text, arrays, black and white images, poses."""
+"""Files of ground truth: text, arrays, black and white images, poses."""
 
 import csv
+from pathlib import Path
 import re
 import zipfile
-from pathlib import Path
 
 import cv2
 import numpy as np
-
 from stavpr_ros.errors import InputError, SourceError
 from stavpr_ros.sources.folder import SUFFIXES
 
 TEXT, ARRAYS = ('.csv', '.tsv', '.txt'), ('.npy', '.npz')
-NAME = 'truth'  # of the array that counts in an .npz with several
+NAME = 'truth'  # of the array to read from an .npz with several
 QUERY_WORDS = ('query', 'live', 'current')
 PLACE_WORDS = ('place', 'ref', 'map', 'database', 'historical')
 BLACK, WHITE = 32, 223  # gray levels; between them an image is not black and white
@@ -24,8 +23,7 @@ def read_pairs(path: Path, N: int, n: int) -> Pairs:
     """
     Read accepted pairs; see :meth:`stavpr_ros.evaluation.ground_truth.GroundTruth.from_file`.
 
-    :returns: queries and places, shape (M,) each, int64, not yet held against N and n where the file does
-        not say how many there are.
+    :returns: queries and places, shape (M,), int64; those of text and pairs may exceed N and n.
     :raises SourceError: the file cannot be read.
     :raises InputError: its size is not that of N queries and n places, or it accepts nothing.
     """
@@ -38,11 +36,11 @@ def read_pairs(path: Path, N: int, n: int) -> Pairs:
         queries, places = _from_image(path, N, n)
     else:
         raise SourceError(
-            f'ground truth {path}: expected text ({" ".join(TEXT)}), an array ({" ".join(ARRAYS)}) or a '
-            'black and white image (.png .bmp ...)'
+            f'ground truth {path}: expected text ({" ".join(TEXT)}), an array '
+            f'({" ".join(ARRAYS)}) or a black and white image (.png .bmp ...)'
         )
     if not queries.size:
-        raise InputError(f'ground truth {path} accepts no pair at all: is it the right file?')
+        raise InputError(f'ground truth {path} accepts no pair: is it the right file?')
     return queries, places
 
 
@@ -50,12 +48,13 @@ def read_poses(path: Path) -> tuple[np.ndarray, bool]:
     """
     Read poses as ``build_map --poses`` takes them: x,y,z or x,y,z,qx,qy,qz,qw a line, meters.
 
-    :returns: shape (images, 7), float64, and whether the file had orientations.
-    :raises SourceError: it cannot be read.
+    :returns: shape (images, 7), float64, and whether the file has orientations.
+    :raises SourceError: the file cannot be read.
     """
     try:
         with path.open(newline='') as file:
-            rows = [[float(value) for value in row] for row in csv.reader(file) if row and row[0][:1] != '#']
+            lines = [row for row in csv.reader(file) if row and row[0][:1] != '#']
+            rows = [[float(value) for value in row] for row in lines]
     except (OSError, ValueError) as error:
         raise SourceError(f'poses {path} cannot be read: {error}') from error
     if {len(row) for row in rows} not in ({3}, {7}):
@@ -86,12 +85,14 @@ def _is_number(cell: str) -> bool:
 
 
 def _columns(names: list[str] | None, width: int, path: Path) -> tuple[int | None, int]:
-    """Find the columns of query and place; None = the query is the line's number."""
+    """Return the columns of query and place; None = the query is the line's number."""
     if names is not None:
         found = []
         for words in (QUERY_WORDS, PLACE_WORDS):
-            hits = [i for i, name in enumerate(names) if any(word in name.casefold() for word in words)]
-            found.append(hits[0] if len(hits) == 1 else None)
+            columns = [
+                i for i, name in enumerate(names) if any(word in name.casefold() for word in words)
+            ]
+            found.append(columns[0] if len(columns) == 1 else None)
         query, place = found
         if place is not None and query != place:
             return query, place
@@ -100,8 +101,8 @@ def _columns(names: list[str] | None, width: int, path: Path) -> tuple[int | Non
     if width == 2:
         return 0, 1
     raise SourceError(
-        f'ground truth {path} has {width} columns: expected two, query and place, or a header that calls '
-        'them so'
+        f'ground truth {path} has {width} columns: expected two, query and place, or a header '
+        'with these names'
     )
 
 
@@ -110,7 +111,11 @@ def _from_text(path: Path, N: int) -> Pairs:
         lines = path.read_text(encoding='utf-8-sig').splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise SourceError(f'ground truth {path} cannot be read: {error}') from error
-    rows = [(i, _cells(line)) for i, line in enumerate(lines, 1) if line.strip() and line.lstrip()[0] != '#']
+    rows = [
+        (number, _cells(line))
+        for number, line in enumerate(lines, 1)
+        if line.strip() and line.lstrip()[0] != '#'
+    ]
     names = None
     if rows and not all(_is_number(cell) for cell in rows[0][1]):
         names = rows.pop(0)[1]
@@ -118,13 +123,17 @@ def _from_text(path: Path, N: int) -> Pairs:
         raise SourceError(f'ground truth {path} holds no line of numbers: expected query,place')
     query_column, place_column = _columns(names, len(rows[0][1]), path)
     if query_column is None and len(rows) != N:
-        raise InputError(f'ground truth {path} has a place for {len(rows)} queries, but there are {N}')
+        raise InputError(
+            f'ground truth {path} has a place for {len(rows)} queries, but there are {N}'
+        )
     queries, places = [], []
     for index, (number, cells) in enumerate(rows):
         place = _whole(cells, place_column, number, path)
         if place == -1:  # not in the map
             continue
-        queries.append(index if query_column is None else _whole(cells, query_column, number, path))
+        queries.append(
+            index if query_column is None else _whole(cells, query_column, number, path)
+        )
         places.append(place)
     return np.array(queries, np.int64), np.array(places, np.int64)
 
@@ -137,7 +146,8 @@ def _whole(cells: list[str], column: int, number: int, path: Path) -> int:
     except (ValueError, IndexError):
         pass
     raise SourceError(
-        f'ground truth {path}, line {number}: {",".join(cells)!r} has no whole number in column {column + 1}'
+        f'ground truth {path}, line {number}: {",".join(cells)!r} has no whole number in column '
+        f'{column + 1}'
     )
 
 
@@ -156,9 +166,9 @@ def _load(path: Path) -> np.ndarray:
     except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
         if 'pickle' in str(error):
             raise SourceError(
-                f'ground truth {path} holds Python objects, which are stored as a pickle, and reading a '
-                'pickle runs whatever program is in it: save it as an array of numbers, or as text, '
-                'query,place a line'
+                f'ground truth {path} holds Python objects, which are stored as a pickle, and '
+                'reading a pickle runs whatever program is in it: save it as an array of numbers, '
+                'or as text, query,place a line'
             ) from error
         raise SourceError(f'ground truth {path} cannot be read: {error}') from error
     raise SourceError(
@@ -172,8 +182,8 @@ def _from_array(array: np.ndarray, path: Path, N: int, n: int) -> Pairs:
     if array.shape == (N, n):
         if not np.isin(array, (0, 1, array.max(initial=1))).all():
             raise InputError(
-                f'ground truth {path} holds other values than 0 and one more: expected 1 where a place is '
-                'right; is it a matrix of distances?'
+                f'ground truth {path} holds other values than 0 and one more: expected 1 where a '
+                'place is correct; is it a matrix of distances?'
             )
         queries, places = np.nonzero(array)
         return queries, places
@@ -192,8 +202,8 @@ def _from_array(array: np.ndarray, path: Path, N: int, n: int) -> Pairs:
 def _wrong_shape(shape: tuple[int, ...], path: Path, N: int, n: int) -> str:
     hint = '; it seems to be transposed: rows are queries' if shape == (n, N) and n != N else ''
     return (
-        f'ground truth {path} has shape {shape}: expected ({N}, {n}) for {N} queries and {n} places, pairs '
-        f'(M, 2), or a place a query ({N},){hint}'
+        f'ground truth {path} has shape {shape}: expected ({N}, {n}) for {N} queries and {n} '
+        f'places, pairs (M, 2), or a place a query ({N},){hint}'
     )
 
 
@@ -210,16 +220,16 @@ def _from_image(path: Path, N: int, n: int) -> Pairs:
         raise SourceError(f'ground truth {path} is no image that can be decoded')
     if image.shape != (N, n):
         raise InputError(
-            f'ground truth {path} is {image.shape[0]} high and {image.shape[1]} wide: expected {N} rows, one '
-            f'a query, and {n} columns, one a place'
+            f'ground truth {path} is {image.shape[0]} high and {image.shape[1]} wide: expected '
+            f'{N} rows, one a query, and {n} columns, one a place'
         )
     if image.max() == 1:  # a mask
         image = image * np.uint8(255)
     gray = np.count_nonzero((image > BLACK) & (image < WHITE))
     if gray:
         raise InputError(
-            f'ground truth {path} has {gray} gray pixels: expected white where a place is right, black '
-            'elsewhere'
+            f'ground truth {path} has {gray} gray pixels: expected white where a place is '
+            'correct, black elsewhere'
         )
     queries, places = np.nonzero(image >= WHITE)
     return queries, places

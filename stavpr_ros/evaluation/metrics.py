@@ -6,14 +6,13 @@ is in the map is a false negative. Average precision is scikit-learn's, which co
 *correct* matches as false negatives; its F1 and recall at 100 % precision are given beside ours.
 """
 
-import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+import importlib
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-
 from stavpr_ros.alignment import aligned_index
 from stavpr_ros.errors import InputError, UnavailableError
 from stavpr_ros.evaluation.ground_truth import GroundTruth
@@ -72,7 +71,8 @@ class Ranking:
     def __post_init__(self) -> None:
         if self.places.ndim != 2 or self.scores.shape != self.places.shape[:1]:
             raise InputError(
-                f'places {self.places.shape} and scores {self.scores.shape}: expected (N, K) and (N,)'
+                f'places {self.places.shape} and scores {self.scores.shape}: expected (N, K) and '
+                '(N,)'
             )
 
     def __len__(self) -> int:
@@ -169,7 +169,10 @@ class Metrics:
 
 
 def counts_at(
-    threshold: float, distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None
+    threshold: float,
+    distances: np.ndarray,
+    correct: np.ndarray,
+    has_match: np.ndarray | None = None,
 ) -> Counts:
     """
     Count at one threshold.
@@ -182,7 +185,9 @@ def counts_at(
     return _counts(np.array([threshold]), *_checked(distances, correct, has_match))[0]
 
 
-def sweep(distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None) -> list[Counts]:
+def sweep(
+    distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None
+) -> list[Counts]:
     """
     Count at every threshold that changes the counts, from rejecting all to accepting all.
 
@@ -190,12 +195,16 @@ def sweep(distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | No
     """
     distances, correct, has_match = _checked(distances, correct, has_match)
     finite = np.unique(distances[np.isfinite(distances)])
-    thresholds = np.append(finite, np.nextafter(finite[-1], np.inf)) if finite.size else np.zeros(1)
+    thresholds = (
+        np.append(finite, np.nextafter(finite[-1], np.inf)) if finite.size else np.zeros(1)
+    )
     return _counts(thresholds, distances, correct, has_match)
 
 
-def best_f1(distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None) -> Counts:
-    """Return the counts with the best F1, on a tie those of the lowest threshold; see :func:`sweep`."""
+def best_f1(
+    distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None
+) -> Counts:
+    """Return the counts of the threshold with the best F1, the lowest on a tie."""
     return max(sweep(distances, correct, has_match), key=lambda counts: counts.f1)
 
 
@@ -254,7 +263,9 @@ def image_matches(matches: Sequence[Match], length: int) -> ImageMatches:
     return ImageMatches(places, distances)
 
 
-def evaluate_ranking(ranking: Ranking, ground_truth: GroundTruth, images: slice = slice(None)) -> Metrics:
+def evaluate_ranking(
+    ranking: Ranking, ground_truth: GroundTruth, images: slice = slice(None)
+) -> Metrics:
     """
     Compare ranked places with the ground truth.
 
@@ -278,20 +289,10 @@ def evaluate_ranking(ranking: Ranking, ground_truth: GroundTruth, images: slice 
         recall_at_full_precision=max(each.recall for each in counts if each.precision == 1),
         sklearn_f1=sklearn_f1,
         sklearn_recall_at_full_precision=sklearn_recall,
-        curve=Curve(*np.array([(each.threshold, each.precision, each.recall) for each in counts]).T),
+        curve=Curve(
+            *np.array([(each.threshold, each.precision, each.recall) for each in counts]).T
+        ),
     )
-
-
-def false_alarm_rate(scores: np.ndarray, threshold: float) -> float:
-    """
-    Return the share of accepted matches among queries whose places are *not* in the map.
-
-    :param scores: distances, shape (N,); +inf or NaN = no match.
-    :raises InputError: no queries.
-    """
-    if not len(scores):
-        raise InputError('the rate of false alarms needs at least one query')
-    return int(np.count_nonzero(scores < threshold)) / len(scores)
 
 
 def smallest_indices(row: np.ndarray, k: int) -> np.ndarray:

@@ -1,18 +1,17 @@
 """
-Pictures of results, made with matplotlib without a screen and without the global state of pyplot.
+Plots of results, drawn by matplotlib without a screen and without the global state of pyplot.
 
-Each takes plain arrays and the path of the picture to write, and returns that path.
+Each function takes plain arrays and the path of the PNG file to write.
 Map indices run along x and query indices along y, as in the paper's matrices.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, TYPE_CHECKING
 
 import numpy as np
-
 from stavpr_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.legend import Legend
 
 Outcome = Literal['right', 'wrong', 'match', 'no match', 'unseen']
+Box = tuple[float, float, float, float]
+"""Left, top, width and height of a plot's axes as fractions of its image."""
 
 INK, QUIET, GRID, PAPER = '#24272c', '#6b7078', '#dcdcd8', '#ffffff'
 COLORS: dict[str, str] = {
@@ -30,26 +31,36 @@ COLORS: dict[str, str] = {
     'no match': '#d99a1c',
     'unseen': '#8a8f98',
 }
-BRIGHT = {'right': '#35d07f', 'wrong': '#ff5440', 'match': '#4fb3ff'}  # the same on the dark of a matrix
+BRIGHT = {'right': '#35d07f', 'wrong': '#ff5440', 'match': '#4fb3ff'}  # on the dark of a matrix
 MEANING: dict[str, str] = {
-    'right': 'match, right', 'wrong': 'match, wrong', 'match': 'match', 'no match': 'no match',
-    'unseen': 'no match, rightly',
+    'right': 'match, correct', 'wrong': 'match, wrong', 'match': 'match', 'no match': 'no match',
+    'unseen': 'no match, correctly',
 }  # fmt: skip
 TRUTH, THRESHOLD = '#f0c419', '#3b6ea5'
-SCALE = 'bone'  # one scale of grays for every distance, dark is near: colors are for outcomes
+SEQUENCE, SEQUENCE_INNER, SINGLE, UNKNOWN = '#2358a5', '#7fa8dc', '#8a94a6', '#d99a1c'
+SCALE = 'bone'  # grays for distances, dark is near: colors are for outcomes
+AXES: dict[str, Any] = {
+    'labelcolor': INK,
+    'edgecolor': QUIET,
+    'linewidth': 0.8,
+    'spines.top': False,
+    'spines.right': False,
+    'axisbelow': True,
+}
 DPI = 150
+BINS = 40  # of a histogram
 
 
 @dataclass(frozen=True)
 class MatchPair:
     """
-    A query and what it was matched with.
+    A query image and the place that it was matched with.
 
     :param query: RGB, shape (h, w, 3), uint8.
     :param place: the matched place's image, or None without a match.
     :param caption: a line below, such as index and distance.
-    :param outcome: 'right' or 'wrong' for a match, 'match' if the truth is unknown; 'no match' for a place
-        that was missed; 'unseen' for a query that has no place in the map and got none.
+    :param outcome: 'right' or 'wrong' for a match, 'match' without ground truth; 'no match' for a
+        place that was missed; 'unseen' for a query that has no place in the map and was rejected.
     """
 
     query: np.ndarray
@@ -62,162 +73,166 @@ class MatchPair:
             raise InputError(f'outcome is {self.outcome!r}; expected one of {", ".join(COLORS)}')
 
 
-def match_overview(path: Path, pairs: Sequence[MatchPair], columns: int = 3) -> Path:
-    """Draw queries beside the places that they were matched with; the frame's color is the outcome."""
+def match_overview(path: Path, pairs: Sequence[MatchPair], columns: int = 3) -> None:
+    """Draw queries beside their matched places; the color of the frame is the outcome."""
     rows = max(1, -(-len(pairs) // columns))
     with page(path, 10, 0.5 + 1.42 * rows) as figure:
         draw_pairs(figure, pairs, columns)
-    return path
 
 
-def distance_matrix(
-    path: Path, distances: np.ndarray, matched: np.ndarray, truth: np.ndarray | None, tolerance: int = 3,
-) -> Path:  # fmt: skip
+def reduced_matrix(
+    path: Path,
+    distances: np.ndarray,
+    shape: tuple[int, int],
+    truth: np.ndarray,
+    matches: Mapping[str, np.ndarray],
+) -> Box:
     """
-    Draw the distance of every query to every place, with the true and the matched places.
+    Draw the distances of a traverse of any length, reduced to blocks.
 
-    :param distances: shape (queries, places).
-    :param matched: matched place of each query, -1 where there is none, shape (queries,).
-    :param truth: true place of each query, -1 where the map has none, shape (queries,); None = unknown.
-    :param tolerance: places that a right match may be off.
+    :param distances: shape (rows, columns); NaN where there is none.
+    :param shape: queries N and places n.
+    :param truth: whether a block has a true place, of the shape of ``distances``, bool.
+    :param matches: (query, place) of accepted matches, shape (count, 2), by outcome.
+    :returns: where the axes are.
     """
-    distances, matched, truth = _check_matrix(distances, matched, truth)
-    queries, places = distances.shape
-    with page(path, 7.5, float(np.clip(7.5 * queries / places, 4, 9))) as figure:
-        _draw_matrix(figure, figure.add_subplot(), distances, matched, truth, tolerance)
-    return path
-
-
-def distance_over_time(
-    path: Path, distances: np.ndarray, threshold: float, outcomes: Sequence[Outcome], unseen: np.ndarray,
-) -> Path:  # fmt: skip
-    """
-    Draw the distance of each query's best answer, the threshold and what came of it.
-
-    :param distances: shape (queries,); nan where there was no answer.
-    :param threshold: answers below it are matches; nan for none.
-    :param outcomes: one for each query.
-    :param unseen: whether the map lacks the query's place, shape (queries,), bool.
-    """
-    with page(path, 10, 3.3) as figure:
-        _draw_time(figure.add_subplot(), distances, threshold, outcomes, unseen)
-    return path
+    with matrix_page(path, shape) as figure:
+        axes = figure.add_subplot()
+        draw_matrix(figure, axes, distances, shape, truth, 'true place', matches)
+    return _box(axes)
 
 
 def precision_recall(
-    path: Path, curves: dict[str, tuple[np.ndarray, np.ndarray]], point: tuple[float, float] | None = None,
-) -> Path:  # fmt: skip
+    path: Path, curves: Mapping[str, tuple[str, np.ndarray, np.ndarray, tuple[float, float]]]
+) -> Box:
     """
-    Draw precision over recall.
+    Draw precision over recall, and a ring where F1 is best.
 
-    :param curves: (recall, precision), each of shape (thresholds,), by name.
-    :param point: recall and precision at the threshold that was used.
+    :param curves: color, recall and precision, shape (T,), and recall and precision at the best
+        F1, by name.
+    :returns: where the axes are.
     """
-    shades = ('#1f3a5f', '#d99a1c', '#2e8b57', '#c8402f', '#8a8f98', '#7b5aa6')
     with page(path, 5.2, 4.8) as figure:
         axes = figure.add_subplot()
-        for k, (name, (recall, precision)) in enumerate(curves.items()):
-            shade = shades[k % len(shades)]
-            axes.plot(recall, precision, color=shade, lw=1.8, label=name, clip_on=False, zorder=3)
-        if point is not None:
-            style: dict[str, Any] = {'ms': 8, 'mfc': PAPER, 'mec': INK, 'mew': 1.6, 'zorder': 4}
-            axes.plot(*point, 'o', label='threshold used', clip_on=False, **style)
+        for name, (color, recall, precision, best) in curves.items():
+            axes.plot(recall, precision, color=color, lw=1.8, label=name, clip_on=False, zorder=3)
+            ring: dict[str, Any] = {'ms': 8, 'mfc': PAPER, 'mec': color, 'mew': 1.8, 'zorder': 4}
+            axes.plot(*best, 'o', clip_on=False, **ring)
         axes.set(xlabel='recall', ylabel='precision', xlim=(0, 1), ylim=(0, 1.0), aspect='equal')
         axes.grid(color=GRID, lw=0.7)
-        if curves or point is not None:
+        if curves:
             axes.legend(loc='lower left')
-    return path
+    return _box(axes)
 
 
-def warping_path(path: Path, distances: np.ndarray, pairs: np.ndarray, first: int = 0) -> Path:
+def distance_histogram(
+    path: Path, groups: Mapping[str, tuple[str, np.ndarray]], threshold: float
+) -> None:
     """
-    Draw the distances of one window of queries to a stretch of the map, and the path of the alignment.
+    Draw the distribution of the distances of correct, wrong and unknown matches.
+
+    :param groups: color and distances of each group, by name; infinite distances are left out.
+    :param threshold: drawn as a line.
+    """
+    finite = {name: values[np.isfinite(values)] for name, (_, values) in groups.items()}
+    everything = np.concatenate([*finite.values(), np.zeros(0)])
+    low, high = (everything.min(), everything.max()) if everything.size else (0.0, 1.0)
+    high = max(high, low + 1e-6)
+    with page(path, 5.2, 4.8) as figure:
+        axes = figure.add_subplot()
+        axes.hist(
+            list(finite.values()),
+            bins=list(np.linspace(low, high, BINS + 1)),
+            color=[color for color, _ in groups.values()],
+            label=list(finite),
+            stacked=True,
+            rwidth=0.9,
+        )
+        if low <= threshold <= high + 1e-3 * (high - low):
+            axes.axvline(
+                threshold, color=INK, lw=1.3, ls=(0, (5, 3)), label=f'threshold {threshold:.3g}'
+            )
+        margin = 0.02 * (high - low)
+        axes.set(
+            xlabel='distance of the match', ylabel='images', xlim=(low - margin, high + margin)
+        )
+        axes.locator_params(axis='y', integer=True)
+        legend_above(axes, 4)
+
+
+def warping_path(path: Path, distances: np.ndarray, pairs: np.ndarray, first: int = 0) -> None:
+    """
+    Draw the distances of one window of queries to a stretch of the map, and the warping path.
 
     :param distances: shape (l, k): images of the window by places of the stretch.
-    :param pairs: (query, place) along the path, counted within the matrix, shape (steps, 2); may be empty.
+    :param pairs: (query, place) along the path, counted within the matrix, shape (m, 2).
     :param first: map index of the stretch's first place.
     """
     distances = np.asarray(distances, float)
     if distances.ndim != 2 or 0 in distances.shape:
-        raise InputError(f'distances of the window have shape {distances.shape}; expected (l, k), neither 0')
+        raise InputError(
+            f'distances of the window have shape {distances.shape}: expected (l, k), not empty'
+        )
     pairs = np.asarray(pairs, int).reshape(-1, 2)
     l, k = distances.shape
     with page(path, 7.0, float(np.clip(1.4 + 5.3 * l / k, 2.6, 7))) as figure:
         axes = figure.add_subplot()
         extent = (first - 0.5, first + k - 0.5, l - 0.5, -0.5)
-        picture = axes.imshow(distances, cmap=SCALE, extent=extent, aspect='auto')
+        image = axes.imshow(distances, cmap=SCALE, extent=extent, aspect='auto')
         if len(pairs):
-            axes.plot(pairs[:, 1] + first, pairs[:, 0], '-o', color=BRIGHT['right'], mec=INK, mew=0.5,
-                      ms=4, lw=1.6, label='warping path')  # fmt: skip
+            style: dict[str, Any] = {
+                'color': BRIGHT['right'],
+                'mec': INK,
+                'mew': 0.5,
+                'ms': 4,
+                'lw': 1.6,
+            }
+            axes.plot(pairs[:, 1] + first, pairs[:, 0], '-o', label='warping path', **style)
             legend_above(axes, 1)
         axes.set(xlabel='place in the map', ylabel='image of the window')
         axes.locator_params(integer=True)
-        color_bar(figure, picture, axes)
-    return path
-
-
-def demo_sheet(
-    path: Path,
-    pairs: Sequence[MatchPair],
-    distances: np.ndarray,
-    matched: np.ndarray,
-    truth: np.ndarray | None,
-    best: np.ndarray,
-    threshold: float,
-    outcomes: Sequence[Outcome],
-    tolerance: int = 3,
-    title: str = '',
-    note: str = '',
-) -> Path:
-    """
-    Draw one page of everything: pairs above, the matrix and the distance over time below.
-
-    :param pairs: six are best: they fill the rows of three.
-    :param distances: every query to every place, shape (queries, places).
-    :param best: distance of each query's best answer, shape (queries,).
-    :param title: a line above.
-    :param note: a quieter line below it: the numbers.
-
-    The others are as in :func:`distance_matrix` and :func:`distance_over_time`.
-    """
-    distances, matched, truth = _check_matrix(distances, matched, truth)
-    rows = max(1, -(-len(pairs) // 3))
-    head = 0.75 if title or note else 0.1
-    above, below = 0.5 + 1.52 * rows, 4.2
-    with page(path, 11, head + above + below) as figure:
-        parts = figure.add_gridspec(3, 2, height_ratios=(head, above, below), width_ratios=(1, 1.18))
-        top = figure.add_subfigure(parts[0, :])
-        top.text(0.012, 0.66, title, fontsize=15, weight='bold', va='center', color=INK)
-        top.text(0.012, 0.2, note, fontsize=10.5, va='center', color=QUIET)
-        draw_pairs(figure.add_subfigure(parts[1, :]), pairs, 3)
-        left = figure.add_subfigure(parts[2, 0])
-        _draw_matrix(left, left.add_subplot(), distances, matched, truth, tolerance)
-        unseen = np.zeros(len(matched), bool) if truth is None else truth < 0
-        _draw_time(figure.add_subfigure(parts[2, 1]).add_subplot(), best, threshold, outcomes, unseen)
-    return path
+        color_bar(figure, image, axes)
 
 
 @contextmanager
 def page(path: Path, width: float, height: float) -> Iterator['Figure']:
-    """Give an empty figure (inches) in our typography, and write it."""
+    """Yield an empty figure (width and height in inches) in the common style, then write it."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     look: dict[Any, Any] = {
-        'font.size': 10.5, 'font.family': 'DejaVu Sans', 'text.color': INK, 'axes.labelcolor': INK,
-        'axes.edgecolor': QUIET, 'axes.linewidth': 0.8, 'axes.spines.top': False, 'axes.spines.right': False,
-        'axes.axisbelow': True, 'xtick.color': QUIET, 'ytick.color': QUIET, 'legend.frameon': False,
-        'legend.fontsize': 9.5, 'xtick.labelsize': 9.5, 'ytick.labelsize': 9.5, 'figure.facecolor': PAPER,
-    }  # fmt: skip
+        'font.size': 10.5,
+        'font.family': 'DejaVu Sans',
+        'text.color': INK,
+        'figure.facecolor': PAPER,
+        'legend.frameon': False,
+        'legend.fontsize': 9.5,
+    }
+    look |= {f'axes.{name}': value for name, value in AXES.items()}
+    for side in ('xtick', 'ytick'):
+        look |= {f'{side}.color': QUIET, f'{side}.labelsize': 9.5}
     with rc_context(look):
         figure = Figure(figsize=(width, height), dpi=DPI, layout='constrained')
         yield figure
         FigureCanvasAgg(figure).print_png(path)
 
 
+@contextmanager
+def matrix_page(path: Path, shape: tuple[int, ...]) -> Iterator['Figure']:
+    """Yield a figure of a matrix's proportions, within limits, then write it."""
+    with page(path, 7.5, float(np.clip(7.5 * shape[0] / shape[1], 4, 9))) as figure:
+        yield figure
+
+
+def _box(axes: 'Axes') -> Box:
+    """Return where the axes of a written figure are."""
+    position = axes.get_position()
+    return position.x0, 1 - position.y1, position.width, position.height
+
+
 def draw_pairs(figure: 'Figure | SubFigure', pairs: Sequence[MatchPair], columns: int) -> None:
-    """Draw the pairs on a grid, with the meaning of the colors above."""
+    """Draw the pairs on a grid, with a legend of the colors above."""
     from matplotlib.lines import Line2D
 
     if not pairs:
@@ -232,12 +247,14 @@ def draw_pairs(figure: 'Figure | SubFigure', pairs: Sequence[MatchPair], columns
     keys = [Line2D([], [], color=COLORS[outcome], lw=3) for outcome in shown]
     names = [MEANING[outcome] for outcome in shown]
     figure.suptitle(' ', fontsize=10)  # keeps room for the legend, which must not widen the grid
-    legend = figure.legend(keys, names, loc='upper left', ncols=4, handlelength=1.2, borderaxespad=0.3)
+    legend = figure.legend(
+        keys, names, loc='upper left', ncols=4, handlelength=1.2, borderaxespad=0.3
+    )
     legend.set_in_layout(False)
 
 
 def _draw_pair(axes: 'Axes', pair: MatchPair) -> None:
-    """Draw a query, its place right of it, and the frame."""
+    """Draw a query with its place on the right, and the frame."""
     from matplotlib.patches import Rectangle
 
     height, width = pair.query.shape[:2]
@@ -249,120 +266,77 @@ def _draw_pair(axes: 'Axes', pair: MatchPair) -> None:
         axes.text(*middle, 'no place', ha='center', va='center', color=QUIET, fontsize=9.5)
     else:
         axes.imshow(pair.place, extent=(start, start + width, height, 0), interpolation='lanczos')
-    frame: dict[str, Any] = {'fill': False, 'ec': COLORS[pair.outcome], 'lw': 2.6, 'clip_on': False}
+    frame: dict[str, Any] = {
+        'fill': False,
+        'ec': COLORS[pair.outcome],
+        'lw': 2.6,
+        'clip_on': False,
+    }
     axes.add_patch(Rectangle((0, 0), start + width, height, **frame))
     axes.set_title(pair.caption, fontsize=9.5, color=INK, y=-0.03, va='top', pad=0)
     axes.set(xlim=(0, start + width), ylim=(height, 0), aspect='equal')
 
 
-def _draw_matrix(
-    figure: 'Figure | SubFigure', axes: 'Axes', distances: np.ndarray, matched: np.ndarray,
-    truth: np.ndarray | None, tolerance: int,
-) -> None:  # fmt: skip
-    """Draw the matrix of distances with the corridor of right answers and the matches."""
-    queries, places = distances.shape
+def draw_matrix(
+    figure: 'Figure | SubFigure',
+    axes: 'Axes',
+    distances: np.ndarray,
+    shape: tuple[int, ...],
+    truth: np.ndarray | None,
+    label: str,
+    matches: Mapping[str, np.ndarray],
+) -> None:
+    """
+    Draw a matrix of distances with the true places and the matches.
+
+    :param distances: of each cell; a cell may be a block of several queries and places.
+    :param shape: queries N and places n.
+    :param truth: whether a cell has a true place, bool; None = unknown.
+    :param label: of the true places.
+    :param matches: (query, place), shape (count, 2), by outcome.
+    """
+    extent = (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
     finite = distances[np.isfinite(distances)]
     low, high = np.quantile(finite, [0.002, 0.995]) if finite.size else (0.0, 1.0)
-    picture = axes.imshow(distances, cmap=SCALE, vmin=low, vmax=max(high, low + 1e-6), aspect='auto')
-    _draw_matches(axes, matched, truth, tolerance)
+    scale: dict[str, Any] = {'cmap': SCALE, 'vmin': low, 'vmax': max(high, low + 1e-6)}
+    image = axes.imshow(distances, aspect='auto', extent=extent, **scale)
     if truth is not None:
-        _draw_unseen(axes, truth < 0, places)
-    axes.set(xlabel='place in the map', ylabel='query image')
-    axes.set(xlim=(-0.5, places - 0.5), ylim=(queries - 0.5, -0.5))
-    color_bar(figure, picture, axes)
+        cells = np.zeros((*truth.shape, 4), np.uint8)
+        cells[truth] = [int(TRUTH[i : i + 2], 16) for i in (1, 3, 5)] + [110]
+        axes.imshow(cells, aspect='auto', extent=extent, interpolation='nearest')
+        axes.plot([], [], 's', color=TRUTH, ms=4, label=label)
+    for outcome, pairs in matches.items():
+        if len(pairs):
+            style: dict[str, Any] = {'color': BRIGHT[outcome], 'label': MEANING[outcome]}
+            axes.plot(pairs[:, 1], pairs[:, 0], '.', ms=4, mew=0, **style)
+    axes.set(xlabel='place in the map', ylabel='query image', xlim=extent[:2], ylim=extent[2:])
+    color_bar(figure, image, axes)
     for handle in legend_above(axes, 3).get_lines():
-        handle.set(linewidth=1.8, markersize=9)
-
-
-def _draw_matches(axes: 'Axes', matched: np.ndarray, truth: np.ndarray | None, tolerance: int) -> None:
-    """Draw the corridor of right answers, if it is known, and the matches by outcome."""
-    index = np.arange(len(matched))
-    accepted = matched >= 0
-    masks = {'match': accepted}
-    if truth is not None:
-        line = np.where(truth >= 0, truth, np.nan).astype(float)
-        line[1:][np.abs(np.diff(line)) > max(10, 3 * tolerance)] = np.nan  # a jump is no path
-        for offset, label in ((-tolerance, f'true place ± {tolerance}'), (tolerance, '')):
-            axes.plot(line + offset, index, color=TRUTH, lw=0.9, label=label)
-        right = accepted & (truth >= 0) & (np.abs(matched - truth) <= tolerance)
-        masks = {'right': right, 'wrong': accepted & ~right}
-    for outcome, mask in masks.items():
-        if mask.any():
-            style: dict[str, Any] = {'color': BRIGHT[outcome], 'ms': 5, 'mew': 0, 'label': MEANING[outcome]}
-            axes.plot(matched[mask], index[mask], '.', **style)
-
-
-def _draw_unseen(axes: 'Axes', unseen: np.ndarray, places: int) -> None:
-    """Shade the queries that have no place in the map."""
-    for start, stop in _runs(unseen):
-        axes.axhspan(start - 0.5, stop - 0.5, color=PAPER, alpha=0.32, lw=0)
-        if stop - start > len(unseen) / 25:
-            middle = (start + stop - 1) / 2
-            axes.text(places * 0.02, middle, 'not in the map', va='center', color=INK, fontsize=9.5)
-
-
-def _draw_time(
-    axes: 'Axes', distances: np.ndarray, threshold: float, outcomes: Sequence[Outcome], unseen: np.ndarray
-) -> None:
-    """Draw distances as dots in the color of the outcome."""
-    distances, unseen = np.asarray(distances, float), np.asarray(unseen, bool)
-    if not distances.shape == unseen.shape == (len(outcomes),):
-        raise InputError(f'distances {distances.shape}, unseen {unseen.shape}, {len(outcomes)} outcomes; '
-                         'expected one of each for every query')  # fmt: skip
-    index = np.arange(len(distances))
-    kinds = np.array(outcomes, dtype=object)
-    axes.plot(index, distances, color=GRID, lw=1.0, zorder=1)
-    for outcome, color in COLORS.items():
-        mask = kinds == outcome
-        if mask.any():
-            style: dict[str, Any] = {'color': color, 'ms': 6, 'mew': 0, 'label': MEANING[outcome]}
-            axes.plot(index[mask], distances[mask], '.', zorder=2, **style)
-    if np.isfinite(threshold):
-        name = f'threshold {threshold:.3g}'
-        axes.axhline(threshold, color=THRESHOLD, lw=1.3, ls=(0, (5, 3)), label=name, zorder=1.5)
-    for number, (start, stop) in enumerate(_runs(unseen)):
-        name = '' if number else 'not in the map'
-        axes.axvspan(start - 0.5, stop - 0.5, color='#e9e9e4', lw=0, zorder=0, label=name)
-    axes.set(xlabel='query image', ylabel='distance of the best answer', xlim=(-1, max(1, len(distances))))
-    axes.grid(axis='y', color=GRID, lw=0.7)
-    legend_above(axes, 3)
+        handle.set_markersize(9)
 
 
 def legend_above(axes: 'Axes', columns: int) -> 'Legend':
-    """Put the legend above the axes, where it hides nothing and does not widen the layout."""
+    """Put the legend above the axes, where it covers nothing and does not widen the layout."""
     handles, labels = axes.get_legend_handles_labels()
-    legend = axes.legend(handles, labels, loc='lower left', bbox_to_anchor=(0, 1.0), borderaxespad=0.2,
-                         ncols=columns, handlelength=1.2, columnspacing=1.2, handletextpad=0.4)  # fmt: skip
+    legend = axes.legend(
+        handles,
+        labels,
+        loc='lower left',
+        bbox_to_anchor=(0, 1.0),
+        borderaxespad=0.2,
+        ncols=columns,
+        handlelength=1.2,
+        columnspacing=1.2,
+        handletextpad=0.4,
+    )
     legend.set_in_layout(False)
     lines = -(-len(legend.get_texts()) // columns)
     axes.set_title('\n'.join(' ' * lines), fontsize=10.5)  # keeps room for it
     return legend
 
 
-def color_bar(figure: 'Figure | SubFigure', picture: object, axes: 'Axes') -> None:
-    bar = figure.colorbar(picture, ax=axes, fraction=0.04, pad=0.015, aspect=32)  # type: ignore[arg-type]
+def color_bar(figure: 'Figure | SubFigure', image: Any, axes: 'Axes') -> None:
+    """Draw the scale of the distances beside the axes."""
+    bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.015, aspect=32)
     bar.outline.set_visible(False)
     bar.set_label('distance')
-
-
-def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """List the runs of True as (first, one past the last)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
-def _check_matrix(
-    distances: np.ndarray, matched: np.ndarray, truth: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Check that the arrays belong together."""
-    distances, matched = np.asarray(distances, float), np.asarray(matched, int)
-    truth = None if truth is None else np.asarray(truth, int)
-    if distances.ndim != 2 or 0 in distances.shape:
-        raise InputError(f'distances have shape {distances.shape}; expected (queries, places), neither 0')
-    if matched.shape != distances.shape[:1] or (truth is not None and truth.shape != matched.shape):
-        shape = None if truth is None else truth.shape
-        raise InputError(
-            f'distances {distances.shape}, matched {matched.shape}, truth {shape}; expected one matched '
-            'and one true place for each query'
-        )
-    return distances, matched, truth

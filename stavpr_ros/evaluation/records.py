@@ -5,9 +5,8 @@ from math import nan
 from typing import Any
 
 import numpy as np
-
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
-from stavpr_ros.evaluation.metrics import Counts, ImageMatches, counts_at, image_matches
+from stavpr_ros.evaluation.metrics import Counts, counts_at, image_matches, ImageMatches
 from stavpr_ros.recognition import Match, Status
 
 IN_WINDOW = ('WARMING_UP', 'NO_MATCH', 'MATCH')  # statuses of images that enter the window
@@ -72,9 +71,9 @@ class TraverseEvaluation:
         if len(self.seconds):
             median, slow = np.percentile(self.seconds, [50, 99]) * 1e3
             lines.append(
-                f'{1 / self.seconds.mean():.1f} images per second, one after the other; from image '
-                f'to match {median:.1f} ms (median), {slow:.1f} ms (99 %), replay and transport '
-                'included'
+                f'{1 / self.seconds.mean():.1f} images per second, one after the other; from '
+                f'image to match {median:.1f} ms (median), {slow:.1f} ms (99 %), replay and '
+                'transport included'
             )
         return '\n'.join(lines)
 
@@ -85,7 +84,9 @@ def match_of(record: dict[str, Any]) -> Match:
     sequence = None
     if record['sequence_middle'] >= 0:
         first, last = path[[0, -1], 1].tolist()
-        sequence = SequenceMatch(first, last, record['sequence_middle'], record['distance'], -1, nan)
+        sequence = SequenceMatch(
+            first, last, record['sequence_middle'], record['distance'], -1, nan
+        )
     return Match(Status[record['status']], sequence=sequence, path=path)
 
 

@@ -1,22 +1,22 @@
 """
-SeqSLAM, the baseline that users compare with, written from its paper.
+SeqSLAM, a baseline, implemented from its paper.
 
-M. Milford, G. Wyeth, "SeqSLAM: Visual Route-Based Navigation for Sunny Summer Days and Stormy Winter
-Nights", ICRA 2012. Small patch-normalized images, the sum of absolute differences, local contrast
-enhancement along the map, straight lines at several speeds through the enhanced differences.
+M. Milford, G. Wyeth, "SeqSLAM: Visual Route-Based Navigation for Sunny Summer Days and Stormy
+Winter Nights", ICRA 2012. Small patch-normalized images, the sum of absolute differences, local
+contrast enhancement along the map, straight lines at several speeds through the enhanced
+differences.
 """
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+import math
 
 import cv2
 import numpy as np
-import torch
-
 from stavpr_ros.checks import float_array, no_nan
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.sources.frame import Frame
+import torch
 
 SCORES = ('sum', 'uniqueness')
 BATCH = 256  # query images whose differences are made at a time
@@ -30,14 +30,14 @@ class SeqSlamSettings:
     :param width: of the small images, pixels (Rx).
     :param height: of the small images, pixels (Ry).
     :param patch: side of the squares that are normalized, pixels; divides width and height.
-    :param contrast_window: places around each one, half before and half after, whose differences its own
-        is held against (R_window); >= 2.
+    :param contrast_window: places around each one, half before and half after, whose differences
+        normalize its own (R_window); >= 2.
     :param length: images in a window (ds), >= 2.
     :param slowest: map images per query image (V_min), > 0.
     :param fastest: the same (V_max), >= slowest.
-    :param speed_step: between the speeds that are tried (V_step), > 0.
-    :param score: ``sum``: the line's mean enhanced difference; ``uniqueness``: that minus the mean of the
-        best line elsewhere, whose place is more than contrast_window / 2 from this one's (mu).
+    :param speed_step: between the speeds of the search (V_step), > 0.
+    :param score: ``sum``: the line's mean enhanced difference; ``uniqueness``: that minus the mean
+        of the best line whose place is more than contrast_window / 2 from this one's (mu).
     """
 
     width: int = 64
@@ -57,29 +57,38 @@ class SeqSlamSettings:
             or self.height % self.patch
         ):
             raise SettingsError(
-                f'images of {self.width} x {self.height} in patches of {self.patch}: expected whole patches'
+                f'images of {self.width} x {self.height} in patches of {self.patch}: expected '
+                'whole patches'
             )
         if self.contrast_window < 2:
-            raise SettingsError(f'contrast_window = {self.contrast_window} must be at least 2 places')
+            raise SettingsError(
+                f'contrast_window = {self.contrast_window} must be at least 2 places'
+            )
         if self.length < 2:
             raise SettingsError(f'length = {self.length} must be at least 2 images')
         speeds = (self.slowest, self.fastest, self.speed_step)
-        if not (all(map(math.isfinite, speeds)) and 0 < self.slowest <= self.fastest and self.speed_step > 0):
+        if not (
+            all(map(math.isfinite, speeds))
+            and 0 < self.slowest <= self.fastest
+            and self.speed_step > 0
+        ):
             raise SettingsError(
-                f'speeds {self.slowest} .. {self.fastest} in steps of {self.speed_step}: expected finite '
-                'numbers above 0, ascending'
+                f'speeds {self.slowest} .. {self.fastest} in steps of {self.speed_step}: expected '
+                'finite numbers above 0, ascending'
             )
         if self.score not in SCORES:
-            raise SettingsError(f'score {self.score!r} is unknown: take one of {", ".join(SCORES)}')
+            raise SettingsError(
+                f'score {self.score!r} is unknown: take one of {", ".join(SCORES)}'
+            )
 
     @property
     def middle(self) -> int:
-        """Position in the window of the image that it answers: floor((first + last) / 2)."""
+        """Position in the window of its middle image: floor((first + last) / 2)."""
         return (self.length - 1) // 2
 
     @property
     def lines(self) -> np.ndarray:
-        """Map images after the start at each position of the window, a row a speed, (speeds, length), int."""
+        """Map images after the start by speed and position in the window, (speeds, length)."""
         count = math.floor((self.fastest - self.slowest) / self.speed_step + 1e-9) + 1
         speeds = self.slowest + self.speed_step * np.arange(count)
         return np.floor(speeds[:, None] * np.arange(self.length) + 0.5 + 1e-9).astype(np.int64)
@@ -91,7 +100,7 @@ def seqslam(
     settings: SeqSlamSettings | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Find each query image in the map.
+    Match each query image with the map.
 
     :param map_images: n frames, or images: uint8, RGB (h, w, 3) or gray (h, w).
     :param query_images: N of the same kind.
@@ -105,16 +114,16 @@ def seqslam(
 
 def match_differences(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndarray, np.ndarray]:
     """
-    Find each query image in the map from the differences of the images.
+    Match each query image with the map from the differences of the images.
 
-    A window of ``length`` query images is held against every straight line through the map; its best line
-    answers the window's middle image, with the place that the line gives that image. The first and the
-    last images, which no window has in its middle, take their places from the first and the last window's
-    line, and its score (as the sequences of this package do it; in the paper they have no answer).
+    A window of ``length`` query images is compared with every straight line through the map; the
+    window's middle image takes its place from the best line. The first and last images, which are
+    in the middle of no window, take place and score from the line of the first and last window, as
+    in the sequences of this package (in the paper they have none).
 
     :param D: differences, shape (N, n), float32 or float64; row = query image, in order.
-    :returns: places, shape (N,), int64, and scores, shape (N,), float64, lower is better; -1 and +inf where
-        there are too few images for a window, or too few places for a line.
+    :returns: places, shape (N,), int64, and scores, shape (N,), float64, lower is better; -1 and
+        +inf where there are too few images for a window, or too few places for a line.
     :raises InputError: wrong shape or type, NaN.
     """
     D = no_nan(float_array(D, 'differences', 2), 'differences')
@@ -131,7 +140,11 @@ def match_differences(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndar
     lines = settings.lines[speeds[rows, starts]] + starts[:, None]
     found = totals[rows, starts] / settings.length
     if settings.score == 'uniqueness':
-        found = found - _best_elsewhere(totals, speeds, lines[:, settings.middle], settings) / settings.length
+        found = (
+            found
+            - _best_elsewhere(totals, speeds, lines[:, settings.middle], settings)
+            / settings.length
+        )
     middle = settings.middle
     places[middle : middle + windows] = lines[:, middle]
     scores[middle : middle + windows] = found
@@ -142,26 +155,34 @@ def match_differences(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndar
 
 def preprocess(images: Iterable[Frame | np.ndarray], settings: SeqSlamSettings) -> np.ndarray:
     """
-    Make small patch-normalized images: in every patch the mean is 0 and the deviation 1.
+    Return small patch-normalized images: in every patch the mean is 0 and the deviation 1.
 
     :returns: shape (images, height * width), float32; a patch of one gray level is 0.
     :raises InputError: no images, or one that is no uint8 image.
     """
-    described = [_extract(item.image if isinstance(item, Frame) else item, settings) for item in images]
-    if not described:
-        raise InputError('SeqSLAM was given no images: expected at least one of the map and of the query')
-    return np.stack(described)
+    processed = [
+        _normalized(item.image if isinstance(item, Frame) else item, settings) for item in images
+    ]
+    if not processed:
+        raise InputError(
+            'no images for SeqSLAM: expected at least one of the map and of the query'
+        )
+    return np.stack(processed)
 
 
-def _extract(image: np.ndarray, settings: SeqSlamSettings) -> np.ndarray:
-    if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
+def _normalized(image: np.ndarray, settings: SeqSlamSettings) -> np.ndarray:
+    if image.dtype != np.uint8 or not (
+        image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
+    ):
         raise InputError(
             f'image is {image.dtype} of shape {image.shape}: expected uint8, (h, w) or (h, w, 3)'
         )
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
     shrinks = gray.shape[0] >= settings.height and gray.shape[1] >= settings.width
     method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    small = cv2.resize(gray, (settings.width, settings.height), interpolation=method).astype(np.float32)
+    small = cv2.resize(gray, (settings.width, settings.height), interpolation=method).astype(
+        np.float32
+    )
     side = settings.patch
     patches = small.reshape(settings.height // side, side, settings.width // side, side)
     patches = patches - patches.mean(axis=(1, 3), keepdims=True)
@@ -187,24 +208,24 @@ def differences(queries: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 def enhance_contrast(D: np.ndarray, window: int) -> np.ndarray:
     """
-    Hold each difference against those of the places around it: (D - mean) / deviation, along the map.
+    Normalize each difference by those of the places around it: (D - mean) / deviation.
 
     :param D: shape (N, n).
-    :param window: half of it lies before the place and half after; less at the map's ends.
+    :param window: half of it before the place and half after; less at the map's ends.
     :returns: shape (N, n), of the same type; 0 where all the differences around are equal.
     """
     n = D.shape[1]
     firsts = np.maximum(np.arange(n) - window // 2, 0)
     ends = np.minimum(np.arange(n) + window // 2 + 1, n)
     enhanced = np.empty_like(D)
-    for i, row in enumerate(D):  # a row at a time: the running sums need float64, the matrix is large
+    for i, row in enumerate(D):  # a row at a time: the sums need float64, the matrix is large
         centered = row.astype(np.float64) - row.mean(dtype=np.float64)
         sums = np.concatenate([[0.0], np.cumsum(centered)])
         squares = np.concatenate([[0.0], np.cumsum(centered**2)])
         count = ends - firsts
         mean = (sums[ends] - sums[firsts]) / count
         variance = (squares[ends] - squares[firsts]) / count - mean**2
-        # running sums leave a rest of rounding where all are equal
+        # rounding leaves small variances where all are equal
         flat = variance <= 1e-12 * (squares[-1] / n)
         enhanced[i] = np.where(flat, 0, (centered - mean) / np.sqrt(np.where(flat, 1, variance)))
     return enhanced
@@ -212,10 +233,10 @@ def enhance_contrast(D: np.ndarray, window: int) -> np.ndarray:
 
 def _line_totals(enhanced: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndarray, np.ndarray]:
     """
-    Add up the best line from every start, for every window.
+    Return the sum of the best line from every start, for every window.
 
-    :returns: sums, shape (windows, n), +inf where every line leaves the map, and the row of
-        ``settings.lines`` that has it (the slowest on a tie), shape (windows, n), int64.
+    :returns: sums, shape (windows, n), +inf where every line leaves the map, and the line's row of
+        ``settings.lines`` (the slowest on a tie), shape (windows, n), int64.
     """
     N, n = enhanced.shape
     windows = N - settings.length + 1
@@ -237,7 +258,7 @@ def _line_totals(enhanced: np.ndarray, settings: SeqSlamSettings) -> tuple[np.nd
 def _best_elsewhere(
     totals: np.ndarray, speeds: np.ndarray, middles: np.ndarray, settings: SeqSlamSettings
 ) -> np.ndarray:
-    """Return the sum of each window's best line at another place; 0, the mean difference, without one."""
+    """Return the sum of each window's best line at another place; without one 0, the mean."""
     found = np.zeros(len(totals))
     starts = np.arange(totals.shape[1])
     offsets = settings.lines[:, settings.middle]

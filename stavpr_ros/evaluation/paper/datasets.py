@@ -1,33 +1,34 @@
-"""The paper's data sets as people have them on disk: where map and query are, and which places are right."""
+"""The paper's data sets on disk: the folders of map and query, and their ground truth."""
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+import re
 
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.ground_truth_files import ARRAYS, TEXT
-from stavpr_ros.evaluation.warp import FrameSource, cropped
-from stavpr_ros.sources.folder import SUFFIXES, FolderSource
+from stavpr_ros.evaluation.warp import cropped, FrameSource
+from stavpr_ros.sources.folder import FolderSource, SUFFIXES
 
-SYNTH = 'synth_'  # before a name: the same with both drives cropped
+SYNTH = 'synth_'  # before a name: the same with both traverses cropped
 CROP_MAP, CROP_QUERY = 0.3, 0.1  # right of every map image, left of every query image (synth-Nord)
-TRUTHS = ('groundtruth', 'gt', 'truth', 'groundtruthnew')
+GROUND_TRUTHS = ('groundtruth', 'gt', 'truth', 'groundtruthnew')
 HOLDERS = ('images', 'data', 'datasets', 'test')  # folders that only hold others
-# What folder names say beside the drive: sizes, rates, that there are images in it.
+# Parts of folder names besides the traverse: sizes, rates, kinds of files.
 NOISE = re.compile(r'\d+x\d+|\dfps|images|image|imgs|frames|grayscale|greyscale|jpg|png|test')
 
 
 @dataclass(frozen=True)
 class Layout:
     """
-    A data set on disk. Names are compared without case, punctuation and what every name may say.
+    Names of a data set's folders, compared without case, punctuation and ``NOISE``.
 
-    :param folders: what its own folder may be called, or begin with.
-    :param map_names: what the folder of the map may be called.
-    :param query_names: what that of the query may be called.
+    :param folders: names, or their first parts, of the data set's folder.
+    :param map_names: names of the folder of the map.
+    :param query_names: names of that of the query.
     :param tolerance: the paper's, places.
-    :param paired: the same index is right where both drives have equally many images; else a file says it.
+    :param paired: the same index is the ground truth where both have equally many images; else a
+        file is needed.
     """
 
     folders: tuple[str, ...]
@@ -53,17 +54,17 @@ NAMES = (*LAYOUTS, *(SYNTH + name for name in LAYOUTS))
 @dataclass(frozen=True)
 class Dataset:
     """
-    Two drives along one route.
+    Two traverses of one route.
 
     :param map: images of the map, in the order of the route.
     :param query: images of the query.
-    :param truth: the places that count as right, the tolerance included.
-    :param tolerance: the paper's, or the one that was asked for, places.
+    :param ground_truth: of the query's images, tolerance included.
+    :param tolerance: the paper's or the requested one, places.
     """
 
     map: FrameSource
     query: FrameSource
-    truth: GroundTruth
+    ground_truth: GroundTruth
     tolerance: int
 
     def synth(self, crop_map: float = CROP_MAP, crop_query: float = CROP_QUERY) -> 'Dataset':
@@ -73,18 +74,20 @@ class Dataset:
         :param crop_map: fraction of the width cut away on the right of every map image.
         :param crop_query: the same on the left of every query image.
         """
-        return replace(self, map=cropped(self.map, 0, crop_map), query=cropped(self.query, crop_query, 0))
+        return replace(
+            self, map=cropped(self.map, 0, crop_map), query=cropped(self.query, crop_query, 0)
+        )
 
 
 def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> Dataset:
     """
     Find a data set on disk.
 
-    :param name: one of ``NAMES``; ``synth_`` before a name crops both drives as synth-Nord is cropped.
+    :param name: one of ``NAMES``; ``synth_`` before a name crops both traverses as synth-Nord.
     :param root: its own folder, or one that holds it.
     :param tolerance: places; None = the paper's.
     :raises SettingsError: an unknown name.
-    :raises SourceError: it is not there; says what was looked for.
+    :raises SourceError: it is not found; names the folders that were searched.
     """
     if name not in NAMES:
         raise SettingsError(f'data set {name!r} is unknown: take one of {", ".join(NAMES)}')
@@ -93,15 +96,12 @@ def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> D
     places, query = FolderSource(map_folder), FolderSource(query_folder)
     tolerance = layout.tolerance if tolerance is None else tolerance
     if layout.paired and len(query) == len(places):
-        truth = GroundTruth.identity(len(query), len(places), tolerance)
+        ground_truth = GroundTruth.identity(len(query), len(places), tolerance)
     else:
-        file = _truth_file(name, folder, len(query), len(places))
-        truth = GroundTruth.from_file(file, len(query), len(places), tolerance)
-    dataset = Dataset(places, query, truth, tolerance)
+        file = _ground_truth_file(name, folder, len(query), len(places))
+        ground_truth = GroundTruth.from_file(file, len(query), len(places), tolerance)
+    dataset = Dataset(places, query, ground_truth, tolerance)
     return dataset.synth() if name.startswith(SYNTH) else dataset
-
-
-# ------------------------------------------------------------------------------------------ finding
 
 
 def _letters(name: str) -> str:
@@ -109,18 +109,21 @@ def _letters(name: str) -> str:
 
 
 def _plain(name: str) -> str:
-    # before the punctuation goes: 64x32-1fps
+    # noise before punctuation: 64x32-1fps
     return _letters(NOISE.sub('', name.casefold()))
 
 
 def _is_called(name: str, layout: Layout) -> bool:
     plain = _plain(name)
-    # short names only as they stand: too many others begin with them
-    return any(plain == folder or (len(folder) > 3 and plain.startswith(folder)) for folder in layout.folders)
+    # short names must be equal: too many others begin with them
+    return any(
+        plain == folder or (len(folder) > 3 and plain.startswith(folder))
+        for folder in layout.folders
+    )
 
 
-def _drive_name(name: str, layout: Layout) -> str:
-    """Return what a folder's name says about the drive: ``nordland_winter_images`` says ``winter``."""
+def _traverse_name(name: str, layout: Layout) -> str:
+    """Return the traverse in a folder's name: ``winter`` of ``nordland_winter_images``."""
     plain = _plain(name)
     for folder in sorted(layout.folders, key=len, reverse=True):
         if plain.startswith(folder):
@@ -142,54 +145,69 @@ def _holders(paths: list[Path]) -> list[Path]:
 
 
 def _find(name: str, layout: Layout, root: Path) -> tuple[Path, Path, Path]:
-    """Find the data set's folder and those of its map and query, the nearest to the root first."""
+    """Return the folders of data set, map and query, those nearest to the root first."""
     inside = _holders([root])
-    own = [child for path in (root, *inside) for child in _folders(path) if _is_called(child.name, layout)]
-    looked: list[Path] = []
+    own = [
+        child
+        for path in (root, *inside)
+        for child in _folders(path)
+        if _is_called(child.name, layout)
+    ]
+    searched: list[Path] = []
     for level in ([root], inside, own, _holders(own)):
-        looked += [path for path in level if path not in looked]
-        hits = [(path, *drives) for path in level if (drives := _drives(path, layout))]
+        searched += [path for path in level if path not in searched]
+        hits = [(path, *found) for path in level if (found := _traverses(path, layout))]
         if len(hits) > 1:
             several = ', '.join(str(path) for path, *_ in hits)
             raise SourceError(
-                f'data set {name} is there more than once: {several}; name the one that is meant'
+                f'data set {name} exists more than once: {several}; name one of these folders'
             )
         if hits:
             return hits[0]
-    seen = ', '.join(folder.name for path in looked for folder in _folders(path)) or 'no folder'
+    seen = ', '.join(folder.name for path in searched for folder in _folders(path)) or 'no folder'
     raise SourceError(
-        f'data set {name} is not in {root}: looked in {", ".join(map(str, looked))} for the map, a folder '
-        f'called {_or(layout.map_names)}, and the query, {_or(layout.query_names)}, and found {seen}; '
-        'rename them, or give map and query by their paths'
+        f'data set {name} is not in {root}: searched {", ".join(map(str, searched))} for the map, '
+        f'a folder called {_or(layout.map_names)}, and the query, {_or(layout.query_names)}, and '
+        f'found {seen}; rename them, or give map and query by their paths'
     )
 
 
-def _drives(path: Path, layout: Layout) -> tuple[Path, Path] | None:
-    drives = []
+def _traverses(path: Path, layout: Layout) -> tuple[Path, Path] | None:
+    traverses = []
     for names in (layout.map_names, layout.query_names):
-        found = [folder for folder in _folders(path) if _drive_name(folder.name, layout) in names]
+        found = [
+            folder for folder in _folders(path) if _traverse_name(folder.name, layout) in names
+        ]
         if not found:
             return None
         if len(found) > 1:
             several = ', '.join(folder.name for folder in found)
-            raise SourceError(f'{path} holds several folders for one drive: {several}; leave one of them')
-        drives.append(found[0])
-    return drives[0], drives[1]
+            raise SourceError(
+                f'{path} holds several folders for one traverse: {several}; leave one of them'
+            )
+        traverses.append(found[0])
+    return traverses[0], traverses[1]
 
 
-def _truth_file(name: str, folder: Path, queries: int, places: int) -> Path:
-    files = [file for file in sorted(folder.iterdir()) if _letters(file.stem) in TRUTHS and file.is_file()]
-    for suffixes in (TEXT, ARRAYS, tuple(SUFFIXES)):  # text first: nothing is unclear about it
+def _ground_truth_file(name: str, folder: Path, queries: int, places: int) -> Path:
+    files = [
+        file
+        for file in sorted(folder.iterdir())
+        if _letters(file.stem) in GROUND_TRUTHS and file.is_file()
+    ]
+    for suffixes in (TEXT, ARRAYS, tuple(SUFFIXES)):  # text first: the least ambiguous
         found = [file for file in files if file.suffix.lower() in suffixes]
         if len(found) > 1:
             several = ', '.join(file.name for file in found)
-            raise SourceError(f'data set {name} in {folder} has several ground truths: {several}; leave one')
+            raise SourceError(
+                f'data set {name} in {folder} has several ground truths: {several}; leave one'
+            )
         if found:
             return found[0]
     raise SourceError(
-        f'data set {name} in {folder} has {queries} query images for {places} places and no ground truth: '
-        f'looked for a file called {_or(TRUTHS)}, text, array or image, such as GroundTruth.csv, a line '
-        'query,place'
+        f'data set {name} in {folder} has {queries} query images for {places} places and no '
+        f'ground truth: searched for a file called {_or(GROUND_TRUTHS)}, text, array or image, '
+        'such as GroundTruth.csv, a line query,place'
     )
 
 

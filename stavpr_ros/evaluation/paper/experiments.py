@@ -1,4 +1,4 @@
-"""The paper's experiments as configurations: one is a column of a table, a drive with features is a row."""
+"""The paper's experiments: configurations are columns of a table, data sets with features rows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -6,12 +6,12 @@ from typing import Any
 
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.evaluation.metrics import Metrics, Ranking, evaluate_ranking
 from stavpr_ros.evaluation.evaluate import evaluate_on_map
+from stavpr_ros.evaluation.metrics import evaluate_ranking, Metrics, Ranking
 from stavpr_ros.evaluation.paper.datasets import Dataset
-from stavpr_ros.evaluation.seqslam import SeqSlamSettings, seqslam
+from stavpr_ros.evaluation.seqslam import seqslam, SeqSlamSettings
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import PlaceMap, build_map
+from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.robust.options import PAPER, ROBUST, RobustOptions
 
@@ -24,13 +24,13 @@ class Configuration:
     """
     One way to recognize places.
 
-    :param name: how the published numbers call it, see :mod:`stavpr_ros.evaluation.paper.published`.
+    :param name: its name in :mod:`stavpr_ros.evaluation.paper.published`.
     :param title: head of its column.
     :param temporal: sequences; False = single images.
     :param strips: W.
     :param projection: dimensions of a random projection, None without.
-    :param robust_options: those of the recognizer, None for those of the mode.
-    :param baseline: ``seqslam``: that instead, with the length of the sequence settings.
+    :param robust_options: of the recognizer; None = those of the mode.
+    :param baseline: ``seqslam``: run that instead, with the length of the sequence settings.
     """
 
     name: str
@@ -76,7 +76,11 @@ PRESETS: dict[str, tuple[Configuration, ...]] = {
         replace(STA_VPR, robust_options=PAPER),
         Configuration('robust', 'robust', robust_options=ROBUST),
         *(
-            Configuration(f'without_{option.name}', f'without {option.name}', robust_options=ROBUST.without(option.name))
+            Configuration(
+                f'without_{option.name}',
+                f'without {option.name}',
+                robust_options=ROBUST.without(option.name),
+            )
             for option in fields(RobustOptions)
         ),
     ),
@@ -90,12 +94,14 @@ SWEEPS: dict[str, tuple[float, ...]] = {
 }
 
 
-def sweep_configurations(parameter: str, values: Sequence[float] = ()) -> tuple[Configuration, ...]:
+def sweep_configurations(
+    parameter: str, values: Sequence[float] = ()
+) -> tuple[Configuration, ...]:
     """
-    Vary one of the paper's parameters, all others at their defaults.
+    Return one configuration a value of a parameter, all others at their defaults.
 
     :param parameter: l, beta, xi, sigma or W.
-    :param values: those that are tried; the table ``SWEEPS`` without.
+    :param values: those of ``SWEEPS`` if none are given.
     :raises SettingsError: no such parameter, or a value out of its range.
     """
     if parameter not in SWEEPS:
@@ -121,11 +127,11 @@ def _changed(plain: Configuration, parameter: str, value: float) -> Configuratio
     return replace(plain, spatial=spatial)
 
 
-class Bench:
+class DatasetExperiment:
     """
-    One data set with one kind of features; descriptions are kept, since several columns want the same.
+    Evaluates configurations on one data set; features are kept, since several columns share them.
 
-    :param dataset: where the images are.
+    :param dataset: images and ground truth.
     :param kind, backbone: of the features, see :class:`stavpr_ros.features.FeatureExtractor`.
     :param mode: of the recognizer, ``paper`` or ``robust``.
     """
@@ -135,13 +141,13 @@ class Bench:
     ) -> None:
         self._dataset, self._kind, self._backbone = dataset, kind, backbone
         self._mode, self._device = mode, device
-        self._described: dict[tuple[int, int | None], tuple[PlaceMap, PlaceMap]] = {}
+        self._features: dict[tuple[int, int | None], tuple[PlaceMap, PlaceMap]] = {}
 
-    def judge(self, configuration: Configuration, progress: bool = False) -> Metrics:
-        """Run one configuration."""
+    def evaluate(self, configuration: Configuration) -> Metrics:
+        """Return the metrics of one configuration."""
         if configuration.baseline:
-            return self._judge_baseline(configuration)
-        reference, query = self._drives(configuration, progress)
+            return self._evaluate_baseline(configuration)
+        reference, query = self._maps(configuration)
         settings = RecognizerSettings(
             threshold=1.0,
             spatial=configuration.spatial,
@@ -149,17 +155,20 @@ class Bench:
             mode=self._mode,
             robust_options=configuration.robust_options,
         )
-        evaluation = evaluate_on_map(reference, query.features, self._dataset.truth, settings)
+        evaluation = evaluate_on_map(
+            reference, query.features, self._dataset.ground_truth, settings
+        )
         return evaluation.sequence if configuration.temporal else evaluation.single
 
-    def _judge_baseline(self, configuration: Configuration) -> Metrics:
+    def _evaluate_baseline(self, configuration: Configuration) -> Metrics:
         settings = SeqSlamSettings(length=configuration.sequence.length)
         places, scores = seqslam(self._dataset.map, self._dataset.query, settings)
-        return evaluate_ranking(Ranking(places[:, None], scores), self._dataset.truth)
+        return evaluate_ranking(Ranking(places[:, None], scores), self._dataset.ground_truth)
 
-    def _drives(self, configuration: Configuration, progress: bool) -> tuple[PlaceMap, PlaceMap]:
+    def _maps(self, configuration: Configuration) -> tuple[PlaceMap, PlaceMap]:
+        """Return the features of map and query."""
         key = (configuration.strips, configuration.projection)
-        if key not in self._described:
+        if key not in self._features:
             extractor = FeatureExtractor(
                 self._kind,
                 self._backbone,
@@ -167,8 +176,8 @@ class Bench:
                 configuration.projection,
                 device=self._device,
             )
-            self._described[key] = tuple(  # type: ignore[assignment]
-                build_map(source, extractor, thumbnails=False, progress=progress)
+            self._features[key] = tuple(  # type: ignore[assignment]
+                build_map(source, extractor, thumbnails=False, progress=False)
                 for source in (self._dataset.map, self._dataset.query)
             )
-        return self._described[key]
+        return self._features[key]

@@ -1,4 +1,4 @@
-"""The numbers that the paper publishes (section 6 of the method), for tables beside ours."""
+"""The numbers that the paper publishes (section 6 of the method)."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ class PublishedF1:
     """
     F1 of one data set.
 
-    :param sta_densenet, sta_vgg: STA-VPR; then the same with random projection and restricted alignment.
+    :param sta_densenet, sta_vgg: STA-VPR; ``fast``: with GRP and restricted alignment.
     :param densenet, vgg: the same features of single images, no alignment.
 
-    The others are what the paper compares with: SeqSLAM with sequences of 20, the rest single images.
+    The others are the paper's baselines: SeqSLAM with sequences of 20, the rest single images.
     """
 
     title: str
@@ -44,7 +44,9 @@ F1 = {
     'gardens_point_night': PublishedF1(
         'GP DL&NR', 0.122, 0.758, 0.367, 0.834, 0.738, 0.671, 0.950, 0.969, 0.947, 0.979, 0.953
     ),
-    'ua': PublishedF1('UA', 0.687, 0.574, 0.794, 0.955, 0.979, 0.492, 0.977, 0.968, 0.963, 0.991, 0.990),
+    'ua': PublishedF1(
+        'UA', 0.687, 0.574, 0.794, 0.955, 0.979, 0.492, 0.977, 0.968, 0.963, 0.991, 0.990
+    ),
     'berlin_a100': PublishedF1(
         'Berlin A100', 0.457, 0.843, 0.603, 0.714, 0.683, 0.527, 0.927, 0.873, 0.857, 0.857, 0.801
     ),
@@ -61,12 +63,12 @@ STRATEGIES = {
 
 def published_f1(dataset: str, backbone: str, configuration: str) -> float | None:
     """
-    Look a number up.
+    Return a published F1.
 
     :param dataset: a name of :mod:`stavpr_ros.evaluation.paper.datasets`.
     :param backbone: ``DenseNet161`` or ``VGG16``.
-    :param configuration: a name of :mod:`stavpr_ros.evaluation.paper.experiments`, such as ``sta_vpr``.
-    :returns: None where the paper has none.
+    :param configuration: a name of :mod:`.experiments`, such as ``sta_vpr``.
+    :returns: None where the paper publishes none.
     """
     row = F1.get(dataset)
     if configuration in ('sliding_window', 'vanilla', 'adaptive'):

@@ -1,0 +1,172 @@
+"""The files of a report: JSON, CSV, plots and the page."""
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+from stavpr_ros.errors import SourceError
+from stavpr_ros.evaluation import plots
+from stavpr_ros.evaluation.evaluate import Evaluation
+from stavpr_ros.evaluation.plots import Box, MatchPair
+from stavpr_ros.evaluation.report import (
+    accepted_matches,
+    chosen_window,
+    METRICS,
+    Report,
+    worst_mistakes,
+)
+from stavpr_ros.evaluation.report_page import html_page
+
+PAGE_MISTAKES, PLOT_MISTAKES = 9, 6
+
+
+def write_json(report: Report, path: Path) -> None:
+    """
+    Write the numbers.
+
+    :raises SourceError: the file cannot be written.
+    """
+    try:
+        text = json.dumps(report.to_json(), indent=2, allow_nan=False)
+        path.write_text(text + '\n', encoding='utf-8')
+    except OSError as error:
+        raise SourceError(f'{path} cannot be written: {error}') from error
+
+
+def write_folder(report: Report, folder: Path) -> Path:
+    """
+    Write the numbers, the matches, the curves, the plots and the page.
+
+    :returns: the page.
+    :raises SourceError: the folder or a file in it cannot be written.
+    :raises UnavailableError: jinja2 is not installed.
+    """
+    page = folder / 'report.html'
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_matches(report, folder / 'answers.csv')
+        _write_curves(report.evaluation, folder / 'curves.csv')
+        boxes = _draw(report, folder)
+        embedded = {
+            'precision_recall': folder / 'precision_recall.png',
+            'distances': folder / 'distances.png',
+            'matrix': folder / 'similarity_matrix.png',
+        }
+        contents = {name: path.read_bytes() for name, path in embedded.items()}
+        mistakes = worst_mistakes(report.evaluation, PAGE_MISTAKES)
+        page.write_text(html_page(report, mistakes, contents, boxes), encoding='utf-8')
+    except OSError as error:
+        raise SourceError(f'the report cannot be written into {folder}: {error}') from error
+    write_json(report, folder / 'results.json')
+    return page
+
+
+def _write_matches(report: Report, path: Path) -> None:
+    results, truth = report.evaluation.results, report.evaluation.ground_truth
+    sequence, single = results.sequence, results.single
+    columns = {
+        'image': range(len(report.query)),
+        'identifier': report.query.ids,
+        'in_map': truth.has_match.astype(int).tolist(),
+        'true_place': truth.middles.tolist(),
+        'sequence_place': sequence.best.tolist(),
+        'sequence_distance': sequence.scores.tolist(),
+        'sequence_right': truth.accepts(sequence.best).astype(int).tolist(),
+        'single_place': single.best.tolist(),
+        'single_distance': single.scores.tolist(),
+        'single_right': truth.accepts(single.best).astype(int).tolist(),
+    }
+    with path.open('w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
+
+
+def _write_curves(evaluation: Evaluation, path: Path) -> None:
+    with path.open('w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file)
+        writer.writerow(['answers', 'threshold', 'precision', 'recall'])
+        for name in METRICS:
+            curve = getattr(evaluation, name).curve
+            for point in zip(curve.thresholds, curve.precision, curve.recall, strict=True):
+                writer.writerow([name, *map(float, point)])
+
+
+def _draw(report: Report, folder: Path) -> dict[str, Box]:
+    """
+    Draw the curves, the distances, the worst mistakes and one window.
+
+    :returns: where the axes of ``curves`` and ``matrix`` are in their plots.
+    """
+    evaluation = report.evaluation
+    boxes = {
+        'curves': _draw_curves(evaluation, folder / 'precision_recall.png'),
+        'matrix': _draw_matrix(evaluation, folder / 'similarity_matrix.png'),
+    }
+    _draw_distances(evaluation, folder / 'distances.png')
+    mistakes = worst_mistakes(evaluation, PLOT_MISTAKES)
+    pairs = [pair for image in mistakes if (pair := _mistake(report, image))]
+    if pairs:
+        plots.match_overview(folder / 'mistakes.png', pairs, columns=2)
+    window = chosen_window(evaluation, report.window)
+    if window is not None:
+        local = window.path - [0, window.first]
+        path = folder / f'window_{window.image}.png'
+        plots.warping_path(path, window.distances, local, window.first)
+    return boxes
+
+
+def _draw_curves(evaluation: Evaluation, path: Path) -> Box:
+    kinds = {
+        'sequences': (plots.SEQUENCE, evaluation.sequence),
+        'sequences, without the ends': (plots.SEQUENCE_INNER, evaluation.sequence_without_ends),
+        'single images': (plots.SINGLE, evaluation.single),
+    }
+    curves = {
+        name: (
+            color,
+            metrics.curve.recall,
+            metrics.curve.precision,
+            (metrics.best.recall, metrics.best.precision),
+        )
+        for name, (color, metrics) in kinds.items()
+    }
+    return plots.precision_recall(path, curves)
+
+
+def _draw_distances(evaluation: Evaluation, path: Path) -> None:
+    matches = evaluation.results.sequence
+    correct = evaluation.ground_truth.accepts(matches.best)
+    groups = {
+        'correct': (plots.COLORS['right'], matches.scores[correct]),
+        'wrong': (plots.COLORS['wrong'], matches.scores[~correct]),
+    }
+    if evaluation.unknown is not None:
+        groups['unknown places'] = (plots.UNKNOWN, evaluation.unknown.sequence.scores)
+    plots.distance_histogram(path, groups, evaluation.sequence.best.threshold)
+
+
+def _draw_matrix(evaluation: Evaluation, path: Path) -> Box:
+    reduced, truth = evaluation.results.distances, evaluation.ground_truth
+    true_blocks = np.zeros(reduced.values.shape, bool)
+    rows, columns = (truth.pairs // reduced.block).T
+    true_blocks[rows, columns] = True
+    shape = truth.N, truth.n
+    return plots.reduced_matrix(
+        path, reduced.values, shape, true_blocks, accepted_matches(evaluation)
+    )
+
+
+def _mistake(report: Report, image: int) -> MatchPair | None:
+    """Return a wrong match beside its query, with the true place in the caption."""
+    matches = report.evaluation.results.sequence
+    place, true = int(matches.best[image]), int(report.evaluation.ground_truth.middles[image])
+    query, shown = report.query.thumbnail(image), report.reference.thumbnail(place)
+    if query is None or shown is None:
+        return None
+    shown = cv2.resize(shown, query.shape[1::-1], interpolation=cv2.INTER_AREA)
+    where = f'true place {true}' if true >= 0 else 'not in the map'
+    caption = f'image {image}: place {place}, {where}, distance {matches.scores[image]:.3f}'
+    return MatchPair(query, shown, caption, 'wrong')

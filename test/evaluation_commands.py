@@ -1,0 +1,33 @@
+"""Inputs and a runner for the tests of the commands ``evaluate`` and ``experiments``."""
+
+import json
+
+import cv2
+import pytest
+
+
+def write_images(folder, images):
+    """Write RGB images as PNG files; returns the folder."""
+    folder.mkdir(parents=True)
+    for i, image in enumerate(images):
+        cv2.imwrite(str(folder / f'{i:03}.png'), image[:, :, ::-1])
+    return folder
+
+
+def runner(command, monkeypatch, capsys):
+    """Return a function that runs a command in this process: exit code, output, errors."""
+    monkeypatch.setattr(command, 'obey_signals', lambda: None)
+
+    def run(*arguments):
+        try:
+            code = command.main([str(argument) for argument in arguments])
+        except SystemExit as error:  # argparse
+            code = error.code
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def read_json(text):
+    """Parse JSON as browsers do: without NaN and Infinity."""
+    return json.loads(text, parse_constant=pytest.fail)
