@@ -1,4 +1,4 @@
-"""LM-DTW written without a thought of the machine: a plain prange over starts, the oracle's loops."""
+"""Plain programs of the same mathematics: LM-DTW and velocity search with prange, the oracle."""
 
 import importlib.util
 import sys
@@ -7,16 +7,17 @@ from functools import lru_cache
 from types import ModuleType
 
 import numpy as np
-from records import ROOT
+from results import ROOT
 
 
 @lru_cache
 def prange() -> Callable[[np.ndarray, int, np.ndarray, np.ndarray], None]:
     """
-    Compile the obvious parallel program: one start after the other on every core, the textbook's loops.
+    Compile the textbook's loops of LM-DTW, parallel over the starts.
 
-    It takes D (l, n) float32, k, and writes distances (n,) float32 and lengths (n,) int32. The same
-    arithmetic, tie rule and answers as ours; two rows of S and C are kept for a start, not the tables.
+    The function takes D (l, n) float32, k, and writes distances (n,) float32 and lengths (n,)
+    int32: the same arithmetic, tie rule and results as the package's kernel. Each start keeps one
+    row.
     """
     import numba as nb
 
@@ -54,6 +55,39 @@ def prange() -> Callable[[np.ndarray, int, np.ndarray, np.ndarray], None]:
 
 
 @lru_cache
+def prange_velocities() -> Callable[[np.ndarray, np.ndarray, np.float32], np.ndarray]:
+    """
+    Compile the recursion of the velocity search row by row, parallel over the places.
+
+    The function takes costs (l, n) float32, steps (V, l) int32 and the penalty, and returns
+    distances (n,) float32, bit for bit those of the package's kernel. It does not track the paths'
+    places.
+    """
+    import numba as nb
+
+    @nb.njit(parallel=True, error_model='numpy')
+    def search(costs: np.ndarray, steps: np.ndarray, penalty: np.float32) -> np.ndarray:
+        l, n = costs.shape
+        best = np.full(n, np.inf, np.float32)
+        for v in range(len(steps)):
+            before = costs[0].copy()
+            for i in range(1, l):
+                now, step = np.empty(n, np.float32), steps[v, i]
+                for y in nb.prange(n):
+                    S = before[y - step] if y >= step else np.float32(np.inf)
+                    if step > 0 and y - step + 1 >= 0:
+                        S = min(S, before[y - step + 1] + penalty)
+                    if y - step - 1 >= 0:
+                        S = min(S, before[y - step - 1] + penalty)
+                    now[y] = costs[i, y] + S
+                before = now
+            best = np.minimum(best, before / np.float32(l))
+        return best
+
+    return search
+
+
+@lru_cache
 def oracle() -> ModuleType:
     """Load test/oracle.py, the method in plain loops."""
     path = ROOT / 'test' / 'oracle.py'
@@ -61,12 +95,12 @@ def oracle() -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # its dataclasses look themselves up there
+    sys.modules[spec.name] = module  # needed by its dataclasses
     spec.loader.exec_module(module)
     return module
 
 
 def sample(n: int, k: int, count: int) -> list[int]:
-    """Return ``count`` starts spread evenly over those that see k whole columns, or all of these."""
+    """Return ``count`` starts, spread evenly over those that see k columns, or all of these."""
     whole = max(1, n - k + 1)
     return sorted({int(start) for start in np.linspace(0, whole - 1, min(count, whole))})

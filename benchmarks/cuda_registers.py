@@ -1,9 +1,10 @@
 """
-What the compiler makes of the CUDA kernels: registers, stack, spills and shared memory of each, as JSON.
+Resources of the compiled CUDA kernels: registers, stack, spills and shared memory, as JSON.
 
-No GPU is needed: numba-cuda compiles each kernel to PTX and NVIDIA's assembler reports on the machine code.
+No GPU is needed: numba-cuda compiles each kernel to PTX, and NVIDIA's assembler reports on the
+code.
 
-    pip install 'numba-cuda[cu13]'      # and ptxas on the PATH: it comes with the CUDA toolkit
+    pip install 'numba-cuda[cu13]'      # and ptxas, a part of the CUDA toolkit, on the PATH
     python benchmarks/cuda_registers.py [--arch 90] [--out FILE]
 """
 
@@ -20,13 +21,13 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-# W and its band: the default, restricted alignment, more strips. l and k: the default, beta = 1.5, others.
+# W and its band: the default, restricted alignment, more strips. l and k: the default and others.
 SPATIAL = [(7, 7), (7, 3), (14, 14)]
 SEQUENCES = [(5, 10), (20, 40), (20, 30), (33, 66), (50, 100), (76, 152), (77, 154), (1000, 2000)]
 
 
 class MissingError(Exception):
-    """Something is not here; its text says what."""
+    """A required program or package is missing; the text names it."""
 
 
 def kernels() -> list[tuple[str, Any, Any]]:
@@ -38,20 +39,30 @@ def kernels() -> list[tuple[str, Any, Any]]:
     images = (float32[:, :, :], float32, int64, int64, float32[:, ::1])
     floats, whole = float32[::1], int32[::1]
     window = (float32[:, ::1], int64, int64, floats, whole, floats, whole, whole, whole, floats)
-    found = [(f'spatial_dtw W={W} xi={xi}', dtw.spatial_dtw(W, xi).py_func, images) for W, xi in SPATIAL]
+    found = [
+        (f'spatial_dtw W={W} xi={xi}', dtw.spatial_dtw(W, xi).py_func, images) for W, xi in SPATIAL
+    ]
     found.append(('sliding_window W=7', dtw.sliding_window(7, 4, 7).py_func, images))
     found += [
-        (f'lm_dtw l={l} k={k}', lm_dtw.lm_dtw(l, k, lm_dtw.BLOCK).py_func, window) for l, k in SEQUENCES
+        (f'lm_dtw l={l} k={k}', lm_dtw.lm_dtw(l, k, lm_dtw.BLOCK).py_func, window)
+        for l, k in SEQUENCES
     ]
     return found
 
 
 def assemble(ptx: str, arch: str) -> str:
-    """Return what ptxas says of one kernel."""
+    """Return the report of ptxas on one kernel."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder, 'kernel.ptx')
         source.write_text(ptx)
-        command = ['ptxas', '-v', f'-arch=sm_{arch}', str(source), '-o', str(Path(folder, 'kernel.cubin'))]
+        command = [
+            'ptxas',
+            '-v',
+            f'-arch=sm_{arch}',
+            str(source),
+            '-o',
+            str(Path(folder, 'kernel.cubin')),
+        ]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     if 'Unsupported .version' in done.stderr:
         raise MissingError(
@@ -63,7 +74,7 @@ def assemble(ptx: str, arch: str) -> str:
 
 
 def number(pattern: str, report: str) -> int:
-    """Return the number in front of, or behind, some words of the report."""
+    """Return the number that a pattern finds in the report."""
     found = re.search(pattern, report)
     if found is None:
         raise SystemExit(f'cuda_registers: the report of ptxas has no {pattern!r}: {report}')
@@ -87,22 +98,28 @@ def report_on(function: Any, types: Any, arch: str) -> dict[str, int]:
 
 
 def require_compilers() -> None:
-    """Look for numba-cuda and ptxas."""
+    """Check that numba-cuda and ptxas are installed."""
     if importlib.util.find_spec('numba_cuda') is None:
         raise MissingError("the package numba-cuda is missing: pip install 'numba-cuda[cu13]'")
     if shutil.which('ptxas') is None:
-        raise MissingError('ptxas is not on the PATH: it comes with the CUDA toolkit')
+        raise MissingError('ptxas is not on the PATH: install the CUDA toolkit')
 
 
 def main() -> int:
     """Report on all kernels."""
-    parser = argparse.ArgumentParser(description='Registers, stack and spills of the CUDA kernels.')
-    parser.add_argument('--arch', default='90', help='compute capability, 90 for H100 and H200 (90)')
+    parser = argparse.ArgumentParser(
+        description='Registers, stack and spills of the CUDA kernels.'
+    )
+    parser.add_argument(
+        '--arch', default='90', help='compute capability, 90 for H100 and H200 (90)'
+    )
     parser.add_argument('--out', type=Path, help='write the JSON to this file as well')
     options = parser.parse_args()
     try:
         require_compilers()
-        results = {name: report_on(function, types, options.arch) for name, function, types in kernels()}
+        results = {
+            name: report_on(function, types, options.arch) for name, function, types in kernels()
+        }
     except MissingError as missing:
         print(f'cuda_registers: {missing}', file=sys.stderr)
         return 2

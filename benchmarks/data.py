@@ -1,60 +1,60 @@
-"""Made-up maps, queries and windows, from a seed; timing depends on their sizes only."""
+"""Data of the benchmarks: the folder of data sets, and synthetic maps, queries and windows."""
 
-from typing import Any
+import os
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 
-SETTINGS = FeatureSettings('made-up', None)
+SETTINGS = FeatureSettings('synthetic', None)
 BLOCK_BYTES = 2**28
+
+
+class NoDataError(Exception):
+    """The folder of data sets is missing."""
+
+
+def data_folder() -> Path:
+    """
+    Return the folder of the data sets: ``STAVPR_DATA``, or ``data`` in the checkout.
+
+    :raises NoDataError: no such folder.
+    """
+    folder = Path(os.environ.get('STAVPR_DATA') or Path(__file__).resolve().parents[1] / 'data')
+    if not folder.is_dir():
+        raise NoDataError(
+            f'no data folder {folder}: set STAVPR_DATA to the folder of the data sets'
+        )
+    return folder
 
 
 def make_features(n: int, d: int, W: int, device: str, seed: int) -> LocalFeatures:
     """
-    Draw unit-norm Gaussian local features on a device, in pieces.
+    Draw unit-norm Gaussian local features on a device, in blocks.
 
-    :returns: strips (W, n, d) float32; every strip weighs the same.
+    :returns: strips (W, n, d) float32, all of equal weight.
     """
     generator = torch.Generator(device).manual_seed(seed)
     strips = torch.empty(W, n, d, device=device)
     rows = strips.view(W * n, d)
-    for piece in rows.split(max(1, BLOCK_BYTES // (4 * d))):
-        piece.normal_(generator=generator)
-        piece.div_(torch.linalg.vector_norm(piece, dim=1, keepdim=True))
+    for block in rows.split(max(1, BLOCK_BYTES // (4 * d))):
+        block.normal_(generator=generator)
+        block.div_(torch.linalg.vector_norm(block, dim=1, keepdim=True))
     weights = torch.full((W, n), W**-0.5, device=device)
     return LocalFeatures(strips, weights, SETTINGS)
 
 
-def make_window(kind: str, l: int, n: int, seed: int) -> np.ndarray:
-    """
-    Make a window of image distances, shape (l, n), float32.
-
-    :param kind: ``random``, independent values; ``walk``, values that change slowly along the map and
-        fall towards a diagonal, as those of a real drive do.
-    """
-    rng = np.random.default_rng(seed)
-    if kind == 'random':
-        return rng.uniform(0.3, 1.0, (l, n)).astype(np.float32)
-    if kind != 'walk':
-        raise ValueError(f'window {kind!r} is unknown: take random or walk')
-    walk = np.cumsum(rng.standard_normal((l, n)) * 0.01, axis=1)
-    walk = 0.7 + 0.2 * np.sin(walk)
-    place = n // 2 + np.arange(l)[:, None]
-    valley = 0.5 * np.exp(-(((np.arange(n) - place) / 3.0) ** 2))
-    return np.clip(walk - valley, 0.05, 1.0).astype(np.float32)
-
-
-def feature_bytes(n: int, d: int, W: int) -> int:
-    """Return the bytes of a float32 map."""
-    return 4 * n * d * W
+def make_window(l: int, n: int, seed: int) -> np.ndarray:
+    """Draw a window of image distances, shape (l, n), float32; times depend on the shape only."""
+    return np.random.default_rng(seed).uniform(0.3, 1.0, (l, n)).astype(np.float32)
 
 
 def free_bytes(device: str) -> int:
-    """Return how much memory is free on a device."""
+    """Return the free memory of a device."""
     if device == 'cuda':
         return int(torch.cuda.mem_get_info()[0])
     with open('/proc/meminfo', encoding='ascii') as lines:
-        found: dict[str, Any] = dict(line.split(':') for line in lines)
+        found = dict(line.split(':') for line in lines)
     return int(found['MemAvailable'].split()[0]) * 1024

@@ -1,29 +1,28 @@
 """
-Benchmark of the matching: every stage and the whole, beside its floor and beside what others would use.
+Benchmark of matching: every stage and whole frames beside lower bounds and peers, and memory.
 
-``make bench``, ``make bench-quick``; or, without building, ``PYTHONPATH=. python benchmarks/matching.py``.
-What is measured and how: benchmarks/README.md.
+``make bench``, ``make bench-quick``; without building, ``PYTHONPATH=. python
+benchmarks/matching.py``. Method and tables: benchmarks/README.md.
 """
 
 import argparse
 import sys
 import time
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from results import RESULTS
 
 if TYPE_CHECKING:
     from peer_process import Peers
     from run import Run
-    from stages import Plan
 
-RESULTS = Path(__file__).resolve().parent / 'results'
-SIZES = (1_000, 2_000, 20_000, 100_000, 1_000_000)
-QUICK_LIMIT = RAW_LIMIT = 20_000
-DIMENSIONS = (512, 10_416)
-BUSY = 0.5  # load average from which a run is worth little
-QUICK_RAW_LIMIT = 2_000
-QUICK_OPERATIONS = 3e10  # of a distance matrix
+SIZES = (2_000, 20_000, 100_000)
+QUICK_LIMIT = 20_000  # most places of --quick
+DIMENSIONS = (224, 512)  # of the gradient features, and of projected ones
+BUSY = 0.5  # load average above which results are not repeatable
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -31,77 +30,86 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('--device', choices=('cpu', 'cuda'), default='cpu')
     parser.add_argument(
-        '--quick',
-        action='store_true',
-        help=f'up to {QUICK_LIMIT:,} places, raw features up to {QUICK_RAW_LIMIT:,}',
+        '--quick', action='store_true', help=f'up to {QUICK_LIMIT:,} places, fewer runs'
     )
     parser.add_argument('--sizes', type=int, nargs='+', default=SIZES, metavar='N', help='places')
     parser.add_argument(
-        '--dimensions', type=int, nargs='+', default=DIMENSIONS, metavar='D',
-        help=f'of a local feature; above 512 up to {RAW_LIMIT:,} places',
-    )  # fmt: skip
+        '--dimensions',
+        type=int,
+        nargs='+',
+        default=DIMENSIONS,
+        metavar='D',
+        help='of a local feature',
+    )
     parser.add_argument('--precisions', nargs='+', metavar='DTYPE', help='of the map (all)')
-    parser.add_argument('--seconds', type=float, help='spent on one stage (0.5; quick: 0.2)')
-    parser.add_argument('--memory', type=float, help='GB to use at most (12; on a GPU: what is free)')
+    parser.add_argument(
+        '--seconds', type=float, help='duration of one measurement (0.5; quick: 0.15)'
+    )
+    parser.add_argument('--memory', type=float, default=12, help='most GB to use (%(default)s)')
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--no-peers', action='store_true', help='without librosa and tslearn (.venv-peers)')
-    parser.add_argument('--commit', default='', help='what is measured, where git does not tell')
-    parser.add_argument('--output', type=Path, default=RESULTS, help='folder of the results (%(default)s)')
+    parser.add_argument(
+        '--no-peers', action='store_true', help='without librosa and tslearn (.venv-peers)'
+    )
+    parser.add_argument(
+        '--no-memory', action='store_true', help='without the memory of the pipeline'
+    )
+    parser.add_argument(
+        '--commit', default='', help='name of the measured commit, outside a git checkout'
+    )
+    parser.add_argument(
+        '--output', type=Path, default=RESULTS, help='folder of the results (%(default)s)'
+    )
     options = parser.parse_args(arguments)
     if options.quick:
         options.sizes = [n for n in options.sizes if n <= QUICK_LIMIT]
-    options.seconds = options.seconds or (0.2 if options.quick else 0.5)
-    options.memory = 1e9 * (options.memory or (12 if options.device == 'cpu' else 1e6))
+    options.seconds = options.seconds or (0.15 if options.quick else 0.5)
     return options
 
 
-def open_peers(stack: ExitStack, refused: bool) -> tuple['Peers | None', str]:
-    """Start the peers; None, and why, where that cannot be."""
+def open_peers(stack: ExitStack, run: 'Run', refused: bool) -> 'Peers | None':
+    """Start the peers of the other environment; None, and recorded reasons, where that fails."""
     from peer_process import Peers, PeersMissingError
 
-    if refused:
-        return None, 'left out: --no-peers'
+    reason = '--no-peers'
     try:
-        return stack.enter_context(Peers()), ''
+        if not refused:
+            return stack.enter_context(Peers())
     except PeersMissingError as error:
-        return None, f'no environment for the peers: {error}'
+        reason = f'no environment for the peers: {error}'
+    for name in ('librosa', 'tslearn'):
+        run.skip(name, 0, 0, reason)
+    return None
 
 
-def bands_of(dimension: int) -> tuple[int | None, ...]:
-    """Return xi: projected features with and without restriction, raw ones without."""
-    return (None, 3) if dimension <= 512 else (None,)
-
-
-def cases_of(options: argparse.Namespace) -> list[tuple[int, int]]:
-    """Return the sizes (n, d) of the maps: raw features of fewer places than projected ones."""
-    raw = QUICK_RAW_LIMIT if options.quick else RAW_LIMIT
-    return [(n, d) for d in options.dimensions for n in options.sizes if d <= 512 or n <= raw]
-
-
-def count_steps(options: argparse.Namespace, cases: list[tuple[int, int]]) -> int:
-    """Return how many stages there will be, for the progress bar."""
-    precisions = len(options.precisions)
-    products = len({*options.precisions, 'bfloat16'})
-    featured = sum(products + precisions * 3 * len(bands_of(d)) for _, d in cases)
-    return featured + (4 if options.device == 'cpu' else 1) * len(options.sizes)
-
-
-def measure_all(run: 'Run', plan: 'Plan', options: argparse.Namespace, cases: list[tuple[int, int]]) -> None:
+def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
     """Measure all stages of all sizes."""
-    from stages import feature_stages, memory_problem, sequence_stages
+    import torch
+    from stages import (
+        device_retrieval,
+        feature_stages,
+        memory_problem,
+        paper_stages,
+        robust_stages,
+    )
 
+    for n in options.sizes:
+        robust_stages(run, n, options.seed)
+    for n in options.sizes:
+        for d in options.dimensions:
+            problem = memory_problem(n, d, run.device, 1e9 * options.memory)
+            try:
+                if not problem:
+                    feature_stages(run, n, d, options.precisions, options.seed)
+            except (MemoryError, torch.cuda.OutOfMemoryError) as error:
+                problem = f'out of memory: {str(error).splitlines()[0]}'
+            if problem:
+                run.skip('frame', n, d, problem)
     with ExitStack() as stack:
-        processes, reason = open_peers(stack, options.no_peers)
+        processes = open_peers(stack, run, options.no_peers)
         for n in options.sizes:
-            sequence_stages(run, plan, n, processes, reason)
-    for n, d in cases:
-        problem = memory_problem(plan, run, n, d)
-        if problem:
-            for precision in options.precisions:
-                run.skip('online_frame', n, d, precision, problem)
-            continue
-        with run.otherwise_skip('online_frame', n, d, options.precisions[0]):
-            feature_stages(run, plan, n, d, bands_of(d))
+            paper_stages(run, n, options.seed, processes)
+            if run.device == 'cuda':
+                device_retrieval(run, n, options.seed)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -117,36 +125,35 @@ def main(arguments: list[str] | None = None) -> int:
     except StavprError as error:
         print(error, file=sys.stderr)
         return 2
-    from ceilings import SIDE, measure_ceilings
-    from marks import with_marks
-    from records import machine, save, slug, with_machine
-    from report import marks_section, write
+    from memory import CASES, measure_memory
+    from peaks import measure_peaks
+    from report import report, target_section
+    from results import environment, file_name, write
     from run import Run
-    from stages import Plan
 
-    from stavpr_ros.alignment import SequenceSettings
     from stavpr_ros.recognition.matcher import PRECISIONS
 
-    most = QUICK_OPERATIONS if options.quick else float('inf')
     options.precisions = tuple(options.precisions or PRECISIONS)
-    plan = Plan(options.precisions, 7, SequenceSettings(), options.memory, options.seed, most)
-    cases = cases_of(options)
-    about = machine(options.device, options.commit)
+    about = environment(options.device, options.commit)
     began = time.perf_counter()
     if about['machine']['load_before'] > BUSY:
-        print(f'The machine is busy (load {about["machine"]["load_before"]}): the figures will not repeat.')
-    before = measure_ceilings(options.device, options.seconds)
-    run = Run(options.device, options.seconds, count_steps(options, cases))
-    measure_all(run, plan, options, cases)
-    run.close()
-    ceilings = before.best(measure_ceilings(options.device, options.seconds, SIDE // 2))
-    records = with_machine(with_marks(run.finished(ceilings)), about)
-    quick = '-quick' if options.quick else ''
-    path = options.output / f'matching-{slug(about["machine"])}{quick}.json'
-    save(records, path)
-    table = write(path)
-    print('\n'.join(marks_section(records)))
-    print(f'took {time.perf_counter() - began:.0f} s\nwrote {path}\nwrote {table}')
+        print(f'busy machine, load {about["machine"]["load_before"]}: do not quote the times')
+    with_memory = options.device == 'cpu' and not options.no_memory
+    memory = [measure_memory(*case) for case in CASES if with_memory]
+    peaks = measure_peaks(options.device, options.seconds)
+    run = Run(options.device, options.seconds)
+    measure_stages(run, options)
+    rows, peaks = run.finish(peaks)
+    name = f'matching-{file_name(about["machine"])}{"-quick" if options.quick else ""}.json'
+    document = about | {
+        'peaks': asdict(peaks),
+        'rows': [row.to_json() for row in rows],
+        'memory': [measured.to_json() for measured in memory],
+        'skipped': [asdict(skipped) for skipped in run.skipped],
+    }
+    write(options.output / name, document, report(about, rows, memory, peaks, run.skipped))
+    print('\n'.join(target_section(rows, options.device)))
+    print(f'took {time.perf_counter() - began:.0f} s\nwrote {options.output / name} and its .md')
     return 0
 
 

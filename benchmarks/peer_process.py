@@ -1,4 +1,4 @@
-"""The peers: their environment, made on first use, and the process in it that runs them on demand."""
+"""The peers: their environment, created on first use, and the process in it that runs them."""
 
 import hashlib
 import json
@@ -12,16 +12,16 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from records import ROOT
+from results import ROOT
 
 FOLDER = Path(__file__).resolve().parent / 'peers'
 ENVIRONMENT = ROOT / '.venv-peers'
-# of another Python or ROS; none may reach the peers
+# variables of another Python or ROS, removed for the peers
 FOREIGN = ('PYTHONPATH', 'PYTHONHOME', 'VIRTUAL_ENV')
 
 
 class PeersMissingError(Exception):
-    """The peers' environment could not be made; says why."""
+    """The peers' environment could not be created."""
 
 
 def _clean() -> dict[str, str]:
@@ -30,22 +30,33 @@ def _clean() -> dict[str, str]:
 
 def make_environment(folder: Path = ENVIRONMENT) -> Path:
     """
-    Make the environment, or take the one that is there and has the packages that are pinned now.
+    Create the environment, unless it exists with the packages that are pinned now.
 
     :returns: its Python.
-    :raises PeersMissingError: no environment could be made, or nothing installed.
+    :raises PeersMissingError: the environment could not be created, or its packages not installed.
     """
     requirements = FOLDER / 'requirements.txt'
     digest = hashlib.sha256(requirements.read_bytes()).hexdigest()
     stamp, python = folder / 'requirements.sha256', folder / 'bin' / 'python3'
     if python.exists() and stamp.exists() and stamp.read_text() == digest:
         return python
-    print(f'Making {folder.name} with the peers (once) ...', flush=True)
+    print(f'Creating {folder.name} with the peers (once) ...', flush=True)
     base = getattr(sys, '_base_executable', '') or sys.executable
-    pip = [str(python), '-I', '-m', 'pip', 'install', '--quiet', '--no-input', '--disable-pip-version-check']
+    pip = [
+        str(python),
+        '-I',
+        '-m',
+        'pip',
+        'install',
+        '--quiet',
+        '--no-input',
+        '--disable-pip-version-check',
+    ]
     for command in ([base, '-m', 'venv', '--clear', str(folder)], [*pip, '-r', str(requirements)]):
         try:
-            done = subprocess.run(command, env=_clean(), capture_output=True, text=True, check=False)
+            done = subprocess.run(
+                command, env=_clean(), capture_output=True, text=True, check=False
+            )
         except OSError as error:
             raise PeersMissingError(str(error)) from error
         if done.returncode:
@@ -57,9 +68,9 @@ def make_environment(folder: Path = ENVIRONMENT) -> Path:
 
 class Peers:
     """
-    A process that does samples of starts with the peers; idle, it sleeps.
+    A process that aligns samples of starts with the peers; it sleeps while idle.
 
-    :param command: the runner; None makes the environment and takes the one in it.
+    :param command: of the runner; None creates the environment and uses the runner in it.
     :raises PeersMissingError: the runner does not start.
     """
 
@@ -69,36 +80,41 @@ class Peers:
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=_clean()
         )
-        self.versions: dict[str, str] = self._answer()
+        self.versions: dict[str, str] = self._reply()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         assert self._process.stdin
         self._process.stdin.close()
         self._process.wait()
         self._folder.cleanup()
 
-    def _answer(self) -> dict[str, Any]:
+    def _reply(self) -> dict[str, Any]:
         assert self._process.stdout
         line = self._process.stdout.readline()
         if not line:
-            raise PeersMissingError(f'the peers ended with status {self._process.wait()}: see above')
+            raise PeersMissingError(
+                f'the peers exited with status {self._process.wait()}: see the output above'
+            )
         return json.loads(line)
 
     def put(self, window: np.ndarray) -> Path:
-        """Keep a window, shape (l, n), where the runner finds it."""
+        """Write a window, shape (l, n), to a file for the runner."""
         path = Path(self._folder.name) / 'window.npy'
         np.save(path, window)
         return path
 
     def run(self, peer: str, window: Path, starts: Sequence[int], k: int) -> dict[str, Any]:
-        """Align the window with some starts; returns ``seconds``, ``ends`` (see the runner)."""
+        """Align the window with some starts; return ``seconds`` and ``ends`` (see the runner)."""
         request = {'peer': peer, 'window': str(window), 'starts': list(starts), 'columns': k}
         assert self._process.stdin
         self._process.stdin.write(json.dumps(request) + '\n')
         self._process.stdin.flush()
-        return self._answer()
+        return self._reply()

@@ -1,138 +1,96 @@
-"""One run: what is measured is collected here, and gets its floors when the ceilings are known."""
+"""One run: measurements are collected, and get their lower bounds once the peaks are known."""
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from floors import STAGES, Ceilings, Part, Sizes, floor_seconds
-from records import Record
-from timing import Job, Timing, events_seconds, measure, synchronizer, timed
+from lower_bounds import Peaks, Work, bound_seconds
+from results import PeerTime, Row, Skipped
+from timing import Job, measure, synchronizer, timed
 from tqdm import tqdm
-
-PRODUCTS = ('product', 'image_distances', 'distance_matrix')  # their first part is a product with the map
 
 
 @dataclass(frozen=True)
 class Peer:
     """
-    With whom a stage is compared.
+    A program or product that a stage is compared with.
 
-    :param name: as it stands in the record.
     :param job: returns the seconds for the whole stage, a sample's scaled.
-    :param extra: what to say of it: ``peer_note``, ``peer_sample``, ...
+    :param note, partial: see :class:`results.PeerTime`.
     """
 
     name: str
     job: Job
-    extra: Mapping[str, Any] = field(default_factory=dict)
+    note: str = ''
+    partial: bool = False
 
 
+@dataclass
 class Run:
     """
     Measures and collects.
 
     :param device: ``cpu`` or ``cuda``.
-    :param seconds: how long to measure one stage and its peers.
-    :param steps: how many stages are announced, for the progress bar; None for no bar.
+    :param seconds: duration of the measurement of one stage and its peers.
+    :param rows: as measured so far, without lower bounds, and their work.
     """
 
-    def __init__(self, device: str, seconds: float = 0.5, steps: int | None = None) -> None:
-        self.device = device
-        self.seconds = seconds
-        self._records: list[tuple[Record, Sequence[Part]]] = []
-        self._bar = tqdm(total=steps, disable=steps is None, unit='stage', file=sys.stderr)
+    device: str
+    seconds: float = 0.5
+    rows: list[tuple[Row, Sequence[Work]]] = field(default_factory=list)
+    skipped: list[Skipped] = field(default_factory=list)
 
-    def say(self, text: str) -> None:
-        """Print a line without disturbing the progress bar."""
-        self._bar.write(text, file=sys.stderr)
-
-    def close(self) -> None:
-        """End the progress bar."""
-        self._bar.close()
+    def __post_init__(self) -> None:
+        self._bar = tqdm(unit='stage', file=sys.stderr, disable=None)
 
     def measure(
         self,
-        name: str,
-        sizes: Sizes,
-        dtype: str,
+        stage: str,
+        size: tuple[int, int],
         call: Callable[[], Any],
+        works: Sequence[Work],
         peers: Sequence[Peer] = (),
-        dim: int | None = None,
-        **extra: Any,
-    ) -> Timing:
+        precision: str = 'float32',
+        mode: str = '',
+        extra: Mapping[str, Any] | None = None,
+    ) -> None:
         """
-        Measure a stage, interleaved with its peers: one record, and one more for each peer.
+        Measure a stage, interleaved with its peers.
 
-        :param name: a stage of :data:`floors.STAGES`.
-        :param call: ours.
-        :param dim: 0 for a stage that sees no features; ``sizes.d`` by default.
-        :param extra: more to say in the record; a function is called with the median.
+        :param size: places n, dimensions d (0 for a stage that reads no features).
+        :param works: for its lower bound.
+        :param extra: further values of the row.
         """
-        dim = sizes.d if dim is None else dim
-        self._bar.set_description(f'{name} n={sizes.n:,} d={dim} {dtype}')
-        jobs = {'': timed(call, synchronizer(self.device))} | {peer.name: peer.job for peer in peers}
+        n, d = size
+        self._bar.set_description(f'{stage} {mode} n={n:,} d={d} {precision}')
+        jobs = {'': timed(call, synchronizer(self.device))} | {p.name: p.job for p in peers}
         timings = measure(jobs, self.seconds)
         own = timings['']
-        if self.device == 'cuda':
-            extra['events_s'] = events_seconds(call)
-        said = {key: value(own.median_s) if callable(value) else value for key, value in extra.items()}
-        base = Record(
-            name, sizes.n, dim, dtype, self.device, own.median_s, own.spread_s, own.runs, extra=said
+        times = tuple(
+            PeerTime(p.name, t.median_s, t.spread_s, t.median_s / own.median_s, p.note, p.partial)
+            for p, t in ((peer, timings[peer.name]) for peer in peers)
         )
-        parts = STAGES[name](sizes, dtype)
-        self._records.append((base, parts))
-        for peer in peers:
-            timing = timings[peer.name]
-            record = replace(
-                base,
-                peer=peer.name,
-                peer_median_s=timing.median_s,
-                peer_spread_s=timing.spread_s,
-                extra=said | dict(peer.extra),
-            )
-            self._records.append((record, parts))
+        row = Row(stage, mode, n, d, precision, own.median_s, own.spread_s, own.runs)
+        self.rows.append((replace(row, peers=times, extra=dict(extra or {})), works))
         self._bar.update()
-        return own
 
-    def skip(self, name: str, n: int, dim: int, dtype: str, reason: str, peer: str | None = None) -> None:
-        """Record that something was not measured, and print why."""
-        self.say(f'skipped: {name}, n = {n:,}, d = {dim}, {dtype}{f", {peer}" if peer else ""}: {reason}')
-        self._records.append((Record(name, n, dim, dtype, self.device, peer=peer, skipped=reason), ()))
+    def skip(self, name: str, n: int, d: int, reason: str) -> None:
+        """Record once that a stage or peer is left out, and print why; n = d = 0 for all sizes."""
+        skipped = Skipped(name, n, d, reason)
+        if skipped not in self.skipped:
+            size = f', n = {n:,}, d = {d}' if n else ''
+            self._bar.write(f'left out: {name}{size}: {reason}', file=sys.stderr)
+            self.skipped.append(skipped)
 
-    @contextmanager
-    def otherwise_skip(self, name: str, n: int, dim: int, dtype: str) -> Iterator[None]:
-        """Skip what runs out of memory after all."""
-        import torch
-
-        try:
-            yield
-        except (MemoryError, torch.cuda.OutOfMemoryError) as error:
-            self.skip(name, n, dim, dtype, f'out of memory: {str(error).splitlines()[0]}')
-
-    def finished(self, ceilings: Ceilings) -> list[Record]:
-        """Return the records with their floors, those of the ceilings first; a stage may raise a ceiling."""
-        for record, parts in self._records:
-            if parts and record.median_s and record.name in PRODUCTS:
-                done = replace(parts[0], operations=sum(part.operations for part in parts))
-                ceilings = ceilings.raised(done, record.median_s, f'{record.name}, n = {record.n:,}')
-        return ceiling_records(ceilings, self.device) + [
-            replace(record, floor_s=floor_seconds(parts, ceilings) if parts else None)
-            for record, parts in self._records
-        ]
-
-
-def ceiling_records(ceilings: Ceilings, device: str) -> list[Record]:
-    """Return what the machine can do, as records without times."""
-    read = ceilings.sources.get('read', 'read')
-    values = {'read_bandwidth': ('float32', {'bytes_per_s': ceilings.read_bytes_per_s, 'source': read})}
-    if ceilings.read_one_core_bytes_per_s:
-        value = {'bytes_per_s': ceilings.read_one_core_bytes_per_s, 'source': 'read'}
-        values['read_bandwidth_one_core'] = ('float32', value)
-    for dtype, peak in ceilings.operations_per_s.items():
-        source = ceilings.sources.get(dtype, 'large matrix product')
-        values[f'matrix_peak_{dtype}'] = (dtype, {'operations_per_s': peak, 'source': source})
-    return [
-        Record(f'ceiling_{name}', 0, 0, dtype, device, extra=extra) for name, (dtype, extra) in values.items()
-    ]
+    def finish(self, peaks: Peaks) -> tuple[list[Row], Peaks]:
+        """Return the rows with their lower bounds, and the peaks as raised by stages."""
+        self._bar.close()
+        for row, works in self.rows:
+            if row.stage in ('image_distances', 'distance_matrix'):
+                # product and alignment are one pass
+                whole = replace(works[0], operations=sum(work.operations for work in works))
+                peaks = peaks.raised(whole, row.median_s, f'{row.stage}, n = {row.n:,}')
+        bounds = [bound_seconds(works, peaks) for _, works in self.rows]
+        rows = [row for row, _ in self.rows]
+        return [replace(row, lower_bound_s=b) for row, b in zip(rows, bounds, strict=True)], peaks

@@ -1,14 +1,13 @@
 """
-Soak: images at a steady rate into a node of its own process, for minutes: losses, latency, memory.
+Soak test: images at a steady rate to a node in a process of its own: losses, latency, memory.
 
-Run it where the package is built and sourced: ``make shell``, then ``python benchmarks/soak.py --help``.
+Run it where the package is built and sourced: ``make shell``, then ``python benchmarks/soak.py``.
 """
 
 import argparse
 import array
 import json
 import os
-import platform
 import signal
 import subprocess
 import tempfile
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from results import commit, cpu_model, versions
 
 
 def texture_route(count: int, height: int, width: int, step: int = 41) -> Iterator[np.ndarray]:
@@ -31,7 +31,7 @@ def texture_route(count: int, height: int, width: int, step: int = 41) -> Iterat
 
 
 def make_map(path: Path, places: int, height: int, width: int) -> None:
-    """Save a map with so many places of made-up images."""
+    """Save a map of synthetic images."""
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import build_map, save_map
     from stavpr_ros.sources.frame import Frame
@@ -41,15 +41,15 @@ def make_map(path: Path, places: int, height: int, width: int) -> None:
 
 
 def memory(pid: int) -> float:
-    """Resident memory of a process, MB."""
+    """Return the resident memory of a process, MB."""
     for line in Path(f'/proc/{pid}/status').read_text().splitlines():
         if line.startswith('VmRSS'):
             return int(line.split()[1]) / 1024
     raise RuntimeError(f'no VmRSS of process {pid}')
 
 
-class Listener:
-    """Hears the node's answers and remembers how late they were."""
+class Latencies:
+    """Status and latency of every match that the node publishes."""
 
     def __init__(self) -> None:
         self.sent: dict[int, float] = {}
@@ -57,7 +57,7 @@ class Listener:
         self.statuses: Counter[int] = Counter()
 
     def on_match(self, match: Any) -> None:
-        """Take in one answer."""
+        """Record one match."""
         stamp = match.header.stamp.sec * 10**9 + match.header.stamp.nanosec
         if stamp not in self.sent:
             return
@@ -66,7 +66,7 @@ class Listener:
             self.latencies.append(time.monotonic() - self.sent[stamp])
 
     def figures(self, published: int, dropped_status: int) -> dict[str, Any]:
-        """Return what came of so many published images."""
+        """Return the counts and latencies of so many published images."""
         milliseconds = np.array(self.latencies) * 1e3
         return {
             'statuses': dict(self.statuses),
@@ -93,7 +93,7 @@ def image_messages(height: int, width: int) -> list[Any]:
 
 
 def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
-    """Publish at the rate, listen, and return the figures."""
+    """Publish at the rate, record the matches, and return the figures."""
     import rclpy
     from rclpy.qos import QoSProfile, qos_profile_sensor_data
     from sensor_msgs.msg import Image
@@ -102,12 +102,14 @@ def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
     from stavpr_ros.ros.discovery import Discovery
     from stavpr_ros.ros.process import ros_node, spin_until
 
-    listener = Listener()
+    matches = Latencies()
     messages = image_messages(arguments.height, arguments.width)
     total = round(arguments.seconds * arguments.rate)
     with ros_node(lambda: rclpy.create_node('soak'), []) as node:
         publisher = node.create_publisher(Image, 'image', qos_profile_sensor_data)
-        node.create_subscription(PlaceMatch, '/stavpr/match', listener.on_match, QoSProfile(depth=1000))
+        node.create_subscription(
+            PlaceMatch, '/stavpr/match', matches.on_match, QoSProfile(depth=1000)
+        )
         spin_until(node, lambda: publisher.get_subscription_count() > 0)
         discovery = Discovery(node, lambda: node.get_subscriptions_info_by_topic('/image'))
         spin_until(node, discovery.done)
@@ -119,18 +121,18 @@ def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
             message = messages[index % len(messages)]
             stamp = 10**9 + index * 1000
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-            listener.sent[stamp] = time.monotonic()
+            matches.sent[stamp] = time.monotonic()
             publisher.publish(message)
 
         published = iter(range(total))
         timer = node.create_timer(1 / arguments.rate, lambda: publish(next(published)))
-        spin_until(node, lambda: len(listener.sent) == total)
+        spin_until(node, lambda: len(matches.sent) == total)
         rate = total / (time.monotonic() - began)
         node.destroy_timer(timer)
         node.destroy_timer(minute)
         end = time.monotonic() + 2
-        spin_until(node, lambda: listener.statuses.total() == total or time.monotonic() > end)
-        figures = listener.figures(total, PlaceMatch.DROPPED)
+        spin_until(node, lambda: matches.statuses.total() == total or time.monotonic() > end)
+        figures = matches.figures(total, PlaceMatch.DROPPED)
         figures |= {'rate_hz': rate, 'memory_mb_start': memory_start, 'memory_mb_end': memory(pid)}
         return figures | {'memory_mb_by_minute': [round(value, 1) for value in by_minute]}
 
@@ -150,11 +152,10 @@ def main() -> None:
         action='append',
         default=[],
         metavar='NAME:=VALUE',
-        help='of the node, besides map_path; as often as you like',
+        help='of the node, besides map_path; may be repeated',
     )
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
-    from stavpr_ros import __version__
     from stavpr_ros.ros.live import executable, private_domain
     from stavpr_ros.ros.transport import prepare_transport
 
@@ -173,11 +174,8 @@ def main() -> None:
         finally:
             node.send_signal(signal.SIGINT)
             node.wait()
-    git = ['git', 'rev-parse', '--short', 'HEAD']
-    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
     figures |= {'places': arguments.places, 'parameters': arguments.parameter}
-    figures |= {'machine': platform.machine(), 'cores': os.cpu_count()}
-    figures |= {'python': platform.python_version(), 'stavpr_ros': __version__, 'commit': commit}
+    figures |= {'cpu': cpu_model(), 'cores': os.cpu_count(), 'commit': commit(), **versions()}
     text = json.dumps(figures, indent=2)
     print(text)
     if arguments.output:

@@ -1,271 +1,312 @@
-"""The stages of one size: with a map of features, and on windows of distances alone."""
+"""The stages of matching, measured on windows of distances and on maps of features."""
 
 import gc
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
+from itertools import cycle
 from typing import Any
 
+import lower_bounds as bounds
 import numpy as np
 import torch
-from baselines import oracle, prange, sample
-from ceilings import is_slow
-from data import feature_bytes, free_bytes, make_features, make_window
-from floors import FRAMES, Sizes, product
+from baselines import oracle, prange, prange_velocities, sample
+from data import free_bytes, make_features, make_window
+from lower_bounds import Sizes
+from peaks import slower_than_float32
 from peer_process import Peers
 from run import Peer, Run
-from subjects import (
-    NEIGHBORHOOD,
-    Call,
-    bare_product,
-    largest_error,
-    online_frames,
-    selection,
-    sequence_kernel,
+from timing import measure, synchronizer, timed
+
+from stavpr_ros.alignment.lm_dtw import (
+    SequenceDistances,
+    best_match,
+    match_padded,
+    padded_width,
+    trace_sequence,
 )
-from timing import Job, synchronizer, timed
-
-from stavpr_ros.alignment import SequenceDistances, SequenceSettings, SpatialSettings
+from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings, VelocitySettings
+from stavpr_ros.alignment.velocity import best_velocity_match, match_scaled, trace_velocity
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.matcher import make_matcher
+from stavpr_ros.recognition.robust.centering import MeanCentering
+from stavpr_ros.recognition.robust.znorm import ZNormalization
+from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
 
-ORACLE_STARTS, LIBROSA_STARTS, TSLEARN_STARTS = 3, 500, 20
-ENDS_CHECKED = 3
-FEW_DIMENSIONS = 8  # of the features where only distances count
+MODES = ('robust', 'paper')  # the default first
+SEQUENCE, SPATIAL, VELOCITY, NMS_RADIUS = (
+    SequenceSettings(),
+    SpatialSettings(),
+    VelocitySettings(),
+    20,
+)
+STRIPS = 7
+FRAMES = 20  # of the distance matrix
+MATRIX_PLACES = 20_000  # most places of the distance matrix
+ORACLE_STARTS, ENDS_CHECKED = 3, 3
+PEER_STARTS = {'librosa': 500, 'tslearn': 20}
 PEER_NOTES = {
     'librosa': 'one core; S of every cell in float64, no path length C, so neither q_m nor m',
-    'tslearn': 'one core; S of every cell in float64 and the path to (l, k); no free end on the last row',
-    'prange': 'all cores; the same answers, bit for bit',
-    'oracle': 'test/oracle.py, Python loops, one core; the same answers, bit for bit',
+    'tslearn': 'one core; S of every cell in float64, path to (l, k); no free end on the last row',
 }
+Call = Callable[[], Any]
 
 
-@dataclass(frozen=True)
-class Plan:
-    """
-    What is measured of every size.
-
-    :param precisions: of the matcher's map.
-    :param W: strips of an image.
-    :param sequence: l and beta.
-    :param memory: bytes that may be used at most.
-    :param seed: of all data.
-    :param most_operations: distance matrices with more are left out.
-    """
-
-    precisions: tuple[str, ...]
-    W: int
-    sequence: SequenceSettings
-    memory: float
-    seed: int
-    most_operations: float = math.inf
-
-    def sizes(self, n: int, d: int, xi: int | None = None) -> Sizes:
-        """Return the sizes of a problem."""
-        return Sizes(n, d, self.W, self.sequence.length, self.sequence.k, xi or self.W)
-
-    def has_matrix(self, sizes: Sizes) -> bool:
-        """Whether the distance matrix of these sizes is measured."""
-        return product(sizes, 'float32', FRAMES, whole=True).operations <= self.most_operations
-
-    def needed(self, n: int, d: int) -> float:
-        """Return the bytes that the stages with features need at least."""
-        half = 0.5 if set(self.precisions) != {'float32'} else 0
-        blocks = 2 * 4 * FRAMES * self.W**2 * n  # twenty frames' distances of all strips: torch's and ours
-        return feature_bytes(n, d, self.W) * (1 + half) + blocks
+def memory_problem(n: int, d: int, device: str, limit: float) -> str:
+    """Return why a map does not fit into memory; empty if it fits."""
+    # features, the recognizer's own, torch's product in both precisions, blocks of strip distances
+    needed = 4 * n * d * STRIPS * 3.5 + 2 * 4 * FRAMES * STRIPS**2 * min(n, MATRIX_PLACES)
+    limit = min(limit, 0.9 * free_bytes(device))
+    return (
+        '' if needed <= limit else f'needs {needed / 1e9:.1f} GB, {limit / 1e9:.1f} GB may be used'
+    )
 
 
-def memory_problem(plan: Plan, run: Run, n: int, d: int) -> str:
-    """Return why the stages with features do not fit, in words; empty if they do."""
-    limit = min(plan.memory, 0.9 * free_bytes(run.device))
-    needed = plan.needed(n, d)
-    return '' if needed <= limit else f'needs {needed / 1e9:.1f} GB, {limit / 1e9:.1f} GB may be used'
+# ------------------------------------------------ on windows of distances, mode robust
 
 
-def release(device: str) -> None:
-    """Give back the memory of what is no longer used."""
-    gc.collect()
-    if device == 'cuda':
-        torch.cuda.empty_cache()
+def robust_stages(run: Run, n: int, seed: int) -> None:
+    """Measure the stages of mode robust that follow the image distances."""
+    add = partial(run.measure, size=(n, 0), mode='robust')
+    rows = make_window(SEQUENCE.length, n, seed)
+    znorm, buffer = ZNormalization(n), SequenceBuffer(SEQUENCE.length, n, SEQUENCE.k)
+    for row in rows:
+        normalized = znorm.normalized(row)
+        znorm.observe(normalized)
+        buffer.push(torch.from_numpy(normalized))
+    sizes = Sizes(n, 0, l=SEQUENCE.length)
+    add('query_znorm', call=lambda: znorm.normalized(rows[-1]), works=[bounds.query_znorm(sizes)])
+    newest = torch.from_numpy(normalized)
+    add('window_push', call=lambda: buffer.push(newest), works=[bounds.window_push(sizes)])
+
+    def reference_znorm() -> None:
+        znorm.observe(normalized)
+        znorm.shift_and_scale(n)
+
+    add('reference_znorm', call=reference_znorm, works=[bounds.reference_znorm(sizes)])
+    shift, scale = znorm.shift_and_scale(n)
+    window = buffer.rows().numpy()
+    search = partial(match_scaled, window, shift, scale, VELOCITY)
+    matches = search()
+    steps = VELOCITY.steps(SEQUENCE.length)
+    add(
+        'velocity_search',
+        call=search,
+        works=[bounds.velocity_search(sizes, VELOCITY)],
+        peers=[_prange_velocities((window[:, :n] - shift) * scale, steps, matches.distances)],
+        extra={'cells': n * steps.size},
+    )
+    select = partial(best_velocity_match, matches, NMS_RADIUS)
+    add('selection', call=select, works=[bounds.selection(sizes)])
+    nearest = select()
+    speed = int(matches.speeds[nearest.last])
+    reach = int(steps.sum(axis=1).max()) + SEQUENCE.length
+    near = slice(max(0, nearest.last - reach), nearest.last + 1)
+
+    def trace() -> np.ndarray:
+        costs = (window[:, near] - shift[near]) * scale[near]
+        return trace_velocity(costs, nearest.last - near.start, speed, VELOCITY)
+
+    width = min(nearest.last + 1, int(steps[speed].sum()) + SEQUENCE.length)
+    add('path_trace', call=trace, works=[bounds.path_trace(SEQUENCE.length, width)])
 
 
-def _products(
-    run: Run,
-    plan: Plan,
-    sizes: Sizes,
-    features: LocalFeatures,
-    queries: LocalFeatures,
-    half: bool,
-) -> dict[tuple[str, int], Peer]:
-    """
-    Measure torch's product of one frame with the map, in the matcher's precisions and in bfloat16.
-
-    :param half: there is memory for a second map, in half width.
-    :returns: the product of one frame, and of twenty, as peers, by precision and frames.
-    """
-    peers = {}
-    rows = queries.strips.transpose(0, 1).reshape(-1, sizes.d)  # the strips of a frame side by side
-    for dtype in dict.fromkeys((*plan.precisions, 'bfloat16')):
-        if dtype != 'float32' and not half:
-            run.skip('product', sizes.n, sizes.d, dtype, 'no memory for a second map in this precision')
-            continue
-        kind = getattr(torch, dtype)
-        references = features.strips.to(kind)
-        for frames in (1, FRAMES) if plan.has_matrix(sizes) else (1,):
-            wait = synchronizer(run.device)
-            queries_rows = rows[: frames * sizes.W].to(references.device, kind)
-            call, form = bare_product(queries_rows, references, wait)
-            if frames == 1:
-                run.measure('product', sizes, dtype, call, what=form)
-                if is_slow(dtype, run.device):
-                    break  # nobody would take it: no peer
-            note = f'{dtype} product of all pairs of strips, no alignment'
-            said = {'peer_note': note, 'peer_part': True, 'peer_what': form}
-            peers[dtype, frames] = Peer(f'torch_{dtype}', timed(call, wait), said)
-    return peers
+def _prange_velocities(costs: np.ndarray, steps: np.ndarray, expected: np.ndarray) -> Peer:
+    """Return the plain program of the velocity search as a peer; its distances must be ours."""
+    kernel, penalty = prange_velocities(), np.float32(VELOCITY.penalty)
+    np.testing.assert_array_equal(kernel(costs, steps, penalty), expected)
+    note = (
+        'plain numba, all cores; the same distances bit for bit, without the places of the paths'
+    )
+    return Peer('prange', timed(lambda: kernel(costs, steps, penalty)), note)
 
 
-def feature_stages(run: Run, plan: Plan, n: int, d: int, bands: Sequence[int | None]) -> None:
-    """Measure the stages that see features: product, image distances, distance matrix, a whole frame."""
-    spare = min(plan.memory, 0.9 * free_bytes(run.device)) - plan.needed(n, d)
-    half = spare > 0.5 * feature_bytes(n, d, plan.W)  # torch's own half-width map beside the matcher's
-    features = make_features(n, d, plan.W, run.device, plan.seed)
-    queries = make_features(FRAMES, d, plan.W, 'cpu', plan.seed + 1)
-    peers = _products(run, plan, plan.sizes(n, d), features, queries, half)
-    for precision in plan.precisions:
-        compared = dict.fromkeys((precision, 'float32', *(('bfloat16',) if precision != 'float32' else ())))
-        of_frame, of_batch = (
-            [peers[dtype, count] for dtype in compared if (dtype, count) in peers] for count in (1, FRAMES)
-        )
-        for xi in bands:
-            sizes = plan.sizes(n, d, xi)
-            measure = partial(run.measure, sizes=sizes, dtype=precision, xi=sizes.xi)
-            spatial = SpatialSettings(xi=xi)
-            _matcher_stages(run, measure, plan, features, queries, spatial, precision, (of_frame, of_batch))
-            release(run.device)
-            frame, what = online_frames(features, queries, spatial, plan.sequence, precision, run.device)
-            measure('online_frame', call=frame, peers=of_frame, what=what)
-            del frame
-            release(run.device)
+# ------------------------------------------------ on windows of distances, mode paper
 
 
-def _matcher_stages(
-    run: Run,
-    measure: Callable[..., Any],
-    plan: Plan,
-    features: LocalFeatures,
-    queries: LocalFeatures,
-    spatial: SpatialSettings,
-    precision: str,
-    peers: tuple[Sequence[Peer], Sequence[Peer]],
-) -> None:
-    """Measure one frame, and twenty at once, with the queries on the map's device."""
-    device = features.strips.device
-    matcher = make_matcher(features, spatial, plan.sequence, device.type, precision)
-    batch = queries.to(device)
-    strips, weights = batch.strips[:, 0].contiguous(), batch.weights[:, 0].contiguous()
-    call = partial(matcher.distances, strips, weights)
-    error = largest_error(call(), features, strips, spatial)
-    measure('image_distances', call=call, peers=peers[0], largest_error=error)
-    call = partial(matcher.distance_matrix, batch.strips, batch.weights)
-    _, n, d = features.strips.shape
-    if not plan.has_matrix(plan.sizes(n, d)):
-        run.skip('distance_matrix', n, d, precision, 'too many operations for --quick')
-        return
-    error = largest_error(call()[0], features, strips, spatial)
-    measure('distance_matrix', call=call, peers=peers[1], frames=FRAMES, largest_error=error)
+def paper_stages(run: Run, n: int, seed: int, processes: Peers | None) -> None:
+    """Measure the stages of mode paper that follow the image distances."""
+    add = partial(run.measure, size=(n, 0), mode='paper')
+    window = make_window(SEQUENCE.length, n, seed)
+    padded = np.full((SEQUENCE.length, padded_width(n, SEQUENCE.k)), np.inf, np.float32)
+    padded[:, :n] = window
+    sizes = Sizes(n, 0, l=SEQUENCE.length, k=SEQUENCE.k)
+    kernel = partial(match_padded, padded, n, SEQUENCE.k)
+    matches = kernel()
+    add(
+        'lm_dtw',
+        call=kernel,
+        works=[bounds.lm_dtw(sizes)],
+        peers=sequence_peers(window, matches, processes),
+        extra={'cells': n * SEQUENCE.length * SEQUENCE.k},
+    )
+    select = partial(best_match, matches, NMS_RADIUS)
+    add('selection', call=select, works=[bounds.selection(sizes)])
+    nearest = select()
+    trace = partial(trace_sequence, padded[:, :n], nearest.first, SEQUENCE.k)
+    width = min(n - nearest.first, SEQUENCE.k)
+    add('path_trace', call=trace, works=[bounds.path_trace(SEQUENCE.length, width)])
 
 
-def _prange_job(window: np.ndarray, k: int, ours: SequenceDistances) -> Job:
-    """Return the plain prange over starts as a job; its answers must be ours."""
+def device_retrieval(run: Run, n: int, seed: int) -> None:
+    """Measure LM-DTW, selection and path on a GPU: one launch, one copy back."""
+    from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
+
+    window = make_window(SEQUENCE.length, n, seed)
+    search = CudaLmDtwSearch(n, SEQUENCE)
+    for row in window:
+        search.buffer.push(torch.from_numpy(row).to(run.device))
+    works = [bounds.lm_dtw(Sizes(n, 0)), bounds.selection(Sizes(n, 0))]
+    run.measure('retrieval', (n, 0), partial(search, NMS_RADIUS), works, mode='paper')
+
+
+def sequence_peers(
+    window: np.ndarray, ours: SequenceDistances, processes: Peers | None
+) -> list[Peer]:
+    """Return all peers of LM-DTW on the same window; their results must be ours."""
+    found = [_prange_peer(window, ours), _oracle_peer(window, ours)]
+    for name in PEER_STARTS if processes else ():
+        assert processes
+        found.append(_process_peer(processes, name, window))
+    return found
+
+
+def _prange_peer(window: np.ndarray, ours: SequenceDistances) -> Peer:
     kernel, n = prange(), window.shape[1]
     distances, lengths = np.empty(n, np.float32), np.empty(n, np.int32)
-    kernel(window, k, distances, lengths)
+    call = partial(kernel, window, SEQUENCE.k, distances, lengths)
+    call()
     np.testing.assert_array_equal(distances, ours.distances)
     np.testing.assert_array_equal(lengths, ours.lengths)
-    return timed(lambda: kernel(window, k, distances, lengths))
+    return Peer('prange', timed(call), 'plain numba, all cores; the same results bit for bit')
 
 
-def _oracle_job(window: np.ndarray, plan: Plan, ours: SequenceDistances) -> tuple[Job, int]:
-    """Return the oracle on a few starts, scaled to all, and how many; its answers must be ours."""
-    n, k, beta = window.shape[1], plan.sequence.k, plan.sequence.beta
-    align = oracle().align_sequence
-    starts = sample(n, k, ORACLE_STARTS)
+def _oracle_peer(window: np.ndarray, ours: SequenceDistances) -> Peer:
+    n, beta, align = window.shape[1], SEQUENCE.beta, oracle().align_sequence
+    starts = sample(n, SEQUENCE.k, ORACLE_STARTS)
     for start in starts:
         aligned = align(window, start, beta, np.float32)
         np.testing.assert_equal(ours.distances[start], aligned.distance)
         np.testing.assert_equal(ours.lengths[start], aligned.path[-1][1] - start + 1)
     job = timed(lambda: [align(window, start, beta, np.float32) for start in starts])
-    return (lambda: job() * n / len(starts)), len(starts)
+    note = f'test/oracle.py, Python loops, one core; {len(starts)} starts, scaled'
+    return Peer('oracle', lambda: job() * n / len(starts), note)
 
 
-def _process_job(peers: Peers, name: str, window: np.ndarray, starts: list[int], k: int) -> Job:
-    """Return a peer of the other environment on a sample, scaled to all; it must accumulate what we do."""
-    path, n = peers.put(window), window.shape[1]
+def _process_peer(peers: Peers, name: str, window: np.ndarray) -> Peer:
+    """Return a peer of the other environment; it must accumulate the oracle's sums."""
+    path, n, k = peers.put(window), window.shape[1], SEQUENCE.k
+    starts = sample(n, k, PEER_STARTS[name])
     few = starts[:ENDS_CHECKED]
     for start, end in zip(few, peers.run(name, path, few, k)['ends'], strict=True):
-        costs = window[:, start : start + k]
-        expected = float(oracle().accumulate(costs, 1, np.float64).S[-1][-1])
+        expected = float(
+            oracle().accumulate(window[:, start : start + k], 1, np.float64).S[-1][-1]
+        )
         np.testing.assert_allclose(end, expected, rtol=1e-6, err_msg=f'{name}, start {start}')
-    return lambda: peers.run(name, path, starts, k)['seconds'] * n / len(starts)
+    note = f'version {peers.versions[name]}, {PEER_NOTES[name]}; {len(starts)} starts, scaled'
+    return Peer(name, lambda: peers.run(name, path, starts, k)['seconds'] * n / len(starts), note)
 
 
-def sequence_peers(
-    plan: Plan, window: np.ndarray, ours: SequenceDistances, processes: Peers | None
+# ------------------------------------------------ on maps of features
+
+
+def feature_stages(run: Run, n: int, d: int, precisions: Sequence[str], seed: int) -> None:
+    """Measure the stages that read features, and whole frames in both modes."""
+    places = make_features(n, d, STRIPS, run.device, seed)
+    queries = make_features(FRAMES, d, STRIPS, 'cpu', seed + 1)
+    sizes, size = Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k), (n, d)
+    centered = partial(MeanCentering(places).next_query, queries.strips[:, 0])
+    run.measure('mean_centering', size, centered, [bounds.mean_centering(sizes)], mode='robust')
+    for precision in precisions:
+        peers = products(run, places, queries[:1], precision)
+        matcher, batch = (
+            make_matcher(places, SPATIAL, run.device, precision),
+            queries.to(run.device),
+        )
+        call = partial(matcher.distances, batch.strips[:, 0].contiguous(), batch.weights[:, 0])
+        works = [bounds.product(sizes, precision), bounds.spatial_alignment(sizes)]
+        run.measure('image_distances', size, call, works, peers, precision)
+        if n <= MATRIX_PLACES:
+            call = partial(matcher.distance_matrix, batch.strips, batch.weights)
+            works = [
+                bounds.product(sizes, precision, FRAMES),
+                bounds.spatial_alignment(sizes, FRAMES),
+            ]
+            many = products(run, places, queries, precision)
+            run.measure('distance_matrix', size, call, works, many, precision)
+        del matcher, call
+        for mode in MODES:
+            call = frame(places, queries, mode, precision, run.device)
+            works = frame_works(sizes, mode, precision)
+            run.measure('frame', size, call, works, peers, precision, mode)
+            del call
+            gc.collect()
+
+
+def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
+    """Return the work of a whole frame; the trace of one path is too short to matter."""
+    works = [bounds.product(sizes, precision), bounds.spatial_alignment(sizes)]
+    works += [bounds.window_push(sizes), bounds.selection(sizes)]
+    if mode == 'paper':
+        return [*works, bounds.lm_dtw(sizes)]
+    znorms = [bounds.query_znorm(sizes), bounds.reference_znorm(sizes)]
+    return [bounds.mean_centering(sizes), *works, *znorms, bounds.velocity_search(sizes, VELOCITY)]
+
+
+def products(
+    run: Run, places: LocalFeatures, queries: LocalFeatures, precision: str
 ) -> list[Peer]:
-    """Return everyone who does LM-DTW's cells on the same window."""
-    n, k = window.shape[1], plan.sequence.k
-    loops, count = _oracle_job(window, plan, ours)
-    found = [
-        Peer('prange', _prange_job(window, k, ours), {'peer_note': PEER_NOTES['prange']}),
-        Peer('oracle', loops, {'peer_note': PEER_NOTES['oracle'], 'peer_sample': count}),
-    ]
-    for name, starts in (('librosa', LIBROSA_STARTS), ('tslearn', TSLEARN_STARTS)):
-        if processes:
-            chosen = sample(n, k, starts)
-            job = _process_job(processes, name, window, chosen, k)
-            said = {'peer_note': PEER_NOTES[name], 'peer_sample': len(chosen)}
-            found.append(Peer(name, job, said | {'peer_version': processes.versions[name]}))
-    return found
+    """Return torch's product in float32, and in the map's precision unless that is slower."""
+    peers, d = [], places.strips.shape[2]
+    for dtype in dict.fromkeys((precision, 'float32')):
+        if reason := slower_than_float32(run.device, dtype):
+            run.skip(f'torch {dtype}', 0, 0, reason)
+            continue
+        kind, wait = getattr(torch, dtype), synchronizer(run.device)
+        rows = queries.strips.transpose(0, 1).reshape(-1, d).to(run.device, kind)
+        call, form = bare_product(rows, places.strips.to(kind), wait)
+        note = f'{form}, all pairs of strips, no alignment'
+        peers.append(Peer(f'torch {dtype}', timed(call, wait), note, partial=True))
+    return peers
 
 
-def _retrieval(plan: Plan, window: np.ndarray, device: str, ours: SequenceDistances) -> Call:
-    """Return the matcher's answer to a window that it holds already; it must be that of the kernel."""
-    features = make_features(window.shape[1], FEW_DIMENSIONS, plan.W, device, plan.seed)
-    matcher = make_matcher(features, SpatialSettings(), plan.sequence, device, 'float32')
-    for row in window:
-        matcher.push(torch.from_numpy(row).to(device))
-    call = partial(matcher.match, NEIGHBORHOOD)
-    # as text: a second best that is not there has a distance of NaN, which equals nothing
-    np.testing.assert_equal(str(call()[0]), str(selection(ours)()))
-    return call
-
-
-def sequence_stages(run: Run, plan: Plan, n: int, processes: Peers | None, no_peers: str) -> None:
+def bare_product(
+    rows: torch.Tensor, places: torch.Tensor, synchronize: Callable[[], None]
+) -> tuple[Call, str]:
     """
-    Measure LM-DTW, the selection, and the matcher's answer, on windows of distances.
+    Return torch's product of queries with the map in its faster orientation, and the name of that.
 
-    :param no_peers: why there are no peers of the other environment.
+    The faster orientation of a skinny product depends on the machine and the precision. The memory
+    of the result is allocated beforehand.
+
+    :param rows: shape (queries, d).
+    :param places: shape (W, n, d), of the same type and device.
     """
-    sizes = plan.sizes(n, 0)
-    measure = partial(run.measure, sizes=sizes, dtype='float32', dim=0)
+    strips = places.reshape(-1, places.shape[2])
+    out = torch.empty(len(rows) * len(strips), dtype=rows.dtype, device=rows.device)
+    wide, tall = out.view(len(rows), len(strips)), out.view(len(strips), len(rows))
+    forms: dict[str, Call] = {
+        'queries @ map.T': lambda: torch.mm(rows, strips.T, out=wide),
+        'map @ queries.T': lambda: torch.mm(strips, rows.T, out=tall),
+    }
+    taken = {
+        form: measure({'': timed(call, synchronize)}, 0)[''].median_s
+        for form, call in forms.items()
+    }
+    best = min(taken, key=taken.__getitem__)
+    return forms[best], best
 
-    def rate(median_s: float) -> float:
-        return sizes.cells / median_s
 
-    window = make_window('random', sizes.l, n, plan.seed)
-    kernel = sequence_kernel(window, sizes.k)
-    matches = kernel()
-    peers = sequence_peers(plan, window, matches, processes)
-    if run.device == 'cpu':
-        measure('lm_dtw', call=kernel, peers=peers, data='random', cells_per_s=rate)
-        walk = sequence_kernel(make_window('walk', sizes.l, n, plan.seed), sizes.k)
-        # what the data do to our own time is seen without peers
-        measure('lm_dtw', call=walk, data='walk', cells_per_s=rate)
-        measure('select', call=selection(matches), data='random')
-        peers = []
-    answer = _retrieval(plan, window, run.device, matches)
-    measure('retrieval', call=answer, peers=peers, data='random', cells_per_s=rate)
-    for name in () if processes else ('librosa', 'tslearn'):
-        run.skip('lm_dtw' if run.device == 'cpu' else 'retrieval', n, 0, 'float32', no_peers, peer=name)
+def frame(
+    places: LocalFeatures, queries: LocalFeatures, mode: str, precision: str, device: str
+) -> Call:
+    """Return a call that updates a recognizer, its window full, with the next image."""
+    n = len(places)
+    place_map = PlaceMap(places, None, np.zeros(n, np.int64), ('',) * n)
+    settings = RecognizerSettings(1.0, SPATIAL, SEQUENCE, NMS_RADIUS, mode)
+    recognizer = PlaceRecognizer(place_map, settings, device, precision)
+    following = cycle([queries[i : i + 1] for i in range(len(queries))])
+    for _ in range(SEQUENCE.length):
+        recognizer.update(next(following))
+    return lambda: recognizer.update(next(following))

@@ -7,21 +7,21 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-Job = Callable[[], float]  # does its work once and returns the seconds that it took
+Job = Callable[[], float]  # runs once and returns the seconds that it took
 
 FEWEST, MOST = 7, 101  # runs of a measurement
-SLOW_S, FEWEST_SLOW = 1.0, 3  # a round of over SLOW_S runs only so often
+SLOW_S, FEWEST_SLOW = 1.0, 3  # fewer runs where one round takes more than SLOW_S
 SHORT_S = 0.01
 
 
 @dataclass(frozen=True)
 class Timing:
     """
-    What a number of runs took.
+    Summary of the runs of one job.
 
-    :param median_s: their median, seconds.
-    :param spread_s: their interquartile range, seconds.
-    :param runs: how many there were, warm-up not counted.
+    :param median_s: median, seconds.
+    :param spread_s: interquartile range, seconds.
+    :param runs: number of runs, warm-up excluded.
     """
 
     median_s: float
@@ -30,17 +30,17 @@ class Timing:
 
     @classmethod
     def of(cls, seconds: list[float]) -> 'Timing':
-        """Summarize the seconds of at least two runs."""
+        """Summarize at least two runs."""
         low, median, high = statistics.quantiles(seconds, n=4, method='inclusive')
         return cls(median, high - low, len(seconds))
 
 
 def nothing() -> None:
-    """Wait for nothing: the CPU's calls are done when they return."""
+    """Return at once: calls on the CPU are complete when they return."""
 
 
 def synchronizer(device: str) -> Callable[[], None]:
-    """Return what waits until everything that was asked of the device is done."""
+    """Return a function that waits for all work queued on the device."""
     if device == 'cpu':
         return nothing
     import torch
@@ -49,7 +49,7 @@ def synchronizer(device: str) -> Callable[[], None]:
 
 
 def timed(call: Callable[[], Any], synchronize: Callable[[], None] = nothing) -> Job:
-    """Return a job that takes the time of a call by the wall clock, as its user has it."""
+    """Return a job that measures a call by the wall clock, results complete."""
 
     def job() -> float:
         synchronize()
@@ -62,7 +62,7 @@ def timed(call: Callable[[], Any], synchronize: Callable[[], None] = nothing) ->
 
 
 def rounds_for(round_s: float, seconds: float) -> int:
-    """Return how often to run a round that takes ``round_s``, to fill ``seconds``."""
+    """Return the number of rounds of ``round_s`` seconds that fill ``seconds``, within limits."""
     if round_s > SLOW_S:
         return FEWEST_SLOW
     return max(FEWEST, min(MOST, math.ceil(seconds / max(round_s, 1e-9))))
@@ -70,15 +70,14 @@ def rounds_for(round_s: float, seconds: float) -> int:
 
 def measure(jobs: Mapping[str, Job], seconds: float = 0.5) -> dict[str, Timing]:
     """
-    Run jobs in turn, A B C A B C, so that what slows the machine for a while slows all of them.
+    Run jobs in turn, A B C A B C, so that a slower machine slows all of them.
 
-    Every job runs once to compile, and once more unless that took long, before anything counts. A short
-    job runs once more directly before every run that counts: what another one left in the caches, and
-    threads that it put to sleep, are no property of this one.
+    Every job runs once to compile, and once more unless that took long, before any run counts. A
+    job under 10 ms runs once more, uncounted, directly before each counted run: the caches and the
+    sleeping threads that another job left behind are not a property of this one.
 
-    :param jobs: what to run, by name.
-    :param seconds: how long to run all of them together; between 7 and 101 rounds, 3 of rounds that take
-        over a second.
+    :param jobs: by name.
+    :param seconds: total time of the counted rounds; 7 to 101 rounds, 3 where a round exceeds 1 s.
     """
     round_s = 0.0
     for job in jobs.values():
@@ -97,17 +96,12 @@ def measure(jobs: Mapping[str, Job], seconds: float = 0.5) -> dict[str, Timing]:
     return {name: Timing.of(values) for name, values in taken.items()}
 
 
-def events_seconds(call: Callable[[], Any], runs: int = FEWEST) -> float:
-    """Return the median seconds between CUDA events recorded before and after a call."""
-    import torch
-
-    taken = []
-    for _ in range(runs):
-        before, after = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        torch.cuda.synchronize()
-        before.record()
-        call()
-        after.record()
-        torch.cuda.synchronize()
-        taken.append(before.elapsed_time(after) / 1e3)
-    return statistics.median(taken)
+def best_seconds(call: Callable[[], Any], device: str, seconds: float) -> float:
+    """Return the shortest of at least three runs that fill ``seconds``, after one to warm up."""
+    job = timed(call, synchronizer(device))
+    job()
+    end = time.perf_counter() + seconds
+    taken = [job() for _ in range(3)]
+    while time.perf_counter() < end:
+        taken.append(job())
+    return min(taken)

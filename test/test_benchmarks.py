@@ -1,12 +1,10 @@
-"""The benchmark of the matching: its clock, floors, records, marks, table and peers, mostly on fakes."""
-# ruff: noqa: E402  (the command's modules lie beside it, not in a package)
+"""The benchmarks: timing, lower bounds, targets, report, peers, memory, accuracy."""
+# ruff: noqa: E402  (the modules of the benchmarks lie beside their commands, not in a package)
 
 import importlib.util
 import json
 import sys
-import time
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,45 +15,50 @@ import torch
 BENCHMARKS = Path(__file__).resolve().parents[1] / 'benchmarks'
 sys.path.insert(0, str(BENCHMARKS))
 
+import accuracy
 import baselines
-import ceilings
+import compare
 import data
-import floors
-import marks
+import lower_bounds as bounds
 import matching
+import memory
+import peaks
 import peer_process
-import records
 import report
+import results
 import stages
-import subjects
+import targets
 import timing
-from records import Record
+from results import PeerTime, Row
 from run import Peer, Run
 from timing import Timing
 
-from stavpr_ros.alignment import SequenceDistances, SequenceSettings, match_sequence
-from stavpr_ros.recognition.matcher import PRECISIONS
+from stavpr_ros.alignment import SequenceDistances, match_sequence
+from stavpr_ros.alignment.settings import VelocitySettings
 
-CEILINGS = floors.Ceilings(100.0, {'float32': 1000.0, 'bfloat16': 4000.0}, 80.0)
-FULL = replace(CEILINGS, operations_per_s=CEILINGS.operations_per_s | {'float16': 4000.0})
-RECORD = Record('lm_dtw', 20_000, 0, 'float32', 'cpu', 0.002, 0.0001, 9, 0.001, extra={'data': 'random'})
+PEAKS = bounds.Peaks(100.0, {'float32': 1000.0, 'bfloat16': 4000.0, 'float16': 4000.0})
+ROW = Row(
+    'lm_dtw', 'paper', 20_000, 0, 'float32', 0.002, 0.0001, 9, 0.001, extra={'cells': 16_000_000}
+)
+
+
+class Clock:
+    """A clock that only jobs advance, and the log of the jobs."""
+
+    def __init__(self):
+        self.now, self.log = 0.0, []
+
+    def job(self, name, seconds):
+        def run():
+            self.log.append(name)
+            self.now += seconds
+            return seconds
+
+        return run
 
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that only jobs move on."""
-
-    class Clock:
-        now = 0.0
-
-        def job(self, name, seconds, log):
-            def run():
-                log.append(name)
-                self.now += seconds
-                return seconds
-
-            return run
-
     clock = Clock()
     monkeypatch.setattr(timing.time, 'perf_counter', lambda: clock.now)
     return clock
@@ -64,320 +67,268 @@ def clock(monkeypatch):
 # ------------------------------------------------ timing
 
 
-def test_median_and_spread_are_quartiles():
+def test_timing_of_several_runs_is_median_and_quartile_range():
     assert Timing.of([5.0, 1.0, 2.0, 4.0, 3.0]) == Timing(3.0, 2.0, 5)
     assert Timing.of([1.0, 1.0, 1.0, 9.0]).median_s == 1.0
 
 
-def test_jobs_run_in_turn_after_warming_up(clock):
-    log = []
-    jobs = {'a': clock.job('a', 0.02, log), 'b': clock.job('b', 0.03, log)}
-    found = timing.measure(jobs, 0.5)
-    assert log[:4] == ['a', 'a', 'b', 'b']
-    assert log[4:] == ['a', 'b'] * 10  # 0.5 s of rounds of 0.05 s
+def test_measure_two_jobs_runs_them_in_turn_after_warm_up(clock):
+    found = timing.measure({'a': clock.job('a', 0.02), 'b': clock.job('b', 0.03)}, 0.5)
+    assert clock.log[:4] == ['a', 'a', 'b', 'b']
+    assert clock.log[4:] == ['a', 'b'] * 10  # 0.5 s of rounds of 0.05 s
     assert found['a'] == Timing(0.02, 0.0, 10)
     assert found['b'].median_s == 0.03
 
 
-def test_a_short_job_runs_once_more_before_it_counts(clock):
-    log = []
-    found = timing.measure({'a': clock.job('a', 0.001, log), 'b': clock.job('b', 0.02, log)}, 0.001)
-    assert log[4:7] == ['a', 'a', 'b']
+def test_measure_short_job_repeats_it_uncounted_before_each_run(clock):
+    found = timing.measure({'a': clock.job('a', 0.001), 'b': clock.job('b', 0.02)}, 0.001)
+    assert clock.log[4:7] == ['a', 'a', 'b']
     assert found['a'].runs == found['b'].runs == timing.FEWEST
 
 
-def test_slow_jobs_warm_up_once_and_run_three_times(clock):
-    log = []
-    assert timing.measure({'a': clock.job('a', 1.5, log)}, 0.5)['a'].runs == 3
-    assert len(log) == 4
+def test_measure_slow_job_warms_up_once_and_runs_three_times(clock):
+    assert timing.measure({'a': clock.job('a', 1.5)}, 0.5)['a'].runs == 3
+    assert len(clock.log) == 4
 
 
-@pytest.mark.parametrize(('round_s', 'rounds'), [(0.2, 7), (0.01, 50), (1e-7, 101), (1.01, 3), (0.0, 101)])
-def test_rounds(round_s, rounds):
+@pytest.mark.parametrize(
+    ('round_s', 'rounds'), [(0.2, 7), (0.01, 50), (1e-7, 101), (1.01, 3), (0.0, 101)]
+)
+def test_rounds_for_a_duration_fills_the_time_within_limits(round_s, rounds):
     assert timing.rounds_for(round_s, 0.5) == rounds
 
 
-def test_a_timed_call_waits_for_the_device_before_and_after(clock):
-    log = []
-    call, wait = clock.job('call', 1.0, log), clock.job('wait', 0.25, log)
-    assert timing.timed(call, wait)() == 1.25  # what was queued before the call does not count
-    assert log == ['wait', 'call', 'wait']
+def test_timed_call_waits_for_the_device_before_and_after(clock):
+    job = timing.timed(clock.job('call', 1.0), clock.job('wait', 0.25))
+    assert job() == 1.25  # work queued before the call does not count
+    assert clock.log == ['wait', 'call', 'wait']
 
 
-# ------------------------------------------------ floors
-
-
-@pytest.mark.parametrize(('xi', 'pairs'), [(1, 7), (3, 29), (7, 49)])
-def test_pairs_in_the_band(xi, pairs):
-    assert floors.Sizes(10, xi=xi).pairs == pairs
-
-
-def test_the_larger_of_bytes_and_operations_counts_for_each_part():
-    parts = [floors.Part(200, 1000), floors.Part(50, 3000), floors.Part(0, 4000, 'bfloat16')]
-    assert floors.floor_seconds(parts, CEILINGS) == 2.0 + 3.0 + 1.0
-
-
-def test_a_product_reads_the_map_once_and_multiplies_the_pairs_of_the_band():
-    sizes = floors.Sizes(10, d=5, W=3, xi=1)
-    assert floors.product(sizes, 'float32', 4) == floors.Part(4 * 3 * 10 * 5, 2 * 4 * 3 * 10 * 5, 'float32')
-    assert floors.product(sizes, 'bfloat16') == floors.Part(2 * 3 * 10 * 5, 2 * 3 * 10 * 5, 'bfloat16')
-    assert floors.product(sizes, 'float32', whole=True).operations == 2 * 9 * 10 * 5
-
-
-@pytest.mark.parametrize('xi', [1, 2, 3])
-def test_operations_of_the_recursions_are_those_of_their_cells(xi):
-    sizes = floors.Sizes(10, W=3, l=4, k=6, xi=xi)
-
-    def count(rows, columns, band, inner):
-        cells = [(i, j) for i in range(rows) for j in range(columns) if abs(i - j) < band and i + j]
-        return sum(inner if i and j else 2 for i, j in cells)
-
-    assert floors.alignment(sizes, 5).operations == 5 * 10 * (count(3, 3, xi, 9) + 1)
-    assert floors.sequence(sizes) == floors.Part(4 * 4 * 10, 10 * (count(4, 6, 99, 8) + 2 * 6))
-    assert sizes.cells == 10 * 4 * 6
-
-
-def test_a_frame_is_the_sum_of_its_stages():
-    sizes = floors.Sizes(1000, xi=3)
-    frame = floors.floor_seconds(floors.STAGES['online_frame'](sizes, 'bfloat16'), CEILINGS)
-    stages = [floors.STAGES[name](sizes, 'bfloat16') for name in ('image_distances', 'lm_dtw', 'select')]
-    assert frame == pytest.approx(sum(floors.floor_seconds(parts, CEILINGS) for parts in stages))
-    assert frame < floors.floor_seconds(floors.STAGES['online_frame'](sizes, 'float32'), CEILINGS)
-
-
-def test_the_best_of_two_measurements_of_the_ceilings():
-    other = floors.Ceilings(90.0, {'float32': 1200.0, 'bfloat16': 10.0}, None)
-    assert CEILINGS.best(other) == floors.Ceilings(100.0, {'float32': 1200.0, 'bfloat16': 4000.0}, None)
-    assert CEILINGS.best(replace(other, read_one_core_bytes_per_s=81.0)).read_one_core_bytes_per_s == 81.0
-
-
-def test_a_stage_that_shows_more_raises_the_ceilings():
-    quick = CEILINGS.raised(floors.Part(2**28, 100, 'bfloat16'), 0.01, 'product')
-    assert quick == replace(
-        CEILINGS,
-        read_bytes_per_s=2**28 / 0.01,
-        operations_per_s={'float32': 1000.0, 'bfloat16': 10_000.0},
-        sources={'read': 'product', 'bfloat16': 'product'},
-    )
-    assert CEILINGS.raised(floors.Part(2**28 - 1, 100, 'bfloat16'), 0.1, 'from a cache') == CEILINGS
-    assert CEILINGS.raised(floors.Part(2**28, 1000), 2**28 / 99, 'slow') == CEILINGS
-
-
-def test_no_precision_is_slower_than_float32():
-    slow = replace(CEILINGS, operations_per_s={'float32': 1000.0, 'bfloat16': 4000.0, 'float16': 1.0})
-    assert slow.widened().operations_per_s == {'float32': 1000.0, 'bfloat16': 4000.0, 'float16': 1000.0}
-    assert slow.widened().sources == {'float16': 'float32'}
-    raised = CEILINGS.raised(floors.Part(0, 5000), 1.0, 'product')
-    assert raised.operations_per_s == {'float32': 5000.0, 'bfloat16': 5000.0}
-
-
-def test_ceilings_are_the_best_run(clock):
+def test_best_seconds_returns_the_shortest_run_after_warm_up(clock):
     seconds = iter([9.0, 3.0, 2.0, 4.0, 5.0, 6.0])
 
     def call():
         clock.now += next(seconds)
 
-    assert ceilings.best_seconds(call, 'cpu', 10.0) == 2.0  # the first one warms up; 3 + 2 + 4 + 5 fill 10 s
+    assert timing.best_seconds(call, 'cpu', 10.0) == 2.0  # 3 + 2 + 4 + 5 fill 10 s
     assert next(seconds) == 6.0
 
 
-@pytest.mark.parametrize('threads', [1, 2])
-def test_the_reader_reads_everything(threads):
-    x = np.arange(1024, dtype=np.float32)
-    assert ceilings._reader(threads)(x) == x.sum()
+# ------------------------------------------------ lower bounds and peaks
 
 
-def test_ceilings_of_this_machine_are_plausible():
-    found = ceilings.measure_ceilings('cpu', 0.0, side=128, megabytes=8)
-    assert 1e8 < found.read_one_core_bytes_per_s <= found.read_bytes_per_s < 1e13
-    assert set(found.operations_per_s) == set(floors.ITEM_BYTES)
-    assert all(1e7 < peak < 1e15 for peak in found.operations_per_s.values())
+def test_bound_of_several_works_adds_the_longer_of_bytes_and_operations():
+    works = [
+        bounds.Work(200, 1000), bounds.Work(50, 3000), bounds.Work(0, 4000, 'bfloat16')
+    ]  # fmt: skip
+    assert bounds.bound_seconds(works, PEAKS) == 2.0 + 3.0 + 1.0
 
 
-# ------------------------------------------------ records
+def test_product_reads_the_map_once_and_multiplies_all_pairs():
+    sizes = bounds.Sizes(10, d=5, W=3)
+    assert bounds.product(sizes, 'float32', 4) == bounds.Work(4 * 3 * 10 * 5, 2 * 4 * 9 * 10 * 5)
+    assert bounds.product(sizes, 'float16').bytes == 2 * 3 * 10 * 5
 
 
-def test_the_file_is_a_list_of_records_with_the_agreed_fields(tmp_path):
-    made = [RECORD, replace(RECORD, peer='prange', peer_median_s=0.016, peer_spread_s=0.001)]
-    made.append(Record('online_frame', 5, 512, 'float32', 'cpu', skipped='no memory'))
-    about = {'machine': {'cpu': 'A CPU', 'cores': 2}, 'versions': {}, 'commit': 'abc', 'date': 'today'}
-    path = tmp_path / 'new' / 'results.json'
-    records.save(records.with_machine(made, about), path)
-    plain, compared, skipped = json.loads(path.read_text())
-    agreed = ('name', 'n', 'dim', 'dtype', 'device', 'median_s', 'spread_s', 'floor_s', 'ratio_to_floor')
-    for fields in (plain, compared, skipped):
-        assert set(agreed) <= set(fields)
-        assert fields['machine']['cores'] == 2
-        assert fields['commit'] == 'abc'
-    assert plain['ratio_to_floor'] == 2.0
-    assert not {'peer', 'speedup', 'skipped'} & set(plain)
-    assert (compared['peer'], compared['peer_median_s'], compared['speedup']) == ('prange', 0.016, 8.0)
-    assert (skipped['skipped'], skipped['median_s'], skipped['ratio_to_floor']) == ('no memory', None, None)
-    assert records.load(path) == records.with_machine(made, about)
+def test_operations_of_the_alignments_are_those_of_their_cells():
+    def count(rows, columns, inner):
+        cells = [(i, j) for i in range(rows) for j in range(columns) if i + j]
+        return sum(inner if i and j else 2 for i, j in cells)
+
+    sizes = bounds.Sizes(10, W=3, l=4, k=6)
+    assert bounds.spatial_alignment(sizes, 5).operations == 5 * 10 * (count(3, 3, 9) + 1)
+    assert bounds.lm_dtw(sizes) == bounds.Work(4 * 4 * 10, 10 * (count(4, 6, 8) + 2 * 6))
 
 
-def test_records_refuse_what_would_be_lost_or_is_missing(tmp_path):
-    with pytest.raises(ValueError, match=r"\['n'\] of lm_dtw are fields of every record"):
-        replace(RECORD, extra={'n': 3}).to_json()
-    with pytest.raises(ValueError, match=r"'x' lacks n, dim"):
-        Record.from_json({'name': 'x', 'dtype': 'float32', 'device': 'cpu'})
-    with pytest.raises(ValueError, match='not JSON compliant'):
-        records.save([replace(RECORD, median_s=float('nan'))], tmp_path / 'results.json')
+def test_operations_of_the_velocity_search_are_those_of_its_predecessors():
+    # one velocity of 1: rows 1 (up to the middle) and 2, 3 (after it), two further predecessors each
+    settings = VelocitySettings(speeds=(1.0,))
+    rows = (1 + 2 * 3) + 2 * (1 + 2 * 4)
+    work = bounds.velocity_search(bounds.Sizes(10, l=4), settings)
+    assert work == bounds.Work(4 * 10 * (4 + 2), 10 * (2 * 4 + rows + 5))
+    still = bounds.velocity_search(bounds.Sizes(10, l=4), VelocitySettings(speeds=(0.0,)))
+    assert still.operations == 10 * (2 * 4 + (1 + 3) + 2 * (1 + 4) + 5)  # one further predecessor
 
 
-def test_every_record_knows_machine_versions_commit_and_date():
-    about = records.machine('cpu')
-    assert about['machine']['cores'] >= 1
-    assert about['versions']['torch'] and about['versions']['stavpr_ros']  # noqa: PT018
-    assert about['commit']
-    assert about['date'][:2] == '20'
-    assert records.machine('cpu', 'abc')['commit'] == 'abc'
+@pytest.mark.parametrize('mode', stages.MODES)
+def test_bound_of_a_frame_is_the_sum_of_its_stages(mode):
+    sizes = bounds.Sizes(1000)
+    works = stages.frame_works(sizes, mode, 'float16')
+    common = [
+        bounds.product(sizes, 'float16'), bounds.spatial_alignment(sizes),
+        bounds.window_push(sizes), bounds.selection(sizes),
+    ]  # fmt: skip
+    own = {
+        'paper': [bounds.lm_dtw(sizes)],
+        'robust': [
+            bounds.mean_centering(sizes), bounds.query_znorm(sizes), bounds.reference_znorm(sizes),
+            bounds.velocity_search(sizes, stages.VELOCITY),
+        ],
+    }  # fmt: skip
+    assert sorted(map(repr, works)) == sorted(map(repr, common + own[mode]))
 
 
-def test_file_names_of_machines():
-    assert records.slug({'cpu': 'AMD EPYC', 'cores': 2}) == 'amd-epyc-2-cores'
-    assert records.slug({'cpu': 'x', 'cores': 2, 'gpu': 'NVIDIA H200'}) == 'nvidia-h200'
+def test_peaks_are_raised_by_a_faster_stage():
+    quick = PEAKS.raised(bounds.Work(2**28, 100, 'bfloat16'), 0.01, 'product')
+    assert quick.bytes_per_s == 2**28 / 0.01
+    assert quick.operations_per_s['bfloat16'] == 10_000.0
+    assert quick.sources == {'read': 'product', 'bfloat16': 'product'}
+    assert PEAKS.raised(bounds.Work(2**28 - 1, 100, 'bfloat16'), 0.1, 'from a cache') == PEAKS
 
 
-# ------------------------------------------------ one run
+def test_peaks_of_a_slower_half_precision_are_those_of_float32():
+    slow = replace(PEAKS, operations_per_s={'float32': 1000.0, 'float16': 1.0}).widened()
+    assert slow.operations_per_s == {'float32': 1000.0, 'float16': 1000.0}
+    assert slow.sources == {'float16': 'float32'}
 
 
-def test_a_stage_gives_a_record_and_one_for_each_peer(clock):
-    log = []
-    run = Run('cpu', 0.1)
-    peers = [Peer('other', clock.job('other', 0.2, log), {'peer_note': 'as it is'})]
-    sizes = floors.Sizes(10, d=0)
-    run.measure(
-        'lm_dtw', sizes, 'float32', clock.job('ours', 0.1, log), peers, rate=lambda s: 1 / s, data='random'
+def test_peaks_of_this_machine_are_plausible():
+    found = peaks.measure_peaks('cpu', 0.0, side=128, megabytes=8)
+    assert 1e7 < found.bytes_per_s < 1e13
+    assert set(found.operations_per_s) == set(bounds.ITEM_BYTES)
+    assert all(1e6 < rate < 1e15 for rate in found.operations_per_s.values())
+
+
+def test_reference_slower_than_float32_is_left_out_by_name(monkeypatch):
+    rates = {'float32': 9e10, 'bfloat16': 1e9, 'float16': 1e11}
+    monkeypatch.setattr(peaks, 'matrix_rate', lambda device, dtype, *_: rates[dtype])
+    peaks.slower_than_float32.cache_clear()
+    monkeypatch.setattr(stages, 'slower_than_float32', peaks.slower_than_float32)
+    assert (
+        peaks.slower_than_float32('cpu', 'float16')
+        == peaks.slower_than_float32('cpu', 'float32')
+        == ''
     )
-    run.skip('online_frame', 10, 512, 'float32', 'too large')
-    made = run.finished(CEILINGS)
-    ceiling_names = [record.name for record in made[:-3]]
-    assert 'ceiling_read_bandwidth' in ceiling_names
-    assert 'ceiling_matrix_peak_bfloat16' in ceiling_names
-    own, compared, skipped = made[-3:]
-    assert (own.median_s, own.peer, own.runs) == (pytest.approx(0.1), None, 7)
-    assert own.extra == {'rate': pytest.approx(10), 'data': 'random'}
-    assert own.floor_s == floors.floor_seconds([floors.sequence(sizes)], CEILINGS)
-    assert compared.speedup == pytest.approx(2.0)
-    assert compared.extra['peer_note'] == 'as it is'
-    assert (skipped.skipped, skipped.floor_s) == ('too large', None)
+    run = Run('cpu')
+    places, queries = (data.make_features(n, 4, 7, 'cpu', 0) for n in (9, 1))
+    found = stages.products(run, places, queries, 'bfloat16')
+    peaks.slower_than_float32.cache_clear()
+    assert [peer.name for peer in found] == ['torch float32']
+    (left_out,) = run.skipped
+    assert (left_out.name, left_out.n) == ('torch bfloat16', 0)
+    assert '1.0 G operations/s, slower than float32 (90.0)' in left_out.reason
 
 
-# ------------------------------------------------ marks and table
+@pytest.mark.parametrize('faster', ['queries @ map.T', 'map @ queries.T'])
+def test_bare_product_takes_the_faster_orientation(faster, clock, monkeypatch):
+    rows, places = torch.randn(3, 4), torch.randn(2, 5, 4)
+    multiply, made = torch.mm, []
 
-MARK = marks.Mark('fast', 'cpu', 'lm_dtw', 20_000, marks._speedup, 8, False, 'prange', 0)
+    def mm(left, right, out):
+        form = 'queries @ map.T' if len(left) == 3 else 'map @ queries.T'
+        clock.now += 0.02 if form == faster else 0.03
+        made.append(out)
+        return multiply(left, right, out=out)
 
-
-@pytest.mark.parametrize(('seconds', 'reached'), [(0.016, True), (0.0159, False)])
-def test_a_mark_is_reached_at_its_bound(seconds, reached):
-    record = replace(RECORD, peer='prange', peer_median_s=seconds)
-    (judged,) = marks.with_marks([record], [MARK])
-    (mark,) = judged.marks
-    assert mark == {'mark': 'fast', 'value': record.speedup, 'wanted': '>= 8', 'reached': reached}
-    below = replace(MARK, at_most=True, value=marks._of_peer, wanted=0.125)
-    assert below.judge(record)['reached'] is reached
-
-
-@pytest.mark.parametrize(
-    'change', [{'n': 2}, {'device': 'cuda'}, {'peer': 'librosa'}, {'dim': 512}, {'name': 'select'}]
-)
-def test_a_mark_is_decided_by_its_own_records_only(change):
-    record = replace(RECORD, peer='prange', peer_median_s=1.0)
-    assert MARK.decided_by(record)
-    assert not MARK.decided_by(replace(record, **change))
-    assert not MARK.decided_by(replace(record, peer_median_s=None))
-    assert not replace(MARK, where={'data': ('walk',)}).decided_by(record)
-    assert marks.undecided([replace(record, **change)], 'cpu', [MARK]) == ['fast']
-    assert marks.undecided([record], 'cpu', [MARK]) == []
-    assert marks.undecided([], 'cuda', [MARK]) == []
+    monkeypatch.setattr(torch, 'mm', mm)
+    call, form = stages.bare_product(rows, places, timing.nothing)
+    call()
+    expected = rows @ places.reshape(10, 4).T
+    assert form == faster
+    wanted = expected if faster == 'queries @ map.T' else expected.T
+    np.testing.assert_allclose(made[-1], wanted, rtol=1e-4)
 
 
-def test_the_marks_are_those_of_the_project():
-    assert len({mark.text for mark in marks.MARKS}) == len(marks.MARKS)
-    assert {text[:3] for text in (mark.text for mark in marks.MARKS)} == {
-        '(a)',
-        '(b)',
-        '(c)',
-        '(d)',
-        '(e)',
-        'GPU',
-    }
-    for mark in marks.MARKS:
-        assert mark.name in floors.STAGES
-        assert mark.n in matching.SIZES
-        assert mark.dim in (0, *matching.DIMENSIONS)
+# ------------------------------------------------ rows, targets, report
+
+
+def test_run_gives_rows_with_bounds_and_peers(clock, capsys):
+    run, sizes = Run('cpu', 0.1), bounds.Sizes(10, d=0)
+    peer = Peer('other', clock.job('other', 0.2), 'its note')
+    run.measure('lm_dtw', (10, 0), clock.job('ours', 0.1), [bounds.lm_dtw(sizes)], [peer])
+    big = bounds.Work(2**30, 5e9)
+    run.measure('image_distances', (10, 4), clock.job('ours', 0.1), [big])
+    run.skip('frame', 10, 512, 'too large')
+    (row, distances), found = run.finish(PEAKS)
+    assert found.bytes_per_s == pytest.approx(
+        2**30 / 0.1
+    )  # a stage that showed more than the peak
+    assert distances.ratio == pytest.approx(1.0)
+    assert row.lower_bound_s == bounds.bound_seconds([bounds.lm_dtw(sizes)], found)
+    assert (row.median_s, row.runs) == (pytest.approx(0.1), 7)
+    assert row.peers == (
+        PeerTime('other', pytest.approx(0.2), pytest.approx(0), pytest.approx(2), 'its note'),
+    )
+    assert 'left out: frame, n = 10, d = 512: too large' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ('seconds', 'text'),
-    [(2.5, '2.50 s'), (0.0123, '12.3 ms'), (0.0005, '500 µs'), (3e-7, '0.30 µs'), (None, '-')],
+    [(2.5, '2.5 s'), (0.0123, '12.3 ms'), (0.0005, '500 µs'), (3e-7, '0.3 µs'), (None, '-')],
 )
-def test_durations_as_text(seconds, text):
-    assert report.seconds_text(seconds) == text
+def test_seconds_text_has_three_digits_and_a_unit(seconds, text):
+    assert results.seconds_text(seconds) == text
 
 
-@pytest.mark.parametrize(
-    ('value', 'text'),
-    [
-        (13.4e9, '1.34e+10'),
-        (12_345.6, '12,346'),
-        (45.67, '45.7'),
-        (1.254, '1.25'),
-        (0.0123, '0.0123'),
-        (0, '0.00'),
-    ],
-)
-def test_numbers_as_text(value, text):
-    assert report.number_text(value) == text
+@pytest.mark.parametrize('value', [(57_740.6, '57,741'), (1.254, '1.25'), (0.01234, '0.0123')])
+def test_number_text_has_no_exponent_above_one(value):
+    assert results.number_text(value[0]) == value[1]
 
 
-def test_the_table_prints_losses_like_wins():
-    about = {'machine': {'cpu': 'A CPU', 'cores': 2}, 'versions': {'torch': '2'}, 'commit': 'abc'}
-    win = replace(RECORD, peer='prange', peer_median_s=0.020)
-    loss = replace(RECORD, peer='librosa', peer_median_s=0.001, extra={'peer_note': 'one core'})
-    part = Record('image_distances', 20_000, 512, 'float32', 'cpu', 0.02, 0.0, 7, 0.01, 'torch', 0.01, 0.0)
-    part = replace(part, extra={'xi': 3, 'peer_part': True})
-    made = [RECORD, win, loss, part, Record('online_frame', 9, 512, 'float32', 'cpu', skipped='no memory')]
-    text = report.markdown(records.with_machine(marks.with_marks(made), about))
-    lines = text.splitlines()
-    assert 'Commit abc' in text
-    assert '| 20,000 | float32 | random | 2.00 ms | 100 µs | 9 | 1.00 ms | 2.00 |' in lines
-    assert 'Against others (1 of 2 lost):' in lines
-    (lost,) = [line for line in lines if line.endswith('| loss |')]
-    assert 'librosa' in lost
-    assert '0.50' in lost
-    assert '* librosa: one core' in lines
-    assert 'Beside a part of the work:' in lines
-    assert '| online_frame | 9 | 512 | float32 | no memory |' in text.replace('|  |', '|')
-    assert (
-        '| (a) LM-DTW, 20,000 starts: times the plain prange | float32, data = random '
-        '| 10.0 | >= 8 | reached |' in lines
+@pytest.mark.parametrize(('ratio', 'reached'), [(8.0, True), (7.99, False)])
+def test_target_at_its_bound_is_reached(ratio, reached):
+    target = targets.Target(
+        'cpu', 'lm_dtw', 'paper', 20_000, 0, 'float32', 'times plain prange', '>=', 8
     )
-    assert '| (a) LM-DTW, 20,000 starts: times librosa | float32 | 0.50 | >= 100 | **not reached** |' in lines
-    assert '| (a) LM-DTW, 100,000 starts: times librosa |  | - |  | not measured |' in lines
+    row = replace(ROW, peers=(PeerTime('prange', 1.0, 0.0, ratio),))
+    assert target.found([replace(row, n=3), row]) == ratio
+    assert target.reached(ratio) is reached
+    below = replace(target, relation='<=', wanted=8)
+    assert below.reached(ratio)
+    assert target.found([replace(row, mode='robust')]) is None
 
 
-# ------------------------------------------------ others
+def test_targets_name_measured_sizes_and_known_values():
+    for target in targets.TARGETS:
+        assert target.value in targets.VALUES
+        assert target.n in matching.SIZES or target.device == 'cuda'
+        assert target.d in (0, *matching.DIMENSIONS)
+
+
+def test_report_counts_losses_and_sums_the_stages_of_a_frame():
+    parts = [Row(s, 'robust', 5, 0, 'float32', 0.001, 0, 7) for s in report.ROBUST_STAGES[2:]]
+    parts += [Row('mean_centering', 'robust', 5, 8, 'float32', 0.001, 0.0, 7)]
+    parts += [Row('image_distances', '', 5, 8, p, 0.002, 0.0, 7) for p in ('float16', 'float32')]
+    whole = Row('frame', 'robust', 5, 8, 'float16', 0.010, 0.001, 7, 0.005)
+    loss = PeerTime('librosa', 0.001, 0.0, 0.5, 'one core')
+    partial = PeerTime('torch float32', 0.001, 0.0, 0.1, partial=True)
+    held = memory.Memory('localization', 'robust', 'float16', 5, 8, 10**6, 3 * 10**6)
+    about = results.environment(named_commit='abc')
+    rows = [*parts, whole, replace(ROW, peers=(loss, partial))]
+    text = '\n'.join(
+        report.report(about, rows, [held], PEAKS, [results.Skipped('x', 1, 0, 'why')])
+    )
+    assert 'Commit abc' in text
+    assert '| 9 ms | 10 ms | 1 ms | 5 ms | 2 |' in text  # seven stages of 1 ms, one of 2 ms
+    assert '## Beside peers (1 of 1 lost)' in text
+    assert '| 1 MB | 3 MB | 3 | <= 1.1 | **not reached** |' in text
+    assert (
+        '| lm_dtw | paper | 20,000 | - | float32 | times librosa | 0.5 | >= 100 | **not reached** |'
+        in text
+    )
+    assert '| x | 1 | - | why |' in text
+
+
+# ------------------------------------------------ peers
 
 RUNNER = """
 import json, sys
 import numpy as np
 print(json.dumps({'librosa': '9', 'tslearn': '9'}), flush=True)
 for line in sys.stdin:
-    asked = json.loads(line)
-    window = np.load(asked['window'])
-    ends = [float(window[:, s : s + asked['columns']].sum()) for s in asked['starts']]
+    request = json.loads(line)
+    window, k = np.load(request['window']), request['columns']
+    ends = [float(window[:, s : s + k].sum()) for s in request['starts']]
     print(json.dumps({'seconds': len(ends) / 8, 'ends': ends}), flush=True)
 """
 
 
-def test_the_peers_answer_for_the_starts_that_are_asked_for():
+def test_peers_run_returns_the_requested_starts():
     window = np.arange(20, dtype=np.float32).reshape(2, 10)
     with peer_process.Peers([sys.executable, '-c', RUNNER]) as peers:
         assert peers.versions['librosa'] == '9'
-        answer = peers.run('librosa', peers.put(window), [0, 4], 3)
-    assert answer == {'seconds': 0.25, 'ends': [36.0, 60.0]}
+        reply = peers.run('librosa', peers.put(window), [0, 4], 3)
+    assert reply == {'seconds': 0.25, 'ends': [36.0, 60.0]}
 
 
 def test_peers_that_do_not_start_are_missing():
@@ -385,7 +336,7 @@ def test_peers_that_do_not_start_are_missing():
         peer_process.Peers([sys.executable, '-c', 'raise SystemExit(3)'])
 
 
-def test_an_environment_is_made_once(tmp_path, monkeypatch):
+def test_environment_of_the_peers_is_created_once(tmp_path, monkeypatch):
     commands = []
 
     class Done:
@@ -398,50 +349,40 @@ def test_an_environment_is_made_once(tmp_path, monkeypatch):
         return Done
 
     monkeypatch.setattr(peer_process.subprocess, 'run', fake)
-    assert peer_process.make_environment(tmp_path) == tmp_path / 'bin' / 'python3'
-    assert [('venv' in command, 'install' in command) for command in commands] == [
-        (True, False),
-        (False, True),
-    ]
-    peer_process.make_environment(tmp_path)
-    assert len(commands) == 2
+    for _ in range(2):
+        assert peer_process.make_environment(tmp_path) == tmp_path / 'bin' / 'python3'
+    assert ['venv' in c for c in commands] == [True, False]
     (tmp_path / 'requirements.sha256').write_text('of other requirements')
     Done.returncode, Done.stderr = 1, 'one\nno such package'
     with pytest.raises(peer_process.PeersMissingError, match='no such package'):
         peer_process.make_environment(tmp_path)
-    assert (tmp_path / 'requirements.sha256').read_text() == 'of other requirements'
-    assert len(commands) == 3  # nothing is installed where no environment could be made
+    assert len(commands) == 3  # nothing is installed where no environment could be created
 
 
-def test_the_runner_times_the_alignments_alone(tmp_path, monkeypatch):
-    spec = importlib.util.spec_from_file_location('peers_runner', BENCHMARKS / 'peers' / 'runner.py')
+def test_runner_passes_the_columns_of_each_start_to_the_peer(tmp_path, monkeypatch):
+    spec = importlib.util.spec_from_file_location(
+        'peers_runner', BENCHMARKS / 'peers' / 'runner.py'
+    )
     runner = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(runner)
-    seen = []
-
-    def align(costs):
-        seen.append(costs.copy())
-        return costs[-1, -1]
-
-    monkeypatch.setattr(runner, 'aligner', lambda peer: align)
-    window = np.arange(20, dtype=np.float32).reshape(2, 10)
-    np.save(tmp_path / 'w.npy', window)
-    asked = {'peer': 'librosa', 'window': str(tmp_path / 'w.npy'), 'starts': [1, 7], 'columns': 3}
-    answer = runner.run(asked)
-    assert answer['ends'] == [13.0, 19.0]
-    assert answer['seconds'] >= 0
-    np.testing.assert_array_equal(seen[0], window[:, 1:4])
+    monkeypatch.setattr(runner, 'aligner', lambda peer: lambda costs: costs[-1, -1])
+    np.save(tmp_path / 'w.npy', np.arange(20, dtype=np.float32).reshape(2, 10))
+    request = {
+        'peer': 'librosa',
+        'window': str(tmp_path / 'w.npy'),
+        'starts': [1, 7],
+        'columns': 3,
+    }
+    assert runner.run(request)['ends'] == [13.0, 19.0]
     monkeypatch.undo()
-    with pytest.raises(ValueError, match="'other' is unknown: take one of librosa, tslearn"):
+    with pytest.raises(ValueError, match="'other' is unknown: expected one of librosa, tslearn"):
         runner.aligner('other')
 
 
-@pytest.mark.parametrize('kind', ['random', 'walk'])
 @pytest.mark.parametrize('n', [1, 7, 30])
-def test_the_plain_prange_gives_the_oracles_answers(kind, n):
-    window = data.make_window(kind, 5, n, seed=1)
-    if kind == 'random':  # few values that add up exactly: ties everywhere
-        window = np.random.default_rng(n).integers(0, 3, (5, n)).astype(np.float32)
+def test_prange_gives_the_results_of_the_oracle(n):
+    # few values that add up exactly: ties everywhere
+    window = np.random.default_rng(n).integers(0, 3, (5, n)).astype(np.float32)
     q, m = oracle.match_sequence(window, 2, np.float32)
     distances, lengths = np.empty(n, np.float32), np.empty(n, np.int32)
     baselines.prange()(window, 10, distances, lengths)
@@ -449,177 +390,174 @@ def test_the_plain_prange_gives_the_oracles_answers(kind, n):
     np.testing.assert_array_equal(lengths, m)
 
 
-def test_peers_that_do_a_sample_are_scaled_to_all_starts(monkeypatch):
-    window = data.make_window('random', 20, 100, 0)
+class FakePeers:
+    """Peers that take half a second for each start and accumulate the oracle's sums of a window."""
 
-    class Fake:
-        versions = {'librosa': '9', 'tslearn': '8'}  # noqa: RUF012
+    versions = {'librosa': '9', 'tslearn': '8'}  # noqa: RUF012
 
-        def put(self, window):
-            return Path('window.npy')
+    def __init__(self, window):
+        self._window = window
 
-        def run(self, peer, path, starts, k):
-            costs = [oracle.accumulate(window[:, s : s + k], 1, np.float64).S[-1][-1] for s in starts[:3]]
-            return {'seconds': 0.5 * len(starts), 'ends': costs}
+    def put(self, window):
+        return Path('window.npy')
 
-    plan = stages.Plan(('float32',), 7, SequenceSettings(), 1e9, 0)
-    ours = match_sequence(window, plan.sequence)
-    found = {peer.name: peer for peer in stages.sequence_peers(plan, window, ours, Fake())}
-    assert found['librosa'].extra['peer_sample'] == 61  # all starts with 40 columns
-    assert found['tslearn'].extra['peer_sample'] == stages.TSLEARN_STARTS
-    assert found['librosa'].job() == found['tslearn'].job() == pytest.approx(50.0)  # half a second a start
-    monkeypatch.setattr(stages, 'timed', lambda call: lambda: 3.0)
-    loops, count = stages._oracle_job(window, plan, ours)
-    assert loops() == pytest.approx(3.0 * 100 / count)
+    def run(self, peer, path, starts, k):
+        costs = [self._window[:, s : s + k] for s in starts[:3]]
+        ends = [oracle.accumulate(c, 1, np.float64).S[-1][-1] for c in costs]
+        return {'seconds': 0.5 * len(starts), 'ends': ends}
+
+
+def test_sequence_peers_scale_samples_and_reject_other_results():
+    window = data.make_window(20, 100, 0)
+    ours = match_sequence(window, stages.SEQUENCE)
+    found = {peer.name: peer for peer in stages.sequence_peers(window, ours, FakePeers(window))}
+    assert found['librosa'].note.endswith('61 starts, scaled')  # all starts with 40 columns
+    assert found['librosa'].job() == found['tslearn'].job() == pytest.approx(50.0)
     wrong = SequenceDistances(ours.distances, ours.lengths + 1)
     with pytest.raises(AssertionError):
-        stages.sequence_peers(plan, window, wrong, Fake())
+        stages.sequence_peers(window, wrong, None)
     with pytest.raises(AssertionError, match='librosa, start 0'):
-        stages._process_job(Fake(), 'librosa', window + 1, [0], 40)
+        stages.sequence_peers(window, ours, FakePeers(window + 1))
 
 
-def test_a_stage_may_raise_a_ceiling(clock):
-    run = Run('cpu', 0.1)
-    sizes = floors.Sizes(1000, d=16)
-    run.measure('distance_matrix', sizes, 'float32', clock.job('ours', 0.1, []), dim=16)
-    run.measure('lm_dtw', sizes, 'float32', clock.job('ours', 1e-9, []), dim=0)
-    made = {record.name: record for record in run.finished(replace(CEILINGS, read_bytes_per_s=1e12))}
-    peak = made['ceiling_matrix_peak_float32'].extra
-    operations = sum(part.operations for part in floors.STAGES['distance_matrix'](sizes, 'float32'))
-    assert operations > 2 * 20 * 49 * 1000 * 16  # the alignment's are among them
-    assert peak['operations_per_s'] == pytest.approx(operations / 0.1)
-    assert peak['source'] == 'distance_matrix, n = 1,000'
-    assert made['distance_matrix'].ratio_to_floor == pytest.approx(1.0)
-
-
-def test_samples_are_spread_over_starts_with_whole_windows():
+def test_sample_is_spread_over_starts_that_see_all_columns():
     assert baselines.sample(1000, 40, 4) == [0, 320, 640, 960]
     assert baselines.sample(42, 40, 500) == [0, 1, 2]
     assert baselines.sample(5, 40, 3) == [0]
 
 
-def test_made_up_features_have_unit_norm_and_a_seed(monkeypatch):
-    monkeypatch.setattr(data, 'BLOCK_BYTES', 4 * 16 * 5)  # pieces that do not divide the rows
+# ------------------------------------------------ data, memory, comparison, accuracy
+
+
+def test_make_features_draws_unit_norm_from_a_seed(monkeypatch):
+    monkeypatch.setattr(data, 'BLOCK_BYTES', 4 * 16 * 5)  # blocks that do not divide the rows
     features, again = (data.make_features(9, 16, 7, 'cpu', 3).strips.numpy() for _ in range(2))
-    assert features.shape == (7, 9, 16)
     np.testing.assert_allclose(np.linalg.norm(features, axis=2), 1, rtol=1e-5)
     np.testing.assert_array_equal(features, again)
-    rows = features.reshape(63, 16)
-    assert all(abs(float(a @ b)) < 0.99 for a, b in pairwise(rows))
+    assert len(np.unique(features.reshape(63, 16), axis=0)) == 63
     assert not np.array_equal(features, data.make_features(9, 16, 7, 'cpu', 4).strips.numpy())
 
 
-def test_made_up_windows_are_distances():
-    for kind in ('random', 'walk'):
-        window = data.make_window(kind, 20, 300, 0)
-        assert (window.shape, window.dtype) == ((20, 300), np.float32)
-        assert 0 < window.min() <= window.max() <= 1
-        np.testing.assert_array_equal(window, data.make_window(kind, 20, 300, 0))
-    slow = np.abs(np.diff(data.make_window('walk', 20, 300, 0))[:, :100]).max()
-    assert slow < 0.05
-    with pytest.raises(ValueError, match='take random or walk'):
-        data.make_window('other', 20, 300, 0)
+def test_data_folder_that_is_missing_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv('STAVPR_DATA', str(tmp_path))
+    assert data.data_folder() == tmp_path
+    monkeypatch.setenv('STAVPR_DATA', str(tmp_path / 'none'))
+    with pytest.raises(data.NoDataError, match='none: set STAVPR_DATA'):
+        data.data_folder()
+
+
+def test_measure_memory_counts_at_least_the_features():
+    found = memory.measure_memory('localization', 'robust', 'float32', 2_000, 512)
+    assert found.feature_bytes == 2_000 * 512 * 7 * 4
+    assert 0.9 < found.ratio < 10
+
+
+def test_compare_takes_ratios_pair_by_pair_and_compares_results():
+    class Fake:
+        def __init__(self, seconds, result):
+            self.seconds, self.result, self.requests = iter(seconds), result, []
+
+        def run(self, **request):
+            self.requests.append(request)
+            if 'n' in request:
+                return {}
+            return {'seconds': [9.0] + [next(self.seconds)] * 3, 'results': self.result}
+
+    this, other = Fake([1.0, 2.0, 3.0], [1]), Fake([2.0, 2.0, 2.0], [1])
+    found = compare.compare(this, other, {'n': 5}, rounds=3, frames=3)
+    assert found['ratio'] == 1.0
+    assert found['ratio_quartiles'] == [0.75, 1.25]
+    assert (found['this_s'], found['other_s'], found['equal_results']) == (2.0, 2.0, True)
+    assert this.requests == [{'n': 5}, *[{'frames': 4}] * 3]
+    differs = compare.compare(Fake([1.0] * 2, [1]), Fake([1.0] * 2, [2]), {'n': 5}, 2, 3)
+    assert not differs['equal_results']
+
+
+def test_compare_of_this_checkout_with_itself_gives_equal_results(capsys):
+    given = '--sizes 40 --dimensions 16 --precisions float32 --rounds 2 --frames 3 --allowed 1e9'
+    assert compare.main([str(BENCHMARKS.parent), *given.split()]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ['mode', 'robust', 'paper']
+    assert all(line.endswith('equal') for line in lines[1:])
+
+
+@pytest.mark.parametrize(
+    ('name', 'before', 'after', 'worse'),
+    [
+        ('f1', 0.9, 0.8, True),
+        ('f1', 0.8, 0.9, False),
+        ('recall_at_1', 0.9, 0.8, True),
+        ('threshold', 0.9, 0.8, False),
+        ('precision', 0.9, 0.8, False),  # at the best F1
+        ('true_positives', 9, 8, False),
+    ],
+)
+def test_changes_of_a_value_are_listed_and_judged(name, before, after, worse):
+    old, new = ({'a': {'sequence': {name: value, 'queries': 5}}} for value in (before, after))
+    lines, found = accuracy.changes(old | {'b': {}}, new)
+    assert lines == [f'{"WORSE" if worse else "changed"}: a sequence.{name}: {before} -> {after}']
+    assert found is worse
+    assert accuracy.changes(old, old) == ([], False)
+
+
+def test_changes_at_the_default_threshold_and_of_unknown_images_are_judged():
+    old = {'a': {'at_default': {'precision': 0.9}}, 't': {'images': 9, 'matched': 3}}
+    new = {'a': {'at_default': {'precision': 0.8}}, 't': {'images': 9, 'matched': 4}}
+    lines, worse = accuracy.changes(old, new)
+    assert worse
+    assert [line.split(':')[0] for line in lines] == ['WORSE', 'WORSE']
+    assert not accuracy.changes(new, old)[1]
+    assert accuracy.changes({'a': {'f1': 1.0}}, {'a': {}})[1]  # a value that is gone
+
+
+def test_committed_accuracy_table_has_all_rows_and_its_markdown():
+    path = BENCHMARKS / 'results' / 'accuracy-eb40c94.json'
+    document = json.loads(path.read_text())
+    text = '\n'.join(accuracy.markdown(document, document['results'])).rstrip() + '\n'
+    assert path.with_suffix('.md').read_text() == text
+    assert document['results']['gardens_point/g/robust/same']['sequence']['f1'] > 0.99
 
 
 # ------------------------------------------------ the command
 
 
-@pytest.mark.parametrize('slow', ['wide', 'tall'])
-def test_the_bare_product_is_that_of_the_faster_orientation(slow, monkeypatch):
-    rows, references = torch.randn(3, 4), torch.randn(2, 5, 4)
-    expected = rows @ references.reshape(10, 4).T
-    original = torch.mm
-    made = []
-
-    def mm(left, right, out):
-        if (len(left) == 3) == (slow == 'wide'):
-            time.sleep(0.005)
-        made.append(out)
-        return original(left, right, out=out)
-
-    monkeypatch.setattr(torch, 'mm', mm)
-    call, form = subjects.bare_product(rows, references, timing.nothing)
-    call()
-    if slow == 'wide':
-        assert form == 'torch.mm, map @ queries.T'
-        np.testing.assert_allclose(made[-1], expected.T, rtol=1e-5)
-    else:
-        assert form == 'torch.mm, queries @ map.T'
-        np.testing.assert_allclose(made[-1], expected, rtol=1e-5)
+def test_parse_quick_keeps_to_small_sizes():
+    assert list(matching.parse(['--quick']).sizes) == [2_000, 20_000]
+    assert list(matching.parse([]).sizes) == [2_000, 20_000, 100_000]
 
 
-def test_quick_keeps_to_small_sizes():
-    quick = matching.parse(['--quick'])
-    assert list(quick.sizes) == [1_000, 2_000, 20_000]
-    assert matching.cases_of(quick)[2:] == [(20_000, 512), (1_000, 10_416), (2_000, 10_416)]
-    assert matching.cases_of(matching.parse([]))[4:] == [
-        (1_000_000, 512),
-        *((n, 10_416) for n in quick.sizes),
-    ]
-    assert list(matching.parse([]).sizes) == [1_000, 2_000, 20_000, 100_000, 1_000_000]
-    assert matching.parse(['--memory', '3']).memory == 3e9
-    assert matching.parse(['--device', 'cuda']).memory > 1e12
-
-
-def test_the_whole_command(tmp_path, monkeypatch):
-    announced = []
-
-    class Announced(Run):
-        def __init__(self, device, seconds, steps):
-            super().__init__(device, seconds)
-            announced.append(steps)
-
-        def measure(self, *arguments, **named):
-            announced.append('measured')
-            return super().measure(*arguments, **named)
-
-    monkeypatch.setattr(ceilings, 'measure_ceilings', lambda *_: FULL)
-    monkeypatch.setattr('run.Run', Announced)
-    given = [
-        '--sizes',
-        '50',
-        '--dimensions',
-        '16',
-        '--seconds',
-        '0.001',
-        '--no-peers',
-        '--commit',
-        'abc',
-    ]
-    assert matching.main([*given, '--output', str(tmp_path)]) == 0
+def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
+    monkeypatch.setattr(peaks, 'measure_peaks', lambda *_: PEAKS)
+    given = '--sizes 50 --dimensions 16 --seconds 0.001 --no-peers --no-memory --commit abc'
+    assert matching.main([*given.split(), '--output', str(tmp_path)]) == 0
     (path,) = tmp_path.glob('matching-*.json')
-    made = records.load(path)
-    assert announced[0] == announced.count('measured')
-    assert {record.name for record in made if record.median_s} == set(floors.STAGES)
-    assert all(record.extra['commit'] == 'abc' for record in made)
-    assert all(record.floor_s and record.spread_s is not None for record in made if record.median_s)
-    assert {record.peer for record in made if record.name == 'lm_dtw'} >= {
-        None,
-        'prange',
-        'oracle',
-        'librosa',
-    }
-    assert {record.skipped for record in made if record.peer == 'librosa'} == {'left out: --no-peers'}
-    errors = {
-        dtype: max(record.extra.get('largest_error', 0) for record in made if record.dtype == dtype)
-        for dtype in PRECISIONS
-    }
-    assert 0 < errors['float32'] < 1e-5 < errors[PRECISIONS[1]] < 1e-2
-    assert path.with_suffix('.md').read_text() == report.markdown(made)
+    document = json.loads(path.read_text())
+    rows = document['rows']
+    robust = {row['stage'] for row in rows if row['mode'] in ('', 'robust')}
+    assert robust == {*report.ROBUST_STAGES, 'distance_matrix', 'frame'}
+    paper = {row['stage'] for row in rows if row['mode'] == 'paper'}
+    assert paper == {'lm_dtw', 'selection', 'path_trace', 'frame'}
+    assert document['commit'] == 'abc'
+    assert all(row['lower_bound_s'] > 0 and row['spread_s'] >= 0 for row in rows)
+    assert {'librosa', 'tslearn'} <= {skipped['name'] for skipped in document['skipped']}
+    text = path.with_suffix('.md').read_text()
+    assert text.index('A frame in mode robust') < text.index('## All stages')
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason='there is a CUDA device')
-def test_a_device_that_is_not_there_is_refused_in_words(tmp_path, capsys):
+def test_command_on_a_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, 'is_available', lambda: False)
     assert matching.main(['--device', 'cuda', '--output', str(tmp_path)]) == 2
     assert 'torch sees no CUDA device here' in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_what_does_not_fit_is_skipped_with_a_reason(tmp_path, monkeypatch):
-    monkeypatch.setattr(ceilings, 'measure_ceilings', lambda *_: FULL)
-    given = ['--sizes', '50', '--dimensions', '16', '--seconds', '0.001', '--no-peers', '--memory', '1e-6']
-    matching.main([*given, '--output', str(tmp_path)])
-    (path,) = tmp_path.glob('*.json')
-    (reason,) = {record.skipped for record in records.load(path) if record.name == 'online_frame'}
-    assert reason == 'needs 0.0 GB, 0.0 GB may be used'
-    assert '| online_frame |' in path.with_suffix('.md').read_text()
+def test_command_skips_sizes_beyond_the_memory_with_a_reason(tmp_path, monkeypatch):
+    run = Run('cpu')
+    options = matching.parse(
+        ['--sizes', '50', '--dimensions', '16', '--memory', '1e-6', '--no-peers']
+    )
+    options.precisions = ('float32',)
+    for name in ('robust_stages', 'paper_stages'):
+        monkeypatch.setattr(stages, name, lambda *_: None)
+    matching.measure_stages(run, options)
+    assert run.skipped[0].reason == 'needs 0.0 GB, 0.0 GB may be used'

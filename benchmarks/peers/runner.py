@@ -1,9 +1,10 @@
 """
-Runs inside the peers' own environment: does a sample of starts with one peer whenever it is told to.
+Runner in the peers' own environment: aligns a sample of starts with one peer on request.
 
 Standard input: a line of JSON for each run, ``{"peer": NAME, "window": FILE.npy, "starts": [...],
-"columns": k}``. Standard output: a line of JSON for each, ``{"seconds": ..., "ends": [...]}``, where
-``ends`` is the accumulated distance in cell (l, k) of each start. The first line out are the versions.
+"columns": k}``. Standard output: a line of JSON for each, ``{"seconds": ..., "ends": [...]}``:
+``ends`` is the accumulated distance in cell (l, k) of each start. The first line holds the
+versions.
 """
 
 import importlib.metadata
@@ -28,14 +29,14 @@ def aligner(peer: str) -> Callable[[np.ndarray], float]:
         from tslearn.metrics import dtw_path_from_metric  # type: ignore[import-not-found]
 
         return lambda costs: dtw_path_from_metric(costs, metric='precomputed')[1]
-    raise ValueError(f'peer {peer!r} is unknown: take one of {", ".join(PEERS)}')
+    raise ValueError(f'peer {peer!r} is unknown: expected one of {", ".join(PEERS)}')
 
 
 def run(request: dict[str, Any]) -> dict[str, Any]:
-    """Do one run."""
+    """Align one sample."""
     window = np.load(request['window'], mmap_mode='r')
     width = request['columns']
-    # what is cut out of the window is made ready before the clock starts
+    # the costs are cut out of the window before the clock starts
     costs = [np.array(window[:, start : start + width]) for start in request['starts']]
     align = aligner(request['peer'])
     began = time.perf_counter()
@@ -45,7 +46,7 @@ def run(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Answer until standard input ends."""
+    """Serve requests until standard input ends."""
     print(json.dumps({peer: importlib.metadata.version(peer) for peer in PEERS}), flush=True)
     for line in sys.stdin:
         print(json.dumps(run(json.loads(line))), flush=True)

@@ -1,0 +1,320 @@
+"""
+Accuracy table: precision, recall and F1 of both modes on the data sets, and its comparison.
+
+``make accuracy``, ``make accuracy ARGS=--quick``; ``--compare OLD.json`` exits with 1 if a value
+is worse. Data sets and columns: benchmarks/README.md.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from data import NoDataError, data_folder
+from results import RESULTS, environment, heading, table, write
+
+from stavpr_ros.errors import UnavailableError
+from stavpr_ros.evaluation.evaluate import (
+    Evaluation,
+    evaluate_loop_closures,
+    evaluate_on_map,
+    recognize_traverse,
+)
+from stavpr_ros.evaluation.ground_truth import GroundTruth
+from stavpr_ros.evaluation.metrics import counts_at
+from stavpr_ros.evaluation.warp import KINDS, cropped, warp_indices
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.features.registry import settings_class
+from stavpr_ros.mapping import PlaceMap, build_map
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.robust.options import LOOP_THRESHOLD, THRESHOLD
+from stavpr_ros.sources import open_source
+
+MODES = ('paper', 'robust')
+FEATURES = {'g': 'gradient', 'o': 'SqueezeNet 1.1, fire6/concat_1'}
+NETWORK = 'squeezenet1_1_imagenet/squeezenet_fp16.onnx'
+EXCLUDED = 20  # latest images in the hallway loop, as its ground truth has them
+# of --compare; the other numbers (thresholds, counts) have no better and worse
+HIGHER_IS_BETTER = ('f1', 'precision', 'recall', 'average_precision')
+AT_BEST = ('precision', 'recall')  # at the best F1 threshold, either may fall while F1 rises
+LOWER_IS_BETTER = ('matched',)
+Results = dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """
+    A query on a map.
+
+    :param name: of the case in the table.
+    :param places, query: images of the map and of the query.
+    :param truth: of number of queries and of places.
+    :param warps: also at other speeds of the query.
+    """
+
+    name: str
+    places: Any
+    query: Any
+    truth: Callable[[int, int], GroundTruth]
+    warps: bool = False
+
+
+def identity(tolerance: int) -> Callable[[int, int], GroundTruth]:
+    """Return the ground truth of sequences that are aligned image by image."""
+    return lambda queries, places: GroundTruth.identity(queries, places, tolerance)
+
+
+def short_cases(folder: Path) -> Iterator[Case]:
+    """Yield the cases of both forms."""
+
+    def images(name: str) -> Any:
+        return open_source(folder / name)
+
+    left, right = images('gardens_point/day_left'), images('gardens_point/day_right')
+    yield Case('gardens_point', left, right, identity(2), warps=True)
+    day, other_day, night = (
+        images(f'walk_by_night/{name}') for name in ('left_day', 'right_day', 'right_night')
+    )
+    yield Case('walk_day', day, other_day, identity(2))
+    yield Case('walk_night', day, night, identity(2), warps=True)
+    yield Case('walk_night_map', night, day, identity(2))
+
+    def corridor(queries: int, places: int) -> GroundTruth:
+        return GroundTruth.from_file(folder / 'corridor/ground_truth.csv', queries, places, 0)
+
+    yield Case('corridor', images('corridor/ref'), images('corridor/query'), corridor)
+
+
+def long_cases(folder: Path, feature: str) -> Iterator[Case]:
+    """Yield the cases of the full form."""
+    summer, winter = (
+        open_source(folder / 'nordland_64x32' / name) for name in ('summer', 'winter')
+    )
+    yield Case('nordland', summer, winter, identity(3))
+    if feature == 'g':
+        shifted = cropped(summer, 0, 0.3), cropped(winter, 0.1, 0)
+        yield Case('synth_nordland', *shifted, identity(3))
+
+
+def extractor(feature: str, folder: Path) -> FeatureExtractor:
+    """
+    Make the extractor of a feature.
+
+    :raises UnavailableError: the extra ``onnx`` or the network's file is missing.
+    """
+    if feature == 'g':
+        return FeatureExtractor('gradient')
+    model = folder / NETWORK
+    if not model.is_file():
+        raise UnavailableError(f'no file {model}')
+    settings = settings_class('onnx')(
+        model=str(model),
+        layer='fire6/concat_1',
+        channels='bgr',
+        scale=1.0,
+        mean=(104, 117, 123),
+        std=(1, 1, 1),
+    )
+    return FeatureExtractor('onnx', settings)
+
+
+def numbers(evaluation: Evaluation, threshold: float | None) -> dict[str, Any]:
+    """
+    Return the numbers of a row.
+
+    :param threshold: the mode's default; None for mode paper, which has none.
+    """
+    found: dict[str, Any] = {
+        name: {k: v for k, v in metrics.to_json().items() if isinstance(v, int | float)}
+        for name, metrics in (('sequence', evaluation.sequence), ('single', evaluation.single))
+    }
+    if threshold is not None:
+        ranking, truth = evaluation.results.sequence, evaluation.ground_truth
+        correct = truth.accepts(ranking.places)[:, 0]
+        counts = counts_at(threshold, ranking.scores, correct, truth.has_match)
+        found['at_default'] = {
+            'threshold': threshold, 'precision': counts.precision, 'recall': counts.recall
+        }  # fmt: skip
+    return found
+
+
+def evaluate_case(
+    case: Case, feature: str, making: FeatureExtractor
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield key and numbers of a case in each mode and at each speed."""
+    place_map, query = (_map(source, making) for source in (case.places, case.query))
+    truth = case.truth(len(query), len(place_map))
+    for mode in MODES:
+        settings = RecognizerSettings(THRESHOLD, mode=mode)
+        for warp in ('same', *KINDS) if case.warps else ('same',):
+            count = len(query)
+            images = np.arange(count) if warp == 'same' else warp_indices(count, warp)
+            evaluation = evaluate_on_map(
+                place_map, _selected(query.features, images), truth.select(images), settings
+            )
+            threshold = THRESHOLD if mode == 'robust' else None
+            yield f'{case.name}/{feature}/{mode}/{warp}', numbers(evaluation, threshold)
+
+
+def evaluate_hallway(
+    folder: Path, feature: str, making: FeatureExtractor
+) -> Iterator[tuple[str, Any]]:
+    """Yield key and numbers of the loop closures in each mode."""
+    route = _map(open_source(folder / 'rtabmap_hallway_loop/samples'), making)
+    file = folder / 'rtabmap_hallway_loop/samples_GT.bmp'
+    truth = GroundTruth.from_file(file, len(route), len(route), 0).loop_closures(EXCLUDED - 1)
+    for mode in MODES:
+        settings = RecognizerSettings(THRESHOLD, mode=mode)
+        evaluation = evaluate_loop_closures(route.features, truth, settings, EXCLUDED)
+        threshold = LOOP_THRESHOLD if mode == 'robust' else None
+        yield f'hallway/{feature}/{mode}/same', numbers(evaluation, threshold)
+
+
+def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict[str, Any]:
+    """Return the images of floors that match maps of other floors, all pairs, mode robust."""
+    floors = [
+        _map(open_source(p), making) for p in sorted((folder / 'tower').iterdir()) if p.is_dir()
+    ]
+    settings = RecognizerSettings(THRESHOLD, mode='robust')
+    images = matched = 0
+    for place_map in floors:
+        for query in floors:
+            if query is not place_map:
+                recognizer = PlaceRecognizer(place_map, settings)
+                found = recognize_traverse(recognizer, query.features, len(place_map), settings)
+                images += len(query)
+                matched += int(np.count_nonzero(found.sequence.scores < THRESHOLD))
+    return {'images': images, 'matched': matched}
+
+
+def _map(source: Any, making: FeatureExtractor) -> PlaceMap:
+    return build_map(source, making, thumbnails=False, progress=False)
+
+
+def _selected(features: LocalFeatures, images: np.ndarray) -> LocalFeatures:
+    strips, weights = (x[:, images].contiguous() for x in (features.strips, features.weights))
+    return LocalFeatures(strips, weights, features.settings, features.cells)
+
+
+def measure(folder: Path, quick: bool) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield key and numbers of every row; print what is left out."""
+    for feature in ('g',) if quick else FEATURES:
+        try:
+            making = extractor(feature, folder)
+        except UnavailableError as error:
+            print(f'left out: {FEATURES[feature]}: {error}', file=sys.stderr)
+            continue
+        for case in short_cases(folder):
+            yield from evaluate_case(case, feature, making)
+        yield from evaluate_hallway(folder, feature, making)
+        if quick:
+            continue
+        yield f'tower/{feature}/robust', evaluate_tower(folder, feature, making)
+        for case in long_cases(folder, feature):
+            yield from evaluate_case(case, feature, making)
+
+
+def changes(old: Results, new: Results) -> tuple[list[str], bool]:
+    """
+    Compare the rows that both tables have, to the last digit.
+
+    :returns: a line for each value that changed, and whether any of them is worse.
+    """
+    lines, worse = [], False
+    for key in old.keys() & new.keys():
+        before, after = _flat(old[key]), _flat(new[key])
+        for name in before.keys() | after.keys():
+            a, b = before.get(name), after.get(name)
+            if a == b:
+                continue
+            verdict = 'changed'
+            if a is not None and (b is None or _is_worse(name, a, b)):
+                verdict, worse = 'WORSE', True
+            lines.append(f'{verdict}: {key} {name}: {a} -> {b}')
+    return sorted(lines), worse
+
+
+def _flat(values: dict[str, Any]) -> dict[str, float]:
+    """Return nested numbers by dotted names."""
+    found = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            found |= {f'{name}.{inner}': number for inner, number in _flat(value).items()}
+        else:
+            found[name] = value
+    return found
+
+
+def _is_worse(name: str, before: float, after: float) -> bool:
+    group, _, value = name.rpartition('.')
+    if value in LOWER_IS_BETTER:
+        return after > before
+    if group != 'at_default' and value in AT_BEST:
+        return False
+    return (value in HIGHER_IS_BETTER or value.startswith('recall_at_')) and after < before
+
+
+def markdown(about: dict[str, Any], results: Results) -> list[str]:
+    """Return the lines of the table."""
+    lines = []
+    for key, values in results.items():
+        name, feature, mode, *speed = key.split('/')
+        row = [name, FEATURES[feature], mode, speed[0] if speed else '-']
+        if 'sequence' not in values:
+            share = values['matched'] / values['images']
+            lines.append([*row, '-', '-', '-', '-', f'{share:.1%} of {values["images"]:,}'])
+            continue
+        best, default = values['sequence'], values.get('at_default')
+        texts = [f'{best["f1"]:.4f}']
+        texts += [f'{default[k]:.4f}' if default else '-' for k in ('precision', 'recall')]
+        lines.append([*row, *texts, f'{best["recall_at_100_precision"]:.4f}', '-'])
+    head = ('data set', 'features', 'mode', 'speed', 'best F1', 'P at default', 'R at default')
+    head += ('R at 100 % P', 'unknown matched')
+    return [*heading('Accuracy', about), *table(head, lines)]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser.add_argument(
+        '--quick', action='store_true', help='gradient features, without Nordland and tower'
+    )
+    parser.add_argument(
+        '--compare', type=Path, metavar='OLD', help='table to compare with; 1 if worse'
+    )
+    parser.add_argument(
+        '--commit', default='', help='name of the measured commit, outside a git checkout'
+    )
+    parser.add_argument(
+        '--output', type=Path, default=RESULTS, help='folder of the table (%(default)s)'
+    )
+    options = parser.parse_args(arguments)
+    try:
+        folder = data_folder()
+    except NoDataError as error:
+        print(f'accuracy: {error}', file=sys.stderr)
+        return 2
+    old = json.loads(options.compare.read_text())['results'] if options.compare else None
+    about, began, results = environment(named_commit=options.commit), time.perf_counter(), {}
+    for key, values in measure(folder, options.quick):
+        results[key] = values
+        print(key, json.dumps(values.get('sequence', values).get('f1', values)), flush=True)
+    path = options.output / f'accuracy{"-quick" if options.quick else ""}-{about["commit"]}.json'
+    write(path, about | {'results': results}, markdown(about, results))
+    print(f'took {time.perf_counter() - began:.0f} s\nwrote {path} and its .md')
+    if old is None:
+        return 0
+    lines, worse = changes(old, results)
+    print(*(lines or ['no value changed']), sep='\n')
+    missing = len(old.keys() - results.keys())
+    print(f'compared {len(old) - missing} rows; {missing} were not measured here')
+    return 1 if worse else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,217 @@
+"""
+Speed of two checkouts: the same frames in turn, A B A B, and the ratio pair by pair.
+
+``python benchmarks/compare.py CHECKOUT [--driver FILE]`` compares this checkout (A) with another
+one (B). Each runs in a process of its own that imports the package from its checkout and sleeps
+while the other is timed. A driver adapts a checkout with other names: a Python file with a
+function
+
+    make_frame(strips, weights, mode, precision) -> call
+
+of a map's strips (W, n, d) and weights (W, n), numpy arrays; ``call(strips, weights)`` updates the
+recognizer with one image, strips (W, 1, d), and returns place and distance.
+"""
+
+import argparse
+import importlib.util
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+STRIPS, LENGTH, QUERIES = 7, 20, 40
+
+
+def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: str) -> Any:
+    """Driver of this checkout, see the module's docstring."""
+    import torch
+
+    from stavpr_ros.features import FeatureSettings, LocalFeatures
+    from stavpr_ros.mapping import PlaceMap
+    from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+
+    def features(strips: np.ndarray, weights: np.ndarray) -> LocalFeatures:
+        return LocalFeatures(torch.from_numpy(strips), torch.from_numpy(weights), settings)
+
+    settings, n = FeatureSettings('synthetic', None), strips.shape[1]
+    place_map = PlaceMap(features(strips, weights), None, np.zeros(n, np.int64), ('',) * n)
+    recognizer = PlaceRecognizer(place_map, RecognizerSettings(1.0, mode=mode), 'cpu', precision)
+
+    def update(strips: np.ndarray, weights: np.ndarray) -> tuple[int, float]:
+        match = recognizer.update(features(strips, weights))
+        return (match.place_index, match.distance) if match.sequence else (-1, 0.0)
+
+    return update
+
+
+def random_strips(n: int, d: int, seed: int) -> np.ndarray:
+    """Draw unit-norm features, shape (W, n, d), float32."""
+    strips = np.random.default_rng(seed).standard_normal((STRIPS, n, d), np.float32)
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+    return strips
+
+
+def serve(driver: str) -> None:
+    """Serve one checkout: read requests, one JSON line each; write the seconds of the frames."""
+    from stavpr_ros.threads import wait_passively
+
+    wait_passively()
+    make = make_frame
+    if driver:
+        spec = importlib.util.spec_from_file_location('driver', driver)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        make = module.make_frame
+    for line in sys.stdin:
+        request = json.loads(line)
+        if 'frames' not in request:
+            n, d, seed = request['n'], request['d'], request['seed']
+            weight, count = np.float32(STRIPS**-0.5), 0
+            places = random_strips(n, d, seed)
+            queries, shares = (
+                random_strips(QUERIES, d, seed + 1),
+                np.full((STRIPS, QUERIES), weight),
+            )
+            call = make(
+                places, np.full((STRIPS, n), weight), request['mode'], request['precision']
+            )
+            request['frames'] = LENGTH
+        taken, results = [], []
+        for _ in range(request['frames']):
+            image = slice(count % QUERIES, count % QUERIES + 1)
+            strips, weights = queries[:, image].copy(), shares[:, image].copy()
+            began = time.perf_counter()
+            results.append(call(strips, weights))
+            taken.append(time.perf_counter() - began)
+            count += 1
+        print(json.dumps({'seconds': taken, 'results': results}), flush=True)
+
+
+class Checkout:
+    """The process of one checkout."""
+
+    def __init__(self, folder: Path, driver: str = '') -> None:
+        command = [sys.executable, __file__, str(folder), '--serve', '--driver', driver]
+        environment = os.environ | {'PYTHONPATH': str(folder)}
+        self._process = subprocess.Popen(
+            command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def run(self, **request: Any) -> dict[str, Any]:
+        """Send a request and return its reply."""
+        assert self._process.stdin
+        assert self._process.stdout
+        self._process.stdin.write(json.dumps(request) + '\n')
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        if not line:
+            raise SystemExit(
+                f'compare: the process of a checkout exited with status {self._process.wait()}'
+            )
+        return json.loads(line)
+
+    def close(self) -> None:
+        """End the process."""
+        assert self._process.stdin
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def compare(
+    this: Checkout, other: Checkout, case: dict[str, Any], rounds: int, frames: int
+) -> dict[str, Any]:
+    """
+    Time frames of both checkouts in turn.
+
+    :returns: medians in seconds, median and quartiles of the pairs' ratios (this over other), and
+        whether all places and distances were equal.
+    """
+    for checkout in (this, other):
+        checkout.run(**case)
+    pairs, medians, equal = [], ([], []), True
+    for _ in range(rounds):
+        # the first frame after the other process ran refills the caches: it does not count
+        replies = [checkout.run(frames=frames + 1) for checkout in (this, other)]
+        ours, theirs = (statistics.median(reply['seconds'][1:]) for reply in replies)
+        equal &= replies[0]['results'] == replies[1]['results']
+        pairs.append(ours / theirs)
+        medians[0].append(ours)
+        medians[1].append(theirs)
+    low, middle, high = statistics.quantiles(pairs, n=4, method='inclusive')
+    return case | {
+        'this_s': statistics.median(medians[0]),
+        'other_s': statistics.median(medians[1]),
+        'ratio': middle,
+        'ratio_quartiles': [low, high],
+        'equal_results': equal,
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; 1 if this checkout is slower than allowed, or a result differs."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser.add_argument('checkout', type=Path, help='folder of the other checkout')
+    parser.add_argument('--driver', default='', help='Python file that adapts the other checkout')
+    parser.add_argument(
+        '--sizes', type=int, nargs='+', default=[2_000, 20_000], metavar='N', help='places'
+    )
+    parser.add_argument('--dimensions', type=int, default=512, metavar='D')
+    parser.add_argument('--precisions', nargs='+', default=['float32', 'float16'], metavar='DTYPE')
+    parser.add_argument('--rounds', type=int, default=15, help='pairs of runs (%(default)s)')
+    parser.add_argument('--frames', type=int, default=20, help='frames of each run (%(default)s)')
+    parser.add_argument('--allowed', type=float, default=1.05, help='largest ratio (%(default)s)')
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--output', type=Path, help='write the results to this JSON file as well')
+    parser.add_argument('--serve', action='store_true', help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.serve:
+        serve(options.driver)
+        return 0
+    cases = [
+        {
+            'mode': mode,
+            'n': n,
+            'd': options.dimensions,
+            'precision': precision,
+            'seed': options.seed,
+        }
+        for mode in ('robust', 'paper')
+        for n in options.sizes
+        for precision in options.precisions
+    ]
+    this, other = Checkout(ROOT), Checkout(options.checkout.resolve(), options.driver)
+    found = []
+    head = ('mode', 'n', 'precision', 'this ms', 'other ms', 'ratio')
+    print('{:8}{:>9} {:10}{:>9}{:>10}{:>7}  quartiles    results'.format(*head))
+    for case in cases:
+        result = compare(this, other, case, options.rounds, options.frames)
+        low, high = result['ratio_quartiles']
+        print(
+            f'{case["mode"]:8}{case["n"]:>9,} {case["precision"]:10}{1e3 * result["this_s"]:>9.2f}'
+            f'{1e3 * result["other_s"]:>10.2f}{result["ratio"]:>7.3f}  {low:.3f} {high:.3f}  '
+            f'{"equal" if result["equal_results"] else "DIFFERENT"}',
+            flush=True,
+        )
+        found.append(result)
+    this.close()
+    other.close()
+    if options.output:
+        from results import environment
+
+        document = environment() | {'other': str(options.checkout.name), 'results': found}
+        options.output.write_text(json.dumps(document, indent=1) + '\n')
+    worse = any(r['ratio'] > options.allowed or not r['equal_results'] for r in found)
+    return 1 if worse else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

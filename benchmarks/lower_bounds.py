@@ -1,0 +1,167 @@
+"""Lower bounds: the least time of a stage, from its bytes, operations and the machine's peaks."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from stavpr_ros.alignment.settings import VelocitySettings
+
+ITEM_BYTES = {'float32': 4, 'bfloat16': 2, 'float16': 2}
+BEYOND_CACHES = 2**28  # bytes; below, a stage may read faster than memory
+
+# Operations of one inner cell. LM-DTW: three sums x + S, two minima, two selections of the path's
+# length, its increment. Image distance: the factor of the diagonal besides. A comparison that also
+# selects counts once, index arithmetic does not count: fewer operations make a stricter bound.
+SEQUENCE_CELL, SPATIAL_CELL = 8, 9
+BORDER_CELL = 2  # one predecessor: S + x, C + 1
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """
+    Sizes of one problem, in the paper's symbols.
+
+    :param n: places.
+    :param d: dimensions of a local feature.
+    :param W: strips of an image.
+    :param l: images of the window.
+    :param k: map images that a start of LM-DTW sees.
+    """
+
+    n: int
+    d: int = 512
+    W: int = 7
+    l: int = 20
+    k: int = 40
+
+
+@dataclass(frozen=True)
+class Work:
+    """
+    Work of one stage.
+
+    :param bytes: read at least once.
+    :param operations: an addition and a multiplication count as two.
+    :param dtype: precision whose peak applies.
+    """
+
+    bytes: float
+    operations: float
+    dtype: str = 'float32'
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """
+    Peaks of the machine, measured in the same run.
+
+    :param bytes_per_s: read bandwidth.
+    :param operations_per_s: rate of the large matrix product, by precision.
+    :param sources: of ``read`` or a precision: the stage that showed more than its measurement.
+    """
+
+    bytes_per_s: float
+    operations_per_s: dict[str, float]
+    sources: dict[str, str] = field(default_factory=dict)
+
+    def raised(self, work: Work, seconds: float, source: str) -> 'Peaks':
+        """
+        Return the peaks, raised to the rates that a stage has shown.
+
+        A shared machine may be busier while a peak is measured than later. Bytes count only beyond
+        the caches.
+
+        :param seconds: duration of the stage.
+        :param source: its name.
+        """
+        raised = self
+        operations, read = work.operations / seconds, work.bytes / seconds
+        if operations > self.operations_per_s[work.dtype]:
+            rates = self.operations_per_s | {work.dtype: operations}
+            raised = replace(
+                raised, operations_per_s=rates, sources=raised.sources | {work.dtype: source}
+            )
+        if work.bytes >= BEYOND_CACHES and read > self.bytes_per_s:
+            raised = replace(raised, bytes_per_s=read, sources=raised.sources | {'read': source})
+        return raised.widened()
+
+    def widened(self) -> 'Peaks':
+        """Raise each half precision to the rate of float32, to which it can be converted."""
+        least = self.operations_per_s['float32']
+        slower = {dtype: least for dtype, rate in self.operations_per_s.items() if rate < least}
+        sources = self.sources | dict.fromkeys(slower, 'float32')
+        return replace(self, operations_per_s=self.operations_per_s | slower, sources=sources)
+
+
+def bound_seconds(works: Sequence[Work], peaks: Peaks) -> float:
+    """Return the sum, over the works, of the longer of reading bytes and doing operations."""
+    return sum(
+        max(work.bytes / peaks.bytes_per_s, work.operations / peaks.operations_per_s[work.dtype])
+        for work in works
+    )
+
+
+def product(sizes: Sizes, dtype: str, frames: int = 1) -> Work:
+    """Product of all pairs of strips of ``frames`` images with the map."""
+    map_bytes = sizes.W * sizes.n * sizes.d * ITEM_BYTES[dtype]
+    return Work(map_bytes, 2 * frames * sizes.W**2 * sizes.n * sizes.d, dtype)
+
+
+def spatial_alignment(sizes: Sizes, frames: int = 1) -> Work:
+    """Spatial alignment; it may read the similarities where the product left them: no bytes."""
+    border = 2 * (sizes.W - 1)
+    inner = sizes.W**2 - 1 - border
+    return Work(0, frames * sizes.n * (inner * SPATIAL_CELL + border * BORDER_CELL + 1))
+
+
+def mean_centering(sizes: Sizes) -> Work:
+    """Sum, mean, difference, norm and division of one image's strips; the sum is float64."""
+    return Work(12 * sizes.W * sizes.d, 6 * sizes.W * sizes.d)
+
+
+def query_znorm(sizes: Sizes) -> Work:
+    """Mean (1), deviation (3) and normalization (2) of a row of distances."""
+    return Work(4 * sizes.n, 6 * sizes.n)
+
+
+def window_push(sizes: Sizes) -> Work:
+    """Copy of a row into the window, and the sum that finds NaN."""
+    return Work(4 * sizes.n, sizes.n)
+
+
+def reference_znorm(sizes: Sizes) -> Work:
+    """Row, mean, variance and count of each place are read; update (10), shift and scale (3)."""
+    return Work(16 * sizes.n, 13 * sizes.n)
+
+
+def velocity_search(sizes: Sizes, settings: VelocitySettings) -> Work:
+    """
+    Search at several velocities: window, shift and scale are read once.
+
+    A cell adds its cost to the best of its predecessors; each of the one or two besides the first
+    costs a sum, a minimum and a selection of the path's first place, after the middle row also of
+    its middle.
+    """
+    operations = 2 * sizes.l  # cost (D - shift) * scale
+    for steps in settings.steps(sizes.l):
+        for i in range(1, sizes.l):
+            others = 2 if steps[i] > 0 else 1
+            operations += 1 + others * (4 if i > (sizes.l - 1) // 2 else 3)
+        operations += 5  # mean, minimum over the velocities, three selections
+    return Work(4 * sizes.n * (sizes.l + 2), operations * sizes.n)
+
+
+def lm_dtw(sizes: Sizes) -> Work:
+    """LM-DTW: the window is read once; a division and a minimum for each end."""
+    l, k = sizes.l, sizes.k
+    each = (l - 1) * (k - 1) * SEQUENCE_CELL + (l + k - 2) * BORDER_CELL + 2 * k
+    return Work(4 * l * sizes.n, sizes.n * each)
+
+
+def selection(sizes: Sizes) -> Work:
+    """Best and second best: distance and middle (or length) of each sequence are read once."""
+    return Work(8 * sizes.n, 6 * sizes.n)
+
+
+def path_trace(l: int, width: int) -> Work:
+    """Recursion on the columns that a path can reach: a cost, two more predecessors a cell."""
+    return Work(4 * l * width, 7 * l * width)

@@ -1,0 +1,190 @@
+"""
+Resident memory of the pipeline over the bytes of its features, in a process of its own.
+
+The process builds the pipeline as the node does, with a map from a file or with a route of images,
+and processes images. It runs a tiny pipeline first, so that compiled kernels, thread pools and
+libraries are resident before. The resident set is read after garbage collection and malloc_trim,
+both times.
+"""
+
+import ctypes
+import gc
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import torch
+
+    from stavpr_ros.pipeline import Pipeline
+
+TARGET = 1.1
+STRIPS = 7
+SMALL = 100  # places of the tiny pipeline
+# places and dimensions: 90 MB of features or more, so that everything else is small beside them
+SIZES = {'localization': (20_000, 512), 'loop_closure': (800, 4_096)}
+CASES = (
+    ('localization', 'robust', 'float32'),
+    ('localization', 'robust', 'float16'),
+    ('loop_closure', 'robust', 'float32'),
+)
+IMAGES = 30  # processed in localization: a full window and more
+
+
+@dataclass(frozen=True)
+class Memory:
+    """
+    One measurement.
+
+    :param feature_bytes: of n places in the precision in which they are kept.
+    :param resident_bytes: growth of the resident set.
+    """
+
+    operation: str
+    mode: str
+    precision: str
+    n: int
+    d: int
+    feature_bytes: int
+    resident_bytes: int
+
+    @property
+    def ratio(self) -> float:
+        """Resident bytes over the bytes of the features."""
+        return self.resident_bytes / self.feature_bytes
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields and the ratio."""
+        return asdict(self) | {'ratio': self.ratio, 'wanted': TARGET}
+
+
+@dataclass(frozen=True)
+class SyntheticSettings:
+    """
+    Settings of the synthetic features.
+
+    :param d: dimensions of a strip.
+    """
+
+    d: int
+
+
+class Synthetic:
+    """Features drawn at random for each image; a kind of features for the package's registry."""
+
+    Settings = SyntheticSettings
+
+    def __init__(self, settings: SyntheticSettings, device: str) -> None:
+        self.settings = settings
+
+    def feature_maps(self, images: list[np.ndarray]) -> 'torch.Tensor':
+        """Return Gaussian feature maps, shape (n, d, 1, W), seeded by the image's first bytes."""
+        import torch
+
+        generators = [
+            np.random.default_rng(int.from_bytes(i.tobytes()[:8], 'little')) for i in images
+        ]
+        drawn = [g.standard_normal((self.settings.d, 1, STRIPS), np.float32) for g in generators]
+        return torch.from_numpy(np.stack(drawn))
+
+
+def measure_memory(operation: str, mode: str, precision: str, n: int = 0, d: int = 0) -> Memory:
+    """
+    Measure one case in a process of its own.
+
+    :param operation: ``localization`` or ``loop_closure``.
+    :param n, d: places and dimensions; 0 = those of ``SIZES``.
+    """
+    import stavpr_ros
+
+    n, d = n or SIZES[operation][0], d or SIZES[operation][1]
+    package = str(Path(stavpr_ros.__file__).resolve().parents[1])
+    path = os.pathsep.join(filter(None, (package, os.environ.get('PYTHONPATH'))))
+    with tempfile.TemporaryDirectory() as folder:
+        if operation == 'localization':
+            for places in (SMALL, n):
+                _save_map(Path(folder, f'{places}.stavpr'), places, d)
+        command = [sys.executable, __file__, operation, mode, precision, str(n), str(d), folder]
+        # one thread: thousands of short calls beside other load, and the bytes are the same
+        variables = {'PYTHONPATH': path, 'OMP_NUM_THREADS': '1', 'NUMBA_NUM_THREADS': '1'}
+        done = subprocess.run(
+            command, env=os.environ | variables, stdout=subprocess.PIPE, text=True, check=True
+        )
+    item = 2 if precision == 'float16' else 4
+    return Memory(operation, mode, precision, n, d, item * n * d * STRIPS, int(done.stdout))
+
+
+def _save_map(path: Path, n: int, d: int) -> None:
+    """Write a map of synthetic places."""
+    from dataclasses import replace
+
+    from data import make_features
+
+    from stavpr_ros.features import FeatureSettings
+    from stavpr_ros.mapping import PlaceMap, save_map
+
+    features = make_features(n, d, STRIPS, 'cpu', seed=0)
+    features = replace(
+        features, settings=FeatureSettings('synthetic', SyntheticSettings(d)), cells=(1, 1)
+    )
+    save_map(PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n), path)
+
+
+def resident_bytes() -> int:
+    """Return the resident set of this process after everything that can be freed is freed."""
+    gc.collect()
+    if sys.platform == 'linux':
+        ctypes.CDLL(None).malloc_trim(0)
+    pages = int(Path('/proc/self/statm').read_text().split()[1])
+    return pages * os.sysconf('SC_PAGE_SIZE')
+
+
+def run_pipeline(
+    operation: str, mode: str, precision: str, n: int, d: int, folder: Path
+) -> 'Pipeline':
+    """Return a pipeline that holds n places and has processed images."""
+    from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
+
+    settings = PipelineSettings(
+        threshold=0.5, mode=mode, backend='cpu', precision=precision, features='synthetic',
+        feature_settings=f'{{"d": {d}}}', max_places=max(n, 1000), thumbnail_width=0,
+    )  # fmt: skip
+    pipeline = Pipeline(settings, operation)
+    if operation == 'localization':
+        pipeline.change(loaded=read_map(str(folder / f'{n}.stavpr'), settings))
+    for i in range(n if operation == 'loop_closure' else IMAGES):
+        pixels = np.frombuffer(i.to_bytes(8, 'little') * 24, np.uint8)
+        message = SimpleNamespace(
+            height=8, width=8, encoding='rgb8', is_bigendian=False, step=24, data=pixels
+        )
+        pipeline.process(message, (i + 1) * 10**9)
+    return pipeline
+
+
+def main(arguments: list[str]) -> None:
+    """Print by how many bytes the resident set of this process grows with a pipeline."""
+    from stavpr_ros.features.registry import KINDS
+    from stavpr_ros.threads import wait_passively
+
+    wait_passively()
+    KINDS['synthetic'] = 'memory:Synthetic'
+    operation, mode, precision, n, d, folder = arguments
+    run = (operation, mode, precision)
+    run_pipeline(*run, SMALL, int(d), Path(folder))
+    before = resident_bytes()
+    pipeline = run_pipeline(*run, int(n), int(d), Path(folder))
+    after = resident_bytes()
+    if pipeline.places is None or len(pipeline.places) != int(n):
+        raise SystemExit(f'memory: the pipeline holds {pipeline.places}: expected {n} places')
+    print(after - before)
+
+
+if __name__ == '__main__':
+    main(sys.argv[1:])

@@ -1,0 +1,215 @@
+"""Results of a run: rows, the machine that they were measured on, JSON and Markdown."""
+
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import subprocess
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / 'benchmarks' / 'results'
+PACKAGES = ('numpy', 'torch', 'numba', 'numba-cuda', 'opencv-python-headless', 'onnxruntime')
+# that decide how fast the kernels and torch's products are
+INSTRUCTION_SETS = re.compile(r'sse4_2|avx\w*|fma|f16c|amx_\w+|asimd\w*|sve\w*|bf16|fphp')
+UNITS = ((1.0, 's'), (1e-3, 'ms'), (1e-6, 'µs'))
+
+
+@dataclass(frozen=True)
+class PeerTime:
+    """
+    A peer's time for the same stage, from the same interleaved run.
+
+    :param median_s, spread_s: seconds for the whole stage; a sample's time is scaled to n.
+    :param ratio: the peer's median over that of the stage; below 1 the peer is faster.
+    :param note: conditions of the comparison.
+    :param partial: the peer does only a part of the stage's work.
+    """
+
+    name: str
+    median_s: float
+    spread_s: float
+    ratio: float
+    note: str = ''
+    partial: bool = False
+
+
+@dataclass(frozen=True)
+class Row:
+    """
+    One measurement.
+
+    :param stage: name, see benchmarks/README.md.
+    :param mode: ``robust``, ``paper``, or empty for a stage of both modes.
+    :param n: places.
+    :param d: dimensions of a local feature; 0 for a stage that reads no features.
+    :param precision: of the map, or of the arithmetic.
+    :param median_s, spread_s: median and interquartile range, seconds.
+    :param runs: number of runs.
+    :param lower_bound_s: least time on this machine; 0 = none known.
+    :param extra: further values by name.
+    """
+
+    stage: str
+    mode: str
+    n: int
+    d: int
+    precision: str
+    median_s: float
+    spread_s: float
+    runs: int
+    lower_bound_s: float = 0.0
+    peers: tuple[PeerTime, ...] = ()
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def ratio(self) -> float | None:
+        """Median over the lower bound."""
+        return self.median_s / self.lower_bound_s if self.lower_bound_s else None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields and the ratio."""
+        return asdict(self) | {'ratio_to_lower_bound': self.ratio}
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A stage or a peer that is left out, and the reason."""
+
+    name: str
+    n: int
+    d: int
+    reason: str
+
+
+def _output(*command: str) -> str:
+    try:
+        return subprocess.run(
+            command, cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ''
+
+
+def commit() -> str:
+    """Return the commit of the checkout, followed by ``+`` after changes; or ``unknown``."""
+    short = _output('git', 'rev-parse', '--short', 'HEAD')
+    # the results themselves change nothing that is measured
+    changed = _output('git', 'status', '--porcelain', '--', '.', ':!benchmarks/results')
+    return short + ('+' if changed else '') if short else 'unknown'
+
+
+def _cpu_info(pattern: str) -> str:
+    try:
+        found = re.search(pattern, Path('/proc/cpuinfo').read_text(), re.MULTILINE)
+    except OSError:
+        return ''
+    return found[1].strip() if found else ''
+
+
+def cpu_model() -> str:
+    """Return the name of the processor."""
+    return _cpu_info(r'^model name\s*: (.*)$') or platform.processor() or platform.machine()
+
+
+def instruction_sets() -> list[str]:
+    """Return the vector instruction sets of the processor, as Linux names them."""
+    flags = _cpu_info(r'^(?:flags|Features)\s*: (.*)$').split()
+    return [flag for flag in flags if INSTRUCTION_SETS.fullmatch(flag)]
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python, of this package and of the packages that it computes with."""
+    from stavpr_ros import __version__
+
+    found = {'python': platform.python_version(), 'stavpr_ros': __version__}
+    for package in PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def environment(device: str = 'cpu', named_commit: str = '') -> dict[str, Any]:
+    """Return machine, versions, commit and date of a run, for a call before it begins."""
+    import numba
+    import torch
+
+    machine: dict[str, Any] = {
+        'cpu': cpu_model(),
+        'architecture': platform.machine(),
+        'instruction_sets': instruction_sets(),
+        'cores': len(os.sched_getaffinity(0)),
+        'torch_threads': torch.get_num_threads(),
+        'numba_threads': numba.get_num_threads(),
+        'omp_wait_policy': os.environ.get('OMP_WAIT_POLICY', ''),
+        'load_before': round(os.getloadavg()[0], 2),
+    }
+    if device == 'cuda':
+        machine |= {'gpu': torch.cuda.get_device_name(), 'cuda': torch.version.cuda}
+    return {
+        'commit': named_commit or commit(),
+        'date': datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds'),
+        'machine': machine,
+        'versions': versions(),
+    }
+
+
+def heading(title: str, about: dict[str, Any]) -> list[str]:
+    """Return the lines that open a report."""
+    machine = about['machine'] | {
+        'instruction_sets': ' '.join(about['machine']['instruction_sets'])
+    }
+    return [
+        f'# {title}',
+        '',
+        f'Commit {about["commit"]}, {about["date"]}.',
+        'Machine: '
+        + ', '.join(f'{k.replace("_", " ")} {v}' for k, v in machine.items() if v != '')
+        + '.',
+        'Versions: '
+        + ', '.join(f'{name} {version}' for name, version in about['versions'].items())
+        + '.',
+        'Method: benchmarks/README.md.',
+        '',
+    ]
+
+
+def file_name(machine: dict[str, Any]) -> str:
+    """Return the name of a machine for file names."""
+    name = machine.get('gpu') or f'{machine["cpu"]} {machine["cores"]} cores'
+    return re.sub(r'[^a-z0-9]+', '-', name.lower()).strip('-')
+
+
+def write(path: Path, document: dict[str, Any], lines: Sequence[str]) -> None:
+    """Write a run as JSON, and its report beside it as Markdown."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document, indent=1, allow_nan=False) + '\n', encoding='utf-8')
+    path.with_suffix('.md').write_text('\n'.join(lines).rstrip() + '\n', encoding='utf-8')
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a Markdown table, followed by an empty one."""
+    lines = ['| ' + ' | '.join(cells) + ' |' for cells in (head, *rows)]
+    return [lines[0], '|' + ' --- |' * len(head), *lines[1:], '']
+
+
+def seconds_text(seconds: float | None) -> str:
+    """Return a duration with three digits and a unit."""
+    if not seconds:
+        return '-'
+    scale, unit = next(((s, u) for s, u in UNITS if seconds >= s), UNITS[-1])
+    return f'{number_text(seconds / scale)} {unit}'
+
+
+def number_text(value: float | None) -> str:
+    """Return a number with three digits, without an exponent above 1."""
+    if value is None:
+        return '-'
+    return f'{value:,.0f}' if value >= 100 else f'{value:.3g}'

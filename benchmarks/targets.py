@@ -1,0 +1,92 @@
+"""The project's targets: bounds for values of single rows, and whether a run reached them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from results import Row
+
+
+def _times(peer: str) -> Callable[[Row], float | None]:
+    return lambda row: next((time.ratio for time in row.peers if time.name == peer), None)
+
+
+def _over_product(row: Row) -> float | None:
+    ratio = _times('torch float32')(row)
+    return 1 / ratio if ratio else None
+
+
+def cells_per_s(row: Row) -> float | None:
+    """Return the cell updates per second of a row that counts cells."""
+    return row.extra['cells'] / row.median_s if 'cells' in row.extra else None
+
+
+VALUES: dict[str, Callable[[Row], float | None]] = {
+    'cells per second': cells_per_s,
+    'times plain prange': _times('prange'),
+    'times librosa': _times('librosa'),
+    'over the float32 product': _over_product,
+    'over the lower bound': lambda row: row.ratio,
+    'seconds': lambda row: row.median_s,
+}
+
+
+@dataclass(frozen=True)
+class Target:
+    """
+    One target; the fields before ``value`` name the row that decides it.
+
+    :param value: a name of :data:`VALUES`.
+    :param relation: ``<=`` or ``>=``.
+    """
+
+    device: str
+    stage: str
+    mode: str
+    n: int
+    d: int
+    precision: str
+    value: str
+    relation: str
+    wanted: float
+
+    def found(self, rows: Sequence[Row]) -> float | None:
+        """Return the value of the row that decides the target; None if it was not measured."""
+        own = (self.stage, self.mode, self.n, self.d, self.precision)
+        for row in rows:
+            if (row.stage, row.mode, row.n, row.d, row.precision) == own:
+                return VALUES[self.value](row)
+        return None
+
+    def reached(self, found: float) -> bool:
+        """Return whether a value reaches the target."""
+        return found <= self.wanted if self.relation == '<=' else found >= self.wanted
+
+
+TARGETS = (
+    Target('cpu', 'lm_dtw', 'paper', 20_000, 0, 'float32', 'cells per second', '>=', 2.5e9),
+    Target('cpu', 'lm_dtw', 'paper', 20_000, 0, 'float32', 'times plain prange', '>=', 8),
+    Target('cpu', 'lm_dtw', 'paper', 20_000, 0, 'float32', 'times librosa', '>=', 100),
+    Target('cpu', 'lm_dtw', 'paper', 100_000, 0, 'float32', 'cells per second', '>=', 2.5e9),
+    Target('cpu', 'lm_dtw', 'paper', 100_000, 0, 'float32', 'times plain prange', '>=', 8),
+    Target('cpu', 'lm_dtw', 'paper', 100_000, 0, 'float32', 'times librosa', '>=', 100),
+    Target(
+        'cpu', 'distance_matrix', '', 2_000, 512, 'float32', 'over the float32 product', '<=', 1.25
+    ),
+    Target(
+        'cpu',
+        'distance_matrix',
+        '',
+        20_000,
+        512,
+        'float32',
+        'over the float32 product',
+        '<=',
+        1.25,
+    ),
+    Target('cpu', 'frame', 'paper', 20_000, 512, 'float32', 'over the lower bound', '<=', 1.5),
+    Target('cpu', 'frame', 'paper', 20_000, 512, 'float16', 'over the float32 product', '<=', 0.6),
+    Target('cpu', 'frame', 'paper', 100_000, 512, 'float16', 'seconds', '<=', 0.1),
+    Target('cuda', 'distance_matrix', '', 2_000, 512, 'float32', 'seconds', '<=', 3e-4),
+    Target('cuda', 'retrieval', 'paper', 2_000, 0, 'float32', 'seconds', '<=', 1e-4),
+    Target('cuda', 'frame', 'paper', 1_000_000, 512, 'float16', 'seconds', '<=', 5e-3),
+)
