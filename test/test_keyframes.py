@@ -125,7 +125,7 @@ def test_selector_queries_change_nothing(route):
 
 
 def test_selector_with_new_settings_keeps_keyframe(route):
-    """The last keyframe is kept, also what no rule asked for when it came."""
+    """The last keyframe is kept, with the values that only later rules need."""
     made = selector(where=pose(), image=route[0])
     for rules in ({'interval': 1}, {'distance': 1}):
         made.settings = KeyframeSettings(**rules)
@@ -229,7 +229,7 @@ def test_image_change_by_hand():
 
 
 def test_image_change_of_dark_noise_is_zero():
-    """What a covered camera sends is noise, and noise has changed every time."""
+    """A covered camera sends noise, which differs in every image."""
     rng = np.random.default_rng(0)
     dark = [small_gray(rng.integers(0, 20, (480, 640, 3), np.uint8)) for _ in range(2)]
     assert image_change(*dark) == 0

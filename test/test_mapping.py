@@ -374,7 +374,7 @@ def test_load_map_with_damage_fails_or_is_identical(saved, small_map, data):
     if data.draw(st.booleans(), label='truncate'):
         damaged.write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
     else:
-        # half of the positions among the headers, where a damage is hardest to tell
+        # half of the positions among the headers, where damage is hardest to detect
         near_end = data.draw(st.booleans())
         low = max(0, len(whole) - 1500) if near_end else 0
         position = data.draw(st.integers(low, len(whole) - 1))

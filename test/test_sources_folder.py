@@ -1,4 +1,4 @@
-"""A folder of images: order, what counts as one, what is refused."""
+"""A folder of images: order, files that count as images, errors."""
 
 import os
 from pathlib import Path

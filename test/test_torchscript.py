@@ -53,7 +53,7 @@ class Branch(nn.Module):
 
 
 class Spoiled(nn.Module):
-    """Overwrites what its layer was given once the layer is done."""
+    """Overwrites the input of its layer after the layer."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -116,7 +116,7 @@ def test_torchscript_inner_layer_equals_hook(net, file, layer):
 
 
 def test_torchscript_runs_nothing_after_layer(file):
-    """At 32 pixels the head does not fit: what comes before it runs."""
+    """At 32 pixels the head does not fit: the layers before it run."""
     backbone = backbone_class('torchscript')(settings(file, layer='body.last', size=32))
     assert backbone.feature_maps(images(2)).shape == (2, 6, 16, 16)
     with pytest.raises(SettingsError, match='rejects 2 images of size 32'):

@@ -126,7 +126,7 @@ def test_download_happens_once(server, cache, content, capsys):
     first = tiny(model='download')
     digest = hashlib.sha256(content).hexdigest()
     assert first.settings.sha256 == digest
-    assert first.settings.model == 'cached'  # what a map remembers must not download elsewhere
+    assert first.settings.model == 'cached'  # recorded in maps: no download elsewhere
     assert sorted(path.name for path in cache.iterdir()) == ['tiny.pth', 'tiny.pth.sha256']
     assert (cache / 'tiny.pth.sha256').read_text() == f'{digest}  tiny.pth\n'
     assert digest in (printed := capsys.readouterr().err)
@@ -320,12 +320,12 @@ def test_read_checkpoint_of_other_files_fails(tmp_path, content):
             UnavailableError, match=r'some\.pth cannot be read as a file of weights: .'
         ):
             read(tmp_path, bad)
-    for bad, what in (
+    for bad, kind in (
         ({}, 'nothing'),
         ([1], 'a list'),
         ({'state_dict': 3}, "a int as 'state_dict'"),
     ):
-        with pytest.raises(UnavailableError, match=f'holds {what}'):
+        with pytest.raises(UnavailableError, match=f'holds {kind}'):
             read(tmp_path, saved(bad))
 
 
