@@ -26,12 +26,13 @@ from stavpr_ros.sources.frame import ImageRecord
 from test_trajectory import write_odometry
 
 SECOND = 10**9
+HANGS = 5 * TIMEOUT  # seconds after which an executable counts as stuck
 
 
 def run_process(name, *arguments):
     """Run an executable as ``ros2 run`` does."""
     command = [executable(name), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=HANGS, check=False)
 
 
 @pytest.fixture
