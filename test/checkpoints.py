@@ -1,15 +1,20 @@
-"""Checkpoints for the tests: random parameters, and files as Python 2 and the torch of 2017 wrote them."""
+"""Checkpoints for the tests: random parameters, in the formats of Python 2 and torch 0.3."""
 
-import struct
 from collections import OrderedDict
+import struct
 
 import numpy as np
 import torch
 
-MAGIC, PROTOCOL = 0x1950A86A20F9469CFC6C, 1001  # the first two numbers in every file of before torch 1.6
+MAGIC, PROTOCOL = (
+    0x1950A86A20F9469CFC6C,
+    1001,
+)  # the first two numbers in every file of before torch 1.6
 
 
-def random_parameters(shapes: dict[str, tuple[int, ...]], seed: int = 0) -> dict[str, torch.Tensor]:
+def random_parameters(
+    shapes: dict[str, tuple[int, ...]], seed: int = 0
+) -> dict[str, torch.Tensor]:
     """
     Return parameters that keep the maps at about one scale, equal to the bit on every machine.
 
@@ -36,14 +41,18 @@ def random_parameters(shapes: dict[str, tuple[int, ...]], seed: int = 0) -> dict
 
 
 class OldPickle:
-    """Pickles as Python 2 did (its byte strings, its long numbers); storages are kept for later."""
+    """Pickles as of Python 2 (byte strings, long numbers); storages are kept for later."""
 
     def __init__(self) -> None:
         self.storages: dict[str, torch.Tensor] = {}
 
     def file(self, content: object) -> bytes:
         """Return the whole file: five pickles, then the numbers of all storages."""
-        system = {'protocol_version': PROTOCOL, 'little_endian': True, 'type_sizes': {'int': 4, 'long': 4}}
+        system = {
+            'protocol_version': PROTOCOL,
+            'little_endian': True,
+            'type_sizes': {'int': 4, 'long': 4},
+        }
         parts = [self.pickle(part) for part in (MAGIC, PROTOCOL, system, content)]
         parts.append(self.pickle(sorted(self.storages)))
         for _, tensor in sorted(self.storages.items()):
@@ -108,7 +117,7 @@ class Call:
 
 
 def places365_file(parameters: dict[str, torch.Tensor]) -> bytes:
-    """A checkpoint as that of Places365 was written: old names, ``module.``, other entries beside."""
+    """Return a checkpoint as that of Places365: old names, ``module.``, other entries beside."""
     old = OrderedDict()
     for name, value in parameters.items():
         older = name

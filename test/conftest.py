@@ -1,26 +1,26 @@
 """Fixtures: the folder of real data, synthetic images and maps."""
 
-import os
 from collections import OrderedDict
 from functools import partial
+import os
 from pathlib import Path
 
+from checkpoints import OldPickle, places365_file, random_parameters
+from hypothesis import settings
 import networks
 import numpy as np
 import pytest
-from checkpoints import OldPickle, places365_file, random_parameters
-from hypothesis import settings
 
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-# A shared machine may be slow at any moment, so time is no property of an example; and a landing must not
-# depend on luck: new examples are searched everywhere but in CI.
+# No deadline: a shared machine may be slow. Examples are random everywhere but in CI, where a
+# failure must be reproducible.
 settings.register_profile('stavpr', deadline=None, derandomize='CI' in os.environ)
 settings.load_profile('stavpr')
 
 
 @pytest.fixture(scope='session')
 def data_folder() -> Path:
-    """The folder of real images and bags: STAVPR_DATA, or the one beside the checkout."""
+    """Return the folder of real images and bags: STAVPR_DATA, or the one beside the checkout."""
     default = Path(__file__).resolve().parents[2] / 'shared' / 'data'
     folder = Path(os.environ.get('STAVPR_DATA', default))
     if not folder.is_dir():
@@ -29,7 +29,7 @@ def data_folder() -> Path:
 
 
 def route_images(count: int, seed: int = 0, size: tuple[int, int] = (96, 128)) -> list[np.ndarray]:
-    """Views of one long random texture, each a step further along it: a route in miniature, RGB uint8."""
+    """Return views of one long random texture, each a step further along it, RGB uint8."""
     rng = np.random.default_rng(seed)
     step, (height, width) = 24, size
     coarse = rng.integers(0, 256, (height // 8, (count * step + width) // 8 + 1, 3), np.uint8)
@@ -39,13 +39,13 @@ def route_images(count: int, seed: int = 0, size: tuple[int, int] = (96, 128)) -
 
 @pytest.fixture(scope='session')
 def route() -> list[np.ndarray]:
-    """Sixty views of a made-up route."""
+    """Sixty views of a synthetic route."""
     return route_images(60)
 
 
 @pytest.fixture(scope='session')
 def small_map(route):
-    """A map of the made-up route, with everything that a map can have."""
+    """Return a map of the synthetic route, with all optional parts of a map."""
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import build_map
     from stavpr_ros.sources.frame import Frame
@@ -58,7 +58,7 @@ def small_map(route):
 
 @pytest.fixture(scope='module')
 def bench():
-    """A node beside the one that is tested, whose images come as a camera's; for those who have ROS."""
+    """Yield a ROS node beside the tested one, with the QoS of a camera."""
     from processes import Bench
 
     bench = Bench()
@@ -68,7 +68,7 @@ def bench():
 
 @pytest.fixture(scope='module')
 def map_file(small_map, tmp_path_factory) -> str:
-    """That map in a file."""
+    """Save that map in a file."""
     from stavpr_ros.mapping import save_map
 
     path = tmp_path_factory.mktemp('map') / 'route.stavpr'
@@ -94,14 +94,14 @@ def stream(bench, process):
 
 @pytest.fixture
 def camera(stream):
-    """The same, with an empty window."""
+    """Return the same, with an empty window."""
     stream.reset()
     return stream
 
 
 @pytest.fixture
 def squeezenet_settings(data_folder):
-    """The real network of the data folder, as it works best: its layer fire6/concat, 13 x 13 x 384."""
+    """Return the settings of the data folder's network, layer fire6/concat, 13 x 13 x 384."""
     pytest.importorskip('onnxruntime', reason='the extra onnx is not installed')
     from stavpr_ros.features.registry import settings_class
 

@@ -1,4 +1,4 @@
-"""The paper's two networks a second time, from their descriptions: shapes, and what is computed."""
+"""A second implementation of the paper's networks: their shapes and computations."""
 
 import torch
 from torch.nn.functional import avg_pool2d, conv2d, max_pool2d, relu
@@ -8,7 +8,7 @@ DENSENET161 = (6, 12, 36, 24)
 
 
 def vgg16_shapes(classes: int = 1000) -> dict[str, tuple[int, ...]]:
-    """Configuration D: 3 x 3 convolutions with bias; each is followed by a ReLU, each stage by a pooling."""
+    """Return those of configuration D: 3 x 3 convolutions with bias, a pooling per stage."""
     shapes, index, before = {}, 0, 3
     for stage in VGG16:
         for width in stage:
@@ -17,7 +17,10 @@ def vgg16_shapes(classes: int = 1000) -> dict[str, tuple[int, ...]]:
             index, before = index + 2, width
         index += 1
     for index, out, into in ((0, 4096, 25088), (3, 4096, 4096), (6, classes, 4096)):
-        shapes[f'classifier.{index}.weight'], shapes[f'classifier.{index}.bias'] = (out, into), (out,)
+        shapes[f'classifier.{index}.weight'], shapes[f'classifier.{index}.bias'] = (
+            (out, into),
+            (out,),
+        )
     return shapes
 
 
@@ -25,7 +28,9 @@ def vgg16_pool4(p: dict[str, torch.Tensor], x: torch.Tensor) -> torch.Tensor:
     index = 0
     for stage in VGG16[:4]:
         for _ in stage:
-            x = relu(conv2d(x, p[f'features.{index}.weight'], p[f'features.{index}.bias'], padding=1))
+            x = relu(
+                conv2d(x, p[f'features.{index}.weight'], p[f'features.{index}.bias'], padding=1)
+            )
             index += 2
         x = max_pool2d(x, 2)
         index += 1

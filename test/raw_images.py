@@ -1,4 +1,4 @@
-"""Raw image messages, byte by byte from the definition of each encoding."""
+"""Raw image messages: the bytes of each encoding, written from its definition."""
 
 import numpy as np
 
@@ -61,7 +61,7 @@ def message(encoding, height, width, big=False, padding=0):
 
 
 def mosaic(encoding, scene, big=False):
-    """Return the bytes of a sensor behind the filter, for an RGB scene."""
+    """Return the rows of bytes of a sensor behind the filter."""
     height, width = scene.shape[:2]
     seen = np.zeros((height, width), np.uint8)
     for y in range(height):
@@ -75,7 +75,7 @@ def mosaic(encoding, scene, big=False):
 
 
 def packed_yuv(encoding, yuv, padding=0):
-    """YUV (height, width, 3) as (step, bytes); shared colors are those of the first pixel."""
+    """Return YUV (height, width, 3) as (step, bytes); the first pixel sets shared colors."""
     height, width = yuv.shape[:2]
     if encoding in PAIRS:
         y0, y1, u, v = PAIRS[encoding]

@@ -1,27 +1,27 @@
-"""The paper's two networks: parameters by name and shape, numbers against a second implementation."""
+"""The paper's networks: parameters by name and shape, against a second implementation."""
 
 import argparse
+from dataclasses import replace
 
 import cv2
 import networks
 import numpy as np
 import pytest
-import torch
-
 from stavpr_ros.commands.feature_options import add_feature_options, make_extractor
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings
 from stavpr_ros.features.paper_networks import (
-    VGG16,
     DenseNet161,
     DenseNet161Places365,
+    VGG16,
     VGG16Pool4,
 )
 from stavpr_ros.features.registry import backbone_class, settings_class
 from stavpr_ros.features.weights import load_parameters
+import torch
 
-# Typed from the published files. The numbers of parameters are those that torchvision documents for its 1000
-# classes; a DenseNet161 for 365 has 635 rows of 2208 + 1 fewer.
+# Typed from the published files. The numbers of parameters are those that torchvision documents
+# for 1000 classes; a DenseNet161 for 365 has 635 rows of 2208 + 1 fewer.
 PUBLISHED = {
     VGG16: (
         138_357_544,
@@ -66,23 +66,32 @@ def test_network_has_published_parameters(network):
 
 
 def test_up_to_layer_drops_later_parameters():
-    """VGG16: the first ten convolutions. DenseNet161: layer 10 of the last block only normalizes."""
+    """VGG16: the first ten convolutions. DenseNet161: of layer 10 only the normalization."""
     with torch.device('meta'):
-        vgg, dense = VGG16Pool4.up_to_layer(VGG16()), DenseNet161Places365.up_to_layer(DenseNet161())
+        vgg, dense = (
+            VGG16Pool4.up_to_layer(VGG16()),
+            DenseNet161Places365.up_to_layer(DenseNet161()),
+        )
     shapes = networks.vgg16_shapes()
     wanted = sum(np.prod(shapes[f'features.{i}.weight']) + shapes[f'features.{i}.weight'][0]
                  for i in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21))  # fmt: skip
     assert sum(value.numel() for value in vgg.parameters()) == wanted == 7_635_264
     shapes = networks.densenet161_shapes()
-    late = [f'denseblock4.denselayer{i}.' for i in range(11, 25)] + ['norm5', 'classifier', 'running']
+    late = [f'denseblock4.denselayer{i}.' for i in range(11, 25)] + [
+        'norm5',
+        'classifier',
+        'running',
+    ]
     late += [f'denseblock4.denselayer10.{part}' for part in ('conv', 'norm2')]
-    wanted = sum(np.prod(s) for name, s in shapes.items() if not any(part in name for part in late))
+    wanted = sum(
+        np.prod(s) for name, s in shapes.items() if not any(part in name for part in late)
+    )
     assert sum(value.numel() for value in dense.parameters()) == wanted
 
 
 @pytest.fixture(scope='module', autouse=True)
 def one_thread():
-    """Threads that must share their cores with others' spend most of the time waiting for each other."""
+    """Use one thread: several of them would wait for each other on shared cores."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -91,30 +100,33 @@ def one_thread():
 
 def standardized(images: list[np.ndarray], size: int) -> torch.Tensor:
     """Prepare images as the networks were trained, step by step in float64: (n, 3, size, size)."""
-    small = np.stack([cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR) for image in images])
+    small = np.stack(
+        [cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR) for image in images]
+    )
     values = (small / 255 - np.array([0.485, 0.456, 0.406])) / np.array([0.229, 0.224, 0.225])
     return torch.from_numpy(values.transpose(0, 3, 1, 2))
 
 
 def assert_same(ours: torch.Tensor, oracle: torch.Tensor) -> None:
-    """Within what float32 may lose: one part in 10^5 of the largest value; and neither is trivial."""
+    """Compare to 10^-5 of the largest value, the accuracy of float32; neither is trivial."""
     assert ours.dtype == torch.float32
     assert 0.05 < float((oracle > 0).double().mean()) < 0.95
     assert float((ours - oracle).abs().max()) < 1e-5 * float(oracle.max())
 
 
-def pictures(*sizes: tuple[int, int]) -> list[np.ndarray]:
-    """Smooth random pictures: neighbors alike, as in photographs, so that resizing keeps most of it."""
+def smooth_images(*sizes: tuple[int, int]) -> list[np.ndarray]:
+    """Smooth random images: neighbors similar, as in photographs, so that resizing keeps most."""
     rng = np.random.default_rng(0)
     coarse = [rng.integers(0, 256, (12, 12, 3), np.uint8) for _ in sizes]
     return [
-        cv2.resize(c, (w, h), interpolation=cv2.INTER_CUBIC) for c, (h, w) in zip(coarse, sizes, strict=True)
+        cv2.resize(c, (w, h), interpolation=cv2.INTER_CUBIC)
+        for c, (h, w) in zip(coarse, sizes, strict=True)
     ]
 
 
 def test_densenet161_equals_second_implementation(densenet_file, densenet_parameters):
-    """The whole way at full size, from the published kind of file to 7 x 7 x 1488, in a batch of two."""
-    images = pictures((120, 160), (300, 200))
+    """At full size, from the published file format to 7 x 7 x 1488, in a batch of two."""
+    images = smooth_images((120, 160), (300, 200))
     settings = settings_class('densenet161_places365')(model=str(densenet_file))
     ours = backbone_class('densenet161_places365')(settings).feature_maps(images)
     doubles = {name: value.double() for name, value in densenet_parameters.items()}
@@ -124,53 +136,59 @@ def test_densenet161_equals_second_implementation(densenet_file, densenet_parame
 
 def test_vgg16_equals_second_implementation(vgg_file, vgg_parameters):
     """At 96 pixels, where nothing but the size of the maps differs from 224."""
-    images = pictures((120, 160), (96, 96), (50, 70))
+    images = smooth_images((120, 160), (96, 96), (50, 70))
     settings = settings_class('vgg16')(model=str(vgg_file), size=96)
     ours = backbone_class('vgg16')(settings).feature_maps(images)
-    doubles = {name: value.double() for name, value in vgg_parameters.items() if 'features' in name}
+    doubles = {
+        name: value.double() for name, value in vgg_parameters.items() if 'features' in name
+    }
     assert ours.shape == (3, 512, 6, 6)
     assert_same(ours, networks.vgg16_pool4(doubles, standardized(images, 96)))
 
 
-def test_vgg16_strips_at_full_size(vgg_file):
-    """14 x 14 x 512 is cut into seven strips of two columns."""
-    extractor = FeatureExtractor('vgg16', settings_class('vgg16')(model=str(vgg_file)))
-    assert extractor.extract(pictures((60, 80))).strips.shape == (7, 1, 14 * 2 * 512)
+@pytest.fixture(scope='module')
+def small_vgg(vgg_file):
+    """VGG16 for images of 32 pixels, in half precision where that is possible."""
+    settings = settings_class('vgg16')(model=str(vgg_file), half=True, size=32)
+    return backbone_class('vgg16')(settings)
 
 
-def test_more_images_than_go_through_at_once(vgg_file, monkeypatch):
+def test_network_with_many_images_runs_in_passes(small_vgg, monkeypatch):
     monkeypatch.setattr('stavpr_ros.features.paper_networks.PER_PASS', 2)
-    backbone = backbone_class('vgg16')(settings_class('vgg16')(model=str(vgg_file), size=32))
-    images = pictures((32, 32), (40, 40), (50, 32), (32, 50), (64, 64))
-    together = backbone.feature_maps(images)
+    images = smooth_images((32, 32), (40, 40), (50, 32), (32, 50), (64, 64))
+    together = small_vgg.feature_maps(images)
     assert together.shape == (5, 512, 2, 2)
     for image, maps in zip(images, together, strict=True):
-        torch.testing.assert_close(backbone.feature_maps([image])[0], maps, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(small_vgg.feature_maps([image])[0], maps, rtol=1e-4, atol=1e-4)
+
+
+def test_network_half_on_cpu_changes_nothing(small_vgg):
+    """A robot's CPU may query a map that a GPU made in half precision."""
+    assert small_vgg.feature_maps(smooth_images((32, 32))).dtype == torch.float32
+    assert small_vgg.settings == replace(small_vgg.settings, half=False)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='no CUDA device')
 @pytest.mark.parametrize('kind', ['vgg16', 'densenet161_places365'])
 def test_network_in_half_precision_on_gpu_is_close(kind, vgg_file, densenet_file):
     path = vgg_file if kind == 'vgg16' else densenet_file
-    images = pictures((120, 160), (300, 200))
+    images = smooth_images((120, 160), (300, 200))
     whole = backbone_class(kind)(settings_class(kind)(model=str(path)), 'cpu').feature_maps(images)
-    half = backbone_class(kind)(settings_class(kind)(model=str(path), half=True), 'cuda').feature_maps(images)
+    half = backbone_class(kind)(
+        settings_class(kind)(model=str(path), half=True), 'cuda'
+    ).feature_maps(images)
     assert half.dtype == torch.float16
     cosines = torch.cosine_similarity(whole.flatten(1), half.float().cpu().flatten(1))
     assert float(cosines.min()) > 0.9999
 
 
-def test_half_is_no_part_of_the_identity_and_no_change_on_a_cpu(vgg_file):
-    """A robot's CPU may query a map that a GPU made in half precision."""
-    settings = settings_class('vgg16')(model=str(vgg_file), half=True, size=32)
-    backbone = backbone_class('vgg16')(settings)
-    assert backbone.feature_maps(pictures((32, 32))).dtype == torch.float32
-    assert backbone.settings == backbone_class('vgg16')(settings_class('vgg16')(model=str(vgg_file), size=32)).settings
-
-
 def test_extractor_with_moved_weights_has_same_settings(vgg_file, tmp_path):
-    settings = FeatureExtractor('vgg16', settings_class('vgg16')(model=str(vgg_file), size=112)).settings
-    settings = FeatureSettings.from_json(settings.to_json().replace(str(vgg_file), '/gone/vgg16.pth'))
+    settings = FeatureExtractor(
+        'vgg16', settings_class('vgg16')(model=str(vgg_file), size=112)
+    ).settings
+    settings = FeatureSettings.from_json(
+        settings.to_json().replace(str(vgg_file), '/gone/vgg16.pth')
+    )
     with pytest.raises(UnavailableError, match=r'/gone/vgg16\.pth.*cannot be read'):
         FeatureExtractor.from_settings(settings, None)
     moved = tmp_path / 'moved.pth'
@@ -185,7 +203,9 @@ def test_load_parameters_of_other_network_is_rejected(densenet_parameters):
         with torch.device('meta'):
             network = DenseNet161()
         parameters = {
-            name: value for name, value in (densenet_parameters | changes).items() if value is not None
+            name: value
+            for name, value in (densenet_parameters | changes).items()
+            if value is not None
         }
         load_parameters(network, parameters, 'a.pth')
 
@@ -216,7 +236,16 @@ def test_published_settings_out_of_range_are_rejected(bad):
 def test_feature_options_make_extractor(vgg_file):
     parser = argparse.ArgumentParser()
     add_feature_options(parser)
-    words = ['--features', 'vgg16', '--vgg16-model', str(vgg_file), '--vgg16-size', '112', '--device', 'cpu']
+    words = [
+        '--features',
+        'vgg16',
+        '--vgg16-model',
+        str(vgg_file),
+        '--vgg16-size',
+        '112',
+        '--device',
+        'cpu',
+    ]
     extractor = make_extractor(parser.parse_args([*words, '--vgg16-half', 'true']))
     assert (extractor.settings.backbone.size, extractor.settings.backbone.half) == (112, True)
     words = ['--features', 'densenet161_places365', '--densenet161_places365-model', '/gone']

@@ -1,4 +1,4 @@
-"""The executables: exit codes, messages, files; in this process where a process of their own adds nothing."""
+"""The executables: exit codes, messages, files; as processes only where that adds something."""
 
 import json
 import math
@@ -7,32 +7,32 @@ import subprocess
 import time
 from types import SimpleNamespace
 
+from conftest import route_images
 import cv2
 import numpy as np
+from processes import executable, Process, TIMEOUT
 import pytest
-from conftest import route_images
-from processes import TIMEOUT, Process, executable
-from test_trajectory import write_odometry
-
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure, PlaceMatch
 from stavpr_ros.commands import build_map, demo, record
 from stavpr_ros.commands.record import loop_closure_record, match_record
 from stavpr_ros.demonstration.loops import choose_closures, read_result
-from stavpr_ros.demonstration.recordings import TOPIC, remove_earlier_bag
+from stavpr_ros.demonstration.recordings import remove_earlier_bag, TOPIC
 from stavpr_ros.errors import SourceError
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.records import evaluate_records
 from stavpr_ros.mapping import load_map
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
+from test_trajectory import write_odometry
 
 SECOND = 10**9
+HANGS = 5 * TIMEOUT  # seconds after which an executable counts as stuck
 
 
 def run_process(name, *arguments):
     """Run an executable as ``ros2 run`` does."""
     command = [executable(name), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=HANGS, check=False)
 
 
 @pytest.fixture
@@ -254,8 +254,10 @@ def test_loop_closure_record_is_plain_json():
 
 @pytest.mark.parametrize(
     'name',
-    ['WARMING_UP', 'NO_MATCH', 'MATCH', 'INVALID_IMAGE', 'NOT_READY', 'DROPPED', 'SKIPPED']
-    + ['MAPPED'],
+    [
+        *('WARMING_UP', 'NO_MATCH', 'MATCH', 'INVALID_IMAGE'),
+        *('NOT_READY', 'DROPPED', 'SKIPPED', 'MAPPED'),
+    ],
 )
 def test_match_record_names_every_status(name):
     plain = match_record(PlaceMatch(status=getattr(PlaceMatch, name), inliers=12))
@@ -395,7 +397,12 @@ def test_read_result_counts_images_not_places():
     statuses = [{'status': name} for name in names]
     truth = GroundTruth.from_pairs([4, 5], [0, 3], 6, 6)
     closures = [
-        {'query_index': 3, 'place_index': 0, 'distance': 0.5, 'pairs': [[3, 9, 0, 9], [2, 9, 0, 9]]},
+        {
+            'query_index': 3,
+            'place_index': 0,
+            'distance': 0.5,
+            'pairs': [[3, 9, 0, 9], [2, 9, 0, 9]],
+        },
         {'query_index': 4, 'place_index': 0, 'distance': 0.6, 'pairs': [[4, 9, 0, 9]]},
     ]
     result = read_result(statuses, closures, truth, 2)

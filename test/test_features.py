@@ -2,17 +2,16 @@
 
 import numpy as np
 import pytest
-import torch
-
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
-from stavpr_ros.features import KINDS, FeatureExtractor, FeatureSettings
+from stavpr_ros.features import FeatureExtractor, FeatureSettings, KINDS
 from stavpr_ros.features.gradient import Gradient, GradientSettings
 from stavpr_ros.features.registry import backbone_class, settings_class
+import torch
 
 
 @pytest.mark.parametrize('kind', list(KINDS))
 def test_kinds_have_settings_and_class(kind):
-    """What the command line and the map need from a kind: a frozen dataclass with a sentence a field."""
+    """Required by command line and maps: a frozen dataclass with a sentence a field."""
     import dataclasses
 
     settings = settings_class(kind)
@@ -27,7 +26,7 @@ def test_extractor_of_unknown_kind_is_rejected():
 
 
 def edge(angle: float, size: int = 224) -> np.ndarray:
-    """A step edge through the middle; its gradient, dark to bright, points along ``angle``."""
+    """Return a step edge through the middle; its gradient points along ``angle``."""
     y, x = np.mgrid[:size, :size] - size / 2
     bright = (x * np.cos(angle) + y * np.sin(angle)) > 0
     return np.repeat((bright * 200 + 20).astype(np.uint8)[:, :, None], 3, axis=2)
@@ -43,7 +42,9 @@ def test_gradient_of_edge_has_its_orientation(direction):
 
 def test_gradient_unsigned_ignores_polarity():
     maps = Gradient(GradientSettings(signed=False)).feature_maps([edge(0.5), 255 - edge(0.5)])
-    torch.testing.assert_close(maps[0].sum(dim=(1, 2)), maps[1].sum(dim=(1, 2)), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(
+        maps[0].sum(dim=(1, 2)), maps[1].sum(dim=(1, 2)), rtol=1e-3, atol=1e-3
+    )
 
 
 def test_extractor_edge_stays_in_its_strip():
@@ -63,7 +64,11 @@ def test_extractor_is_robust_to_contrast(route):
 
 def test_extractor_batch_equals_single_images(route):
     extractor = FeatureExtractor()
-    mixed = [route[0], np.ascontiguousarray(route[1][:50]), route[2].repeat(3, axis=0)]  # sizes differ
+    mixed = [
+        route[0],
+        np.ascontiguousarray(route[1][:50]),
+        route[2].repeat(3, axis=0),
+    ]  # sizes differ
     together = extractor.extract(mixed)
     for i, image in enumerate(mixed):
         torch.testing.assert_close(extractor.extract([image]).strips[:, 0], together.strips[:, i])
@@ -82,7 +87,10 @@ def test_gradient_settings_out_of_range_are_rejected(bad):
 
 
 def test_feature_settings_survive_json():
-    for settings in (FeatureExtractor().settings, FeatureExtractor(strips=5, projection=32, seed=3).settings):
+    for settings in (
+        FeatureExtractor().settings,
+        FeatureExtractor(strips=5, projection=32, seed=3).settings,
+    ):
         assert FeatureSettings.from_json(settings.to_json()) == settings
     with pytest.raises(SettingsError, match='cannot be read'):
         FeatureSettings.from_json('{"kind": "gradient", "backbone": {"teleport": 1}, "strips": 7}')
@@ -92,9 +100,9 @@ def test_feature_settings_survive_json():
 
 @pytest.fixture(scope='session')
 def tiny_onnx(tmp_path_factory):
-    """A network of one convolution, to be worked out by hand: it sums each 2 x 2 block."""
+    """Save a network of one convolution that sums each 2 x 2 block."""
     onnx = pytest.importorskip('onnx', reason='the extra onnx is not installed')
-    from onnx import TensorProto, helper, numpy_helper
+    from onnx import helper, numpy_helper, TensorProto
 
     weights = numpy_helper.from_array(np.ones((1, 3, 2, 2), np.float32), 'w')
     nodes = [
@@ -116,12 +124,18 @@ def tiny_onnx(tmp_path_factory):
 
 
 def onnx_settings(path, **changes):
-    options = {'layer': 'relu', 'size': 16, 'scale': 1.0, 'mean': (0, 0, 0), 'std': (1, 1, 1)} | changes
+    options = {
+        'layer': 'relu',
+        'size': 16,
+        'scale': 1.0,
+        'mean': (0, 0, 0),
+        'std': (1, 1, 1),
+    } | changes
     return settings_class('onnx')(model=str(path), **options)
 
 
 def test_onnx_inner_layer_by_hand(tiny_onnx):
-    """Pixel value 10 r + g + ... summed over a block of four equal pixels: worked by hand; batch of two."""
+    """Pixel values summed over a block of four equal pixels, by hand; batch of two."""
     image = np.zeros((16, 16, 3), np.uint8)
     image[:, :, 0], image[:, :, 1], image[:, :, 2] = 1, 2, 3
     backbone = backbone_class('onnx')(onnx_settings(tiny_onnx))
@@ -153,7 +167,7 @@ def test_onnx_errors_name_file_and_layer(tiny_onnx, tmp_path):
 
 
 def test_onnx_model_may_move_but_not_change(tiny_onnx, tmp_path):
-    """The same file elsewhere gives the same features; another file under the same name is refused."""
+    """A moved file gives the same features; another file under its name is rejected."""
     settings = FeatureExtractor('onnx', onnx_settings(tiny_onnx)).settings
     moved = tmp_path / 'moved.onnx'
     moved.write_bytes(tiny_onnx.read_bytes())

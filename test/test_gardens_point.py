@@ -1,8 +1,7 @@
-"""Real images through the real node over ROS: the same answers as the core gives offline, match for match."""
+"""Real images through the node over ROS: equal to the library, match for match."""
 
 import numpy as np
 import pytest
-
 from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.evaluation.metrics import best_f1, image_matches
 from stavpr_ros.evaluation.records import evaluate_records
@@ -19,7 +18,7 @@ TOLERANCE, ACCEPT_ALL = 2, 10.0
 
 @pytest.fixture(scope='module')
 def bags(data_folder, tmp_path_factory):
-    """The two drives as bags, at 10 images per second."""
+    """Write the two traverses as bags, at 10 images per second."""
     folder = tmp_path_factory.mktemp('gardens_point')
     for name in ('day_left', 'day_right'):
         frames = open_source(data_folder / 'gardens_point' / name)
@@ -32,8 +31,10 @@ def bags(data_folder, tmp_path_factory):
     ('kind', 'mode', 'known_f1'),
     [('gradient', 'paper', 0.75), ('onnx', 'paper', 0.92), ('gradient', 'robust', 0.99)],
 )
-def test_node_on_gardens_point_equals_library(bags, request, tmp_path, kind, mode, known_f1, record_property):
-    """In the defaults of both modes; the F1 that is asserted is the one measured, a little below."""
+def test_node_on_gardens_point_equals_library(
+    bags, request, tmp_path, kind, mode, known_f1, record_property
+):
+    """In the defaults of both modes; the asserted F1 is a little below the measured one."""
     threshold = ACCEPT_ALL if mode == 'paper' else 1.0
     settings = request.getfixturevalue('squeezenet_settings') if kind == 'onnx' else None
     extractor = FeatureExtractor(kind, settings)
@@ -42,7 +43,9 @@ def test_node_on_gardens_point_equals_library(bags, request, tmp_path, kind, mod
     save_map(place_map, map_path)
 
     query = extract_features(open_source(bags / 'day_right'), extractor, progress=False)
-    offline = recognize_all(PlaceRecognizer(place_map, RecognizerSettings(threshold, mode=mode)), query)
+    offline = recognize_all(
+        PlaceRecognizer(place_map, RecognizerSettings(threshold, mode=mode)), query
+    )
     expected = image_matches(offline, 20)
 
     parameters = {'map_path': map_path, 'threshold': threshold, 'mode': mode}

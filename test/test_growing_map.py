@@ -1,18 +1,17 @@
-"""The growing map: what was added comes out, room doubles, places are forgotten, errors change nothing."""
+"""The growing map: places added and evicted, memory that doubles, errors without effect."""
 
 import dataclasses
 
-import numpy as np
-import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
-
+import numpy as np
+import pytest
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import GrowingMap, growing_map, load_map, save_map
+from stavpr_ros.mapping import growing_map, GrowingMap, load_map, save_map
+import torch
 
-DESCRIBER = FeatureExtractor()
+EXTRACTOR = FeatureExtractor()
 W, D = 7, 5
 
 
@@ -22,7 +21,7 @@ def little_room(monkeypatch):
     monkeypatch.setattr(growing_map, 'ROOM', 4)
 
 
-def features(i, d=D, settings=DESCRIBER.settings, count=1):
+def features(i, d=D, settings=EXTRACTOR.settings, count=1):
     strips = torch.arange(W * count * d, dtype=torch.float32).reshape(W, count, d) + 1000 * i
     return LocalFeatures(strips, torch.full((W, count), float(i)), settings, (5, 1))
 
@@ -32,8 +31,8 @@ def where(i):
 
 
 def grown(count, limit=100):
-    """A map of places 0 to count - 1; every third has no pose, every second no picture."""
-    made = GrowingMap(DESCRIBER.settings, None, limit)
+    """Return a map of count places; every third has no pose, every second no thumbnail."""
+    made = GrowingMap(EXTRACTOR.settings, None, limit)
     for i in range(count):
         add(made, i)
     return made
@@ -45,13 +44,15 @@ def add(made, i):
 
 
 def assert_holds(made, numbers):
-    """The map, or a snapshot of one, holds these places."""
+    """Compare the places of a map, or a snapshot of one, with these numbers."""
     assert len(made) == len(numbers)
     assert made.stamps.tolist() == [i * 10 for i in numbers]
     assert tuple(made.ids) == tuple(f'place {i}' for i in numbers)
     assert tuple(made.features.strips.shape) == (W, len(numbers), D)
     for place, i in enumerate(numbers):
-        torch.testing.assert_close(made.features.strips[:, place], features(i).strips[:, 0], rtol=0, atol=0)
+        torch.testing.assert_close(
+            made.features.strips[:, place], features(i).strips[:, 0], rtol=0, atol=0
+        )
         assert made.features.weights[:, place].tolist() == [i] * W
         known = where(i) if i % 3 else np.full(7, np.nan)
         np.testing.assert_allclose(made.poses[place], known)
@@ -68,7 +69,7 @@ def test_growing_map_holds_added_places(count):
 
 
 def test_growing_map_memory_doubles_up_to_limit():
-    made, rooms = GrowingMap(DESCRIBER.settings, None, 18), []
+    made, rooms = GrowingMap(EXTRACTOR.settings, None, 18), []
     for i in range(18):
         rooms.append(made.memory)
         assert add(made, i) == i
@@ -101,7 +102,7 @@ def test_snapshot_is_independent_of_map():
 
 
 def test_snapshot_without_places_or_extras_is_empty():
-    made = GrowingMap(DESCRIBER.settings, None, 3)
+    made = GrowingMap(EXTRACTOR.settings, None, 3)
     assert len(made.snapshot()) == 0
     assert len(made.features) == 0
     made.add(features(1))
@@ -113,7 +114,7 @@ def test_snapshot_without_places_or_extras_is_empty():
 
 
 def test_snapshot_saved_and_loaded_continues(tmp_path):
-    """Poses of some places, pictures of some places."""
+    """Poses of some places, thumbnails of some places."""
     save_map(grown(7).snapshot(), tmp_path / 'map')
     loaded = load_map(tmp_path / 'map')
     assert_holds(loaded, range(7))
@@ -171,7 +172,7 @@ def test_forget_removes_oldest_places():
 @given(st.lists(st.one_of(st.none(), st.integers(0, 6)), max_size=60))
 def test_growing_map_equals_plain_list(steps):
     """None adds a place, a number forgets so many."""
-    made, plain, added = GrowingMap(DESCRIBER.settings, None, 9), [], 0
+    made, plain, added = GrowingMap(EXTRACTOR.settings, None, 9), [], 0
     for step in steps:
         if step is not None:
             made.forget(min(step, len(plain)))
@@ -191,7 +192,11 @@ def test_growing_map_equals_plain_list(steps):
 @pytest.mark.parametrize(
     ('arguments', 'error', 'words'),
     [
-        ((features(1, settings=FeatureExtractor(strips=6).settings),), FeatureMismatchError, 'strips'),
+        (
+            (features(1, settings=FeatureExtractor(strips=6).settings),),
+            FeatureMismatchError,
+            'strips',
+        ),
         ((features(1, count=2),), InputError, 'features of 2 images'),
         ((features(1, count=0),), InputError, 'features of 0 images'),
         ((features(float('nan')),), InputError, 'not finite'),
@@ -219,7 +224,10 @@ def test_add_of_other_dimension_is_rejected():
 
 def test_growing_map_with_wrong_settings_is_rejected(small_map):
     with pytest.raises(SettingsError, match='limit = 0'):
-        GrowingMap(DESCRIBER.settings, None, 0)
-    for settings, projection in ((small_map.settings, None), (DESCRIBER.settings, small_map.projection)):
+        GrowingMap(EXTRACTOR.settings, None, 0)
+    for settings, projection in (
+        (small_map.settings, None),
+        (EXTRACTOR.settings, small_map.projection),
+    ):
         with pytest.raises(InputError, match='projection'):
             GrowingMap(settings, projection, 5)

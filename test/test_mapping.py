@@ -1,6 +1,8 @@
-"""Maps: built of images or keyframes; the file: round trip, atomicity, every way in which it can be bad."""
+"""Maps of images or keyframes; their files: round trip, atomicity, damage of every kind."""
 
 import dataclasses
+import hashlib
+import io
 import json
 import os
 import pickle
@@ -8,21 +10,26 @@ import threading
 import zipfile
 
 import cv2
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-
-from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, MapFileError, SettingsError
+from stavpr_ros.errors import (
+    FeatureMismatchError,
+    ImageError,
+    InputError,
+    MapFileError,
+    SettingsError,
+)
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import (
-    KeyframeSettings,
-    PlaceMap,
-    Trajectory,
     build_map,
     encode_thumbnail,
+    KeyframeSettings,
     load_map,
+    PlaceMap,
     save_map,
+    Trajectory,
 )
 from stavpr_ros.sources.frame import Frame
 
@@ -58,7 +65,9 @@ def test_save_map_then_load_map_is_identical(small_map, saved, route):
 
 
 def test_save_map_without_extras_loads(route, tmp_path):
-    plain = build_map([Frame(route[0], 0, '')], FeatureExtractor(), thumbnails=False, progress=False)
+    plain = build_map(
+        [Frame(route[0], 0, '')], FeatureExtractor(), thumbnails=False, progress=False
+    )
     save_map(plain, tmp_path / 'plain.stavpr')
     loaded = load_map(tmp_path / 'plain.stavpr')
     assert_same(plain, loaded)
@@ -71,7 +80,11 @@ def test_recognizer_with_other_features_rejects_them(small_map, route):
     from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
     recognizer = PlaceRecognizer(small_map, RecognizerSettings(threshold=1.0))
-    for other in (FeatureExtractor(projection=64, seed=1), FeatureExtractor(), FeatureExtractor(projection=64, strips=6)):
+    for other in (
+        FeatureExtractor(projection=64, seed=1),
+        FeatureExtractor(),
+        FeatureExtractor(projection=64, strips=6),
+    ):
         with pytest.raises(FeatureMismatchError) as caught:
             recognizer.update(other.extract(route[:1]))
         assert small_map.settings.to_json() in str(caught.value)
@@ -118,7 +131,9 @@ def test_place_map_with_partial_pose_is_rejected(small_map):
         with pytest.raises(InputError, match='place 3'):
             dataclasses.replace(small_map, poses=poses)
     with pytest.raises(InputError, match='place 3'):
-        dataclasses.replace(small_map, poses=np.where(np.arange(60)[:, None] == 3, np.inf, small_map.poses))
+        dataclasses.replace(
+            small_map, poses=np.where(np.arange(60)[:, None] == 3, np.inf, small_map.poses)
+        )
 
 
 def test_place_map_without_one_thumbnail_returns_none(small_map):
@@ -127,11 +142,11 @@ def test_place_map_without_one_thumbnail_returns_none(small_map):
     assert some.thumbnail(1) is not None
 
 
-# ------------------------------------------------------------------------------------------ keyframes
+# --------------------------------------------------------------------------- keyframes
 
 
-def drive(images):
-    """Frames of a drive, a second and a meter each."""
+def traverse(images):
+    """Frames of a traverse, a second and a meter each."""
     return [Frame(image, (i + 1) * SECOND, f'{i}') for i, image in enumerate(images)]
 
 
@@ -143,7 +158,7 @@ def straight(count):
 
 @pytest.mark.parametrize('known', ['array', 'trajectory'])
 def test_build_map_with_distance_selects_keyframes(route, known):
-    frames, poses = drive(route[:20]), straight(20)
+    frames, poses = traverse(route[:20]), straight(20)
     poses[4] = np.nan
     if known == 'trajectory':
         trajectory = Trajectory(max_gap=1.5)
@@ -151,7 +166,9 @@ def test_build_map_with_distance_selects_keyframes(route, known):
             if not np.isnan(pose[0]):
                 trajectory.add(frame.stamp, pose)
         poses = trajectory
-    built = build_map(frames, FeatureExtractor(), poses, progress=False, keyframes=KeyframeSettings(distance=2))
+    built = build_map(
+        frames, FeatureExtractor(), poses, progress=False, keyframes=KeyframeSettings(distance=2)
+    )
     assert built.ids == ('0', '2', *map(str, range(5, 20, 2)))  # of 4 nothing is known
     assert built.poses[:, 0].tolist() == [0, 2, *range(5, 20, 2)]
     every = build_map(frames, FeatureExtractor(), poses, progress=False)
@@ -161,7 +178,7 @@ def test_build_map_with_distance_selects_keyframes(route, known):
 
 
 def test_build_map_with_wrong_poses_fails(route):
-    frames, extractor = drive(route[:20]), FeatureExtractor()
+    frames, extractor = traverse(route[:20]), FeatureExtractor()
     for count in (19, 21):
         with pytest.raises(InputError, match=f'{count} poses for 20 images'):
             build_map(frames, extractor, straight(count), progress=False)
@@ -178,22 +195,28 @@ def test_build_map_with_wrong_poses_fails(route):
         build_map(frames, extractor, progress=False, keyframes=KeyframeSettings(angle=1))
     nowhere = Trajectory()
     with pytest.raises(InputError, match=r'none of 20 images became a place.*no odometry'):
-        build_map(frames, extractor, nowhere, progress=False, keyframes=KeyframeSettings(distance=1))
+        build_map(
+            frames, extractor, nowhere, progress=False, keyframes=KeyframeSettings(distance=1)
+        )
     assert build_map(frames, extractor, nowhere, progress=False).poses is None
 
 
 def test_build_map_scales_thumbnails(route):
     image = cv2.resize(route[0], (640, 480))
-    built = build_map(drive([image]), FeatureExtractor(), progress=False, thumbnail_width=320)
+    built = build_map(traverse([image]), FeatureExtractor(), progress=False, thumbnail_width=320)
     assert built.thumbnail(0).shape == (240, 320, 3)
     assert built.thumbnails[0] == encode_thumbnail(image, 320)
-    assert build_map(drive([image]), FeatureExtractor(), progress=False).thumbnail(0).shape == (144, 192, 3)
+    assert build_map(traverse([image]), FeatureExtractor(), progress=False).thumbnail(0).shape == (
+        144,
+        192,
+        3,
+    )
     with pytest.raises(SettingsError, match='width 0'):
-        build_map(drive([image]), FeatureExtractor(), progress=False, thumbnail_width=0)
+        build_map(traverse([image]), FeatureExtractor(), progress=False, thumbnail_width=0)
 
 
 class Watched:
-    """A source that knows which threads used and closed it."""
+    """A source that records which threads used and closed it."""
 
     def __init__(self, frames, fails_at=None):
         self.frames, self.fails_at = frames, fails_at
@@ -211,18 +234,18 @@ class Watched:
 
 
 def test_build_map_reads_and_closes_source_on_one_thread(route):
-    """What a bag needs; also when the images, or their features, fail."""
-    whole = Watched(drive(route))
+    """Required by bags; also if the images, or their features, fail."""
+    whole = Watched(traverse(route))
     assert len(build_map(whole, FeatureExtractor(), progress=False)) == 60
-    damaged = Watched(drive(route), fails_at=40)
+    damaged = Watched(traverse(route), fails_at=40)
     with pytest.raises(ImageError, match='40'):
         build_map(damaged, FeatureExtractor(), progress=False)
-    given_up = Watched(drive(route))
+    abandoned = Watched(traverse(route))
     broken = FeatureExtractor()
     broken.extract = lambda images: 1 / 0
     with pytest.raises(ZeroDivisionError):
-        build_map(given_up, broken, progress=False)
-    for source in (whole, damaged, given_up):
+        build_map(abandoned, broken, progress=False)
+    for source in (whole, damaged, abandoned):
         assert len(source.used) == 1
         assert source.closed == list(source.used)
         assert threading.get_ident() not in source.used
@@ -245,32 +268,42 @@ def test_save_map_that_fails_keeps_old_file(small_map, saved, monkeypatch):
     assert [path.name for path in saved.parent.iterdir()] == [saved.name]
 
 
-def test_save_into_missing_folder(small_map, tmp_path):
+def test_save_map_into_missing_folder_fails(small_map, tmp_path):
     with pytest.raises(MapFileError, match='cannot be written'):
         save_map(small_map, tmp_path / 'missing' / 'map.stavpr')
 
 
-def test_missing_file(tmp_path):
-    with pytest.raises(MapFileError, match='does not exist'):
-        load_map(tmp_path / 'nothing.stavpr')
-    with pytest.raises(MapFileError):
+def zip_of(name):
+    """Return the bytes of a ZIP file with one member."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, 'w') as archive:
+        archive.writestr(name, 'hello')
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ('content', 'text'),
+    [
+        (None, 'does not exist'),
+        (b'', 'no map'),
+        (b'hello', 'no map'),
+        (b'PK\x03\x04' + bytes(100), 'no map'),
+        (bytes(range(256)) * 4, 'no map'),
+        (zip_of('hello.txt'), 'no map of this program'),
+        (zip_of('manifest.json'), 'damaged'),
+    ],
+)
+def test_load_map_of_other_file_fails(tmp_path, content, text):
+    path = tmp_path / 'other'
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(MapFileError, match=text):
+        load_map(path)
+
+
+def test_load_map_of_folder_fails(tmp_path):
+    with pytest.raises(MapFileError, match='name a map file'):
         load_map(tmp_path)
-
-
-@pytest.mark.parametrize('content', [b'', b'hello', b'PK\x03\x04' + bytes(100), os.urandom(1000)])
-def test_foreign_file(tmp_path, content):
-    path = tmp_path / 'foreign'
-    path.write_bytes(content)
-    with pytest.raises(MapFileError):
-        load_map(path)
-
-
-def test_foreign_zip(tmp_path):
-    path = tmp_path / 'foreign.zip'
-    with zipfile.ZipFile(path, 'w') as archive:
-        archive.writestr('hello.txt', 'hello')
-    with pytest.raises(MapFileError, match='no map of this program'):
-        load_map(path)
 
 
 def rewritten(saved, change, members=None):
@@ -306,13 +339,12 @@ def test_load_map_executes_no_pickle(saved, tmp_path):
         def __reduce__(self):
             return (os.mkdir, (str(tmp_path / 'exploded'),))
 
-    import hashlib
-    import io
-
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, np.array([Bomb()], object), allow_pickle=True)
     digest = hashlib.sha256(buffer.getvalue()).hexdigest()
-    rewritten(saved, lambda m: m['members'].update(stamps=digest), {'stamps.npy': buffer.getvalue()})
+    rewritten(
+        saved, lambda m: m['members'].update(stamps=digest), {'stamps.npy': buffer.getvalue()}
+    )
     with pytest.raises(MapFileError, match='damaged'):
         load_map(saved)
     saved.write_bytes(pickle.dumps(Bomb()))
@@ -331,7 +363,9 @@ def test_load_map_with_compressed_members_fails(saved):
         load_map(saved)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(data=st.data())
 def test_load_map_with_damage_fails_or_is_identical(saved, small_map, data):
     """Any byte changed, any tail cut off: the same map or a clear error, nothing else."""
@@ -340,7 +374,7 @@ def test_load_map_with_damage_fails_or_is_identical(saved, small_map, data):
     if data.draw(st.booleans(), label='truncate'):
         damaged.write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
     else:
-        # half of the positions among the headers, where a damage is hardest to tell
+        # half of the positions among the headers, where damage is hardest to detect
         near_end = data.draw(st.booleans())
         low = max(0, len(whole) - 1500) if near_end else 0
         position = data.draw(st.integers(low, len(whole) - 1))

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import Writer as Ros2Writer
-from rosbags.typesys import Stores, get_typestore
-
+from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.sources import open_source
-from stavpr_ros.sources.bag import COMPRESSED, RAW, BagSource, image_topics
+from stavpr_ros.sources.bag import BagSource, COMPRESSED, image_topics, RAW
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 
@@ -30,22 +29,33 @@ def records(count=5, stamped=True):
 
 
 def write_mixed(path, ros1=False, bad=()):
-    """A bag with /raw, /small (compressed, PNG) and /text; messages in `bad` of /small are damaged."""
+    """Write a bag with /raw, /small (PNG, those in `bad` damaged) and /text."""
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
     serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
     types = store.types
     extra = {'seq': 0} if ros1 else {}
     with Ros1Writer(path) if ros1 else Ros2Writer(path, version=9) as writer:
         kinds = {'/raw': RAW, '/small': COMPRESSED, '/text': 'std_msgs/msg/String', '/silent': RAW}
-        topics = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
+        topics = {
+            topic: writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in kinds.items()
+        }
         for i, record in enumerate(records()):
             stamp = types['builtin_interfaces/msg/Time'](sec=i, nanosec=5)
             header = types['std_msgs/msg/Header'](stamp=stamp, frame_id='camera', **extra)
             raw = types[RAW](
-                header=header, height=6, width=8, encoding='rgb8', is_bigendian=0, step=24, data=record.data
+                header=header,
+                height=6,
+                width=8,
+                encoding='rgb8',
+                is_bigendian=0,
+                step=24,
+                data=record.data,
             )
             png = cv2.imencode('.png', record.data.reshape(6, 8, 3)[..., ::-1].copy())[1].ravel()
-            small = types[COMPRESSED](header=header, format='png', data=png[:40] if i in bad else png)
+            small = types[COMPRESSED](
+                header=header, format='png', data=png[:40] if i in bad else png
+            )
             text = types['std_msgs/msg/String'](data='hello')
             for topic, sent in (('/raw', raw), ('/small', small), ('/text', text)):
                 writer.write(topics[topic], record.time_ns, serialize(sent, kinds[topic]))
@@ -63,7 +73,9 @@ def test_write_bag_then_open_source_is_identical(tmp_path, storage):
         assert isinstance(source, BagSource)
         assert (len(source), source.topic) == (5, '/camera/image')
         for original, read in zip(records(), source.records(), strict=True):
-            assert [getattr(read, name) for name in FIELDS] == [getattr(original, name) for name in FIELDS]
+            assert [getattr(read, name) for name in FIELDS] == [
+                getattr(original, name) for name in FIELDS
+            ]
             np.testing.assert_array_equal(read.data, original.data)
         for i, (original, frame) in enumerate(zip(records(), source, strict=True)):
             np.testing.assert_array_equal(frame.image, original.data.reshape(6, 8, 3))
@@ -83,10 +95,16 @@ def test_bag_raw_and_compressed_images_are_equal(tmp_path, ros1):
     assert image_topics(path) == {'/raw': (RAW, 5), '/silent': (RAW, 0), '/small': (COMPRESSED, 5)}
     for topic in ('/raw', '/small'):
         source = open_source(path, topic)
-        for i, (original, frame, record) in enumerate(zip(records(), source, source.records(), strict=True)):
+        for i, (original, frame, record) in enumerate(
+            zip(records(), source, source.records(), strict=True)
+        ):
             np.testing.assert_array_equal(frame.image, original.data.reshape(6, 8, 3))
             assert frame.stamp == record.stamp_ns == i * 1_000_000_000 + 5
-            assert (record.time_ns, record.encoding, record.frame_id) == (original.time_ns, 'rgb8', 'camera')
+            assert (record.time_ns, record.encoding, record.frame_id) == (
+                original.time_ns,
+                'rgb8',
+                'camera',
+            )
 
 
 def test_bag_with_ambiguous_or_wrong_topic_lists_topics(tmp_path):
@@ -107,7 +125,9 @@ def test_bag_without_images_lists_topics(tmp_path):
     store = get_typestore(Stores.ROS2_JAZZY)
     with Ros2Writer(tmp_path / 'bag', version=9) as writer:
         writer.add_connection('/text', 'std_msgs/msg/String', typestore=store)
-    with pytest.raises(SourceError, match=r'no images.*there are /text \(std_msgs/msg/String, 0 messages\)'):
+    with pytest.raises(
+        SourceError, match=r'no images.*there are /text \(std_msgs/msg/String, 0 messages\)'
+    ):
         open_source(tmp_path / 'bag')
 
 
@@ -130,7 +150,9 @@ def test_bag_without_metadata_is_read(tmp_path, storage):
     assert len(list(open_source(tmp_path / 'bag'))) == 5
     file = next((tmp_path / 'bag').iterdir())
     shutil.copy(file, file.with_stem('second'))
-    with pytest.raises(SourceError, match=r'expected exactly one .db3 or .mcap file then, found .*second'):
+    with pytest.raises(
+        SourceError, match=r'expected exactly one .db3 or .mcap file then, found .*second'
+    ):
         open_source(tmp_path / 'bag')
 
 
@@ -148,7 +170,8 @@ def test_bag_with_write_ahead_log_is_read_and_unchanged(tmp_path):
     database.execute('PRAGMA journal_mode=WAL')
     database.execute('PRAGMA wal_autocheckpoint=0')
     database.execute(
-        'INSERT INTO messages SELECT 99, topic_id, timestamp + 1000000000, data FROM messages WHERE id=1'
+        'INSERT INTO messages SELECT 99, topic_id, timestamp + 1000000000, data FROM messages '
+        'WHERE id=1'
     )
     database.commit()
     before = listing(folder)
@@ -200,7 +223,9 @@ def test_bag_of_foreign_content_fails(tmp_path, name):
         open_source(tmp_path / name)
 
 
-@pytest.mark.parametrize('text', ['', 'a: [', 'rosbag2_bagfile_information: {version: 99}', '[1, 2]'])
+@pytest.mark.parametrize(
+    'text', ['', 'a: [', 'rosbag2_bagfile_information: {version: 99}', '[1, 2]']
+)
 def test_bag_with_foreign_metadata_fails(tmp_path, text):
     write_bag(tmp_path / 'bag', '/image', records())
     (tmp_path / 'bag' / 'metadata.yaml').write_text(text)

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from raw_images import BAYER, PAIRS, YUV, mosaic, packed_yuv, padded
-
+from raw_images import BAYER, mosaic, packed_yuv, padded, PAIRS, YUV
 from stavpr_ros.errors import ImageError
 from stavpr_ros.sources.encodings import decode_image
 
@@ -74,7 +73,9 @@ def test_bayer_of_noise_is_bilinear(encoding):
 @pytest.mark.parametrize('encoding', sorted(BAYER))
 @pytest.mark.parametrize(('height', 'width'), [(1, 1), (1, 6), (5, 1)])
 def test_bayer_without_every_color_is_rejected(encoding, height, width):
-    with pytest.raises(ImageError, match=f'{width}x{height} pixels: expected at least 2x2') as caught:
+    with pytest.raises(
+        ImageError, match=f'{width}x{height} pixels: expected at least 2x2'
+    ) as caught:
         decode_image(height, width, encoding, False, 2 * width, bytes(2 * height * width))
     assert caught.value.kind == 'size'
 
@@ -88,7 +89,9 @@ def test_yuv_of_known_colors_by_table(encoding, rgb):
 
 
 @pytest.mark.parametrize('encoding', YUV)
-@pytest.mark.parametrize(('height', 'width', 'padding'), [(2, 2, 0), (6, 8, 0), (4, 10, 6), (2, 64, 1)])
+@pytest.mark.parametrize(
+    ('height', 'width', 'padding'), [(2, 2, 0), (6, 8, 0), (4, 10, 6), (2, 64, 1)]
+)
 def test_yuv_of_noise_equals_definition(encoding, height, width, padding):
     rng = np.random.default_rng(3)
     yuv = rng.integers(16, 236, (height, width, 3)).astype(np.uint8)

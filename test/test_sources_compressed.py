@@ -1,24 +1,31 @@
-"""Image files and compressed image messages to RGB: every format, mosaics, depth, damage, garbage."""
+"""Image files and compressed messages to RGB: formats, mosaics, depth, damage, garbage."""
 
 from io import BytesIO
 from types import SimpleNamespace
 from unittest import mock
 
 import cv2
-import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+import numpy as np
 from PIL import Image
-
+import pytest
 from stavpr_ros.errors import ImageError
 from stavpr_ros.sources import files, open_source
-from stavpr_ros.sources.files import decode_compressed
 from stavpr_ros.sources.encodings import decode_compressed_message, decode_message
+from stavpr_ros.sources.files import decode_compressed
 
 # the color at each pixel of the top-left 2x2, in reading order
 PATTERNS = {'rggb': (0, 1, 1, 2), 'bggr': (2, 1, 1, 0), 'gbrg': (1, 2, 0, 1), 'grbg': (1, 0, 2, 1)}
-GARBAGE = ['', ';', 'jpeg', 'png', 'rgb8; jpeg compressed bgr8', 'bayer_rggb8; png compressed ', 'compressed']
+GARBAGE = [
+    '',
+    ';',
+    'jpeg',
+    'png',
+    'rgb8; jpeg compressed bgr8',
+    'bayer_rggb8; png compressed ',
+    'compressed',
+]
 
 
 def encoded(suffix, image):
@@ -37,13 +44,18 @@ def test_decode_compressed_of_lossless_file_is_exact(suffix):
 
 def test_decode_compressed_of_jpeg_is_close():
     rgb = np.full((16, 24, 3), (200, 100, 30), np.uint8)
-    assert np.abs(decode_compressed(encoded('.jpg', rgb[..., ::-1].copy())).astype(int) - rgb).max() <= 4
+    assert (
+        np.abs(decode_compressed(encoded('.jpg', rgb[..., ::-1].copy())).astype(int) - rgb).max()
+        <= 4
+    )
 
 
 @pytest.mark.parametrize('suffix', ['.png', '.pgm', '.tiff'])
 def test_decode_compressed_of_16_bits_keeps_upper_byte(suffix):
     gray = (np.arange(12, dtype=np.uint16) * 5000).reshape(3, 4)
-    np.testing.assert_array_equal(decode_compressed(encoded(suffix, gray)), np.dstack([gray >> 8] * 3))
+    np.testing.assert_array_equal(
+        decode_compressed(encoded(suffix, gray)), np.dstack([gray >> 8] * 3)
+    )
 
 
 def test_decode_compressed_drops_transparency():
@@ -74,7 +86,7 @@ def test_decode_compressed_of_damaged_file_decodes_or_fails(data):
         file[data.draw(st.integers(0, len(file) - 1))] = data.draw(st.integers(0, 255))
     del file[data.draw(st.integers(0, len(file))) :]
     try:
-        # a damaged header may promise as many pixels as are allowed: a lower limit keeps this test short
+        # a damaged header may claim the largest size: a lower limit keeps this test short
         with mock.patch.object(files, 'MAX_PIXELS', 10**6):
             image = decode_compressed(bytes(file))
     except ImageError:
@@ -94,7 +106,9 @@ def test_decode_compressed_of_no_image_fails(data):
 
 def test_decode_compressed_of_cut_off_png_fails():
     data = encoded('.png', np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8))
-    with pytest.raises(ImageError, match='is damaged or cut off: copy or record it again') as caught:
+    with pytest.raises(
+        ImageError, match='is damaged or cut off: copy or record it again'
+    ) as caught:
         decode_compressed(data[:-30])
     assert caught.value.kind == 'damaged'
 
@@ -103,7 +117,9 @@ def test_decode_compressed_of_cut_off_jpeg_fails():
     rgb = np.full((64, 64, 3), (200, 100, 30), np.uint8)
     small = encoded('.jpg', rgb[:8, :8])
     data = encoded('.jpg', rgb[..., ::-1].copy())
-    segment = b'\xff\xe1' + (len(small) + 2).to_bytes(2, 'big') + small  # where cameras put a thumbnail
+    segment = (
+        b'\xff\xe1' + (len(small) + 2).to_bytes(2, 'big') + small
+    )  # where cameras put a thumbnail
     data = data[:2] + segment + data[2:]
     # cameras fill up with zeros
     assert np.abs(decode_compressed(data + bytes(50)).astype(int) - rgb).max() <= 4
@@ -117,7 +133,7 @@ def test_decode_compressed_of_cut_off_jpeg_fails():
     'options', [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]]
 )
 def test_decode_compressed_of_jpeg_with_video_ignores_it(options):
-    """As phones append one; any two bytes may be in it. Noise: the picture has every byte too."""
+    """As phones append one; any two bytes may be in it. Noise: its own data has every byte too."""
     bgr = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
     data = cv2.imencode('.jpg', bgr, options)[1].tobytes()
     expected = decode_compressed(data)
@@ -182,7 +198,7 @@ def test_compressed_message_format_is_taken_from_bytes(transport):
     ],
 )
 def test_compressed_message_of_depth_is_rejected(transport):
-    png = encoded('.png', np.zeros((4, 4), np.uint8))  # a picture, so that nothing but the name is wrong
+    png = encoded('.png', np.zeros((4, 4), np.uint8))  # an image, so that only the name is wrong
     with pytest.raises(ImageError, match='holds depth or measurements, not an image') as caught:
         decode_compressed_message(compressed(transport, png))
     assert repr(transport) in str(caught.value)
@@ -242,7 +258,9 @@ def test_compressed_message_of_color_is_no_bayer():
 
 
 def test_compressed_message_of_tiny_bayer_fails():
-    message = compressed('bayer_rggb8; png compressed ', encoded('.png', np.zeros((1, 5), np.uint8)))
+    message = compressed(
+        'bayer_rggb8; png compressed ', encoded('.png', np.zeros((1, 5), np.uint8))
+    )
     with pytest.raises(ImageError, match='5x1 pixels: expected at least 2x2') as caught:
         decode_compressed_message(message)
     assert caught.value.kind == 'size'

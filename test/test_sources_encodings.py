@@ -5,18 +5,17 @@ import copy
 import pickle
 from types import SimpleNamespace
 
-import numpy as np
-import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from raw_images import BAYER, CHANNELS, PAIRS, YUV, message
+import numpy as np
+import pytest
+from raw_images import BAYER, CHANNELS, message, PAIRS, YUV
 from rosbags.rosbag2 import Writer
-from rosbags.typesys import Stores, get_typestore
-
+from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import ImageError
 from stavpr_ros.sources import files, open_source
 from stavpr_ros.sources.bag import RAW
-from stavpr_ros.sources.encodings import ENCODINGS, decode_image, decode_message
+from stavpr_ros.sources.encodings import decode_image, decode_message, ENCODINGS
 
 
 def test_encodings_are_all_tested():
@@ -88,16 +87,36 @@ def test_decode_image_without_last_padding_is_exact():
             r'3x3 .*multiple of 2 and a height that is a multiple of 1',
         ),
         ({'encoding': 'yuyv', 'step': 7}, 'step', 'expected 8'),
-        ({'encoding': 'nv12'}, 'size', r'4x3 pixels: .*multiple of 2 and a height that is a multiple of 2'),
+        (
+            {'encoding': 'nv12'},
+            'size',
+            r'4x3 pixels: .*multiple of 2 and a height that is a multiple of 2',
+        ),
         ({'encoding': 'nv21', 'height': 2, 'width': 3}, 'size', '3x2 pixels'),
-        ({'encoding': 'nv12', 'height': 4, 'step': 4, 'data': bytes(23)}, 'cut off', 'expected 24'),
-        ({'encoding': 'nv21', 'height': 4, 'step': 9, 'data': bytes(48)}, 'cut off', 'expected 49'),
-        ({'encoding': 'nv24', 'height': 2, 'step': 4, 'data': bytes(23)}, 'cut off', 'expected 24'),
+        (
+            {'encoding': 'nv12', 'height': 4, 'step': 4, 'data': bytes(23)},
+            'cut off',
+            'expected 24',
+        ),
+        (
+            {'encoding': 'nv21', 'height': 4, 'step': 9, 'data': bytes(48)},
+            'cut off',
+            'expected 49',
+        ),
+        (
+            {'encoding': 'nv24', 'height': 2, 'step': 4, 'data': bytes(23)},
+            'cut off',
+            'expected 24',
+        ),
         ({'encoding': 'bayer_rggb16', 'step': 7}, 'step', 'expected 8'),
         ({'encoding': '32FC1'}, 'depth', 'depth'),
         ({'encoding': '32FC1x'}, 'encoding', "'32FC1x' is not supported"),
         ({'encoding': '8UC2'}, 'encoding', "'8UC2' is not supported"),
-        ({'encoding': 'bayer_rggb9'}, 'encoding', "'bayer_rggb9' is not supported: expected one of rgb8"),
+        (
+            {'encoding': 'bayer_rggb9'},
+            'encoding',
+            "'bayer_rggb9' is not supported: expected one of rgb8",
+        ),
         ({'encoding': ''}, 'encoding', 'is not supported'),
     ],
 )
@@ -117,7 +136,8 @@ def test_decode_image_with_wrong_header_is_rejected(change, kind, text):
 
 @pytest.mark.parametrize(
     'encoding',
-    [f'{kind}C{n}' for kind in ('8S', '16S', '32S', '32F', '64F') for n in (1, 2, 3, 4)] + ['32FC', '32FC12'],
+    [f'{kind}C{n}' for kind in ('8S', '16S', '32S', '32F', '64F') for n in (1, 2, 3, 4)]
+    + ['32FC', '32FC12'],
 )
 def test_decode_image_of_measurements_is_rejected(encoding):
     with pytest.raises(ImageError, match=f'{encoding!r} holds depth or measurements') as caught:
@@ -135,7 +155,9 @@ def test_decode_image_of_too_large_image_is_rejected(monkeypatch):
 
 def test_decode_message_of_either_type_is_exact():
     step, data, expected = message('mono16', 4, 5, big=True, padding=1)
-    raw = SimpleNamespace(height=4, width=5, encoding='mono16', is_bigendian=1, step=step, data=data)
+    raw = SimpleNamespace(
+        height=4, width=5, encoding='mono16', is_bigendian=1, step=step, data=data
+    )
     np.testing.assert_array_equal(decode_message(raw), expected)
     pgm = SimpleNamespace(format='pgm', data=b'P5 5 4 255 ' + expected[..., 0].tobytes())
     np.testing.assert_array_equal(decode_message(pgm), expected)
@@ -199,14 +221,22 @@ def test_decode_image_of_random_message_decodes_or_fails(height, width, encoding
     padding=st.integers(-1, 5),
     missing=st.integers(-3, 1),
 )
-def test_decode_image_rejects_exactly_invalid_messages(encoding, height, width, big, padding, missing):
+def test_decode_image_rejects_exactly_invalid_messages(
+    encoding, height, width, big, padding, missing
+):
     if encoding in CHANNELS:
         row = len(message(encoding, 1, width)[1])
     else:
         row = width * (2 if encoding in PAIRS or encoding.endswith('16') else 1)
     step = row + padding
-    rows = {'nv12': height * 3 // 2, 'nv21': height * 3 // 2, 'nv24': 3 * height}.get(encoding, height)
-    data = np.random.default_rng(5).integers(0, 256, (rows - 1) * step + row - missing, np.uint8).tobytes()
+    rows = {'nv12': height * 3 // 2, 'nv21': height * 3 // 2, 'nv24': 3 * height}.get(
+        encoding, height
+    )
+    data = (
+        np.random.default_rng(5)
+        .integers(0, 256, (rows - 1) * step + row - missing, np.uint8)
+        .tobytes()
+    )
     fits = padding >= 0 and missing <= 0
     if encoding in BAYER:
         fits &= min(height, width) > 1

@@ -1,14 +1,13 @@
-"""A folder of images: order, what counts as one, what is refused."""
+"""A folder of images: order, files that count as images, errors."""
 
 import os
+from pathlib import Path
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-
 from stavpr_ros.errors import ImageError, InputError, SourceError
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.folder import FolderSource, natural_key
@@ -20,7 +19,17 @@ def fill(folder, names):
 
 
 def test_natural_key_sorts_numbers():
-    names = ['10.jpg', 'a2b10.png', '2.jpg', '1.jpg', 'a2b9.png', 'A1.png', '01.jpg', 'a.png', 'frame-3.png']
+    names = [
+        '10.jpg',
+        'a2b10.png',
+        '2.jpg',
+        '1.jpg',
+        'a2b9.png',
+        'A1.png',
+        '01.jpg',
+        'a.png',
+        'frame-3.png',
+    ]
     assert sorted(names, key=natural_key) == [
         '01.jpg',
         '1.jpg',
@@ -64,7 +73,10 @@ def test_folder_with_damaged_file_fails_or_skips(tmp_path):
     with pytest.raises(ImageError, match=r'2\.png: 12 bytes are no image'):
         list(FolderSource(tmp_path))
     errors = []
-    assert [frame.identifier for frame in FolderSource(tmp_path, errors.append)] == ['1.png', '3.png']
+    assert [frame.identifier for frame in FolderSource(tmp_path, errors.append)] == [
+        '1.png',
+        '3.png',
+    ]
     assert ['2.png' in str(error) for error in errors] == [True]
 
 
@@ -112,7 +124,8 @@ def test_folder_with_names_not_utf8_is_read(tmp_path):
 
 def test_import_of_sources_is_light():
     code = (
-        'import sys, stavpr_ros.sources; sys.exit(any(m in sys.modules for m in ("rosbags", "cv2", "rclpy")))'
+        'import sys, stavpr_ros.sources; sys.exit(any(m in sys.modules for m in ("rosbags", '
+        '"cv2", "rclpy")))'
     )
     assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0
 

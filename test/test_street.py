@@ -1,23 +1,22 @@
-"""The made-up world: reproducible, geometrically sane, and with the truth known."""
+"""The synthetic street: reproducible, geometrically sane, with known ground truth."""
 
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-
 from stavpr_ros.demonstration.street import (
-    GOOD_LIGHT,
-    RAINY_DUSK,
     Conditions,
-    Drive,
+    first_traverse,
+    GOOD_LIGHT,
+    nearest_places,
+    RAINY_DUSK,
     Route,
+    second_traverse,
+    Traverse,
     World,
-    first_drive,
-    ground_truth,
-    second_drive,
 )
-from stavpr_ros.demonstration.street.street import CELL, grow_street
+from stavpr_ros.demonstration.street.street import CELL, make_street
 from stavpr_ros.errors import InputError, SettingsError
 
 SIZE = (96, 72)
@@ -31,7 +30,9 @@ def world():
 
 def view(world, along, conditions, size=SIZE):
     """Render one image on the street."""
-    return Drive(world, Route(np.array([along]), np.array([False])), conditions, size=size)[0].image
+    return Traverse(world, Route(np.array([along]), np.array([False])), conditions, size=size)[
+        0
+    ].image
 
 
 def difference(a, b):
@@ -39,8 +40,8 @@ def difference(a, b):
 
 
 def test_traverse_images_are_rgb_and_not_blank(world):
-    for drive in (first_drive(world, 5, SIZE), second_drive(world, 5, SIZE)):
-        for frame in drive:
+    for traverse in (first_traverse(world, 5, SIZE), second_traverse(world, 5, SIZE)):
+        for frame in traverse:
             assert frame.image.shape == (72, 96, 3)
             assert frame.image.dtype == np.uint8
             assert frame.image.flags.c_contiguous
@@ -48,22 +49,25 @@ def test_traverse_images_are_rgb_and_not_blank(world):
 
 
 def test_world_with_same_seed_renders_same_bytes():
-    one, same, other = (second_drive(World(seed), 40, SIZE) for seed in (3, 3, 4))
+    one, same, other = (second_traverse(World(seed), 40, SIZE) for seed in (3, 3, 4))
     assert all(np.array_equal(one[k].image, same[k].image) for k in (0, 17, 39))
     assert not np.array_equal(one[17].image, other[17].image)
 
 
 def test_traverse_image_is_independent_of_order(world):
-    drive = second_drive(world, 30, SIZE)
-    alone = drive[12].image
-    assert np.array_equal(list(drive)[12].image, alone)
-    assert np.array_equal(drive[10:14][2].image, alone)
-    assert np.array_equal(drive[-18].image, alone)
+    traverse = second_traverse(world, 30, SIZE)
+    alone = traverse[12].image
+    assert np.array_equal(list(traverse)[12].image, alone)
+    assert np.array_equal(traverse[10:14][2].image, alone)
+    assert np.array_equal(traverse[-18].image, alone)
 
 
 def test_traverse_at_same_place_renders_same_scene(world):
-    drive = Drive(world, Route(np.full(2, 100.0), np.zeros(2, bool)), STILL, size=SIZE)
-    still, later = drive[0].image, drive[1].image  # only the cars ahead may have moved a little
+    traverse = Traverse(world, Route(np.full(2, 100.0), np.zeros(2, bool)), STILL, size=SIZE)
+    still, later = (
+        traverse[0].image,
+        traverse[1].image,
+    )  # only the cars ahead may have moved a little
     assert difference(still, later) < 1.0
     assert difference(view(world, 130.0, STILL), still) > 10.0
 
@@ -76,14 +80,16 @@ def shift_of_patch(before, after, x, y, size=36, reach=14):
 
 
 def test_render_with_lateral_step_shows_parallax(world):
-    """Houses at the sides are some 20 m away, what is seen around the vanishing point some 60 m and more."""
+    """Houses at the sides are some 20 m away, the vanishing point 60 m and more."""
     near, far = [], []
     for along in np.arange(20.0, 320.0, 20.0):
         before = view(world, along, replace(STILL, lane=0.0), (320, 240))
         after = view(world, along, replace(STILL, lane=0.6), (320, 240))
         near += [shift_of_patch(before, after, x, 60) for x in (24, 260)]
         far.append(shift_of_patch(before, after, 142, 116))
-    assert -9 <= np.median(near) <= -3  # the camera steps to the right, the image moves to the left
+    assert (
+        -9 <= np.median(near) <= -3
+    )  # the camera steps to the right, the image moves to the left
     assert abs(np.median(far)) <= 2
     assert abs(np.median(near)) >= 2 * abs(np.median(far))
 
@@ -106,10 +112,10 @@ def test_conditions_fog_hides_and_exposure_darkens(world):
 
 
 def test_default_traverses_have_expected_lengths_and_detour(world):
-    first, second = first_drive(world), second_drive(world)
+    first, second = first_traverse(world), second_traverse(world)
     assert len(first) == 300
     np.testing.assert_allclose(np.diff(first.position), 2.0)
-    truth = ground_truth(first, second)
+    truth = nearest_places(first, second)
     assert 300 <= len(second) <= 350
     assert 40 <= np.count_nonzero(truth < 0) <= 60
     assert np.all(np.diff(np.flatnonzero(truth < 0)) == 1)  # one stretch
@@ -118,7 +124,7 @@ def test_default_traverses_have_expected_lengths_and_detour(world):
 
 
 def test_second_traverse_stops_once_and_varies_speed(world):
-    second = second_drive(world)
+    second = second_traverse(world)
     step = np.diff(second.position)
     step = step[np.isfinite(step) & (step < 20)]  # not across the detour
     assert np.all(step >= 0)
@@ -130,25 +136,27 @@ def test_second_traverse_stops_once_and_varies_speed(world):
 
 
 def test_nearest_places_by_hand(world):
-    def drive(along, detour):
-        return Drive(world, Route(np.array(along), np.array(detour)), STILL, size=SIZE)
+    def traverse(along, detour):
+        return Traverse(world, Route(np.array(along), np.array(detour)), STILL, size=SIZE)
 
-    first = drive([0.0, 2.0, 4.0, 6.0], [False] * 4)
-    second = drive([0.9, 1.1, 50.0, 6.9, 3.0], [False, False, True, False, False])
-    assert ground_truth(first, second).tolist() == [0, 1, -1, 3, 1]  # the lower one on a tie
+    first = traverse([0.0, 2.0, 4.0, 6.0], [False] * 4)
+    second = traverse([0.9, 1.1, 50.0, 6.9, 3.0], [False, False, True, False, False])
+    assert nearest_places(first, second).tolist() == [0, 1, -1, 3, 1]  # the lower one on a tie
     assert np.isnan(second[2].position)
     with pytest.raises(InputError, match='1 of them without a position'):
-        ground_truth(second, first)
+        nearest_places(second, first)
 
 
 def test_world_detour_is_another_street(world):
     assert world.detour.seed != world.street.seed
-    here = Drive(world, Route(np.array([60.0, 60.0]), np.array([False, True])), STILL, size=SIZE)
+    here = Traverse(
+        world, Route(np.array([60.0, 60.0]), np.array([False, True])), STILL, size=SIZE
+    )
     assert difference(here[0].image, here[1].image) > 10.0
 
 
 def test_make_street_of_any_length_starts_equally():
-    short, long = grow_street(5, 100.0), grow_street(5, 400.0)
+    short, long = make_street(5, 100.0), make_street(5, 400.0)
     cells = int(100.0 / CELL)
     assert np.array_equal(short.lots[short.lot_of[:, :cells]], long.lots[long.lot_of[:, :cells]])
     assert long.lot_of.max() < len(long.lots)
@@ -172,10 +180,10 @@ def test_street_settings_out_of_range_are_rejected(world):
     with pytest.raises(SettingsError, match='detour from'):
         World(detour_from=500.0, detour_to=400.0)
     with pytest.raises(SettingsError, match='places is 1'):
-        first_drive(world, 1)
+        first_traverse(world, 1)
     with pytest.raises(SettingsError, match='images is 0'):
-        second_drive(world, 0)
+        second_traverse(world, 0)
     with pytest.raises(SettingsError, match='size of the images'):
-        first_drive(world, 5, (8, 8))
+        first_traverse(world, 5, (8, 8))
     with pytest.raises(IndexError, match='image 5'):
-        first_drive(world, 5, SIZE)[5]
+        first_traverse(world, 5, SIZE)[5]

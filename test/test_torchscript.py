@@ -1,13 +1,12 @@
-"""Features from TorchScript files: their output, inner modules of traced and scripted networks, errors."""
+"""Features of TorchScript files: outputs and inner modules, traced and scripted, errors."""
 
 import numpy as np
 import pytest
-import torch
-from torch import nn
-
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class, settings_class
+import torch
+from torch import nn
 
 pytestmark = pytest.mark.filterwarnings('ignore:.torch.jit:DeprecationWarning')
 
@@ -17,7 +16,10 @@ class Block(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.first, self.second = nn.Conv2d(3, 4, 3, padding=1), nn.Conv2d(4, 5, 3, stride=2, padding=1)
+        self.first, self.second = (
+            nn.Conv2d(3, 4, 3, padding=1),
+            nn.Conv2d(4, 5, 3, stride=2, padding=1),
+        )
         self.relu, self.unused = nn.ReLU(), nn.ReLU()
 
     def forward(self, x, shift):
@@ -51,7 +53,7 @@ class Branch(nn.Module):
 
 
 class Spoiled(nn.Module):
-    """Overwrites what its layer was given once the layer is done."""
+    """Overwrites the input of its layer after the layer."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -72,7 +74,9 @@ def net():
 def file(request, net, tmp_path_factory):
     path = tmp_path_factory.mktemp('script') / f'{request.param}.pt'
     script = (
-        torch.jit.trace(net, torch.rand(1, 3, 16, 16)) if request.param == 'traced' else torch.jit.script(net)
+        torch.jit.trace(net, torch.rand(1, 3, 16, 16))
+        if request.param == 'traced'
+        else torch.jit.script(net)
     )
     torch.jit.save(script, path)
     return path
@@ -88,31 +92,37 @@ def images(count: int, size: int = 16) -> list[np.ndarray]:
 
 
 def expected(net, layer: str, batch: torch.Tensor) -> torch.Tensor:
-    """What the module gives in its last call, taken by a hook from the network in Python."""
+    """Return the output of the module's last call, by a hook on the network in Python."""
     kept = []
-    hook = net.get_submodule(layer).register_forward_hook(lambda _, __, output: kept.append(output))
+    hook = net.get_submodule(layer).register_forward_hook(
+        lambda _, __, output: kept.append(output)
+    )
     with torch.no_grad():
         net(batch)
     hook.remove()
     return kept[-1]
 
 
-@pytest.mark.parametrize('layer', ['body.block', 'body.last', 'body.block.second', 'body.block.relu'])
+@pytest.mark.parametrize(
+    'layer', ['body.block', 'body.last', 'body.block.second', 'body.block.relu']
+)
 def test_torchscript_inner_layer_equals_hook(net, file, layer):
-    """The block also takes a second argument, and its ReLU is called twice: the last call counts."""
+    """The block has a second argument, and its ReLU two calls: the last one counts."""
     backbone = backbone_class('torchscript')(settings(file, layer=layer))
-    pictures = images(3)
-    batch = torch.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2).float()
+    three = images(3)
+    batch = torch.from_numpy(np.stack(three)).permute(0, 3, 1, 2).float()
     for _ in range(3):  # torch compiles a program anew in its second run
-        torch.testing.assert_close(backbone.feature_maps(pictures), expected(net, layer, batch))
+        torch.testing.assert_close(backbone.feature_maps(three), expected(net, layer, batch))
 
 
 def test_torchscript_runs_nothing_after_layer(file):
-    """At 32 pixels the head does not fit: what comes before it does not mind."""
+    """At 32 pixels the head does not fit: the layers before it run."""
     backbone = backbone_class('torchscript')(settings(file, layer='body.last', size=32))
     assert backbone.feature_maps(images(2)).shape == (2, 6, 16, 16)
     with pytest.raises(SettingsError, match='rejects 2 images of size 32'):
-        backbone_class('torchscript')(settings(file, layer='head', size=32)).feature_maps(images(2))
+        backbone_class('torchscript')(settings(file, layer='head', size=32)).feature_maps(
+            images(2)
+        )
 
 
 def test_torchscript_layer_keeps_its_input(tmp_path):
@@ -122,7 +132,7 @@ def test_torchscript_layer_keeps_its_input(tmp_path):
 
 
 def test_torchscript_output_by_hand(net, tmp_path):
-    """Worked by hand: the sum of four pixels; blue first, mean and deviation by channel; batch of two."""
+    """By hand: sums of four pixels; blue first, mean and std by channel; batch of two."""
     conv = nn.Conv2d(3, 1, 2, stride=2, bias=False)
     nn.init.constant_(conv.weight, 1)
     torch.jit.save(torch.jit.script(conv), tmp_path / 'sum.pt')
@@ -143,9 +153,13 @@ def test_torchscript_errors_name_file_and_layer(file, tmp_path):
     (tmp_path / 'broken.pt').write_bytes(file.read_bytes()[:-200])
     with pytest.raises(UnavailableError, match='no usable TorchScript file'):
         FeatureExtractor('torchscript', settings(tmp_path / 'broken.pt'))
-    with pytest.raises(SettingsError, match=r"no layer 'body\.fire'.*body, body\.block, body\.block\.first"):
+    with pytest.raises(
+        SettingsError, match=r"no layer 'body\.fire'.*body, body\.block, body\.block\.first"
+    ):
         FeatureExtractor('torchscript', settings(file, layer='body.fire'))
-    with pytest.raises(SettingsError, match=r"the layer 'body\.block\.unused', but calls it .* not at all"):
+    with pytest.raises(
+        SettingsError, match=r"the layer 'body\.block\.unused', but calls it .* not at all"
+    ):
         FeatureExtractor('torchscript', settings(file, layer='body.block.unused'))
     with pytest.raises(SettingsError, match=r'returns \(1, 10\) for 1 images: expected a map'):
         FeatureExtractor('torchscript', settings(file)).extract(images(1))
@@ -190,4 +204,6 @@ def test_torchscript_in_half_precision_on_gpu_is_close(file, net):
     batch = torch.from_numpy(np.stack(images(2))).permute(0, 3, 1, 2).float() / 255
     maps = backbone.feature_maps(images(2))
     assert maps.dtype == torch.float16
-    torch.testing.assert_close(maps.float().cpu(), expected(net, 'body.last', batch), rtol=1e-2, atol=1e-2)
+    torch.testing.assert_close(
+        maps.float().cpu(), expected(net, 'body.last', batch), rtol=1e-2, atol=1e-2
+    )

@@ -1,33 +1,32 @@
 """
 Maps of format version 1, as robots have them: they load and recognize, and their keys are fixed.
 
-The files in ``data/version1`` were written by commit eb40c94, before the rename of most names, with
-its ``build_map(frames, Describer(kind, settings_class(kind)(**BACKBONE), STRIPS, PROJECTION))`` on
-the eight images ``route_images(8)`` of conftest.py. That of ``gradient_projected`` has stamps,
+The files in ``data/version1`` were written by commit eb40c94, before most names changed, with its
+``build_map`` on the eight images ``route_images(8)`` of conftest.py, and with an extractor of the
+kind, settings, strips and projection of the table ``MAPS`` below. ``gradient_projected`` has stamps,
 identifiers, poses (x = i, that of place 3 unknown) and thumbnails 48 pixels wide. ``tiny.onnx`` and
 ``tiny.pt`` are one convolution and a ReLU; the weights of the paper's networks are the random ones
 of conftest.py, whose files are equal to the bit on every machine.
 """
 
 import json
-import zipfile
 from pathlib import Path
+import zipfile
 
+from conftest import route_images
 import cv2
 import numpy as np
 import pytest
-import torch
-from conftest import route_images
-
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.features import KINDS
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+import torch
 
 FOLDER = Path(__file__).parent / 'data' / 'version1'
 PLACES = 8
 IMAGENET = {'mean': [0.485, 0.456, 0.406], 'std': [0.229, 0.224, 0.225], 'scale': 1 / 255}
-# File: kind, its settings (BACKBONE), STRIPS, and the dimensions of the PROJECTION.
+# File: kind, its settings, strips, dimensions of the projection (seed 0).
 MAPS = {
     'gradient': (
         'gradient',
@@ -76,7 +75,7 @@ MAPS = {
 
 @pytest.fixture
 def model(request, name):
-    """The file of the map's network: stored beside the map, or made anew."""
+    """Return the file of the map's network: stored beside the map, or made again."""
     stored = {'onnx': 'tiny.onnx', 'torchscript': 'tiny.pt'}
     if name in stored:
         return str(FOLDER / stored[name])

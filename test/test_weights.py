@@ -1,32 +1,31 @@
-"""Files of weights: paths, cache, downloads from a server of our own, hashes, hostile and damaged files."""
+"""Files of weights: paths, cache, downloads from a local server, hashes, damaged files."""
 
 import hashlib
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import io
 import pickle
 import socket
 import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+from checkpoints import Call, Global, OldPickle
 import numpy as np
 import pytest
-import torch
-from checkpoints import Call, Global, OldPickle
-from torch import nn
-
 from stavpr_ros.errors import FeatureMismatchError, UnavailableError
 from stavpr_ros.features.paper_networks import PublishedNetwork
 from stavpr_ros.features.registry import PublishedSettings
 from stavpr_ros.features.weights import (
-    PublishedFile,
     cache_folder,
     download,
     expected_hash,
+    PublishedFile,
     read_checkpoint,
 )
+import torch
+from torch import nn
 
 
 class Tiny(PublishedNetwork):
-    """One convolution and a rest that no one needs; the tests say where it is published."""
+    """One convolution and unused layers; the tests set its address."""
 
     @staticmethod
     def whole_network():
@@ -45,7 +44,7 @@ def saved(content: object) -> bytes:
 
 @pytest.fixture(scope='module')
 def content():
-    """A file of weights for Tiny, as torch writes it now."""
+    """Return a file of weights for Tiny in the current format of torch."""
     torch.manual_seed(0)
     return saved(Tiny.whole_network().state_dict())
 
@@ -57,15 +56,15 @@ def cache(tmp_path, monkeypatch):
 
 
 class Server:
-    """Serves one answer under every address, and counts how often it was asked."""
+    """Serves one response under every address, and counts the requests."""
 
     def __init__(self) -> None:
-        self.status, self.body, self.announced, self.asked = 200, b'', None, 0
+        self.status, self.body, self.announced, self.requests = 200, b'', None, 0
         outer = self
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self):
-                outer.asked += 1
+                outer.requests += 1
                 self.send_response(outer.status)
                 self.send_header('Content-Length', str(outer.announced or len(outer.body)))
                 self.end_headers()
@@ -115,9 +114,11 @@ def test_published_files_have_official_names():
 
 
 def test_network_by_default_downloads_nothing(server, cache):
-    with pytest.raises(UnavailableError, match=rf"{cache}/tiny\.pth.*'download'.*{server.address}"):
+    with pytest.raises(
+        UnavailableError, match=rf"{cache}/tiny\.pth.*'download'.*{server.address}"
+    ):
         Tiny(PublishedSettings())
-    assert server.asked == 0
+    assert server.requests == 0
     assert not cache.exists()
 
 
@@ -125,15 +126,15 @@ def test_download_happens_once(server, cache, content, capsys):
     first = tiny(model='download')
     digest = hashlib.sha256(content).hexdigest()
     assert first.settings.sha256 == digest
-    assert first.settings.model == 'cached'  # what a map remembers must not download elsewhere
+    assert first.settings.model == 'cached'  # recorded in maps: no download elsewhere
     assert sorted(path.name for path in cache.iterdir()) == ['tiny.pth', 'tiny.pth.sha256']
     assert (cache / 'tiny.pth.sha256').read_text() == f'{digest}  tiny.pth\n'
-    assert digest in (said := capsys.readouterr().err)
-    assert 'trusted now' in said
+    assert digest in (printed := capsys.readouterr().err)
+    assert 'trusted now' in printed
     server.http.shutdown()
     for model in ('download', 'cached', str(cache / 'tiny.pth')):
         assert tiny(model=model).settings == first.settings
-    assert server.asked == 1
+    assert server.requests == 1
 
 
 @pytest.mark.parametrize(
@@ -180,7 +181,9 @@ def test_download_to_unwritable_cache_fails(server, tmp_path, monkeypatch):
         Tiny(PublishedSettings(model='download'))
 
 
-def test_download_with_other_published_hash_is_rejected(server, cache, content, monkeypatch, capsys):
+def test_download_with_other_published_hash_is_rejected(
+    server, cache, content, monkeypatch, capsys
+):
     monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address, sha256='0123abcd'))
     with pytest.raises(UnavailableError, match=r'expected 0123abcd: it was changed or damaged'):
         Tiny(PublishedSettings(model='download'))
@@ -192,7 +195,7 @@ def test_download_with_other_published_hash_is_rejected(server, cache, content, 
 
 
 def test_download_unlike_the_first_is_rejected(server, cache, content):
-    """A file that was deleted and got again must be that of the first time, while the note is there."""
+    """A file that was deleted and downloaded again must equal the first one."""
     tiny(model='download')
     (cache / 'tiny.pth').unlink()
     server.body = content + b'\x00'
@@ -260,8 +263,16 @@ WEIGHT = torch.arange(6.0).reshape(2, 3)
     [
         saved({'a.weight': WEIGHT}),
         saved({'a.weight': nn.Parameter(WEIGHT)}),
-        saved({'epoch': 3, 'state_dict': {'module.a.weight': WEIGHT}, 'best_prec1': torch.tensor(1.0)}),
-        OldPickle().file({'epoch': 90, 'arch': 'x', 'state_dict': {'module.a.weight': WEIGHT}, 'best': None}),
+        saved(
+            {
+                'epoch': 3,
+                'state_dict': {'module.a.weight': WEIGHT},
+                'best_prec1': torch.tensor(1.0),
+            }
+        ),
+        OldPickle().file(
+            {'epoch': 90, 'arch': 'x', 'state_dict': {'module.a.weight': WEIGHT}, 'best': None}
+        ),
     ],
     ids=['plain', 'parameters', 'with entries', 'Python 2'],
 )
@@ -283,24 +294,38 @@ class Hostile:
 def test_read_checkpoint_executes_nothing(tmp_path):
     mark = tmp_path / 'executed'
     old = OldPickle().file({'state_dict': Call(Global('posix', 'mkdir'), (str(mark),))})
-    for hostile in (saved({'a.weight': Hostile(str(mark))}), old, pickle.dumps(Hostile(str(mark)))):
-        with pytest.raises(UnavailableError, match=r'some\.pth cannot be read as a file of weights'):
+    for hostile in (
+        saved({'a.weight': Hostile(str(mark))}),
+        old,
+        pickle.dumps(Hostile(str(mark))),
+    ):
+        with pytest.raises(
+            UnavailableError, match=r'some\.pth cannot be read as a file of weights'
+        ):
             read(tmp_path, hostile)
         assert not mark.exists()
     with pytest.raises(UnavailableError, match=r'requires posix\.mkdir, .* not executed'):
         read(tmp_path, old)
 
 
-@pytest.mark.filterwarnings('ignore::DeprecationWarning', 'ignore:.*looks like a TorchScript archive')
+@pytest.mark.filterwarnings(
+    'ignore::DeprecationWarning', 'ignore:.*looks like a TorchScript archive'
+)
 def test_read_checkpoint_of_other_files_fails(tmp_path, content):
     stream = io.BytesIO()
     torch.jit.save(torch.jit.script(nn.ReLU()), stream)
     old = OldPickle().file({'a.weight': WEIGHT})
     for bad in (b'', b'no model', b'<!DOCTYPE html>', content[:-100], old[:-4], stream.getvalue()):
-        with pytest.raises(UnavailableError, match=r'some\.pth cannot be read as a file of weights: .'):
+        with pytest.raises(
+            UnavailableError, match=r'some\.pth cannot be read as a file of weights: .'
+        ):
             read(tmp_path, bad)
-    for bad, what in (({}, 'nothing'), ([1], 'a list'), ({'state_dict': 3}, "a int as 'state_dict'")):
-        with pytest.raises(UnavailableError, match=f'holds {what}'):
+    for bad, kind in (
+        ({}, 'nothing'),
+        ([1], 'a list'),
+        ({'state_dict': 3}, "a int as 'state_dict'"),
+    ):
+        with pytest.raises(UnavailableError, match=f'holds {kind}'):
             read(tmp_path, saved(bad))
 
 

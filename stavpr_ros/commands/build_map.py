@@ -240,9 +240,9 @@ def main(args: list[str] | None = None) -> int:
     wait_passively()
     state = 'nothing was written'
     try:
+        arguments = _parser().parse_args(args)
         from stavpr_ros.mapping import save_map
 
-        arguments = _parser().parse_args(args)
         place_map = _build(arguments)
         save_map(place_map, arguments.output)
         state = f'{arguments.output} is written, without a suggested threshold'
