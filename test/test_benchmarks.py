@@ -141,7 +141,7 @@ def test_operations_of_the_alignments_are_those_of_their_cells():
 
 
 def test_operations_of_the_velocity_search_are_those_of_its_predecessors():
-    # one velocity of 1: rows 1 (up to the middle) and 2, 3 (after it), two further predecessors each
+    # one velocity of 1: row 1 (the middle) and rows 2, 3 after it, two further predecessors each
     settings = VelocitySettings(speeds=(1.0,))
     rows = (1 + 2 * 3) + 2 * (1 + 2 * 4)
     work = bounds.velocity_search(bounds.Sizes(10, l=4), settings)
@@ -303,7 +303,7 @@ def test_report_counts_losses_and_sums_the_stages_of_a_frame():
     assert '## Beside peers (1 of 1 lost)' in text
     assert '| 1 MB | 3 MB | 3 | <= 1.1 | **not reached** |' in text
     assert (
-        '| lm_dtw | paper | 20,000 | - | float32 | times librosa | 0.5 | >= 100 | **not reached** |'
+        'paper | 20,000 | - | float32 | times librosa | 0.5 | >= 100 | **not reached** |'
         in text
     )
     assert '| x | 1 | - | why |' in text
@@ -391,7 +391,7 @@ def test_prange_gives_the_results_of_the_oracle(n):
 
 
 class FakePeers:
-    """Peers that take half a second for each start and accumulate the oracle's sums of a window."""
+    """Peers that take half a second for a start and accumulate the oracle's sums of a window."""
 
     versions = {'librosa': '9', 'tslearn': '8'}  # noqa: RUF012
 
