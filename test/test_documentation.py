@@ -1,0 +1,145 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The documentation: its examples run, its names exist, its numbers are those of the results."""
+
+import json
+from pathlib import Path
+import re
+import shlex
+import subprocess
+import sys
+
+from conftest import route_images
+import cv2
+import pytest
+
+from stavpr_ros.commands.stavpr import COMMANDS
+from stavpr_ros.parameters import PARAMETERS
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').glob('*.md'))]
+README_LINES = 180
+NAMES = {row.name for row in PARAMETERS}
+
+
+def write_images(folder: Path, count: int, seed: int) -> None:
+    folder.mkdir()
+    for i, image in enumerate(route_images(count, seed)):
+        cv2.imwrite(str(folder / f'{i:03d}.png'), image)
+
+
+@pytest.fixture(scope='module')
+def workspace(tmp_path_factory) -> Path:
+    """A folder with the images and ground truth that the examples name."""
+    folder = tmp_path_factory.mktemp('workspace')
+    for name, seed in (('monday', 0), ('tuesday', 0), ('another_town', 7)):
+        write_images(folder / name, 40, seed)
+    for name, copy in (('summer', 'monday'), ('winter', 'tuesday'), ('loop', 'monday')):
+        (folder / name).symlink_to(folder / copy)
+    (folder / 'pairs.csv').write_text(''.join(f'{i},{i}\n' for i in range(40)))
+    return folder
+
+
+def code_blocks(page: Path, language: str = '') -> list[str]:
+    return re.findall(rf'^```{language}\n(.*?)^```', page.read_text(), re.M | re.S)
+
+
+def documented_commands() -> list[list[str]]:
+    """Every ``build_map``, ``evaluate``, ``replay`` and ``record`` command of the pages."""
+    found = []
+    for page in PAGES:
+        for block in code_blocks(page):
+            for line in block.replace('\\\n', ' ').splitlines():
+                words = shlex.split(line.split('  #')[0].removeprefix('$ '), comments=False)
+                words = [word.removeprefix('$bin/') for word in words if word != '&']
+                if words[:3] == ['ros2', 'run', 'stavpr_ros']:
+                    words = words[3:]
+                if words and words[0] in COMMANDS and words[0] != 'node':
+                    found.append(words)
+    return found
+
+
+def test_readme_python_example_runs(workspace):
+    (example,) = code_blocks(ROOT / 'README.md', 'python')
+    done = subprocess.run(
+        [sys.executable, '-c', example], cwd=workspace, capture_output=True, text=True, check=True
+    )
+    lines = done.stdout.splitlines()
+    assert len(lines) == 40
+    assert lines[0].startswith('0 WARMING_UP -1 nan')
+    assert [line.split()[1] for line in lines[30:]] == ['MATCH'] * 10
+
+
+def test_build_map_and_evaluate_examples_run(workspace):
+    python = [sys.executable, '-m', 'stavpr_ros.commands.stavpr']
+    examples = [
+        ['build_map', '--input', 'monday/', '--output', 'monday.stavpr'],
+        ['evaluate', '--map', 'summer/', '--query', 'winter/', '--warp', 'vary', '--crop-map']
+        + ['0.3', '--crop-query', '0.1', '--json', 'result.json'],
+        ['evaluate', '--map', 'monday/', '--query', 'tuesday/', '--truth', 'pairs.csv']
+        + ['--unknown', 'another_town/', '--json', 'unknown.json'],
+    ]
+    documented = documented_commands()
+    for words in examples:
+        assert any(words[: len(given)] == given for given in documented), f'undocumented: {words}'
+        subprocess.run([*python, *words], cwd=workspace, capture_output=True, check=True)
+    assert json.loads((workspace / 'result.json').read_text())['settings']['mode'] == 'robust'
+    assert (workspace / 'monday.stavpr').stat().st_size > 0
+
+
+def test_documented_options_exist():
+    commands = documented_commands()
+    assert len(commands) > 8
+    helps: dict[str, str] = {}
+    for name, *words in commands:
+        if name not in helps:
+            program = [sys.executable, '-m', 'stavpr_ros.commands.stavpr', name, '--help']
+            done = subprocess.run(program, capture_output=True, text=True, check=True)
+            helps[name] = done.stdout
+        for word in words:
+            if word.startswith('--') and word != '--ros-args':
+                assert re.search(rf'{re.escape(word)}\b', helps[name]), f'{name} has no {word}'
+
+
+def test_documented_parameters_exist():
+    text = '\n'.join(page.read_text() for page in PAGES)
+    given = set(re.findall(r'-p (\w+):=', text)) | set(re.findall(r'param set /stavpr (\w+)', text))
+    assert given
+    assert given <= NAMES
+    table = (ROOT / 'README.md').read_text().partition('| parameter |')[2].partition('\n\n')[0]
+    assert set(re.findall(r'^\| `(\w+)`', table, re.M)) <= NAMES
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_links_between_pages_resolve(page):
+    for target in re.findall(r'\]\((?!https?://)([^)#\s]+)', page.read_text()):
+        assert (page.parent / target).exists(), f'{page.name} links to {target}'
+
+
+def test_readme_is_short():
+    assert len((ROOT / 'README.md').read_text().splitlines()) <= README_LINES
+
+
+def test_readme_results_are_those_of_the_accuracy_table():
+    results = ROOT / 'benchmarks/results/accuracy-eb40c94.json'
+    table = json.loads(results.read_text())['results']
+
+    def f1(key: str) -> float:
+        return float(table[key]['sequence']['f1'])
+
+    rows = {
+        mode: [float(cell) for cell in re.findall(r'[\d.]+', line)]
+        for mode, line in re.findall(
+            r'^\| `(paper|robust)` \| ([.\d| ]+)\|$', (ROOT / 'README.md').read_text(), re.M
+        )
+    }
+    assert set(rows) == {'paper', 'robust'}
+    for mode, numbers in rows.items():
+        speeds = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')
+        expected = [
+            f1(f'gardens_point/g/{mode}/same'),
+            min(f1(f'gardens_point/g/{mode}/{speed}') for speed in speeds),
+            f1(f'nordland/g/{mode}/same'),
+            f1(f'corridor/g/{mode}/same'),
+        ]
+        assert numbers == pytest.approx(expected, abs=0.0006)
