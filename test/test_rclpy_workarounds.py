@@ -283,10 +283,3 @@ def test_services_of_a_destroyed_lifecycle_node_of_upstream_stay(context, node):
     managed.destroy_node()
     wait_until(lambda: '/managed/get_parameters' not in services(node))
     assert '/managed/get_state' in services(node)
-
-
-def test_services_of_a_destroyed_managed_node_are_removed(context, node):
-    managed = ManagedNode('managed', context=context)
-    assert '/managed/get_state' in services(node)
-    managed.destroy_node()
-    wait_until(lambda: '/managed/get_state' not in services(node))

@@ -158,9 +158,9 @@ class ManagedNode(LifecycleNodeMixin, Node):
         No upstream issue was found: rclpy leaves these services to the garbage collector, and
         until then other nodes discover them and send requests that nobody answers.
         """
-        super().destroy_node()
         if not self.left_behind:  # otherwise a transition may still be running
             self._state_machine.destroy_when_not_in_use()
+        super().destroy_node()
 
     def _change_or_reject(self, request: Any, response: Any) -> Any:
         requested = request.transition.label or request.transition.id
