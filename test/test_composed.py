@@ -112,7 +112,7 @@ def test_failed_odometry_subscription_is_the_problem(make, map_file):
     assert node.trigger_configure() == node.trigger_activate() == SUCCESS
     assert set_parameter(node, 'keyframe_distance', 1.0).successful
     assert 'correct qos_overrides./odom.subscription' in node.runtime.problem
-    assert node.runtime.pipeline.settings.keyframes.meters == 1
+    assert node.runtime.pipeline.settings.keyframes.distance == 1
 
 
 def test_odometry_is_subscribed_while_it_is_needed(make, map_file):

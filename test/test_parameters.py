@@ -91,9 +91,9 @@ def test_default_values_give_default_settings():
         ('sequence_length', 7, 'sequence.length', 7),
         ('beta', 3.0, 'sequence.beta', 3.0),
         ('threshold', 0.3, 'threshold', 0.3),
-        ('keyframe_interval', 1.5, 'keyframes.seconds', 1.5),
-        ('keyframe_distance', 2.5, 'keyframes.meters', 2.5),
-        ('keyframe_angle', 3.5, 'keyframes.degrees', 3.5),
+        ('keyframe_interval', 1.5, 'keyframes.interval', 1.5),
+        ('keyframe_distance', 2.5, 'keyframes.distance', 2.5),
+        ('keyframe_angle', 3.5, 'keyframes.angle', 3.5),
         ('geometric_check', 'sift', 'geometric.method', 'sift'),
     ],
 )

@@ -2,7 +2,6 @@
 
 import cv2
 import numpy as np
-
 from stavpr_ros.errors import InputError
 
 RIGHT, NO_MATCH = (46, 125, 80), (200, 150, 40)  # RGB

@@ -1,12 +1,12 @@
 """The pipeline: from one image message to one match; the map and the operation."""
 
-import math
-import os
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+import math
+import os
 from pathlib import Path
+import time
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from stavpr_ros.mapping import GrowingMap, place_thumbnail, PlaceMap
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.pipeline.operations import Mapping, Observation, Operation
-from stavpr_ros.pipeline.saving import MapSnapshot, SaveState
+from stavpr_ros.pipeline.save_state import MapSnapshot, SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.pipeline.start import LoadedMap, start_operation
 from stavpr_ros.recognition import Match, Status

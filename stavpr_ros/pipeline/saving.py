@@ -1,67 +1,21 @@
 """Saving a recorded map while images are processed; files of other maps are never overwritten."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 import itertools
 from logging import Logger
 import os
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from stavpr_ros.errors import StavprError
-from stavpr_ros.mapping import PlaceMap, save_map
-
-if TYPE_CHECKING:
-    from stavpr_ros.pipeline.pipeline import Pipeline
+from stavpr_ros.mapping import save_map
+from stavpr_ros.pipeline.pipeline import Pipeline
+from stavpr_ros.pipeline.save_state import SaveState
 
 OnWorker = Callable[[Callable[[], Any]], Any]
 
 
-@dataclass
-class SaveState:
-    """
-    Files that hold a map, and the number of its recorded places that are in none.
-
-    :param path: file that the map was loaded from or last saved to, '' = none.
-    :param recorded: places recorded since the map was loaded or started; ``saved`` of them are in
-        a file.
-    """
-
-    path: str = ''
-    recorded: int = 0
-    saved: int = 0
-    _files: set[str] = field(default_factory=set)
-
-    def __post_init__(self) -> None:
-        if self.path:
-            self._files.add(os.path.abspath(self.path))
-
-    @property
-    def unsaved(self) -> int:
-        """Number of recorded places that are in no file."""
-        return self.recorded - self.saved
-
-    def owns(self, path: str) -> bool:
-        """Return whether a file holds, or held, this map, and may be overwritten."""
-        return os.path.abspath(path) in self._files
-
-
-@dataclass(frozen=True)
-class MapSnapshot:
-    """A map to be written, and its state when it was copied."""
-
-    places: PlaceMap
-    state: SaveState
-    recorded: int
-
-    def mark_saved(self, path: str) -> None:
-        """Update the state after writing; later places, or another map in use, are unaffected."""
-        state = self.state
-        state.path, state.saved = path, max(state.saved, self.recorded)
-        state._files.add(os.path.abspath(path))
-
-
-def write_map(pipeline: 'Pipeline', on_worker: OnWorker, path: str, overwrite: bool) -> int:
+def write_map(pipeline: Pipeline, on_worker: OnWorker, path: str, overwrite: bool) -> int:
     """
     Write the map of the pipeline to a file, on this thread; return its number of places.
 
@@ -75,7 +29,7 @@ def write_map(pipeline: 'Pipeline', on_worker: OnWorker, path: str, overwrite: b
 
 
 def save_recorded_map(
-    pipeline: 'Pipeline', on_worker: OnWorker, path: str, log: 'Logger | Any'
+    pipeline: Pipeline, on_worker: OnWorker, path: str, log: 'Logger | Any'
 ) -> None:
     """
     Write unsaved places to ``path``; log errors.

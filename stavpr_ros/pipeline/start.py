@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, PlaceMap, open_map
+from stavpr_ros.mapping import GrowingMap, open_map, PlaceMap
 from stavpr_ros.pipeline.operations import Localization, LoopClosing, Mapping, Operation
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.recognition import PlaceRecognizer

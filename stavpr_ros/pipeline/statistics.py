@@ -1,11 +1,11 @@
 """Counts of the node: images, results, drops, and the time of each stage."""
 
-import math
-import threading
-import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+import math
+import threading
+import time
 from typing import Generic, TypeVar
 
 RECENT = 10

@@ -1,19 +1,44 @@
 """The services of the node; each returns the error as its message."""
 
 from collections.abc import Callable
-from typing import Any, TYPE_CHECKING
+from typing import Any, Protocol
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
+from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.saving import write_map
 from stavpr_ros.ros.messages import candidates_message, match_message
 from stavpr_ros.ros.rclpy_workarounds import repeat_responses
+from stavpr_ros.ros.runtime import Runtime
 from std_srvs.srv import Trigger
 
-if TYPE_CHECKING:
-    from stavpr_ros.ros.node import PlaceRecognitionNode
-    from stavpr_ros.ros.runtime import Runtime
+
+class ServedNode(Protocol):
+    """The node of the services."""
+
+    @property
+    def runtime(self) -> Runtime:
+        """The runtime; raises StavprError while the node is not configured."""
+
+    @property
+    def settings(self) -> NodeSettings:
+        """The settings in force."""
+
+    def load_map(self, path: str) -> None:
+        """Load a map and use it."""
+
+    def set_operation(self, operation: str) -> None:
+        """Change the operation."""
+
+    def publish_map_info(self) -> None:
+        """Publish ``~/map_info``."""
+
+    def get_logger(self) -> Any:
+        """Return the logger."""
+
+    def create_service(self, *arguments: Any, **options: Any) -> Any:
+        """Create a service."""
 
 
 class Services:
@@ -23,7 +48,7 @@ class Services:
     They share a callback group of their own: a long request delays neither images nor diagnostics.
     """
 
-    def __init__(self, node: 'PlaceRecognitionNode') -> None:
+    def __init__(self, node: ServedNode) -> None:
         self._node = node
         group = MutuallyExclusiveCallbackGroup()
         for kind, name, serve in (
@@ -39,7 +64,7 @@ class Services:
             )
 
     def _callback(
-        self, name: str, serve: Callable[['Runtime', Any, Any], str]
+        self, name: str, serve: Callable[[Runtime, Any, Any], str]
     ) -> Callable[[Any, Any], Any]:
         """Return a service callback that fills ``success`` and ``message``, and logs errors."""
 
@@ -59,14 +84,14 @@ class Services:
 
         return callback
 
-    def _load_map(self, runtime: 'Runtime', request: Any, response: Any) -> str:
+    def _load_map(self, runtime: Runtime, request: Any, response: Any) -> str:
         if not request.path:
             raise StavprError("path = '' is no file: set the path of the map")
         self._node.load_map(request.path)
         response.map = runtime.map_info()
         return f'{response.map.places} places from {request.path}'
 
-    def _save_map(self, runtime: 'Runtime', request: Any, response: Any) -> str:
+    def _save_map(self, runtime: Runtime, request: Any, response: Any) -> str:
         path = request.path or self._node.settings.save_path or runtime.pipeline.path
         if not path:
             raise StavprError(
@@ -76,11 +101,11 @@ class Services:
         self._node.publish_map_info()
         return f'{response.places} places to {path}'
 
-    def _reset(self, runtime: 'Runtime', request: Any, response: Any) -> str:
+    def _reset(self, runtime: Runtime, request: Any, response: Any) -> str:
         runtime.reset()
         return 'the window is empty'
 
-    def _relocalize(self, runtime: 'Runtime', request: Any, response: Any) -> str:
+    def _relocalize(self, runtime: Runtime, request: Any, response: Any) -> str:
         count = request.count or self._node.settings.pipeline.candidates
 
         def relocalize() -> None:
@@ -95,6 +120,6 @@ class Services:
         runtime.worker.run(relocalize)
         return response.match.reason or f'place {response.match.place_index}'
 
-    def _set_operation(self, runtime: 'Runtime', request: Any, response: Any) -> str:
+    def _set_operation(self, runtime: Runtime, request: Any, response: Any) -> str:
         self._node.set_operation(request.operation)
         return f'operation {request.operation}'

@@ -1,0 +1,50 @@
+"""The files of a map, and its recorded places that are in none of them."""
+
+from dataclasses import dataclass, field
+import os
+
+from stavpr_ros.mapping import PlaceMap
+
+
+@dataclass
+class SaveState:
+    """
+    Files that hold a map, and the number of its recorded places that are in none.
+
+    :param path: file that the map was loaded from or last saved to, '' = none.
+    :param recorded: places recorded since the map was loaded or started; ``saved`` of them are in
+        a file.
+    """
+
+    path: str = ''
+    recorded: int = 0
+    saved: int = 0
+    _files: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        if self.path:
+            self._files.add(os.path.abspath(self.path))
+
+    @property
+    def unsaved(self) -> int:
+        """Number of recorded places that are in no file."""
+        return self.recorded - self.saved
+
+    def owns(self, path: str) -> bool:
+        """Return whether a file holds, or held, this map, and may be overwritten."""
+        return os.path.abspath(path) in self._files
+
+
+@dataclass(frozen=True)
+class MapSnapshot:
+    """A map to be written, and its state when it was copied."""
+
+    places: PlaceMap
+    state: SaveState
+    recorded: int
+
+    def mark_saved(self, path: str) -> None:
+        """Update the state after writing; later places, or another map in use, are unaffected."""
+        state = self.state
+        state.path, state.saved = path, max(state.saved, self.recorded)
+        state._files.add(os.path.abspath(path))
