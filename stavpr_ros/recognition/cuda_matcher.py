@@ -21,8 +21,7 @@ PLACES_IN_PIECES = (
 
 class CudaMatcher:
     """
-    See :class:`stavpr_ros.recognition.matcher.Matcher`; this one works on torch's current CUDA
-    device.
+    See :class:`stavpr_ros.recognition.matcher.Matcher`; on torch's current CUDA device.
 
     Products by torch, alignment by the kernel of the strategy. Calls are queued on torch's current
     stream.
