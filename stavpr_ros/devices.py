@@ -20,7 +20,9 @@ def choose_device(requested: str) -> str:
         raise SettingsError(f'device {requested!r} is unknown: take one of {", ".join(DEVICES)}')
     available = torch.cuda.is_available()
     if requested == 'cuda' and not available:
-        raise UnavailableError("device 'cuda': torch sees no CUDA device here; take 'cpu' or 'auto'")
+        raise UnavailableError(
+            "device 'cuda': torch sees no CUDA device here; take 'cpu' or 'auto'"
+        )
     return ('cuda' if available else 'cpu') if requested == 'auto' else requested
 
 
@@ -29,7 +31,8 @@ def choose_backend(requested: str) -> str:
     Turn ``auto`` into the backend of the matching, ``cuda`` or ``cpu``.
 
     :raises SettingsError: no such backend.
-    :raises UnavailableError: ``cuda`` was requested, and its device or the package numba-cuda is not available.
+    :raises UnavailableError: ``cuda`` was requested, and its device or the package numba-cuda is
+        not available.
     """
     if requested == 'auto':
         return 'cpu' if why_no_cuda() else 'cuda'

@@ -27,7 +27,9 @@ MAY_IMPORT = {
 
 
 MODULES = {
-    '.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts).removesuffix('.__init__'): path
+    '.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts).removesuffix(
+        '.__init__'
+    ): path
     for path in sorted(PACKAGE.rglob('*.py'))
 }
 
@@ -75,7 +77,9 @@ def test_every_folder_is_in_the_plan():
 
 def test_importing_the_package_is_light():
     code = 'import sys, stavpr_ros; print(*sys.modules)'
-    loaded = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
+    loaded = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=True
+    ).stdout
     assert not {'torch', 'numba', 'numpy', 'cv2', 'rclpy', 'rosbags'} & set(loaded.split())
 
 

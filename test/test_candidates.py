@@ -62,12 +62,18 @@ def test_an_example_by_hand():
     nearest = nearest_of(costs, places, 0.05)
     ranked = ranked_candidates(nearest, (costs, places), 9, 2, False)
     # 12 is within two places of the nearest, and 13 of 14, which is nearer
-    assert ranked == [Candidate(10, 0.05), Candidate(14, float(np.float32(0.2))), Candidate(0, 0.5)]
+    assert ranked == [
+        Candidate(10, 0.05),
+        Candidate(14, float(np.float32(0.2))),
+        Candidate(0, 0.5),
+    ]
 
 
 def test_scores_are_evidence_against_the_nearest():
     costs, places = np.array([-3.0, -1.0, -2.875], np.float32), np.array([0, 50, 100])
-    found = ranked_candidates(nearest_of(costs, places, 0.125), (costs, places), 3, 10, relative=True)
+    found = ranked_candidates(
+        nearest_of(costs, places, 0.125), (costs, places), 3, 10, relative=True
+    )
     assert found == [
         Candidate(0, 0.125),
         Candidate(100, score(evidence(-2.875, -3.0))),
@@ -94,7 +100,10 @@ def test_the_first_two_are_the_nearest_and_the_runner_up(small_map, mode):
             assert ranked == []
             continue
         assert (ranked[0].place, ranked[0].distance) == (nearest.middle, nearest.distance)
-        assert (ranked[1].place, ranked[1].distance) == (nearest.second_best_index, nearest.second_best_distance)
+        assert (ranked[1].place, ranked[1].distance) == (
+            nearest.second_best_index,
+            nearest.second_best_distance,
+        )
         assert len(ranked) == 4
         places = sorted(c.place for c in ranked)
         assert min(np.diff(places)) > 5

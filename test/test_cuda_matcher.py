@@ -49,7 +49,9 @@ def features(n, seed=0, strips=W, zero=()):
     weights = torch.rand((strips, n), generator=generator) + 0.1
     for strip, image in zero:
         x[strip, image] = weights[strip, image] = 0
-    return LocalFeatures(x, weights / weights.norm(dim=0), FeatureSettings('gradient', None, strips))
+    return LocalFeatures(
+        x, weights / weights.norm(dim=0), FeatureSettings('gradient', None, strips)
+    )
 
 
 def rounded(x, precision):
@@ -62,7 +64,9 @@ def expected_row(reference, query, i, settings):
     x, y = query.strips[:, i].double().numpy(), reference.strips.double().numpy()
     products = np.einsum('id,jnd->ijn', x, y)
     if settings.strategy == 'none':
-        weights = query.weights[:, i].double().numpy()[:, None] * reference.weights.double().numpy()
+        weights = (
+            query.weights[:, i].double().numpy()[:, None] * reference.weights.double().numpy()
+        )
         return 1 - (np.einsum('iin->in', products) * weights).sum(axis=0)
     return oracle.image_distances(1 - products, settings.strategy, settings.sigma, settings.xi)
 

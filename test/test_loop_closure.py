@@ -16,7 +16,12 @@ from stavpr_ros.alignment.velocity import best_velocity_match, match_velocities
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition import RecognizerSettings, Status
-from stavpr_ros.recognition.loop_closer import EVICTED, LEAST_PLACES, LoopCloser, choose_loop_backend
+from stavpr_ros.recognition.loop_closer import (
+    EVICTED,
+    LEAST_PLACES,
+    LoopCloser,
+    choose_loop_backend,
+)
 from stavpr_ros.recognition.robust.hysteresis import Hysteresis, evidence, score
 from stavpr_ros.recognition.robust.options import PAPER, ROBUST
 from stavpr_ros.recognition.robust.znorm import MEMORY, MIN_DEVIATION, PRIOR
@@ -27,7 +32,9 @@ SECOND = 10**9
 
 
 def features_of(strips):
-    return LocalFeatures(strips, torch.ones(strips.shape[:2]), FeatureSettings('gradient', None, 7))
+    return LocalFeatures(
+        strips, torch.ones(strips.shape[:2]), FeatureSettings('gradient', None, 7)
+    )
 
 
 def laps_of(count, places, noise=0.4, seed=0):
@@ -50,7 +57,9 @@ def laps():
 
 def settings_of(robust_options, **changes):
     mode = 'robust' if robust_options.second_best_margin else 'paper'
-    return RecognizerSettings(1.0, sequence=SHORT, nms_radius=5, mode=mode, robust_options=robust_options, **changes)
+    return RecognizerSettings(
+        1.0, sequence=SHORT, nms_radius=5, mode=mode, robust_options=robust_options, **changes
+    )
 
 
 def drive(closer, features, stamps=None):
@@ -85,7 +94,11 @@ class PlainCloser:
 
         out = np.empty((1, last), np.float32)
         dot.image_distances(
-            self.all[:, :last].contiguous().numpy(), tiled(self.all[:, image : image + 1]), self.a, 7, out
+            self.all[:, :last].contiguous().numpy(),
+            tiled(self.all[:, image : image + 1]),
+            self.a,
+            7,
+            out,
         )
         return out[0]
 
@@ -111,14 +124,18 @@ class PlainCloser:
         self.seen[live] = np.minimum(self.seen[live] + 1, MEMORY)
         off = row - self.mean[live]
         self.mean[live] += off / self.seen[live]
-        self.variance[live] += (off * (row - self.mean[live]) - self.variance[live]) / self.seen[live]
+        self.variance[live] += (off * (row - self.mean[live]) - self.variance[live]) / self.seen[
+            live
+        ]
 
     def match(self, window, robust_options):
         scale = np.ones_like(self.mean)
         if robust_options.reference_znorm:
             scale = 1 / np.sqrt(np.maximum(self.variance, 1e-6))
         if not robust_options.velocity_search:
-            self.found = found = match_sequence((window - self.mean) * scale, self.settings.sequence)
+            self.found = found = match_sequence(
+                (window - self.mean) * scale, self.settings.sequence
+            )
             return best_match(found, self.settings.nms_radius)
         if not (robust_options.query_znorm or robust_options.reference_znorm):
             known = window[np.isfinite(window)]
@@ -158,7 +175,13 @@ CHOICES = {
 @pytest.mark.parametrize('choice', CHOICES)
 @pytest.mark.parametrize(
     ('limit', 'exclude', 'sequence'),
-    [(41, 12, SHORT), (64, 12, SHORT), (100, 12, SHORT), (300, 12, SHORT), (48, 2, SequenceSettings())],
+    [
+        (41, 12, SHORT),
+        (64, 12, SHORT),
+        (100, 12, SHORT),
+        (300, 12, SHORT),
+        (48, 2, SequenceSettings()),
+    ],
 )
 def test_forgetting_is_banning(laps, choice, limit, exclude, sequence):
     """Exactly: what is answered after forgetting is what is answered with everything before banned."""
@@ -175,9 +198,15 @@ def test_forgetting_is_banning(laps, choice, limit, exclude, sequence):
             continue
         answered += 1
         found = answer.sequence
-        assert (found.first, found.last, found.middle) == (expected.first, expected.last, expected.middle)
+        assert (found.first, found.last, found.middle) == (
+            expected.first,
+            expected.last,
+            expected.middle,
+        )
         assert found.second_best_index == expected.second_best_index
-        np.testing.assert_array_equal([found.distance, found.second_best_distance], plain.judged(expected))
+        np.testing.assert_array_equal(
+            [found.distance, found.second_best_distance], plain.judged(expected)
+        )
         assert answer.path[:, 1].min() == found.first >= closer.first
         assert answer.path[-1].tolist() == [sequence.length - 1, found.last]
         assert found.last < i + 1 - exclude
@@ -189,7 +218,9 @@ def test_forgetting_is_banning(laps, choice, limit, exclude, sequence):
 @pytest.mark.parametrize('limit', [376, 5000])
 def test_a_limit_that_is_never_reached_changes_nothing(laps, mode, limit):
     settings = RecognizerSettings(1.0, sequence=SHORT, nms_radius=5, mode=mode)
-    bounded, unbounded = (LoopCloser(settings, 12, laps.settings, limit=value) for value in (limit, None))
+    bounded, unbounded = (
+        LoopCloser(settings, 12, laps.settings, limit=value) for value in (limit, None)
+    )
     for i in range(len(laps)):
         same(bounded.update(laps[i : i + 1]), unbounded.update(laps[i : i + 1]))
         assert bounded.ranked(3) == unbounded.ranked(3)
@@ -229,7 +260,9 @@ def route_of(features, centering, limit=None):
             evicted += limit // EVICTED
             route.evict(limit // EVICTED)
             expected = features.strips[:, evicted:i].mean(dim=1)
-            torch.testing.assert_close(route.mean, expected if centering else 0 * expected, atol=1e-6, rtol=0)
+            torch.testing.assert_close(
+                route.mean, expected if centering else 0 * expected, atol=1e-6, rtol=0
+            )
         route.append(features[i : i + 1])
     return route, evicted
 
@@ -270,7 +303,9 @@ def test_a_closer_returns_the_features_of_its_route(laps):
 
 
 def blurred(features, seed=0, noise=0.25):
-    noise = noise * torch.randn(features.strips.shape, generator=torch.Generator().manual_seed(seed))
+    noise = noise * torch.randn(
+        features.strips.shape, generator=torch.Generator().manual_seed(seed)
+    )
     return features_of(torch.nn.functional.normalize(features.strips + noise, dim=2))
 
 
@@ -305,7 +340,9 @@ def test_places_younger_than_so_many_seconds_are_left_out(laps):
     old = 0
     for i in range(375):
         closer.update(laps[i : i + 1], int(stamps[i]))
-        while old <= i and (not stamps[old] or (stamps[i] and stamps[i] - stamps[old] >= 9.5 * SECOND)):
+        while old <= i and (
+            not stamps[old] or (stamps[i] and stamps[i] - stamps[old] >= 9.5 * SECOND)
+        ):
             old += 1
         expected = min(i + 1 - 7, old) if stamps[i] else i + 1 - 7
         assert len(closer.newest_row()) == max(0, expected)
@@ -454,9 +491,16 @@ def test_seconds_that_are_refused(laps, seconds):
 
 @pytest.mark.parametrize(
     ('backend', 'precision', 'words'),
-    [('cuda', 'float32', 'cuda'), ('auto', 'float16', 'float16'), ('cpu', 'float16', 'float16'), ('tpu', 'float32', 'tpu')],
+    [
+        ('cuda', 'float32', 'cuda'),
+        ('auto', 'float16', 'float16'),
+        ('cpu', 'float16', 'float16'),
+        ('tpu', 'float32', 'tpu'),
+    ],
 )
-def test_a_backend_or_precision_without_loop_closure_is_refused_by_name(laps, backend, precision, words):
+def test_a_backend_or_precision_without_loop_closure_is_refused_by_name(
+    laps, backend, precision, words
+):
     with pytest.raises(SettingsError, match=words):
         choose_loop_backend(backend, precision)
     with pytest.raises(SettingsError, match=words):

@@ -47,7 +47,9 @@ def random_features(W, n, d, seed=0):
     weights = rng.uniform(0.1, 1, (W, n))
     weights /= np.linalg.norm(weights, axis=0)
     settings = FeatureSettings('gradient', GradientSettings(), W)
-    return LocalFeatures(torch.from_numpy(strips).float(), torch.from_numpy(weights).float(), settings)
+    return LocalFeatures(
+        torch.from_numpy(strips).float(), torch.from_numpy(weights).float(), settings
+    )
 
 
 def make(features, spatial=None, precision='float32'):
@@ -73,7 +75,9 @@ def test_fused_is_the_same_as_one_after_the_other(W, n, d, strategy, data):
     matrix = make(features, spatial).distance_matrix(queries.strips, queries.weights)
     assert matrix.shape == (3, n)
     for x in range(3):
-        separate = image_distances(strip_distances(queries.strips[:, x], features.strips).numpy(), spatial)
+        separate = image_distances(
+            strip_distances(queries.strips[:, x], features.strips).numpy(), spatial
+        )
         np.testing.assert_array_equal(matrix[x], separate)
         row = make(features, spatial).distances(queries.strips[:, x], queries.weights[:, x])
         np.testing.assert_array_equal(row, separate)
@@ -98,7 +102,9 @@ def test_strategies_without_dtw(W):
         if W >= 4:
             row = make(features, SpatialSettings('sliding_window')).distances(strips, weights)
             d = strip_distances(strips, features.strips).numpy()
-            np.testing.assert_array_equal(row, image_distances(d, SpatialSettings('sliding_window')))
+            np.testing.assert_array_equal(
+                row, image_distances(d, SpatialSettings('sliding_window'))
+            )
 
 
 def test_features_that_do_not_lie_in_one_piece():
@@ -134,7 +140,9 @@ def test_search_of_a_rolling_window_equals_the_plain_functions(n):
             assert repr(found.nearest) == repr(expected)  # a second best's distance may be NaN
             aligned = align_sequence(window, expected.first, SequenceSettings(5))
             np.testing.assert_array_equal(found.path, aligned.path)
-            for one, other in zip(found.sequences(), (matches.distances, matches.middles), strict=True):
+            for one, other in zip(
+                found.sequences(), (matches.distances, matches.middles), strict=True
+            ):
                 np.testing.assert_array_equal(one, other)
 
 
@@ -186,16 +194,22 @@ def test_half_width_rounds_as_it_says(d):
 def test_half_width_answers_on_real_images(data_folder):
     """The same place, window for window, on a walk in the paper's configuration; distances within 1e-3."""
     extractor = FeatureExtractor()
-    place_map = build_map(open_source(data_folder / 'gardens_point' / 'day_left'), extractor, progress=False)
+    place_map = build_map(
+        open_source(data_folder / 'gardens_point' / 'day_left'), extractor, progress=False
+    )
     query = extract_features(
         open_source(data_folder / 'gardens_point' / 'day_right'), extractor, progress=False
     )
     exact, half = (
-        recognize_all(PlaceRecognizer(place_map, RecognizerSettings(10.0), precision=p), query)[19:]
+        recognize_all(PlaceRecognizer(place_map, RecognizerSettings(10.0), precision=p), query)[
+            19:
+        ]
         for p in ('float32', 'float16')
     )
     assert [a.sequence.middle for a in half] == [a.sequence.middle for a in exact]
-    moved = [abs(a.sequence.distance - b.sequence.distance) for a, b in zip(half, exact, strict=True)]
+    moved = [
+        abs(a.sequence.distance - b.sequence.distance) for a, b in zip(half, exact, strict=True)
+    ]
     print(f'float16: {len(half)} windows, distances moved by {max(moved):.1e} at most')
     assert max(moved) < 1e-3
 

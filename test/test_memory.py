@@ -16,7 +16,9 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap, load_map, open_map, save_ma
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CACHE_LINE
 
-LARGEST = 1.15  # of resident bytes over bytes of the features; the heap and the window take their part
+LARGEST = (
+    1.15  # of resident bytes over bytes of the features; the heap and the window take their part
+)
 
 
 @pytest.fixture
@@ -28,7 +30,11 @@ def path(small_map, tmp_path):
 def test_open_map_holds_the_same_map_as_load_map(path, small_map):
     opened, loaded = open_map(path), load_map(path)
     assert len(opened) == len(loaded.features) == len(small_map)
-    assert (opened.settings, opened.ids, opened.dimension) == (loaded.settings, loaded.ids, loaded.dimension)
+    assert (opened.settings, opened.ids, opened.dimension) == (
+        loaded.settings,
+        loaded.ids,
+        loaded.dimension,
+    )
     for features in (opened.features, opened.features[:], opened.features.to('cpu')):
         assert torch.equal(features.strips, small_map.features.strips)
         assert torch.equal(features.weights, small_map.features.weights)
@@ -76,7 +82,9 @@ def test_an_opened_map_outlives_its_name(path, small_map, change):
 
 def test_an_opened_map_that_is_overwritten_is_an_error(path, small_map):
     opened = open_map(path)
-    path.write_bytes(path.read_bytes().replace(small_map.features.strips.numpy().tobytes()[:64], bytes(64)))
+    path.write_bytes(
+        path.read_bytes().replace(small_map.features.strips.numpy().tobytes()[:64], bytes(64))
+    )
     with pytest.raises(MapFileError, match='damaged'):
         _ = opened.features.strips
 
@@ -84,7 +92,10 @@ def test_an_opened_map_that_is_overwritten_is_an_error(path, small_map):
 def test_a_growing_map_may_leave_the_features_to_another_owner(small_map):
     kept = small_map.features
     growing = GrowingMap(
-        small_map.settings, small_map.projection, 50, held_features=lambda: kept[2 : 2 + len(growing)]
+        small_map.settings,
+        small_map.projection,
+        50,
+        held_features=lambda: kept[2 : 2 + len(growing)],
     )
     for i in range(40):
         growing.add(kept[i : i + 1], i + 1)
@@ -157,7 +168,9 @@ def maps(tmp_path_factory):
     }
 
 
-@pytest.mark.skipif(not Path('/proc/self/statm').exists(), reason='resident memory is read from /proc')
+@pytest.mark.skipif(
+    not Path('/proc/self/statm').exists(), reason='resident memory is read from /proc'
+)
 @pytest.mark.parametrize(
     ('owner', 'mode', 'precision'),
     [

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from stavpr_ros.alignment import SequenceSettings, SpatialSettings, align_sequence, best_match, match_sequence
+from stavpr_ros.alignment import (
+    SequenceSettings,
+    SpatialSettings,
+    align_sequence,
+    best_match,
+    match_sequence,
+)
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
@@ -51,21 +57,28 @@ def test_frame_by_frame_is_the_whole_matrix_at_once(small_map, strategy):
         window = D[end - 4 : end + 1]
         expected = best_match(match_sequence(window, SHORT), 5)
         assert answers[end].sequence == expected
-        np.testing.assert_array_equal(answers[end].path, align_sequence(window, expected.first, SHORT).path)
+        np.testing.assert_array_equal(
+            answers[end].path, align_sequence(window, expected.first, SHORT).path
+        )
 
 
 def test_a_threshold_is_a_strict_bound(small_map, route):
     query = FeatureExtractor(projection=64).extract([255 - image for image in route[3:8]])
     distance = recognize_all(recognizer(small_map), query)[-1].sequence.distance
     assert distance > 0.01
-    for threshold, status in ((distance, Status.NO_MATCH), (np.nextafter(distance, 1), Status.MATCH)):
+    for threshold, status in (
+        (distance, Status.NO_MATCH),
+        (np.nextafter(distance, 1), Status.MATCH),
+    ):
         assert recognize_all(recognizer(small_map, float(threshold)), query)[-1].status is status
 
 
 def test_no_match_names_no_place(small_map):
     rng = np.random.default_rng(1)
     elsewhere = [rng.integers(0, 256, (96, 128, 3), np.uint8) for _ in range(8)]
-    answers = recognize_all(recognizer(small_map, 0.05), FeatureExtractor(projection=64).extract(elsewhere))
+    answers = recognize_all(
+        recognizer(small_map, 0.05), FeatureExtractor(projection=64).extract(elsewhere)
+    )
     assert answers[-1].status is Status.NO_MATCH
     assert answers[-1].place_index == answers[-1].newest_index == -1
     assert 'threshold' in answers[-1].reason
@@ -166,7 +179,10 @@ def test_sequence_buffer_that_grows_and_evicts_keeps_its_rows():
     assert buffer.rows()[:, :5].tolist() == [[1, 2, np.inf, np.inf, np.inf], [3, 4, 5, 6, np.inf]]
     buffer.evict(1)
     assert (buffer.first, buffer.known, buffer.places) == (1, 3, 5)
-    assert buffer.rows()[:, :5].tolist() == [[2, np.inf, np.inf, np.inf, np.inf], [4, 5, 6, np.inf, np.inf]]
+    assert buffer.rows()[:, :5].tolist() == [
+        [2, np.inf, np.inf, np.inf, np.inf],
+        [4, 5, 6, np.inf, np.inf],
+    ]
 
 
 @pytest.mark.parametrize('value', [np.nan, -np.inf])
@@ -195,7 +211,9 @@ def test_an_unseen_stretch_is_far(small_map, route):
     from conftest import route_images
 
     extractor = FeatureExtractor(projection=64)
-    dim = [np.clip(image.astype(int) * 3 // 4 + 20, 0, 255).astype(np.uint8) for image in route[10:30]]
+    dim = [
+        np.clip(image.astype(int) * 3 // 4 + 20, 0, 255).astype(np.uint8) for image in route[10:30]
+    ]
     other = route_images(20, seed=9)
     seen = recognize_all(recognizer(small_map, 0.15), extractor.extract(dim))
     unseen = recognize_all(recognizer(small_map, 0.15), extractor.extract(other))

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-from stavpr_ros.demonstration.street import World, first_traverse
+from stavpr_ros.demonstration.street import World, first_drive
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
-from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import best_f1, counts_at, image_matches
+from stavpr_ros.evaluation.metrics import best_f1, frame_answers, score_at
+from stavpr_ros.evaluation.offline import recognize_all, window_answers
 from stavpr_ros.evaluation.warp import warp_indices
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import build_map, extract_features
@@ -53,10 +53,16 @@ def test_choices_of_options():
     assert options_of('robust') == ROBUST == RobustOptions()
     assert options_of('paper') == PAPER
     assert not PAPER.any
-    assert RobustOptions.only('velocity_search') == RobustOptions(False, False, False, True, False, False)
+    assert RobustOptions.only('velocity_search') == RobustOptions(
+        False, False, False, True, False, False
+    )
     assert not ROBUST.without('mean_centering', 'velocity_search').mean_centering
     assert ROBUST.without('mean_centering').velocity_search
-    for wrong in (lambda: ROBUST.without('hope'), lambda: RobustOptions.only('hope'), lambda: options_of('hope')):
+    for wrong in (
+        lambda: ROBUST.without('hope'),
+        lambda: RobustOptions.only('hope'),
+        lambda: options_of('hope'),
+    ):
         with pytest.raises(SettingsError, match='hope'):
             wrong()
     with pytest.raises(SettingsError, match='chance'):
@@ -113,7 +119,9 @@ def test_centering_forgets_no_image_of_a_long_query():
     generator = torch.Generator().manual_seed(0)
     places = torch.rand((2, 3, 8), generator=generator)
     strips = torch.rand((2, 8), generator=generator)
-    mean_centering = MeanCentering(LocalFeatures(places, torch.ones(2, 3), FeatureSettings('gradient', None, 2)))
+    mean_centering = MeanCentering(
+        LocalFeatures(places, torch.ones(2, 3), FeatureSettings('gradient', None, 2))
+    )
     first = mean_centering.next_query(strips)
     for _ in range(5000):
         last = mean_centering.next_query(strips)
@@ -190,12 +198,22 @@ def test_what_is_no_nearer_than_chance_is_no_answer(small_map, route):
 
 
 @pytest.mark.parametrize(
-    'without', ['', 'mean_centering', 'query_znorm', 'reference_znorm', 'velocity_search', 'second_best_margin']
+    'without',
+    [
+        '',
+        'mean_centering',
+        'query_znorm',
+        'reference_znorm',
+        'velocity_search',
+        'second_best_margin',
+    ],
 )
 @pytest.mark.parametrize('strategy', ['adaptive', 'none'])
 def test_every_choice_of_cures_works(small_map, without, strategy):
     robust_options = ROBUST.without(without) if without else ROBUST
-    settings = RecognizerSettings(1e6, SpatialSettings(strategy), SHORT, 5, mode='robust', robust_options=robust_options)
+    settings = RecognizerSettings(
+        1e6, SpatialSettings(strategy), SHORT, 5, mode='robust', robust_options=robust_options
+    )
     one = PlaceRecognizer(small_map, settings)
     answers = recognize_all(one, small_map.features[10:30])
     middles = [a.sequence.middle for a in answers[4:]]
@@ -211,7 +229,10 @@ def test_candidates_in_mode_paper(small_map):
     one = PlaceRecognizer(small_map, RecognizerSettings(1.0, sequence=SHORT))
     answer = recognize_all(one, small_map.features[10:20])[-1]
     places, distances = one.candidates(3)
-    assert (places[0], distances[0]) == (answer.sequence.middle, np.float32(answer.sequence.distance))
+    assert (places[0], distances[0]) == (
+        answer.sequence.middle,
+        np.float32(answer.sequence.distance),
+    )
     assert int(np.argmin(one.newest_row())) == 19
 
 
@@ -219,7 +240,9 @@ def test_candidates_in_mode_paper(small_map):
 
 
 def features_of(strips):
-    return LocalFeatures(strips, torch.ones(strips.shape[:2]), FeatureSettings('gradient', None, 7))
+    return LocalFeatures(
+        strips, torch.ones(strips.shape[:2]), FeatureSettings('gradient', None, 7)
+    )
 
 
 @pytest.fixture(scope='module')
@@ -301,7 +324,9 @@ def drives(data_folder):
 
     def drive(name):
         if name not in known:
-            known[name] = extract_features(open_source(data_folder / name), extractor, progress=False)
+            known[name] = extract_features(
+                open_source(data_folder / name), extractor, progress=False
+            )
         return known[name]
 
     return drive
@@ -316,9 +341,11 @@ def as_map(features):
 
 def judged(reference, query, truth):
     """Best F1, and the precision at the default threshold."""
-    answers = image_matches(recognize_all(robust(as_map(reference)), query), 20)
+    answers = frame_answers(window_answers(recognize_all(robust(as_map(reference)), query)), 20)
     correct = truth.accepts(answers.places)
-    return best_f1(answers.distances, correct).f1, counts_at(1.0, answers.distances, correct).precision
+    return best_f1(answers.distances, correct).f1, score_at(
+        1.0, answers.distances, correct
+    ).precision
 
 
 def taken(features, indices):
@@ -357,8 +384,12 @@ def test_a_corridor_that_looks_alike(drives, data_folder):
     assert precision >= 0.95
 
 
-@pytest.mark.parametrize('route', ['gardens_point/day_left', 'nordland_64x32/summer', 'corridor/ref'])
-@pytest.mark.parametrize('query', ['gardens_point/day_right', 'nordland_64x32/winter', 'corridor/query'])
+@pytest.mark.parametrize(
+    'route', ['gardens_point/day_left', 'nordland_64x32/summer', 'corridor/ref']
+)
+@pytest.mark.parametrize(
+    'query', ['gardens_point/day_right', 'nordland_64x32/winter', 'corridor/query']
+)
 def test_other_routes_are_not_matched(drives, route, query):
     if route.split('/')[0] == query.split('/')[0]:
         pytest.skip('the same route')
@@ -370,13 +401,15 @@ def test_other_routes_are_not_matched(drives, route, query):
 
 def test_the_hallway_is_closed(drives, data_folder):
     features = drives('rtabmap_hallway_loop/samples')
-    truth = GroundTruth.from_file(data_folder / 'rtabmap_hallway_loop' / 'samples_GT.bmp', 84, 84, 0)
+    truth = GroundTruth.from_file(
+        data_folder / 'rtabmap_hallway_loop' / 'samples_GT.bmp', 84, 84, 0
+    )
     truth = truth.loop_closures(19)
     assert truth.has_match.sum() == 44
     closer = LoopCloser(RecognizerSettings(1.0, mode='robust'), 20, features.settings)
     answers = [closer.update(features[i : i + 1]) for i in range(84)]
-    answered = image_matches(answers, 20)
-    score = counts_at(1.0, answered.distances, truth.accepts(answered.places), truth.has_match)
+    answered = frame_answers(window_answers(answers), 20)
+    score = score_at(1.0, answered.distances, truth.accepts(answered.places), truth.has_match)
     print(f'hallway: precision {score.precision:.3f}, recall {score.recall:.3f}')
     assert score.precision >= 0.95
     assert score.recall >= 0.8
@@ -411,8 +444,12 @@ def test_a_route_that_has_just_begun_closes_no_loops_by_chance():
     """Three streets of the made-up world, driven once: nothing can be right, and chance had a lead before."""
     extractor = FeatureExtractor()
     for seed in (3, 7, 11):
-        images = [frame.image for frame, _ in zip(first_traverse(World(seed)), range(130), strict=False)]
+        images = [
+            frame.image for frame, _ in zip(first_drive(World(seed)), range(130), strict=False)
+        ]
         features = extractor.extract(images)
-        closer = LoopCloser(RecognizerSettings(LOOP_THRESHOLD, mode='robust'), 50, features.settings)
+        closer = LoopCloser(
+            RecognizerSettings(LOOP_THRESHOLD, mode='robust'), 50, features.settings
+        )
         found = [closer.update(features[i : i + 1]).place_index for i in range(len(images))]
         assert sum(place >= 0 for place in found) <= 2

@@ -5,7 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stavpr_ros.alignment import VelocitySettings, best_velocity_match, match_velocities, trace_velocity
+from stavpr_ros.alignment import (
+    VelocitySettings,
+    best_velocity_match,
+    match_velocities,
+    trace_velocity,
+)
 from stavpr_ros.alignment.cpu import velocity as kernel
 from stavpr_ros.errors import InputError, SettingsError
 
@@ -69,19 +74,25 @@ def test_steps_of_a_speed():
     l=st.integers(2, 8),
     n=st.integers(1, 45),
     levels=st.sampled_from([0, 2, 5]),
-    speeds=st.lists(st.sampled_from([0.0, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0]), min_size=1, max_size=4),
+    speeds=st.lists(
+        st.sampled_from([0.0, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0]), min_size=1, max_size=4
+    ),
     penalty=st.sampled_from([0.0, 0.25, 2.0]),
     banned=st.sampled_from([0.0, 0.2]),
     dtype=st.sampled_from([np.float32, np.float64]),
 )
 def test_against_plain_loops(seed, l, n, levels, speeds, penalty, banned, dtype):
     rng = np.random.default_rng(seed)
-    costs = rng.standard_normal((l, n)) if not levels else rng.integers(-levels, levels, (l, n)) / 4
+    costs = (
+        rng.standard_normal((l, n)) if not levels else rng.integers(-levels, levels, (l, n)) / 4
+    )
     costs[rng.random((l, n)) < banned] = INF
     costs = costs.astype(dtype)
     chosen = VelocitySettings(tuple(speeds), penalty)
     matches = match_velocities(costs, chosen)
-    for end, (distance, first, middle, speed, path) in enumerate(plain_paths(costs, speeds, dtype(penalty))):
+    for end, (distance, first, middle, speed, path) in enumerate(
+        plain_paths(costs, speeds, dtype(penalty))
+    ):
         assert matches.distances[end] == pytest.approx(distance, abs=1e-5)
         if not np.isfinite(distance) or levels != 0:
             continue  # of equal paths any may be taken
@@ -91,7 +102,9 @@ def test_against_plain_loops(seed, l, n, levels, speeds, penalty, banned, dtype)
         np.testing.assert_array_equal(traced[:, 1], path)
 
 
-@pytest.mark.parametrize('n', [kernel.ENDS - 1, kernel.ENDS, kernel.ENDS + 1, 2 * kernel.ENDS + 17])
+@pytest.mark.parametrize(
+    'n', [kernel.ENDS - 1, kernel.ENDS, kernel.ENDS + 1, 2 * kernel.ENDS + 17]
+)
 def test_borders_of_blocks_leave_no_trace(n):
     """The ends round a border give what they give in a map that is cut out round them."""
     rng = np.random.default_rng(n)
@@ -103,8 +116,12 @@ def test_borders_of_blocks_leave_no_trace(n):
         part = match_velocities(window[:, near], VelocitySettings(), shift[near], scale[near])
         count = min(n, border + 20) - (border - 20)
         np.testing.assert_array_equal(whole.distances[near][-count:], part.distances[-count:])
-        np.testing.assert_array_equal(whole.firsts[near][-count:], part.firsts[-count:] + border - 100)
-        np.testing.assert_array_equal(whole.middles[near][-count:], part.middles[-count:] + border - 100)
+        np.testing.assert_array_equal(
+            whole.firsts[near][-count:], part.firsts[-count:] + border - 100
+        )
+        np.testing.assert_array_equal(
+            whole.middles[near][-count:], part.middles[-count:] + border - 100
+        )
 
 
 def test_shift_and_scale():
@@ -128,7 +145,9 @@ def test_the_runner_up_is_elsewhere_and_nothing_is_nothing():
     alone = best_velocity_match(matches, 30)
     assert alone.second_best_index == -1
     assert np.isnan(alone.second_best_distance)
-    assert best_velocity_match(match_velocities(np.full((4, 6), INF), VelocitySettings()), 0) is None
+    assert (
+        best_velocity_match(match_velocities(np.full((4, 6), INF), VelocitySettings()), 0) is None
+    )
     assert best_velocity_match(match_velocities(np.empty((4, 0)), VelocitySettings()), 0) is None
 
 

@@ -24,7 +24,9 @@ def random_features(n, H=4, channels=3, columns=2, W=5, seed=0):
     strips = rng.random((W, n, channels * H * columns))
     strips[1, 0].reshape(channels, H, columns)[:, 2] = 0  # one cell of one strip is empty
     strips /= np.linalg.norm(strips, axis=2, keepdims=True)
-    return LocalFeatures(torch.from_numpy(strips).float(), torch.ones(W, n), SETTINGS, (H, columns))
+    return LocalFeatures(
+        torch.from_numpy(strips).float(), torch.ones(W, n), SETTINGS, (H, columns)
+    )
 
 
 def test_cells_are_those_of_the_feature_map():
@@ -41,7 +43,9 @@ def test_cells_are_those_of_the_feature_map():
 
 
 @pytest.mark.parametrize('n', [1, 15, 64, 65, 130])
-@pytest.mark.parametrize(('strategy', 'xi'), [('adaptive', None), ('adaptive', 2), ('vanilla', None)])
+@pytest.mark.parametrize(
+    ('strategy', 'xi'), [('adaptive', None), ('adaptive', 2), ('vanilla', None)]
+)
 def test_against_the_oracle(n, strategy, xi):
     """Cell by cell as the method says: the inner alignment has its own central cell and no band."""
     reference, query = random_features(n), random_features(2, seed=1)
@@ -58,12 +62,16 @@ def test_against_the_oracle(n, strategy, xi):
                 d[i, j] = oracle.align_images(cells, strategy).distance
         expected = oracle.align_images(d, strategy, xi=xi).distance
         assert found[1, image] == pytest.approx(expected, abs=2e-6)
-    np.testing.assert_array_equal(matcher.distances(query.strips[:, 1], query.weights[:, 1]), found[1])
+    np.testing.assert_array_equal(
+        matcher.distances(query.strips[:, 1], query.weights[:, 1]), found[1]
+    )
 
 
 def test_a_map_remembers_its_cells(route, tmp_path):
     place_map = build_map(
-        [Frame(image, i, '') for i, image in enumerate(route[:8])], FeatureExtractor(), progress=False
+        [Frame(image, i, '') for i, image in enumerate(route[:8])],
+        FeatureExtractor(),
+        progress=False,
     )
     assert place_map.features.cells == (14, 2)
     save_map(place_map, tmp_path / 'map')
@@ -71,7 +79,9 @@ def test_a_map_remembers_its_cells(route, tmp_path):
     assert loaded.features.cells == (14, 2)
     assert loaded.features[2:5].cells == (14, 2)
     spatial = SpatialSettings(vertical=True)
-    distances = PlaceRecognizer(loaded, RecognizerSettings(1.0, spatial)).distances(loaded.features)
+    distances = PlaceRecognizer(loaded, RecognizerSettings(1.0, spatial)).distances(
+        loaded.features
+    )
     np.testing.assert_allclose(np.diag(distances), 0, atol=1e-5)
 
 
@@ -90,12 +100,22 @@ def test_a_drone_that_flies_higher(data_folder):
     frames = list(open_source(data_folder / 'gardens_point' / 'day_left'))[::2]
     extractor = FeatureExtractor()
     place_map = build_map(frames, extractor, progress=False)
-    higher = extractor.extract([np.ascontiguousarray(f.image[: -f.image.shape[0] // 3]) for f in frames])
-    lower = extractor.extract([np.ascontiguousarray(f.image[f.image.shape[0] // 3 :]) for f in frames])
+    higher = extractor.extract(
+        [np.ascontiguousarray(f.image[: -f.image.shape[0] // 3]) for f in frames]
+    )
+    lower = extractor.extract(
+        [np.ascontiguousarray(f.image[f.image.shape[0] // 3 :]) for f in frames]
+    )
     right = {}
     for vertical in (False, True):
-        recognizer = PlaceRecognizer(place_map, RecognizerSettings(1.0, SpatialSettings(vertical=vertical)))
+        recognizer = PlaceRecognizer(
+            place_map, RecognizerSettings(1.0, SpatialSettings(vertical=vertical))
+        )
         found = [recognizer.distances(query).argmin(axis=1) for query in (higher, lower)]
-        right[vertical] = np.mean([np.abs(places - np.arange(len(frames))) <= 1 for places in found])
-    print(f'shifted up and down: right {right[False]:.3f} without, {right[True]:.3f} with vertical alignment')
+        right[vertical] = np.mean(
+            [np.abs(places - np.arange(len(frames))) <= 1 for places in found]
+        )
+    print(
+        f'shifted up and down: right {right[False]:.3f} without, {right[True]:.3f} with vertical alignment'
+    )
     assert right[True] > right[False] + 0.05

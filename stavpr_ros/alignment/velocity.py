@@ -1,9 +1,9 @@
 """
 A window against every place of the map at several speeds (beyond the paper).
 
-LM-DTW may let one place absorb a whole window. Here a path holds exactly one place for each query image,
-so that no run of cheap pairs can dilute its mean, and keeps close to one of a few speeds (places an image):
-a step of one place more or less than the speed's costs a penalty.
+LM-DTW may let one place absorb a whole window. Here a path holds exactly one place for each query
+image, so that no run of cheap pairs can dilute its mean, and keeps close to one of a few speeds
+(places an image): a step of one place more or less than the speed's costs a penalty.
 
     S[i, y] = d[i, y] + min(S[i-1, y-r], S[i-1, y-r+1] + p, S[i-1, y-r-1] + p),   never back
     r = round(v i) - round(v (i-1)),   distance = min over the speeds v of S[l, y] / l
@@ -26,7 +26,8 @@ class VelocityMatches:
     """
     The best path to each of n places.
 
-    :param distances: mean cost of an image, penalties included, shape (n,); +inf where there is no path.
+    :param distances: mean cost of an image, penalties included, shape (n,); +inf where there is no
+        path.
     :param firsts: place of the window's first image, shape (n,), int32.
     :param middles: place of its middle image, (l - 1) // 2, shape (n,), int32.
     :param speeds: index into the settings' speeds, shape (n,), int32.
@@ -47,8 +48,8 @@ def match_velocities(
     """
     Find the best path to every place.
 
-    :param window: image distances, shape (l, n), float32 or float64; row = query image, oldest first. +inf
-        bans a pair.
+    :param window: image distances, shape (l, n), float32 or float64; row = query image, oldest
+        first. +inf bans a pair.
     :param shift, scale: the costs are (window - shift) * scale, shape (n,) each; None for 0 and 1.
     :raises InputError: wrong shape or type, NaN.
     """
@@ -67,7 +68,8 @@ def match_scaled(
     window: np.ndarray, shift: np.ndarray, scale: np.ndarray, settings: VelocitySettings
 ) -> VelocityMatches:
     """
-    Match a window that is known to be good; nothing is checked or copied (see :func:`match_velocities`).
+    Match a window that is known to be good; nothing is checked or copied (see
+    :func:`match_velocities`).
 
     :param window: shape (l, n or more), C-contiguous.
     :param shift, scale: shape (n,), of the window's type.
@@ -90,7 +92,9 @@ def match_scaled(
     return matches
 
 
-def trace_velocity(costs: np.ndarray, end: int, speed: int, settings: VelocitySettings) -> np.ndarray:
+def trace_velocity(
+    costs: np.ndarray, end: int, speed: int, settings: VelocitySettings
+) -> np.ndarray:
     """
     Return the path to one end at one speed.
 

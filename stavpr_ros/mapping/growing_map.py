@@ -18,16 +18,16 @@ class GrowingMap:
     """
     Places in the order in which they were added.
 
-    A place costs no rebuild: memory doubles when it is full, up to ``limit`` places. The oldest places may be
-    forgotten; a place that is number i here was number ``first`` + i of all that were added. Not for several
-    threads at once.
+    A place costs no rebuild: memory doubles when it is full, up to ``limit`` places. The oldest
+    places may be forgotten; a place that is number i here was number ``first`` + i of all that
+    were added. Not for several threads at once.
 
     :param settings: how the features are made.
     :param projection: the random projection of the features, if they have one.
     :param limit: most places held at a time, at least 1.
     :param cells: see :class:`LocalFeatures`; taken from the first place if not given.
-    :param held_features: returns the features of the places held, in memory of their own, where another
-        object is their owner; None = they are held here.
+    :param held_features: returns the features of the places held, in memory of their own, where
+        another object is their owner; None = they are held here.
     :raises SettingsError: no room for a place.
     :raises InputError: the projection is not that of the settings.
     """
@@ -63,12 +63,17 @@ class GrowingMap:
         """
         n = len(place_map)
         if n > limit:
-            raise InputError(f'a map of {n} places does not fit into a limit of {limit}: raise the limit')
+            raise InputError(
+                f'a map of {n} places does not fit into a limit of {limit}: raise the limit'
+            )
         features = place_map.features.to('cpu')
         growing = cls(place_map.settings, place_map.projection, limit, features.cells)
         growing.dimension = features.dimension
         growing._make_room(max(n, min(ROOM, limit)))
-        growing._strips[:, :n], growing._weights[:, :n] = features.strips.numpy(), features.weights.numpy()
+        growing._strips[:, :n], growing._weights[:, :n] = (
+            features.strips.numpy(),
+            features.weights.numpy(),
+        )
         growing._stamps[:n] = place_map.stamps
         growing._poses[:n] = np.nan if place_map.poses is None else place_map.poses
         growing._ids = list(place_map.ids)
@@ -99,7 +104,10 @@ class GrowingMap:
         n = self._count
         if self._held_features is not None:
             return self._held_features()
-        strips, weights = torch.from_numpy(self._strips[:, :n]), torch.from_numpy(self._weights[:, :n])
+        strips, weights = (
+            torch.from_numpy(self._strips[:, :n]),
+            torch.from_numpy(self._weights[:, :n]),
+        )
         return LocalFeatures(strips, weights, self.settings, self._cells)
 
     @property

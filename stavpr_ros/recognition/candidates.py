@@ -23,12 +23,12 @@ def ranked_candidates(
     The first is the nearest sequence, the second its second best. O(count x n).
 
     :param nearest: the nearest sequence as it was matched; None if there is none.
-    :param sequences: costs of all sequences, shape (n,), +inf where there is none, and their places, shape
-        (n,), whole numbers, in any order; of equal costs the first is taken.
+    :param sequences: costs of all sequences, shape (n,), +inf where there is none, and their
+        places, shape (n,), whole numbers, in any order; of equal costs the first is taken.
     :param count: most candidates, at least 0.
     :param nms_radius: candidates are more than so many places from each other.
-    :param relative: the distance of the nearest is a score of mode robust; those of the others are then scores
-        of their evidence against the nearest.
+    :param relative: the distance of the nearest is a score of mode robust; those of the others are
+        then scores of their evidence against the nearest.
     :raises InputError: count below 0.
     """
     if count < 0:

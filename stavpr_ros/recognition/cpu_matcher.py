@@ -32,8 +32,8 @@ class CpuMatcher:
     """
     See :class:`stavpr_ros.recognition.matcher.Matcher`.
 
-    :param features: those of the map. Contiguous float32 ones whose memory begins with a cache line are
-        shared, not copied.
+    :param features: those of the map. Contiguous float32 ones whose memory begins with a cache
+        line are shared, not copied.
     """
 
     def __init__(
@@ -72,7 +72,9 @@ class CpuMatcher:
         queries = tiled(strips if self._cells is None else cut_cells(strips.cpu(), self._cells))
         out = np.empty((len(queries), self.places), np.float32)
         if self._cells is not None:
-            dot.vertical_image_distances(self._map, queries, self._cell_a, self._a, self._band, out)
+            dot.vertical_image_distances(
+                self._map, queries, self._cell_a, self._a, self._band, out
+            )
         elif self._spatial.strategy in ('adaptive', 'vanilla'):
             dot.image_distances(self._map, queries, self._a, self._band, out)
         else:

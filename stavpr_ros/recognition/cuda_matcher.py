@@ -14,19 +14,22 @@ from stavpr_ros.features import LocalFeatures
 
 BLOCK_WORDS = 2**26  # most words of products that lie in memory at a time: 256 MiB
 QUERIES = 32  # most images of a batch whose products are made at once
-PLACES_IN_PIECES = 2**14  # most places widened at a time, where the half-width product is not available
+PLACES_IN_PIECES = (
+    2**14
+)  # most places widened at a time, where the half-width product is not available
 
 
 class CudaMatcher:
     """
-    See :class:`stavpr_ros.recognition.matcher.Matcher`; this one works on torch's current CUDA device.
+    See :class:`stavpr_ros.recognition.matcher.Matcher`; on torch's current CUDA device.
 
-    Products by torch, alignment by the kernel of the strategy. Calls are queued on torch's current stream.
+    Products by torch, alignment by the kernel of the strategy. Calls are queued on torch's current
+    stream.
 
     :param features: those of the map, on any device; unit norm, strips (W, n, d), weights (W, n).
     :param spatial: how two images are compared.
-    :param precision: ``float32``, or ``float16``: the map is held in half width and the query is rounded to
-        it; products are summed up in float32.
+    :param precision: ``float32``, or ``float16``: the map is held in half width and the query is
+        rounded to it; products are summed up in float32.
     :raises UnavailableError: no CUDA device here, or the package numba-cuda is missing.
     :raises SettingsError: xi > W.
     :raises InputError: fewer strips than the sliding window has.
@@ -121,9 +124,13 @@ class CudaMatcher:
         """Multiply query strips by those of some places: (Q W, W, last - first), as the kernels take it."""
         W, n, d = self._strips.shape
         rows = len(vectors)
-        if last - first == n and not self._in_pieces:  # one product: the map is one matrix, read once
+        if (
+            last - first == n and not self._in_pieces
+        ):  # one product: the map is one matrix, read once
             block, view = self._space((rows, W, n), (0, 1, 2))
-            self._multiply(torch.mm, vectors, self._strips.view(W * n, d).T, block.view(rows, W * n))
+            self._multiply(
+                torch.mm, vectors, self._strips.view(W * n, d).T, block.view(rows, W * n)
+            )
             return view
         block, view = self._space((W, rows, last - first), (1, 0, 2))
         references = self._strips[:, first:last].transpose(1, 2)
@@ -138,7 +145,9 @@ class CudaMatcher:
             self._workspace = block, self._runtime.array(block.permute(order))
         return self._workspace
 
-    def _multiply(self, product: Any, left: torch.Tensor, right: torch.Tensor, out: torch.Tensor) -> None:
+    def _multiply(
+        self, product: Any, left: torch.Tensor, right: torch.Tensor, out: torch.Tensor
+    ) -> None:
         """Multiply, in half width with a float32 result."""
         if not self._half:
             product(left, right, out=out)

@@ -84,5 +84,7 @@ class CudaLmDtwSearch:
     def _sequences(self) -> Sequences:
         """Copy distances and lengths of all starts to the host."""
         n = self.buffer.places
-        found = SequenceDistances(self._distances[:n].cpu().numpy(), self._lengths[:n].cpu().numpy())
+        found = SequenceDistances(
+            self._distances[:n].cpu().numpy(), self._lengths[:n].cpu().numpy()
+        )
         return found.distances, found.middles

@@ -42,18 +42,21 @@ class LoopCloser(SequenceRecognizer):
     """
     Recognizes places that the same traverse has passed before, one image at a time, on the CPU.
 
-    Every image becomes a place; an image is compared with those that came at least ``exclude`` images and
-    ``exclude_seconds`` before it. Growing needs no rebuild: memory doubles when it is full, and the mean that
-    is subtracted (option ``mean_centering``) is updated when the route is an eighth longer. The closer is the
-    owner of the route's features; :meth:`features` returns them as they came.
+    Every image becomes a place; an image is compared with those that came at least ``exclude``
+    images and ``exclude_seconds`` before it. Growing needs no rebuild: memory doubles when it is
+    full, and the mean that is subtracted (option ``mean_centering``) is updated when the route is
+    an eighth longer. The closer is the owner of the route's features; :meth:`features` returns
+    them as they came.
 
-    With a ``limit``, the oldest eighth of the places is evicted whenever there are so many. Places are
-    numbered from the start of the route all the same: a number never comes to mean another image.
+    With a ``limit``, the oldest eighth of the places is evicted whenever there are so many. Places
+    are numbered from the start of the route all the same: a number never comes to mean another
+    image.
 
     :param settings: strategies ``adaptive`` and ``vanilla``.
     :param exclude: the latest images that are not part of the map, at least 1.
     :param feature_settings: how the features are made.
-    :param limit: most places held; None for all. It must leave room for more than the excluded images.
+    :param limit: most places held; None for all. It must leave room for more than the excluded
+        images.
     :param exclude_seconds: places younger than so many seconds are not part of the map either.
     :param backend, precision: see :func:`choose_loop_backend`.
     :raises SettingsError: invalid settings.
@@ -76,9 +79,15 @@ class LoopCloser(SequenceRecognizer):
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
         self._band = settings.spatial.band(W)
         self._a = adaptive_weights(W, settings.spatial, np.dtype(np.float32))
-        self._route = RouteFeatures(feature_settings, settings.applied_options.mean_centering, limit)
-        self._young: deque[int] = deque()  # stamps of the latest places, not yet old enough in seconds
-        self._places = 0  # held places that the newest image may be matched with: the oldest so many
+        self._route = RouteFeatures(
+            feature_settings, settings.applied_options.mean_centering, limit
+        )
+        self._young: deque[int] = (
+            deque()
+        )  # stamps of the latest places, not yet old enough in seconds
+        self._places = (
+            0  # held places that the newest image may be matched with: the oldest so many
+        )
 
     def __len__(self) -> int:
         """Return the number of places that are held; ``first + len`` images have come."""
@@ -102,7 +111,8 @@ class LoopCloser(SequenceRecognizer):
         """
         Begin a new window: the clock jumped, or the robot was carried elsewhere. The route stays.
 
-        Places before the reset count as old enough in seconds, since stamps cannot be compared over a jump.
+        Places before the reset count as old enough in seconds, since stamps cannot be compared
+        over a jump.
         """
         self._clear_window()
         self._young.clear()
@@ -114,7 +124,8 @@ class LoopCloser(SequenceRecognizer):
         An error leaves everything as it was.
 
         :param features: those of one image, strips (W, 1, d).
-        :param stamp: when it was taken, ns; 0 = unknown: it is then excluded by the count of images alone.
+        :param stamp: when it was taken, ns; 0 = unknown: it is then excluded by the count of
+            images alone.
         :raises FeatureMismatchError: made with other settings.
         :raises InputError: not one image, or features that are not finite.
         """
@@ -127,7 +138,7 @@ class LoopCloser(SequenceRecognizer):
 
     def newest_row(self) -> np.ndarray:
         """
-        Return the distances of the newest image to the places it may be matched with, as they are matched.
+        Return the distances of the newest image to the places it may be matched with.
 
         :returns: shape (m,), float32, of the places from ``first`` on; lower is nearer.
         """

@@ -54,13 +54,14 @@ class Match:
     :param threshold: a window is matched below it; NaN = not set.
     :param sequence: the nearest sequence of the map, accepted or not; None where there is none.
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
-    :param relative: distances are scores of mode robust, with memory and with the chance level at 1
-        (:mod:`stavpr_ros.recognition.robust.hysteresis`).
+    :param relative: distances are scores of mode robust, with memory and with the chance level at
+        1 (:mod:`stavpr_ros.recognition.robust.hysteresis`).
     :param window_stamps: stamps (ns) of the images in the window, oldest first, this one the last.
     :param image_index: place of a growing map that this image has become, -1 = none.
     :param inliers: of the geometric verification, -1 = not verified.
     :param candidates: nearest places, nearest first.
-    :param cause: why the image is in no window, two or three words to be counted; '' = it is in one.
+    :param cause: why the image is in no window, two or three words to be counted; '' = it is in
+        one.
     :param stages: seconds that each stage took.
     :param image: the image, RGB, where it was decoded.
     """
@@ -99,9 +100,10 @@ class Match:
         """
         Distance of the nearest sequence, accepted or not; NaN without one.
 
-        In mode paper, q_m of LM-DTW: a mean image distance of this window alone. In mode robust (``relative``),
-        a score with memory from 0 (certain) to 1 (chance level): see
-        :mod:`stavpr_ros.recognition.robust.hysteresis`. Successive scores are correlated, since hysteresis keeps
+        In mode paper, q_m of LM-DTW: a mean image distance of this window alone. In mode robust
+        (``relative``), a score with memory from 0 (certain) to 1 (chance level): see
+        :mod:`stavpr_ros.recognition.robust.hysteresis`. Successive scores are correlated, since
+            hysteresis keeps
         strong evidence for some images; they are not independent measurements.
         """
         return self.sequence.distance if self.sequence else math.nan

@@ -48,16 +48,19 @@ def make_matcher(
     Put a map's features on a backend.
 
     :param backend: ``cpu`` or ``cuda``.
-    :param precision: of the map's features in memory: ``float32``, or ``float16``, half the memory and half
-        the time to read it; sums are float32 in both. The query's features are rounded as well on ``cuda``.
-        Image distances of the backends differ by 1e-5 at most, except where a tie of two strips is decided
-        otherwise.
-    :raises SettingsError: no such precision, or settings that do not fit the map (xi > W) or the backend.
+    :param precision: of the map's features in memory: ``float32``, or ``float16``, half the memory
+        and half the time to read it; sums are float32 in both. The query's features are rounded as
+        well on ``cuda``. Image distances of the backends differ by 1e-5 at most, except where a
+        tie of two strips is decided otherwise.
+    :raises SettingsError: no such precision, or settings that do not fit the map (xi > W) or the
+        backend.
     :raises InputError: vertical alignment of features whose cells are not known.
     :raises UnavailableError: the backend is not available.
     """
     if precision not in PRECISIONS:
-        raise SettingsError(f'precision {precision!r} is unknown: take one of {", ".join(PRECISIONS)}')
+        raise SettingsError(
+            f'precision {precision!r} is unknown: take one of {", ".join(PRECISIONS)}'
+        )
     spatial.band(features.settings.strips)
     if backend == 'cuda' and spatial.vertical:
         raise SettingsError("backend 'cuda' has no vertical alignment: take 'cpu'")

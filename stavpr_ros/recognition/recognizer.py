@@ -38,7 +38,8 @@ class RecognizerSettings:
     :param threshold: a window is matched when its distance is below it; > 0.
     :param spatial: how two images are compared.
     :param sequence: how a window is matched.
-    :param nms_radius: the second best's midpoint is more than so many places from the nearest one's.
+    :param nms_radius: the second best's midpoint is more than so many places from the nearest
+        one's.
     :param mode: ``paper``, or ``robust``, with all options of
         :class:`stavpr_ros.recognition.robust.options.RobustOptions`.
     :param robust_options: another choice of options than the mode's.
@@ -53,10 +54,16 @@ class RecognizerSettings:
 
     def __post_init__(self) -> None:
         if not self.threshold > 0 or math.isnan(self.threshold):
-            raise SettingsError(f'threshold = {self.threshold} must be above 0: nothing is nearer than 0')
+            raise SettingsError(
+                f'threshold = {self.threshold} must be above 0: nothing is nearer than 0'
+            )
         if self.nms_radius < 0:
             raise SettingsError(f'nms_radius = {self.nms_radius} must be at least 0 places')
-        if options_of(self.mode).second_best_margin and self.robust_options is None and self.threshold > 1:
+        if (
+            options_of(self.mode).second_best_margin
+            and self.robust_options is None
+            and self.threshold > 1
+        ):
             raise SettingsError(
                 f'threshold = {self.threshold}: distances of mode robust end at 1, the chance level'
             )
@@ -119,8 +126,8 @@ class SequenceRecognizer:
         """
         Rank places for the newest window, no two of them neighbors, nearest first.
 
-        The first is the nearest place of the match, accepted or not, with its distance, the second its second
-        best.
+        The first is the nearest place of the match, accepted or not, with its distance, the second
+        its second best.
 
         :param count: most candidates, at least 0.
         :returns: none before the first full window.
@@ -171,7 +178,10 @@ class SequenceRecognizer:
             reason = f'{len(self._buffer)} of {length} images in the window'
             return Match(Status.WARMING_UP, reason, threshold)
         self._window = self._search(self._settings.nms_radius)
-        self._nearest, relative = self._window.nearest, self._settings.applied_options.second_best_margin
+        self._nearest, relative = (
+            self._window.nearest,
+            self._settings.applied_options.second_best_margin,
+        )
         if self._nearest is None:
             return Match(Status.NO_MATCH, 'the map is empty', threshold)
         if relative:
@@ -180,7 +190,8 @@ class SequenceRecognizer:
         if not self._nearest.distance < threshold:
             status = Status.NO_MATCH
             reason = (
-                f'nearest distance {self._nearest.distance:.4f} is not below the threshold {threshold:.4f}'
+                f'nearest distance {self._nearest.distance:.4f} is not below the threshold '
+                f'{threshold:.4f}'
             )
         return Match(status, reason, threshold, self._nearest, self._window.path, relative)
 
@@ -201,14 +212,14 @@ class PlaceRecognizer(SequenceRecognizer):
     """
     Recognizes places of one map, one image at a time.
 
-    The matcher holds features of its own, unless they are the map's unchanged (float32, without mean
-    centering, on the CPU): then both share the memory. For a map of
+    The matcher holds features of its own, unless they are the map's unchanged (float32, without
+    mean centering, on the CPU): then both share the memory. For a map of
     :func:`stavpr_ros.mapping.open_map`, the matcher's are the only ones in memory.
 
     :param place_map: the reference map.
     :param settings: see :class:`RecognizerSettings`.
-    :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``. In mode robust, image distances are
-        computed there and sequences on the CPU.
+    :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``. In mode robust, image
+        distances are computed there and sequences on the CPU.
     :param precision: of the map's features in the matcher, ``float32`` or ``float16``; see
         :func:`stavpr_ros.recognition.matcher.make_matcher`.
     :raises UnavailableError: no such backend here.

@@ -13,8 +13,8 @@ class RouteFeatures:
     """
     Features of the places of a route, less their mean if that is wanted, unit norm.
 
-    With the norm that a centered feature had before it was made unit norm, the features give back the original
-    ones: nothing is held twice.
+    With the norm that a centered feature had before it was made unit norm, the features give back
+    the original ones: nothing is held twice.
 
     :param settings: how the features are made.
     :param mean_centering: subtract the mean.
@@ -29,7 +29,9 @@ class RouteFeatures:
         self._weights = torch.empty((settings.strips, 0))
         # (W, room): the norm of each feature less the mean; 0 for zero features
         self._norms = torch.empty((settings.strips, 0))
-        self._sum = self._mean = torch.empty((settings.strips, 0))  # of the original features, (W, d)
+        self._sum = self._mean = torch.empty(
+            (settings.strips, 0)
+        )  # of the original features, (W, d)
         self._next_mean = 1
 
     @property
@@ -101,7 +103,11 @@ class RouteFeatures:
         n, W = self.count, self._settings.strips
         room = max(ROOM, 2 * self.room)
         room = room if self._limit is None else min(room, self._limit)
-        strips, norms, weights = torch.empty((W, room, d)), torch.empty((W, room)), torch.empty((W, room))
+        strips, norms, weights = (
+            torch.empty((W, room, d)),
+            torch.empty((W, room)),
+            torch.empty((W, room)),
+        )
         if n:
             strips[:, :n], norms[:, :n], weights[:, :n] = self.strips, self._norms, self._weights
         else:

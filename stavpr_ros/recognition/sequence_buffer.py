@@ -13,14 +13,14 @@ class SequenceBuffer:
     """
     A ring of the last l rows that always lies contiguous in memory, oldest row first.
 
-    Every row is written twice, l rows apart, so that the last l rows are one slice of the memory. Rows are
-    checked when they are pushed; the searches over the buffer trust them.
+    Every row is written twice, l rows apart, so that the last l rows are one slice of the memory.
+    Rows are checked when they are pushed; the searches over the buffer trust them.
 
     :param length: rows l.
     :param places: places n of the map.
     :param k: places that one start of LM-DTW sees.
-    :param row_width: words from row to row for n places and k; the padding that a kernel needs behind the
-        places is +inf.
+    :param row_width: words from row to row for n places and k; the padding that a kernel needs
+        behind the places is +inf.
     :param device: of the memory.
     """
 
@@ -81,8 +81,8 @@ class SequenceBuffer:
         :param row: shape (m,), float32, of the first m <= n places; the others become +inf. On the
             buffer's device.
         :param stamp: of the image, ns; 0 = unknown.
-        :raises InputError: NaN or -inf in the row; the buffer is unchanged. Not checked on a CUDA device,
-            which would have to be waited for.
+        :raises InputError: NaN or -inf in the row; the buffer is unchanged. Not checked on a CUDA
+            device, which would have to be waited for.
         """
         if not row.is_cuda and not float(row.sum()) > -torch.inf:
             no_nan(row.numpy(), 'image distances')

@@ -32,8 +32,8 @@ class WindowMatch:
 
     :param nearest: with the second best; None where no sequence is possible.
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
-    :param sequences: returns the costs of all sequences, shape (n,), float32, +inf where there is none, and
-        their middle places, shape (n,); valid until the next search.
+    :param sequences: returns the costs of all sequences, shape (n,), float32, +inf where there is
+        none, and their middle places, shape (n,); valid until the next search.
     """
 
     nearest: SequenceMatch | None = None
@@ -69,7 +69,9 @@ class LmDtwSearch:
         path = NO_PATH
         if nearest is not None:
             path = trace_sequence(window[:, :n], nearest.first, k).path
-        return _renumbered(nearest, path, lambda: (matches.distances, matches.middles + first), first)
+        return _renumbered(
+            nearest, path, lambda: (matches.distances, matches.middles + first), first
+        )
 
 
 class VelocitySearch:
@@ -77,18 +79,23 @@ class VelocitySearch:
     Search along lines of constant velocity (:mod:`stavpr_ros.alignment.velocity`), on the CPU.
 
     :param buffer: the window.
-    :param znorm: applied to the distances. Without any z-normalization they are divided by the standard
-        deviation of the window, since the penalty of the search is meant in deviations.
+    :param znorm: applied to the distances. Without any z-normalization they are divided by the
+        standard deviation of the window, since the penalty of the search is meant in deviations.
     :param settings: velocities and penalty.
     """
 
     def __init__(
-        self, buffer: SequenceBuffer, znorm: ZNormalization, settings: VelocitySettings | None = None
+        self,
+        buffer: SequenceBuffer,
+        znorm: ZNormalization,
+        settings: VelocitySettings | None = None,
     ) -> None:
         self.buffer, self._znorm = buffer, znorm
         self._settings = settings or VelocitySettings()
         steps = self._settings.steps(buffer.length)
-        self._reach = int(steps.sum(axis=1).max()) + buffer.length  # most places that a path passes
+        self._reach = (
+            int(steps.sum(axis=1).max()) + buffer.length
+        )  # most places that a path passes
 
     def __call__(self, nms_radius: int) -> WindowMatch:
         rows, n, first = self.buffer.rows().numpy(), self.buffer.known, self.buffer.first
@@ -105,7 +112,9 @@ class VelocitySearch:
             velocity = int(matches.speeds[nearest.last])
             path = trace_velocity(costs, nearest.last - near.start, velocity, self._settings)
             path[:, 1] += near.start
-        return _renumbered(nearest, path, lambda: (matches.distances, matches.middles + first), first)
+        return _renumbered(
+            nearest, path, lambda: (matches.distances, matches.middles + first), first
+        )
 
 
 def _renumbered(

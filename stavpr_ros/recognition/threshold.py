@@ -28,7 +28,8 @@ class ThresholdSuggestion:
 
 def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np.ndarray:
     """
-    Alter an image as another day and another lane might: shifted, lit and exposed otherwise, duller, noisy.
+    Alter an image as another day and another lane might: shifted, lit and exposed otherwise,
+    duller, noisy.
 
     :param image: RGB (h, w, 3) uint8.
     :param variant: 0..3: shifted to one side or the other, darker or brighter.
@@ -56,9 +57,10 @@ def suggest_threshold(
     """
     Ask how near the map's places come to *other* places of it when they look different.
 
-    Windows spread over the map are altered (:func:`harder_look`, on the thumbnails) and matched with the
-    map without their own nms_radius. All those answers are wrong; the suggestion is the median of
-    their distances. It is a start: where precision matters, evaluate with a second real drive.
+    Windows spread over the map are altered (:func:`harder_look`, on the thumbnails) and matched
+    with the map without their own nms_radius. All those answers are wrong; the suggestion is the
+    median of their distances. It is a start: where precision matters, evaluate with a second real
+    drive.
 
     :param settings: of the recognizer; its threshold is not used.
     :param windows: how many windows are tried.
@@ -68,7 +70,9 @@ def suggest_threshold(
     sequence = settings.sequence
     n, l = len(place_map), sequence.length
     if n < 4 * l:
-        raise InputError(f'a map of {n} places is too short for a threshold: at least {4 * l} are needed')
+        raise InputError(
+            f'a map of {n} places is too short for a threshold: at least {4 * l} are needed'
+        )
     if not place_map.thumbnails:
         raise InputError('the map was built without thumbnails: a threshold cannot be tried on it')
     recognizer, extractor = PlaceRecognizer(place_map, settings), place_map.extractor()
@@ -79,7 +83,9 @@ def suggest_threshold(
         tqdm(starts, desc='threshold', unit='window', disable=None if progress else True)
     ):
         pictures = [place_map.thumbnail(place) for place in range(start, start + l)]
-        altered = [harder_look(picture, variant, rng) for picture in pictures if picture is not None]
+        altered = [
+            harder_look(picture, variant, rng) for picture in pictures if picture is not None
+        ]
         features = extractor.extract(altered)
         window = recognizer.distances(features)
         window[:, max(0, start - l) : start + 2 * l] = np.inf

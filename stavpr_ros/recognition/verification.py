@@ -1,8 +1,8 @@
 """
 Geometric verification: whether two pictures show the same scene from two viewpoints.
 
-Keypoints of both are matched, and the matches counted that one epipolar geometry explains. A wrong place that
-looks alike has matches as well, but few that one geometry explains.
+Keypoints of both are matched, and the matches counted that one epipolar geometry explains. A wrong
+place that looks alike has matches as well, but few that one geometry explains.
 """
 
 import math
@@ -27,8 +27,9 @@ class GeometricSettings:
     """
     How two pictures are checked against each other.
 
-    The defaults belong together: more features, a ratio nearer to 1 and more pixels let more matches of wrong
-    places through, and ``min_inliers`` has to rise with them. For ``sift``, 20 do.
+    The defaults belong together: more features, a ratio nearer to 1 and more pixels let more
+    matches of wrong places through, and ``min_inliers`` has to rise with them. For ``sift``, 20
+    do.
 
     :param method: keypoints: ``orb`` (fast) or ``sift`` (slower, fewer matches).
     :param min_inliers: matches that one geometry must explain; at least 8.
@@ -47,7 +48,9 @@ class GeometricSettings:
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
-            raise SettingsError(f'method {self.method!r} is unknown: take one of {", ".join(METHODS)}')
+            raise SettingsError(
+                f'method {self.method!r} is unknown: take one of {", ".join(METHODS)}'
+            )
         for name, value in (('min_inliers', self.min_inliers), ('features', self.features)):
             if value < LEAST_MATCHES:
                 raise SettingsError(
@@ -73,8 +76,8 @@ class GeometricVerifier:
     """
     Counts the matches of two pictures that one geometry explains. Belongs to one thread.
 
-    The same pictures give the same count. The keypoints of the last query are kept, so that one image is
-    checked against several places at little more than the places' cost.
+    The same pictures give the same count. The keypoints of the last query are kept, so that one
+    image is checked against several places at little more than the places' cost.
 
     :param settings: see :class:`GeometricSettings`.
     """
@@ -111,11 +114,15 @@ class GeometricVerifier:
     def _small_gray(self, image: np.ndarray, name: str) -> np.ndarray:
         """Return a picture at the common width, (h, w) uint8."""
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
-            raise InputError(f'{name} is {image.dtype} {image.shape}: expected RGB (h, w, 3) uint8')
+            raise InputError(
+                f'{name} is {image.dtype} {image.shape}: expected RGB (h, w, 3) uint8'
+            )
         (height, width), to = image.shape[:2], self.settings.width
         size = to, min(max(1, round(height * to / width)), TALLEST * to)
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        return cv2.resize(gray, size, interpolation=cv2.INTER_AREA if width > to else cv2.INTER_LINEAR)
+        return cv2.resize(
+            gray, size, interpolation=cv2.INTER_AREA if width > to else cv2.INTER_LINEAR
+        )
 
     def _detected(self, gray: np.ndarray) -> _Keypoints:
         nothing = _Keypoints(np.empty((0, 2), np.float32), np.empty((0, 0), np.uint8))
@@ -128,7 +135,11 @@ class GeometricVerifier:
 
     def _matches(self, mine: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of keypoints, each other's nearest and clearly so: two arrays (m,) of their numbers."""
-        how = (cv2.CV_32S, cv2.NORM_HAMMING) if self.settings.method == 'orb' else (cv2.CV_32F, cv2.NORM_L2)
+        how = (
+            (cv2.CV_32S, cv2.NORM_HAMMING)
+            if self.settings.method == 'orb'
+            else (cv2.CV_32F, cv2.NORM_L2)
+        )
         distances, nearest = cv2.batchDistance(mine, theirs, how[0], normType=how[1], K=2)
         clear = np.flatnonzero(distances[:, 0] < self.settings.ratio * distances[:, 1])
         matched = nearest[clear, 0]
@@ -149,7 +160,9 @@ def _detector(settings: GeometricSettings) -> Any:
 def _explained(points: np.ndarray, others: np.ndarray, pixels: float) -> int:
     """Matches (m, 2) with (m, 2) that the best fundamental matrix explains; also those of a flat scene."""
     try:
-        _, mask = cv2.findFundamentalMat(points, others, cv2.USAC_MAGSAC, pixels, CONFIDENCE, ITERATIONS)
+        _, mask = cv2.findFundamentalMat(
+            points, others, cv2.USAC_MAGSAC, pixels, CONFIDENCE, ITERATIONS
+        )
     except cv2.error:  # how it says of some matches, many in one point, that no matrix fits
         return 0
     return 0 if mask is None else int(np.count_nonzero(mask))

@@ -32,7 +32,7 @@ class MeanCentering:
 
     def next_query(self, strips: torch.Tensor) -> torch.Tensor:
         """
-        Return features of the next image of the query less the query's running mean, this image included.
+        Return the next image's features less the query's running mean, it included.
 
         :param strips: shape (W, d); the same is returned.
         """
@@ -48,6 +48,6 @@ def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
     for j in range(len(strips)):
         for whole, piece in zip(strips[j].split(PIECE), out[j].split(PIECE), strict=True):
             torch.sub(whole, mean[j], out=piece)
-            piece *= whole.any(dim=1, keepdim=True)
-            piece /= piece.norm(dim=1, keepdim=True).clamp_(min=1e-12)
+            piece.mul_(whole.any(dim=1, keepdim=True))
+            piece.div_(piece.norm(dim=1, keepdim=True).clamp_(min=1e-12))
     return out

@@ -1,19 +1,20 @@
 """
 The score of mode robust: second-best margin and hysteresis.
 
-A sequence is scored by its mean z-normalized distance and its margin to the second best, both in standard
-deviations. With hysteresis the score has memory: strong evidence of earlier windows lasts, fading, while the
-matched place moves on steadily. Successive scores are therefore correlated.
+A sequence is scored by its mean z-normalized distance and its margin to the second best, both in
+standard deviations. With hysteresis the score has memory: strong evidence of earlier windows
+lasts, fading, while the matched place moves on steadily. Successive scores are therefore
+correlated.
 """
 
 import math
 
-# The evidence that windows from unknown places show as well, in deviations: at most one in thirty of them
-# shows more on every pair of data sets that was tried.
+# The evidence that windows from unknown places show as well, in deviations: at most one in thirty
+# of them shows more on every pair of data sets that was tried.
 CHANCE = -2.2
-# The best of few sequences is far away: on a short map, or at the start of a route, every window would have a
-# large margin. The second best is then taken to be at least as near as the best of many in windows from
-# unknown places.
+# The best of few sequences is far away: on a short map, or at the start of a route, every window
+# would have a large margin. The second best is then taken to be at least as near as the best of
+# many in windows from unknown places.
 FEW_SEQUENCES = 20
 USUAL_SECOND_BEST = -0.8
 FADING = 0.05  # deviations that evidence loses with each image

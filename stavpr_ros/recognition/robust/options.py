@@ -6,7 +6,9 @@ from stavpr_ros.errors import SettingsError
 
 MODES = ('paper', 'robust')
 THRESHOLD = 1.0  # of mode robust; smaller is stricter
-LOOP_THRESHOLD = 0.8  # for loop closure, where every image is a query and a false match bends a map
+LOOP_THRESHOLD = (
+    0.8  # for loop closure, where every image is a query and a false match bends a map
+)
 
 
 @dataclass(frozen=True)
@@ -14,16 +16,19 @@ class RobustOptions:
     """
     Failure modes of the paper's method and their mitigations.
 
-    :param mean_centering: subtract the mean of the map's features from its features, and the running mean of
-        the query from the query's: the part shared by all images distinguishes no places.
-    :param query_znorm: z-normalize the distances of an image to all places: some images are far from all.
-    :param reference_znorm: z-normalize the distances of a place to the latest images, against hubness: some
-        places are near to all images.
+    :param mean_centering: subtract the mean of the map's features from its features, and the
+        running mean of the query from the query's: the part shared by all images distinguishes no
+        places.
+    :param query_znorm: z-normalize the distances of an image to all places: some images are far
+        from all.
+    :param reference_znorm: z-normalize the distances of a place to the latest images, against
+        hubness: some places are near to all images.
     :param velocity_search: match windows along lines of several velocities
-        (:mod:`stavpr_ros.alignment.velocity`) instead of by LM-DTW, where one place may absorb a window.
+        (:mod:`stavpr_ros.alignment.velocity`) instead of by LM-DTW, where one place may absorb a
+        window.
     :param second_best_margin: score the nearest sequence by its margin to the second best as well.
-    :param hysteresis: keep evidence for some images while the matched place moves on steadily; needs
-        ``second_best_margin``.
+    :param hysteresis: keep evidence for some images while the matched place moves on steadily;
+        needs ``second_best_margin``.
     """
 
     mean_centering: bool = True

@@ -1,10 +1,10 @@
 """
 Z-normalization of image distances, over the map (query) and over time (reference).
 
-Query z-normalization brings a row, the distances of one image to all places, to mean 0 and standard deviation
-1. Reference z-normalization does the same for each place over the latest rows, against hubness: places that
-are near to every image. Its running mean and variance start from the distances of the map to itself. Causal:
-only rows that have arrived count.
+Query z-normalization brings a row, the distances of one image to all places, to mean 0 and
+standard deviation 1. Reference z-normalization does the same for each place over the latest rows,
+against hubness: places that are near to every image. Its running mean and variance start from the
+distances of the map to itself. Causal: only rows that have arrived count.
 """
 
 from collections.abc import Callable
@@ -34,8 +34,8 @@ class ZNormalization:
         """
         Start from the distances of the map to itself.
 
-        :param rows: distances of some places to all, shape (m, n), float32; NaN where they are neighbors.
-            Written over: copies of all of them would stay in the heap of the process.
+        :param rows: distances of some places to all, shape (m, n), float32; NaN where they are
+            neighbors. Written over: copies of all of them would stay in the heap of the process.
         """
         n = len(self._mean)
         count, total, squares = np.zeros(n, np.int64), np.zeros(n, np.float32), np.zeros(n)
@@ -67,11 +67,15 @@ class ZNormalization:
     def grow(self, places: int) -> None:
         """Make room for more places, which start with mean 0 and deviation 1."""
         more = places - len(self._mean)
-        self._change_each(lambda values, start: np.append(values, np.full(more, start, np.float32)))
+        self._change_each(
+            lambda values, start: np.append(values, np.full(more, start, np.float32))
+        )
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up, and as many new ones have room behind them."""
-        self._change_each(lambda values, start: np.append(values[count:], np.full(count, start, np.float32)))
+        self._change_each(
+            lambda values, start: np.append(values[count:], np.full(count, start, np.float32))
+        )
 
     def _change_each(self, change: Callable[[np.ndarray, float], np.ndarray]) -> None:
         """Change every array of one value a place; the second argument is the value of a new place."""
