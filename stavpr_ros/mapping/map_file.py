@@ -1,31 +1,31 @@
 """
 One map, one file.
 
-The file is a ZIP archive without compression: ``manifest.json`` (format, version, feature settings,
-ids, the hash of every other member) and one ``.npy`` array each for strips, weights, stamps, poses,
-projection and thumbnails. Nothing in it is executable, arrays of objects (pickles) are refused.
+The file is a ZIP archive without compression: ``manifest.json`` (format, version, feature
+settings, ids, the hash of every other member) and one ``.npy`` array each for strips, weights,
+stamps, poses, projection and thumbnails. Nothing in it is executable, arrays of objects (pickles)
+are rejected.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 import hashlib
 import io
 import json
 import os
+from pathlib import Path
 import tempfile
+from threading import Lock
+from typing import Any, IO
 import weakref
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import replace
-from pathlib import Path
-from threading import Lock
-from typing import IO, Any
 
 import numpy as np
-import torch
-
 from stavpr_ros.errors import InputError, MapFileError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.place_map import PlaceMap
+import torch
 
 FORMAT = 'stavpr-map'
 VERSION = 1
@@ -55,13 +55,15 @@ def _arrays(place_map: PlaceMap) -> dict[str, np.ndarray]:
         arrays['projection'] = place_map.projection.matrix
     if place_map.thumbnails:
         arrays['thumbnails'] = np.frombuffer(b''.join(place_map.thumbnails), np.uint8)
-        arrays['thumbnail_ends'] = np.cumsum([len(picture) for picture in place_map.thumbnails])
+        arrays['thumbnail_ends'] = np.cumsum(
+            [len(thumbnail) for thumbnail in place_map.thumbnails]
+        )
     return {name: np.ascontiguousarray(array, _TYPES[name]) for name, array in arrays.items()}
 
 
 def save_map(place_map: PlaceMap, path: str | Path) -> None:
     """
-    Write a map to a file, whole or not at all: a file that was there stays until the new one is complete.
+    Write a map to a file atomically: an existing file is replaced by the complete new one.
 
     :raises MapFileError: the file cannot be written.
     """
@@ -78,11 +80,15 @@ def save_map(place_map: PlaceMap, path: str | Path) -> None:
         'projection': place_map.projection.name if place_map.projection else None,
         'cells': place_map.features.cells,
         'ids': place_map.ids,
-        'members': {name: hashlib.sha256(content).hexdigest() for name, content in members.items()},
+        'members': {
+            name: hashlib.sha256(content).hexdigest() for name, content in members.items()
+        },
     }
     temporary = None
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f'.{path.name}.', delete=False) as file:
+        with tempfile.NamedTemporaryFile(
+            dir=path.parent, prefix=f'.{path.name}.', delete=False
+        ) as file:
             temporary = file.name
             with zipfile.ZipFile(file, 'w', zipfile.ZIP_STORED) as archive:
                 archive.writestr(MANIFEST, json.dumps(manifest))
@@ -93,7 +99,9 @@ def save_map(place_map: PlaceMap, path: str | Path) -> None:
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
     except OSError as error:
-        raise MapFileError(f'map {path} cannot be written ({error}); what was there is untouched') from error
+        raise MapFileError(
+            f'map {path} cannot be written ({error}); an existing file is untouched'
+        ) from error
     finally:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
@@ -109,7 +117,8 @@ def load_map(path: str | Path) -> PlaceMap:
     """
     Read a map.
 
-    :raises MapFileError: no such file, or one that is damaged, truncated, foreign or from a newer version.
+    :raises MapFileError: no such file, or one that is damaged, truncated, foreign or of a newer
+        version.
     """
     with _readable(Path(path)), open(path, 'rb') as file:
         return _read_map(file, Path(path))
@@ -117,7 +126,7 @@ def load_map(path: str | Path) -> PlaceMap:
 
 def open_map(path: str | Path) -> PlaceMap:
     """
-    Read and check a map, but leave its features in the file: they are read again whenever they are used.
+    Read and check a map whose features stay in the file and are read on every use.
 
     :raises MapFileError: see :func:`load_map`.
     """
@@ -133,13 +142,12 @@ def open_map(path: str | Path) -> PlaceMap:
 
 class StoredFeatures(LocalFeatures):
     """
-    Features of a map in its file: in memory only while they are used, and only where they are used.
+    Features of a map that stay in its file, without a copy in memory.
 
-    ``strips`` and ``weights`` are read anew each time; ``features[:]`` reads both. The file stays open, so that
-    it may be replaced or deleted meanwhile; its content is checked at every reading. May be used from any
-    thread.
+    Every access to ``strips`` and ``weights`` reads and checks them; ``features[:]`` reads both.
+    The file stays open, so that it may be replaced or deleted. Thread-safe.
 
-    :param features: those that the file holds.
+    :param features: the features in the file.
     :param file: the map file.
     :param path: its name, for error messages.
     """
@@ -158,7 +166,9 @@ class StoredFeatures(LocalFeatures):
         return f'StoredFeatures({str(self._path)!r}, shape {self._shape}, {self.settings})'
 
     def __getitem__(self, images: slice) -> LocalFeatures:
-        return LocalFeatures(self.strips[:, images], self.weights[:, images], self.settings, self.cells)
+        return LocalFeatures(
+            self.strips[:, images], self.weights[:, images], self.settings, self.cells
+        )
 
     @property
     def dimension(self) -> int:
@@ -188,7 +198,9 @@ def _read_map(file: IO[bytes], path: Path) -> PlaceMap:
     with zipfile.ZipFile(file) as archive:
         manifest = _read_manifest(archive, path)
         members = manifest['members'].items()
-        return _assemble(manifest, {name: _read_array(archive, name, digest) for name, digest in members})
+        return _assemble(
+            manifest, {name: _read_array(archive, name, digest) for name, digest in members}
+        )
 
 
 @contextmanager
@@ -201,7 +213,9 @@ def _readable(path: Path) -> Iterator[None]:
     except FileNotFoundError as error:
         raise MapFileError(f'map {path} does not exist: make one with build_map') from error
     except (IsADirectoryError, PermissionError) as error:
-        raise MapFileError(f'map {path} cannot be read ({error.strerror}): name a map file') from error
+        raise MapFileError(
+            f'map {path} cannot be read ({error.strerror}): name a map file'
+        ) from error
     except (
         OSError,
         EOFError,
@@ -216,14 +230,15 @@ def _readable(path: Path) -> Iterator[None]:
         ) from error
     except zipfile.BadZipFile as error:
         raise MapFileError(
-            f'{path} is no map of this program, or damaged or truncated ({error}): build it with build_map'
+            f'{path} is no map of this program, or damaged or truncated ({error}): build it with '
+            'build_map'
         ) from error
 
 
 def _read(archive: zipfile.ZipFile, member: str) -> np.ndarray:
     """Return the bytes of a member, uint8, in memory that begins with a cache line."""
     info = archive.getinfo(member)
-    if info.compress_type != zipfile.ZIP_STORED:  # ours never is; a bomb would be
+    if info.compress_type != zipfile.ZIP_STORED:  # rejects ZIP bombs
         raise ValueError(f'{member} is compressed')
     content = torch.empty(info.file_size, dtype=torch.uint8).numpy()
     at = 0
@@ -236,13 +251,18 @@ def _read(archive: zipfile.ZipFile, member: str) -> np.ndarray:
 
 def _read_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
     if MANIFEST not in archive.namelist():
-        raise MapFileError(f'{path} is no map of this program: it is a ZIP file without {MANIFEST}')
+        raise MapFileError(
+            f'{path} is no map of this program: it is a ZIP file without {MANIFEST}'
+        )
     manifest = json.loads(_read(archive, MANIFEST).tobytes())
     if not isinstance(manifest, dict) or manifest.get('format') != FORMAT:
-        raise MapFileError(f'{path} is no map of this program: its manifest does not say {FORMAT!r}')
+        raise MapFileError(
+            f'{path} is no map of this program: its manifest does not state {FORMAT!r}'
+        )
     if manifest['version'] > VERSION:
         raise MapFileError(
-            f'{path} has format version {manifest["version"]}, this program reads up to {VERSION}: update it'
+            f'{path} has format version {manifest["version"]}, this program reads up to '
+            f'{VERSION}: update it'
         )
     return manifest
 
@@ -258,16 +278,24 @@ def _read_array(archive: zipfile.ZipFile, name: str, digest: str) -> np.ndarray:
     if dtype != _TYPES[name] or columns_first:
         raise ValueError(f'{name} is {dtype}, columns first {columns_first}')
     # not a copy, and aligned: NumPy's headers end at a multiple of 64 bytes
-    return content[header.tell() :].view(dtype).reshape(shape)
+    return content[header.seek(0, io.SEEK_CUR) :].view(dtype).reshape(shape)
 
 
 def _assemble(manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> PlaceMap:
     try:
         settings = FeatureSettings.from_json(manifest['settings'])
         strips, weights = arrays['strips'], arrays['weights']
-        if strips.ndim != 3 or strips.shape[0] != settings.strips or weights.shape != strips.shape[:2]:
-            raise ValueError(f'strips {strips.shape} and weights {weights.shape} for W = {settings.strips}')
-        extremes = [extreme(initial=0) for array in (strips, weights) for extreme in (array.min, array.max)]
+        if (
+            strips.ndim != 3
+            or strips.shape[0] != settings.strips
+            or weights.shape != strips.shape[:2]
+        ):
+            raise ValueError(
+                f'strips {strips.shape} and weights {weights.shape} for W = {settings.strips}'
+            )
+        extremes = [
+            extreme(initial=0) for array in (strips, weights) for extreme in (array.min, array.max)
+        ]
         if not np.isfinite(extremes).all():  # NaN among the values is their minimum
             raise ValueError('features are not finite')
         cells = manifest.get('cells')
@@ -279,17 +307,21 @@ def _assemble(manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> PlaceM
         projection = None
         if manifest['projection'] is not None:
             projection = Projection(arrays['projection'], manifest['projection'])
-        pictures: tuple[bytes, ...] = ()
+        thumbnails: tuple[bytes, ...] = ()
         if 'thumbnails' in arrays:
             content, ends = arrays['thumbnails'].tobytes(), arrays['thumbnail_ends'].tolist()
-            pictures = tuple(content[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True))
+            thumbnails = tuple(
+                content[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)
+            )
         return PlaceMap(
-            features=LocalFeatures(torch.from_numpy(strips), torch.from_numpy(weights), settings, cells),
+            features=LocalFeatures(
+                torch.from_numpy(strips), torch.from_numpy(weights), settings, cells
+            ),
             projection=projection,
             stamps=arrays['stamps'],
             ids=tuple(str(identifier) for identifier in manifest['ids']),
             poses=arrays.get('poses'),
-            thumbnails=pictures,
+            thumbnails=thumbnails,
         )
     except (InputError, SettingsError) as error:
         raise ValueError(str(error)) from error
