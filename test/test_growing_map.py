@@ -77,7 +77,7 @@ def test_growing_map_memory_doubles_up_to_limit():
     texts = [sum(len(f'place {j}') + (j % 2 == 0) for j in range(i)) for i in range(18)]
     places = [(room - text) / place for room, text in zip(rooms, texts, strict=True)]
     assert places == [0, *[4] * 4, *[8] * 4, *[16] * 8, 18]
-    with pytest.raises(InputError, match=r'full, it has 18 places: raise its limit, forget'):
+    with pytest.raises(InputError, match=r'full, it has 18 places: raise its limit, evict'):
         add(made, 18)
     assert_holds(made, range(18))
 
@@ -217,7 +217,7 @@ def test_add_with_error_changes_nothing(count, arguments, error, words):
 
 def test_add_of_other_dimension_is_rejected():
     made = grown(2)
-    with pytest.raises(InputError, match='6 dimensions came: the map has 5'):
+    with pytest.raises(InputError, match='6 dimensions: the map has 5'):
         made.add(features(2, d=6))
     assert_holds(made, range(2))
 

@@ -1,12 +1,17 @@
-"""The reference map: build, grow, save, load; and which images become its places."""
+"""The reference map: build, grow, save and load it; keyframes and trajectories."""
 
 from stavpr_ros.mapping.builder import build_map, extract_features
 from stavpr_ros.mapping.growing_map import GrowingMap
-from stavpr_ros.mapping.keyframes import KeyframeSelector, KeyframeSettings, image_change, small_gray
+from stavpr_ros.mapping.keyframes import (
+    image_change,
+    KeyframeSelector,
+    KeyframeSettings,
+    small_gray,
+)
 from stavpr_ros.mapping.map_file import load_map, open_map, save_map
 from stavpr_ros.mapping.place import Place, place_at, place_thumbnail
-from stavpr_ros.mapping.place_map import PlaceMap, encode_thumbnail
-from stavpr_ros.mapping.trajectory import Trajectory, distance, rotation
+from stavpr_ros.mapping.place_map import encode_thumbnail, PlaceMap
+from stavpr_ros.mapping.trajectory import distance, rotation, Trajectory
 
 __all__ = [
     'GrowingMap',
@@ -16,9 +21,9 @@ __all__ = [
     'PlaceMap',
     'Trajectory',
     'build_map',
-    'extract_features',
     'distance',
     'encode_thumbnail',
+    'extract_features',
     'image_change',
     'load_map',
     'open_map',

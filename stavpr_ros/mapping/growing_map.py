@@ -1,30 +1,28 @@
-"""A map that grows by one place at a time, while the robot drives."""
+"""A map that grows by one place at a time."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
+import dataclasses
 
 import numpy as np
-import torch
-
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.place_map import PlaceMap, require_projection
 from stavpr_ros.mapping.trajectory import checked_pose
+import torch
 
-ROOM = 256  # places that there is room for at first; doubled when they are full
+ROOM = 256  # initial capacity in places; doubled when it is full
 
 
 class GrowingMap:
     """
     Places in the order in which they were added.
 
-    A place costs no rebuild: memory doubles when it is full, up to ``limit`` places. The oldest
-    places may be forgotten; a place that is number i here was number ``first`` + i of all that
-    were added. Not for several threads at once.
+    Adding is cheap: memory doubles when it is full, up to ``limit`` places. The oldest places may
+    be evicted; place i of the map is place ``first`` + i of all added ones. Not thread-safe.
 
-    :param settings: how the features are made.
+    :param settings: of the features.
     :param projection: the random projection of the features, if they have one.
-    :param limit: most places held at a time, at least 1.
+    :param limit: most places kept, at least 1.
     :param cells: see :class:`LocalFeatures`; taken from the first place if not given.
     :param held_features: returns the features of the places held, in memory of their own, where
         another object is their owner; None = they are held here.
@@ -86,7 +84,7 @@ class GrowingMap:
 
     @property
     def first(self) -> int:
-        """Number of places forgotten so far: the number of the oldest one that is held."""
+        """Number of places evicted so far: the number of the oldest kept place."""
         return self._first
 
     @property
@@ -112,7 +110,7 @@ class GrowingMap:
 
     @property
     def stamps(self) -> np.ndarray:
-        """When each place was seen, ns, 0 = unknown: a view, shape (n,), int64."""
+        """Stamp of each place, ns, 0 = unknown: a view, shape (n,), int64."""
         return self._stamps[: self._count]
 
     @property
@@ -161,15 +159,15 @@ class GrowingMap:
         thumbnail: bytes = b'',
     ) -> int:
         """
-        Add a place; an error leaves everything as it was.
+        Add a place; an error changes nothing.
 
         :param features: those of one image, strips (W, 1, d).
-        :param stamp: when it was seen, ns; 0 = unknown.
-        :param identifier: what others call it.
+        :param stamp: time of its image, ns; 0 = unknown.
+        :param identifier: external identifier.
         :param pose: x y z (meters) and quaternion x y z w, shape (7,); None = unknown.
         :param thumbnail: a small JPEG, see :func:`encode_thumbnail`.
-        :returns: number of the place, counting all that were ever added.
-        :raises FeatureMismatchError: features made with other settings.
+        :returns: number of the place, counting all added places.
+        :raises FeatureMismatchError: features with other settings.
         :raises InputError: the map is full; not one image; values that are not finite.
         """
         strips, weights = self._checked(features)
@@ -190,13 +188,13 @@ class GrowingMap:
 
     def forget(self, count: int) -> None:
         """
-        Drop the oldest places; those that stay are moved, so drop many at a time.
+        Evict the oldest places; the others are moved, so evict many at a time.
 
         :raises InputError: there are not so many.
         """
         n = self._count
         if not 0 <= count <= n:
-            raise InputError(f'{count} places cannot be forgotten: expected 0 to {n}')
+            raise InputError(f'{count} places cannot be evicted: expected 0 to {n}')
         features = (*self._strips, *self._weights) if self._held_features is None else ()
         for array in (*features, self._stamps, self._poses):
             array[: n - count] = array[count:n]
@@ -222,22 +220,23 @@ class GrowingMap:
         """Return the strips (W, d) and weights (W,) of an image that fits."""
         features.require_same_settings(self.settings, 'the map')
         if len(features) != 1:
-            raise InputError(f'features of {len(features)} images came: expected those of one')
+            raise InputError(f'features of {len(features)} images: expected those of one')
         if self.full:
             raise InputError(
-                f'the map is full, it has {self.limit} places: raise its limit, forget the oldest places or '
-                'save it and begin another'
+                f'the map is full, it has {self.limit} places: raise its limit, evict the oldest '
+                'places or '
+                'save it and start another'
             )
         strips, weights = features.strips[:, 0].cpu().numpy(), features.weights[:, 0].cpu().numpy()
         d = self.dimension
         if d and strips.shape[1] != d:
-            raise InputError(f'strips of {strips.shape[1]} dimensions came: the map has {d}')
+            raise InputError(f'strips of {strips.shape[1]} dimensions: the map has {d}')
         if not np.isfinite(strips).all() or not np.isfinite(weights).all():
             raise InputError('the features are not finite: check the network and its input')
         return strips, weights
 
     def _make_room(self, room: int) -> None:
-        """Give every array room for so many places; all or none."""
+        """Reallocate every array with a capacity of ``room`` places; all or none."""
         n, W = self._count, self.settings.strips
         stamps, poses = np.empty(room, np.int64), np.empty((room, 7))
         stamps[:n], poses[:n] = self._stamps[:n], self._poses[:n]

@@ -4,29 +4,28 @@ One map, one file.
 The file is a ZIP archive without compression: ``manifest.json`` (format, version, feature
 settings, ids, the hash of every other member) and one ``.npy`` array each for strips, weights,
 stamps, poses, projection and thumbnails. Nothing in it is executable, arrays of objects (pickles)
-are refused.
+are rejected.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 import hashlib
 import io
 import json
 import os
+from pathlib import Path
 import tempfile
+from threading import Lock
+from typing import Any, IO
 import weakref
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import replace
-from pathlib import Path
-from threading import Lock
-from typing import IO, Any
 
 import numpy as np
-import torch
-
 from stavpr_ros.errors import InputError, MapFileError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.place_map import PlaceMap
+import torch
 
 FORMAT = 'stavpr-map'
 VERSION = 1
@@ -56,13 +55,15 @@ def _arrays(place_map: PlaceMap) -> dict[str, np.ndarray]:
         arrays['projection'] = place_map.projection.matrix
     if place_map.thumbnails:
         arrays['thumbnails'] = np.frombuffer(b''.join(place_map.thumbnails), np.uint8)
-        arrays['thumbnail_ends'] = np.cumsum([len(picture) for picture in place_map.thumbnails])
+        arrays['thumbnail_ends'] = np.cumsum(
+            [len(thumbnail) for thumbnail in place_map.thumbnails]
+        )
     return {name: np.ascontiguousarray(array, _TYPES[name]) for name, array in arrays.items()}
 
 
 def save_map(place_map: PlaceMap, path: str | Path) -> None:
     """
-    Write a map to a file, whole or not at all; an existing file stays until then.
+    Write a map to a file atomically: an existing file is replaced by the complete new one.
 
     :raises MapFileError: the file cannot be written.
     """
@@ -99,7 +100,7 @@ def save_map(place_map: PlaceMap, path: str | Path) -> None:
         os.replace(temporary, path)
     except OSError as error:
         raise MapFileError(
-            f'map {path} cannot be written ({error}); what was there is untouched'
+            f'map {path} cannot be written ({error}); an existing file is untouched'
         ) from error
     finally:
         if temporary is not None and os.path.exists(temporary):
@@ -116,7 +117,7 @@ def load_map(path: str | Path) -> PlaceMap:
     """
     Read a map.
 
-    :raises MapFileError: no such file, or one that is damaged, truncated, foreign or from a newer
+    :raises MapFileError: no such file, or one that is damaged, truncated, foreign or of a newer
         version.
     """
     with _readable(Path(path)), open(path, 'rb') as file:
@@ -125,7 +126,7 @@ def load_map(path: str | Path) -> PlaceMap:
 
 def open_map(path: str | Path) -> PlaceMap:
     """
-    Read and check a map, but leave its features in the file until they are used.
+    Read and check a map whose features stay in the file and are read on every use.
 
     :raises MapFileError: see :func:`load_map`.
     """
@@ -141,13 +142,12 @@ def open_map(path: str | Path) -> PlaceMap:
 
 class StoredFeatures(LocalFeatures):
     """
-    Features of a map in its file: in memory only while, and where, they are used.
+    Features of a map that stay in its file, without a copy in memory.
 
-    ``strips`` and ``weights`` are read anew each time; ``features[:]`` reads both. The file stays
-    open, so that it may be replaced or deleted meanwhile; its content is checked at every reading.
-    May be used from any thread.
+    Every access to ``strips`` and ``weights`` reads and checks them; ``features[:]`` reads both.
+    The file stays open, so that it may be replaced or deleted. Thread-safe.
 
-    :param features: those that the file holds.
+    :param features: the features in the file.
     :param file: the map file.
     :param path: its name, for error messages.
     """
@@ -230,14 +230,15 @@ def _readable(path: Path) -> Iterator[None]:
         ) from error
     except zipfile.BadZipFile as error:
         raise MapFileError(
-            f'{path} is no map of this program, or damaged or truncated ({error}): build it with build_map'
+            f'{path} is no map of this program, or damaged or truncated ({error}): build it with '
+            'build_map'
         ) from error
 
 
 def _read(archive: zipfile.ZipFile, member: str) -> np.ndarray:
     """Return the bytes of a member, uint8, in memory that begins with a cache line."""
     info = archive.getinfo(member)
-    if info.compress_type != zipfile.ZIP_STORED:  # ours never is; a bomb would be
+    if info.compress_type != zipfile.ZIP_STORED:  # rejects ZIP bombs
         raise ValueError(f'{member} is compressed')
     content = torch.empty(info.file_size, dtype=torch.uint8).numpy()
     at = 0
@@ -256,11 +257,12 @@ def _read_manifest(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
     manifest = json.loads(_read(archive, MANIFEST).tobytes())
     if not isinstance(manifest, dict) or manifest.get('format') != FORMAT:
         raise MapFileError(
-            f'{path} is no map of this program: its manifest does not say {FORMAT!r}'
+            f'{path} is no map of this program: its manifest does not state {FORMAT!r}'
         )
     if manifest['version'] > VERSION:
         raise MapFileError(
-            f'{path} has format version {manifest["version"]}, this program reads up to {VERSION}: update it'
+            f'{path} has format version {manifest["version"]}, this program reads up to '
+            f'{VERSION}: update it'
         )
     return manifest
 
@@ -276,7 +278,7 @@ def _read_array(archive: zipfile.ZipFile, name: str, digest: str) -> np.ndarray:
     if dtype != _TYPES[name] or columns_first:
         raise ValueError(f'{name} is {dtype}, columns first {columns_first}')
     # not a copy, and aligned: NumPy's headers end at a multiple of 64 bytes
-    return content[header.tell() :].view(dtype).reshape(shape)
+    return content[header.seek(0, io.SEEK_CUR) :].view(dtype).reshape(shape)
 
 
 def _assemble(manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> PlaceMap:
@@ -305,10 +307,10 @@ def _assemble(manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> PlaceM
         projection = None
         if manifest['projection'] is not None:
             projection = Projection(arrays['projection'], manifest['projection'])
-        pictures: tuple[bytes, ...] = ()
+        thumbnails: tuple[bytes, ...] = ()
         if 'thumbnails' in arrays:
             content, ends = arrays['thumbnails'].tobytes(), arrays['thumbnail_ends'].tolist()
-            pictures = tuple(
+            thumbnails = tuple(
                 content[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)
             )
         return PlaceMap(
@@ -319,7 +321,7 @@ def _assemble(manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> PlaceM
             stamps=arrays['stamps'],
             ids=tuple(str(identifier) for identifier in manifest['ids']),
             poses=arrays.get('poses'),
-            thumbnails=pictures,
+            thumbnails=thumbnails,
         )
     except (InputError, SettingsError) as error:
         raise ValueError(str(error)) from error

@@ -1,31 +1,30 @@
-"""The reference map: the local features of the places of a route, and what is known about each place."""
+"""The reference map: local features, stamps, identifiers, poses, thumbnails of places."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
 import numpy as np
-
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
 
-THUMBNAIL_WIDTH = 192  # pixels: enough to look at
+THUMBNAIL_WIDTH = 192  # pixels
 
 
 @dataclass(frozen=True)
 class PlaceMap:
     """
-    Places in the order in which they were passed; place i is column i of everything.
+    Places in the order of the route; place i is column i of everything.
 
     :param features: local features of n places, strips (W, n, d); in memory, or in the map's file
         (:func:`stavpr_ros.mapping.open_map`).
     :param projection: the random projection of the features, if they have one.
-    :param stamps: when each place was seen, ns, shape (n,), int64; 0 = unknown.
+    :param stamps: time of its image, ns, shape (n,), int64; 0 = unknown.
     :param ids: external identifiers, n strings; '' = none.
-    :param poses: x y z (meters) and quaternion x y z w of each place, shape (n, 7), float64; a row of NaN =
-        unknown for that place; None = unknown for all.
-    :param thumbnails: a small JPEG of each place, n byte strings, an empty one = none of that place; empty =
-        none kept.
+    :param poses: x y z (meters) and quaternion x y z w of each place, shape (n, 7), float64; a row
+        of NaN = unknown for that place; None = unknown for all.
+    :param thumbnails: a small JPEG of each place, n byte strings, an empty one = none of that
+        place; empty = none kept.
     """
 
     features: LocalFeatures
@@ -46,7 +45,9 @@ class PlaceMap:
         if self.poses is not None:
             _require_whole_rows(self.poses)
         if len(self.thumbnails) not in (0, n):
-            raise InputError(f'{len(self.thumbnails)} thumbnails for {n} places: expected all or none')
+            raise InputError(
+                f'{len(self.thumbnails)} thumbnails for {n} places: expected all or none'
+            )
         require_projection(self.projection, self.settings)
 
     def __len__(self) -> int:
@@ -54,7 +55,7 @@ class PlaceMap:
 
     @property
     def settings(self) -> FeatureSettings:
-        """How the features were made."""
+        """The settings of the features."""
         return self.features.settings
 
     @property
@@ -85,38 +86,41 @@ class PlaceMap:
 
     def extractor(self, device: str = 'cpu', model: str = '') -> FeatureExtractor:
         """
-        Make the extractor for queries: the one that this map's features were made with.
+        Make the extractor for queries, with the settings of this map.
 
-        :param model: where the network's file lies now, if it is not where it was.
+        :param model: path of the network's file, if it has moved.
         :raises FeatureMismatchError: the file is not the map's.
         """
         return FeatureExtractor.from_settings(self.settings, self.projection, device, model=model)
 
     def thumbnail(self, place: int) -> np.ndarray | None:
-        """Return the small picture of a place, RGB (h, w, 3) uint8, or None."""
+        """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None."""
         if not self.thumbnails or not self.thumbnails[place]:
             return None
-        picture = cv2.imdecode(np.frombuffer(self.thumbnails[place], np.uint8), cv2.IMREAD_COLOR)
-        return None if picture is None else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+        image = cv2.imdecode(np.frombuffer(self.thumbnails[place], np.uint8), cv2.IMREAD_COLOR)
+        return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def require_projection(projection: Projection | None, settings: FeatureSettings) -> None:
     """
-    Refuse a projection that is not the one features were made with.
+    Reject another projection than that of the features.
 
     :raises InputError: names both.
     """
     identity = projection.identity if projection else None
     if identity != settings.projection:
-        raise InputError(f'projection {identity} is not that of the features, {settings.projection}')
+        raise InputError(
+            f'projection {identity} is not that of the features, {settings.projection}'
+        )
 
 
 def _require_whole_rows(poses: np.ndarray) -> None:
-    """Refuse poses of which a part is known."""
+    """Reject rows of poses that are only partly known."""
     bad = np.flatnonzero(~(np.isfinite(poses).all(axis=1) | np.isnan(poses).all(axis=1)))
     if len(bad):
         raise InputError(
-            f'the pose of place {bad[0]} (and {len(bad) - 1} others) is {poses[bad[0]].tolist()}: expected 7 '
+            f'the pose of place {bad[0]} (and {len(bad) - 1} others) is {poses[bad[0]].tolist()}: '
+            'expected 7 '
             'finite numbers, or 7 times NaN where it is unknown'
         )
 
