@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Accuracy table: precision, recall and F1 of both modes on the data sets, and its comparison.
 
@@ -6,31 +8,30 @@ is worse. Data sets and columns: benchmarks/README.md.
 """
 
 import argparse
-import json
-import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+import json
 from pathlib import Path
+import sys
+import time
 from typing import Any
 
+from data import data_folder, NoDataError
 import numpy as np
-from data import NoDataError, data_folder
-from results import RESULTS, environment, heading, table, write
-
+from results import environment, heading, RESULTS, table, write
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.evaluation.evaluate import (
-    Evaluation,
     evaluate_loop_closures,
     evaluate_on_map,
+    Evaluation,
     recognize_traverse,
 )
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.metrics import counts_at
-from stavpr_ros.evaluation.warp import KINDS, cropped, warp_indices
+from stavpr_ros.evaluation.warp import cropped, KINDS, warp_indices
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.features.registry import settings_class
-from stavpr_ros.mapping import PlaceMap, build_map
+from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.robust.options import LOOP_THRESHOLD, THRESHOLD
 from stavpr_ros.sources import open_source

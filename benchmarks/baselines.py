@@ -1,9 +1,11 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Plain programs of the same mathematics: LM-DTW and velocity search with prange, the oracle."""
 
-import importlib.util
-import sys
 from collections.abc import Callable
 from functools import lru_cache
+import importlib.util
+import sys
 from types import ModuleType
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Speed of two checkouts: the same frames in turn, A B A B, and the ratio pair by pair.
 
@@ -16,11 +18,11 @@ import argparse
 import importlib.util
 import json
 import os
+from pathlib import Path
 import statistics
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,11 +33,10 @@ STRIPS, LENGTH, QUERIES = 7, 20, 40
 
 def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: str) -> Any:
     """Driver of this checkout, see the module's docstring."""
-    import torch
-
     from stavpr_ros.features import FeatureSettings, LocalFeatures
     from stavpr_ros.mapping import PlaceMap
     from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+    import torch
 
     def features(strips: np.ndarray, weights: np.ndarray) -> LocalFeatures:
         return LocalFeatures(torch.from_numpy(strips), torch.from_numpy(weights), settings)

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Resources of the compiled CUDA kernels: registers, stack, spills and shared memory, as JSON.
 
@@ -11,12 +13,12 @@ code.
 import argparse
 import importlib.util
 import json
+from pathlib import Path
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
-from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -33,7 +35,6 @@ class MissingError(Exception):
 def kernels() -> list[tuple[str, Any, Any]]:
     """List name, Python function and argument types of each kernel."""
     from numba import float32, int32, int64
-
     from stavpr_ros.alignment.cuda import dtw, lm_dtw
 
     images = (float32[:, :, :], float32, int64, int64, float32[:, ::1])

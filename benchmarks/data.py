@@ -1,12 +1,13 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Data of the benchmarks: the folder of data sets, and synthetic maps, queries and windows."""
 
 import os
 from pathlib import Path
 
 import numpy as np
-import torch
-
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+import torch
 
 SETTINGS = FeatureSettings('synthetic', None)
 BLOCK_BYTES = 2**28

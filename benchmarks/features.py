@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Gradient features: one image on one core and on all, batches, raw encodings; JPEG decoding apart.
 
@@ -8,18 +10,18 @@ a GPU.
 """
 
 import argparse
-import itertools
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+import itertools
+import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from lower_bounds import Work
+import numpy as np
 from peaks import read_bandwidth
-from results import Row, environment, heading, number_text, seconds_text, table, write
+from results import environment, heading, number_text, Row, seconds_text, table, write
 from run import Peer, Run
 from timing import timed
 
@@ -66,10 +68,9 @@ def cores(count: int) -> Iterator[None]:
 def plain(images: Sequence[np.ndarray]) -> Any:
     """Extract features with the operators of OpenCV and torch only."""
     import cv2
-    import torch
-
-    from stavpr_ros.features.gradient import GradientSettings, feature_maps_by_torch
     from stavpr_ros.features.extractor import cut_strips, normalize
+    from stavpr_ros.features.gradient import feature_maps_by_torch, GradientSettings
+    import torch
 
     s = GradientSettings()
     square = partial(cv2.resize, dsize=(s.size, s.size), interpolation=cv2.INTER_AREA)
@@ -127,7 +128,6 @@ class FeatureBenchmark:
 
     def _jpeg(self, threads: int) -> None:
         import cv2
-
         from stavpr_ros.sources.files import decode_compressed
 
         options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
@@ -172,7 +172,6 @@ def main() -> None:
     parser.add_argument('--output', type=Path, help='write the results to this JSON file as well')
     arguments = parser.parse_args()
     from lower_bounds import Peaks
-
     from stavpr_ros.threads import wait_passively
 
     wait_passively()

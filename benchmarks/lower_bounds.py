@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Lower bounds: the least time of a stage, from its bytes, operations and the machine's peaks."""
 
 from collections.abc import Sequence

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Benchmark of matching: every stage and whole frames beside lower bounds and peers, and memory.
 
@@ -6,11 +8,11 @@ benchmarks/matching.py``. Method and tables: benchmarks/README.md.
 """
 
 import argparse
-import sys
-import time
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
+import sys
+import time
 from typing import TYPE_CHECKING
 
 from results import RESULTS
@@ -83,7 +85,6 @@ def open_peers(stack: ExitStack, run: 'Run', refused: bool) -> 'Peers | None':
 
 def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
     """Measure all stages of all sizes."""
-    import torch
     from stages import (
         device_retrieval,
         feature_stages,
@@ -91,6 +92,7 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
         paper_stages,
         robust_stages,
     )
+    import torch
 
     for n in options.sizes:
         robust_stages(run, n, options.seed)
@@ -130,7 +132,6 @@ def main(arguments: list[str] | None = None) -> int:
     from report import report, target_section
     from results import environment, file_name, write
     from run import Run
-
     from stavpr_ros.recognition.matcher import PRECISIONS
 
     options.precisions = tuple(options.precisions or PRECISIONS)

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Resident memory of the pipeline over the bytes of its features, in a process of its own.
 
@@ -8,22 +10,21 @@ both times.
 """
 
 import ctypes
+from dataclasses import asdict, dataclass
 import gc
 import os
+from pathlib import Path
 import subprocess
 import sys
 import tempfile
-from dataclasses import asdict, dataclass
-from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
-    import torch
-
     from stavpr_ros.pipeline import Pipeline
+    import torch
 
 TARGET = 1.1
 STRIPS = 7
@@ -126,7 +127,6 @@ def _save_map(path: Path, n: int, d: int) -> None:
     from dataclasses import replace
 
     from data import make_features
-
     from stavpr_ros.features import FeatureSettings
     from stavpr_ros.mapping import PlaceMap, save_map
 

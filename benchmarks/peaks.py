@@ -1,10 +1,12 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The machine's peaks: read bandwidth, and the large matrix product in each precision."""
 
 from collections.abc import Callable
 from functools import cache, partial
 
-import numpy as np
 from lower_bounds import ITEM_BYTES, Peaks
+import numpy as np
 from timing import best_seconds
 
 SIDE = 4096  # of the large matrix product

@@ -1,12 +1,14 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The Markdown report of a run of benchmarks/matching.py."""
 
 from collections.abc import Sequence
 from typing import Any
 
 from lower_bounds import Peaks
-from memory import TARGET, Memory
-from results import Row, Skipped, heading, number_text, seconds_text, table
-from targets import TARGETS, Target, cells_per_s
+from memory import Memory, TARGET
+from results import heading, number_text, Row, seconds_text, Skipped, table
+from targets import cells_per_s, Target, TARGETS
 
 ROBUST_STAGES = (
     'mean_centering',

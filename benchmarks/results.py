@@ -1,15 +1,17 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Results of a run: rows, the machine that they were measured on, JSON and Markdown."""
 
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 import datetime
 import importlib.metadata
 import json
 import os
+from pathlib import Path
 import platform
 import re
 import subprocess
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]

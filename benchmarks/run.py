@@ -1,11 +1,13 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """One run: measurements are collected, and get their lower bounds once the peaks are known."""
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+import sys
 from typing import Any
 
-from lower_bounds import Peaks, Work, bound_seconds
+from lower_bounds import bound_seconds, Peaks, Work
 from results import PeerTime, Row, Skipped
 from timing import Job, measure, synchronizer, timed
 from tqdm import tqdm

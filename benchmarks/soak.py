@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Soak test: images at a steady rate to a node in a process of its own: losses, latency, memory.
 
@@ -6,15 +8,15 @@ Run it where the package is built and sourced: ``make shell``, then ``python ben
 
 import argparse
 import array
+from collections import Counter
+from collections.abc import Iterator
 import json
 import os
+from pathlib import Path
 import signal
 import subprocess
 import tempfile
 import time
-from collections import Counter
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -95,9 +97,8 @@ def image_messages(height: int, width: int) -> list[Any]:
 def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
     """Publish at the rate, record the matches, and return the figures."""
     import rclpy
-    from rclpy.qos import QoSProfile, qos_profile_sensor_data
+    from rclpy.qos import qos_profile_sensor_data, QoSProfile
     from sensor_msgs.msg import Image
-
     from stavpr_msgs.msg import PlaceMatch
     from stavpr_ros.ros.discovery import Discovery
     from stavpr_ros.ros.process import ros_node, spin_until

@@ -1,27 +1,26 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The stages of matching, measured on windows of distances and on maps of features."""
 
-import gc
 from collections.abc import Callable, Sequence
 from functools import partial
+import gc
 from itertools import cycle
 from typing import Any
 
-import lower_bounds as bounds
-import numpy as np
-import torch
 from baselines import oracle, prange, prange_velocities, sample
 from data import free_bytes, make_features, make_window
+import lower_bounds as bounds
 from lower_bounds import Sizes
+import numpy as np
 from peaks import slower_than_float32
 from peer_process import Peers
 from run import Peer, Run
-from timing import measure, synchronizer, timed
-
 from stavpr_ros.alignment.lm_dtw import (
-    SequenceDistances,
     best_match,
     match_padded,
     padded_width,
+    SequenceDistances,
     trace_sequence,
 )
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings, VelocitySettings
@@ -33,6 +32,8 @@ from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust.centering import MeanCentering
 from stavpr_ros.recognition.robust.znorm import ZNormalization
 from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
+from timing import measure, synchronizer, timed
+import torch
 
 MODES = ('robust', 'paper')  # the default first
 SEQUENCE, SPATIAL, VELOCITY, NMS_RADIUS = (

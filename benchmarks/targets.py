@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The project's targets: bounds for values of single rows, and whether a run reached them."""
 
 from collections.abc import Callable, Sequence

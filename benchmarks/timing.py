@@ -1,10 +1,12 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Timings: warm-up, interleaved runs, median and spread."""
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 import math
 import statistics
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 Job = Callable[[], float]  # runs once and returns the seconds that it took

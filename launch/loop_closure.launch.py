@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Close loops: ros2 launch stavpr_ros loop_closure.launch.py image:=/camera/image_raw odom:=/odom.
 

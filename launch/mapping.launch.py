@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Record a map: ros2 launch stavpr_ros mapping.launch.py image:=/camera/image_raw save_path:=FILE.
 

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Start the node: ros2 launch stavpr_ros stavpr.launch.py map_path:=FILE image:=TOPIC."""
 
 from launch import LaunchDescription

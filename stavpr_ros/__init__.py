@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 STA-VPR place recognition: spatio-temporal alignment of image sequences, and a ROS 2 node for it.
 

@@ -1,7 +1,8 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Checks of arrays at the border of the public functions."""
 
 import numpy as np
-
 from stavpr_ros.errors import InputError
 
 
@@ -27,5 +28,7 @@ def no_nan(array: np.ndarray, name: str) -> np.ndarray:
     """
     bad = np.count_nonzero(~(array > -np.inf))
     if bad:
-        raise InputError(f'{name} holds {bad} NaN or -inf among {array.size} values: check the features')
+        raise InputError(
+            f'{name} holds {bad} NaN or -inf among {array.size} values: check the features'
+        )
     return array

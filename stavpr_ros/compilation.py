@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """How the kernels are compiled: cached on disk, without the interpreter's lock, numbers as IEEE has them."""
 
 import numba as nb

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The choice of the device for the features and of the backend for the matching."""
 
 import importlib.util

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Every error that the package raises on purpose; all of them are a :class:`StavprError`."""
 
 

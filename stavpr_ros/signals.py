@@ -1,8 +1,10 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Signal handling of every executable."""
 
-import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+import signal
 from types import FrameType
 
 

@@ -1,7 +1,9 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """How the numerics use the processor beside everything else that runs on a robot."""
 
-import os
 from functools import cache
+import os
 
 
 def wait_passively() -> None:

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """A node and one camera: how the node is started, and images with their matches."""
 
 from pathlib import Path

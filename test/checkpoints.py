@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Checkpoints for the tests: random parameters, in the formats of Python 2 and torch 0.3."""
 
 from collections import OrderedDict

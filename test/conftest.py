@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Fixtures: the folder of real data, synthetic images and maps."""
 
 from collections import OrderedDict

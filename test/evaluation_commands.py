@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Inputs and a runner for the tests of the commands ``evaluate`` and ``experiments``."""
 
 import json

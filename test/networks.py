@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """A second implementation of the paper's networks: their shapes and computations."""
 
 import torch

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 The method in plain loops, written from its description alone; every kernel is held against this file.
 
@@ -6,8 +8,8 @@ every single operation to it, so a kernel that does the same arithmetic in float
 Indices going in and out are 0-based; comments quote the 1-based formulae of the method.
 """
 
-import math
 from dataclasses import dataclass
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -76,7 +78,12 @@ def cut_strips(feature_map: Array, W: int) -> Array:
     for i in range(W):
         first = left + i * columns
         for image in range(n):
-            cells = [(c, h, w) for c in range(C) for h in range(H) for w in range(first, first + columns)]
+            cells = [
+                (c, h, w)
+                for c in range(C)
+                for h in range(H)
+                for w in range(first, first + columns)
+            ]
             for at, (c, h, w) in enumerate(cells):
                 strips[i, image, at] = feature_map[image, c, h, w]
     return strips
@@ -182,7 +189,11 @@ def adaptive_weight(d: Array, sigma: float, dtype: type) -> tuple[Any, int]:
 
 
 def align_images(
-    d: Array, strategy: str = 'adaptive', sigma: float = 1.0, xi: int | None = None, dtype: type = np.float64
+    d: Array,
+    strategy: str = 'adaptive',
+    sigma: float = 1.0,
+    xi: int | None = None,
+    dtype: type = np.float64,
 ) -> Aligned:
     """Align one pair d (W, W) with 'adaptive' or 'vanilla' DTW; the end is (W, W)."""
     d = restrict(d.astype(dtype), xi)
@@ -206,7 +217,11 @@ def sliding_window(d: Array, xi: int | None = None, dtype: type = np.float64) ->
 
 
 def image_distances(
-    d: Array, strategy: str = 'adaptive', sigma: float = 1.0, xi: int | None = None, dtype: type = np.float64
+    d: Array,
+    strategy: str = 'adaptive',
+    sigma: float = 1.0,
+    xi: int | None = None,
+    dtype: type = np.float64,
 ) -> Array:
     """Distance of one query image to n map images: d (W, W, n) -> (n,)."""
     result: Array = np.empty(d.shape[2], dtype)

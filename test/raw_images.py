@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Raw image messages: the bytes of each encoding, written from its definition."""
 
 import numpy as np

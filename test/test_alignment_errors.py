@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """What the alignments refuse: each error names the value that came."""
 
 import math
@@ -5,15 +7,14 @@ import math
 import numpy as np
 import oracle
 import pytest
-
 from stavpr_ros.alignment import (
-    SequenceSettings,
-    SpatialSettings,
     align_images,
     align_sequence,
     aligned_index,
     image_distances,
     match_sequence,
+    SequenceSettings,
+    SpatialSettings,
 )
 from stavpr_ros.errors import InputError, SettingsError, StavprError
 

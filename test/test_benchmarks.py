@@ -1,11 +1,13 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The benchmarks: timing, lower bounds, targets, report, peers, memory, accuracy."""
 # ruff: noqa: E402  (the modules of the benchmarks lie beside their commands, not in a package)
 
+from dataclasses import replace
 import importlib.util
 import json
-import sys
-from dataclasses import replace
 from pathlib import Path
+import sys
 
 import numpy as np
 import oracle
@@ -26,15 +28,14 @@ import peaks
 import peer_process
 import report
 import results
-import stages
-import targets
-import timing
 from results import PeerTime, Row
 from run import Peer, Run
-from timing import Timing
-
-from stavpr_ros.alignment import SequenceDistances, match_sequence
+import stages
+from stavpr_ros.alignment import match_sequence, SequenceDistances
 from stavpr_ros.alignment.settings import VelocitySettings
+import targets
+import timing
+from timing import Timing
 
 PEAKS = bounds.Peaks(100.0, {'float32': 1000.0, 'bfloat16': 4000.0, 'float16': 4000.0})
 ROW = Row(
@@ -303,8 +304,7 @@ def test_report_counts_losses_and_sums_the_stages_of_a_frame():
     assert '## Beside peers (1 of 1 lost)' in text
     assert '| 1 MB | 3 MB | 3 | <= 1.1 | **not reached** |' in text
     assert (
-        'paper | 20,000 | - | float32 | times librosa | 0.5 | >= 100 | **not reached** |'
-        in text
+        'paper | 20,000 | - | float32 | times librosa | 0.5 | >= 100 | **not reached** |' in text
     )
     assert '| x | 1 | - | why |' in text
 

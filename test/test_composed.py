@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The node in a process of another program: its executor, its context, its end."""
 
 import threading

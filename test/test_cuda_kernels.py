@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 The CUDA kernels, bit for bit against the oracle.
 
@@ -9,20 +11,19 @@ test_cuda_matcher.py once more.
 import json
 import math
 import os
+from pathlib import Path
 import re
 import subprocess
 import sys
-from pathlib import Path
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import oracle
 import pytest
-import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
-from stavpr_ros.alignment import SequenceDistances, best_match
+from stavpr_ros.alignment import best_match, SequenceDistances
 from stavpr_ros.errors import UnavailableError
+import torch
 
 SIMULATOR = os.environ.get('NUMBA_ENABLE_CUDASIM') == '1'
 INF = math.inf
@@ -37,7 +38,9 @@ def runtime():
     try:
         return compilation.runtime()
     except UnavailableError as error:
-        pytest.skip(f'{error}; the same test runs in the simulator (test_everything_in_the_simulator)')
+        pytest.skip(
+            f'{error}; the same test runs in the simulator (test_everything_in_the_simulator)'
+        )
 
 
 @pytest.mark.skipif(SIMULATOR, reason='this is the simulator')
@@ -56,7 +59,9 @@ def test_everything_in_the_simulator():
         '-c',
         root / 'pytest.ini',
     ]
-    done = subprocess.run([*command, *files], env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*command, *files], env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-2000:]
     assert ' passed' in done.stdout
 
@@ -84,7 +89,9 @@ def test_the_compiler_keeps_everything_in_registers():
     from stavpr_ros.alignment.cuda import lm_dtw
 
     program = Path(__file__).resolve().parents[1] / 'benchmarks' / 'cuda_registers.py'
-    done = subprocess.run([sys.executable, str(program)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, str(program)], capture_output=True, text=True, check=False
+    )
     if done.returncode == 2:
         pytest.skip(done.stderr.strip())
     assert done.returncode == 0, done.stderr
@@ -117,7 +124,9 @@ def image_distances(runtime, products, strategy, sigma=1.0, xi=None, block=4):
     out = torch.full((queries + 1, n + 2), -7.0, device=device)
     weight = np.float32(sigma if strategy == 'adaptive' else 0)
     grid = (-(-n // block), queries)
-    runtime.launch(function, grid, block, runtime.array(block_of_products), weight, 1, 2, runtime.array(out))
+    runtime.launch(
+        function, grid, block, runtime.array(block_of_products), weight, 1, 2, runtime.array(out)
+    )
     out = out.cpu().numpy()
     assert (out[0] == -7).all()
     assert (out[:, :2] == -7).all()
@@ -126,17 +135,25 @@ def image_distances(runtime, products, strategy, sigma=1.0, xi=None, block=4):
 
 def expected_images(products, strategy, sigma=1.0, xi=None):
     d = np.float32(1) - products
-    return np.stack([oracle.image_distances(query, strategy, sigma, xi, np.float32) for query in d])
+    return np.stack(
+        [oracle.image_distances(query, strategy, sigma, xi, np.float32) for query in d]
+    )
 
 
 def random_products(seed, queries, W, n, levels=None):
     rng = np.random.default_rng(seed)
     products = rng.random((queries, W, W, n), np.float32)
-    return products if levels is None else np.round(products * levels).astype(np.float32) / np.float32(levels)
+    return (
+        products
+        if levels is None
+        else np.round(products * levels).astype(np.float32) / np.float32(levels)
+    )
 
 
 @pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'sliding_window'])
-@pytest.mark.parametrize(('W', 'xi', 'n'), [(7, None, 9), (7, 3, 5), (7, 1, 4), (4, 2, 1), (6, None, 3)])
+@pytest.mark.parametrize(
+    ('W', 'xi', 'n'), [(7, None, 9), (7, 3, 5), (7, 1, 4), (4, 2, 1), (6, None, 3)]
+)
 @pytest.mark.parametrize('levels', [None, 3])  # three levels: ties everywhere
 def test_image_distances_are_the_oracles(runtime, strategy, W, xi, n, levels):
     products = random_products(W * 10 + n, 2, W, n, levels)
@@ -154,8 +171,12 @@ def test_other_numbers_of_strips_and_sigmas(runtime, W, sigma):
 
 def test_the_published_figure(runtime):
     products = (1 - oracle.GOLDEN.astype(np.float32))[None, :, :, None]
-    assert image_distances(runtime, products, 'adaptive')[0, 0] == pytest.approx(0.28724851, abs=1e-6)
-    assert image_distances(runtime, products, 'vanilla')[0, 0] == pytest.approx(0.31888889, abs=1e-6)
+    assert image_distances(runtime, products, 'adaptive')[0, 0] == pytest.approx(
+        0.28724851, abs=1e-6
+    )
+    assert image_distances(runtime, products, 'vanilla')[0, 0] == pytest.approx(
+        0.31888889, abs=1e-6
+    )
 
 
 def test_cells_outside_the_band_are_not_read(runtime):
@@ -222,13 +243,19 @@ def check_sequences(runtime, D, beta, apart=3, **launch):
     assert (answer is None) == (twin is None) == (found.start == -1)
     if answer is None:
         return
-    assert (found.start, found.length, found.distance) == (answer.start, answer.length, answer.distance)
+    assert (found.start, found.length, found.distance) == (
+        answer.start,
+        answer.length,
+        answer.distance,
+    )
     if answer.second_best_index == -1:
         assert found.second_best_start == twin.second_best_index == -1
     else:
         middle = (2 * found.second_best_start + found.second_best_length - 1) // 2
         assert middle == answer.second_best_index == twin.second_best_index
-        assert found.second_best_distance == answer.second_best_distance == twin.second_best_distance
+        assert (
+            found.second_best_distance == answer.second_best_distance == twin.second_best_distance
+        )
     seen = D[:, found.start : found.start + k]
     np.testing.assert_array_equal(found.cells[:, : seen.shape[1]], seen)
     assert np.isinf(found.cells[:, seen.shape[1] :]).all()
@@ -262,7 +289,9 @@ def test_sequences_are_the_oracles(runtime, l, n, beta, columns):
 @pytest.mark.parametrize('columns', [None, 0])
 def test_ties_and_bans(runtime, columns):
     for seed, banned in ((1, 0.0), (2, 0.3), (3, 0.8)):
-        check_sequences(runtime, random_window(seed, 4, 21, levels=2, banned=banned), 2.0, columns=columns)
+        check_sequences(
+            runtime, random_window(seed, 4, 21, levels=2, banned=banned), 2.0, columns=columns
+        )
 
 
 def test_a_window_of_33_rows(runtime):
@@ -298,7 +327,10 @@ def test_the_window_may_start_at_any_row_and_be_matched_again(runtime):
     again = run_sequences(runtime, D, k, 2, first=3, launches=3)
     for a, b in zip(once[:2], again[:2], strict=True):
         np.testing.assert_array_equal(a, b)
-    assert (once[2].start, once[2].second_best_start) == (again[2].start, again[2].second_best_start)
+    assert (once[2].start, once[2].second_best_start) == (
+        again[2].start,
+        again[2].second_best_start,
+    )
 
 
 @settings(max_examples=12)
@@ -331,7 +363,7 @@ def test_the_default_window_is_staged_at_once_and_long_ones_not_at_all():
 
 @pytest.mark.skipif(SIMULATOR, reason='sizes of a real map take a real device')
 def test_many_places_on_the_device(runtime):
-    from stavpr_ros.alignment import SequenceSettings, match_sequence
+    from stavpr_ros.alignment import match_sequence, SequenceSettings
 
     for l, n, beta in ((20, 70_001, 2.0), (33, 5000, 1.7), (80, 3000, 1.5)):
         D = random_window(l, l, n)

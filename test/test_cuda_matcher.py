@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The matcher on CUDA beside the one on the CPU; in the simulator as well (see test_cuda_kernels.py)."""
 
 import os
@@ -5,8 +7,6 @@ import os
 import numpy as np
 import oracle
 import pytest
-import torch
-
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.features import LocalFeatures
@@ -14,6 +14,7 @@ from stavpr_ros.features.extractor import FeatureSettings
 from stavpr_ros.recognition.robust.znorm import ZNormalization
 from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
 from stavpr_ros.recognition.sequence_search import LmDtwSearch
+import torch
 
 SIMULATOR = os.environ.get('NUMBA_ENABLE_CUDASIM') == '1'
 SHORT = SequenceSettings(length=3, beta=2.0)

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The paper's data sets: found under their usual names, or not found with the reason."""
 
 import cv2

@@ -1,13 +1,14 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Diagnostics of every state: levels, messages and values."""
 
-import math
 from dataclasses import replace
+import math
 
-import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import pytest
 from rclpy.serialization import deserialize_message, serialize_message
-
 from stavpr_ros.pipeline.statistics import Counts, StageTime
 from stavpr_ros.ros.diagnostics import diagnostic_array
 from stavpr_ros.ros.health import Health

@@ -12,7 +12,6 @@ import sys
 from conftest import route_images
 import cv2
 import pytest
-
 from stavpr_ros.commands.stavpr import COMMANDS
 from stavpr_ros.parameters import PARAMETERS
 
@@ -103,7 +102,9 @@ def test_documented_options_exist():
 
 def test_documented_parameters_exist():
     text = '\n'.join(page.read_text() for page in PAGES)
-    given = set(re.findall(r'-p (\w+):=', text)) | set(re.findall(r'param set /stavpr (\w+)', text))
+    given = set(re.findall(r'-p (\w+):=', text)) | set(
+        re.findall(r'param set /stavpr (\w+)', text)
+    )
     assert given
     assert given <= NAMES
     table = (ROOT / 'README.md').read_text().partition('| parameter |')[2].partition('\n\n')[0]

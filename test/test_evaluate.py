@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The command ``evaluate``, on synthetic traverses and on real ones."""
 
 import csv

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Evaluation of a traverse by hand: matches, reduced distances, the worst mistakes."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The paper's experiments: configurations, published numbers, and the command."""
 
 from conftest import route_images

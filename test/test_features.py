@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The kinds of features, the extractor, and the table that they are rows of."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Real images through the node over ROS: equal to the library, match for match."""
 
 import numpy as np

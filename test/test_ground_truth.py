@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Ground truth: accepted places by hand, and every kind of file."""
 
 import pickle

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The growing map: places added and evicted, memory that doubles, errors without effect."""
 
 import dataclasses

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Keyframes: each rule by hand, all of them against a plain loop, image change against noise."""
 
 import dataclasses

@@ -1,26 +1,27 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The life cycle of the node from outside: states, transitions, and requests at any time."""
 
 import dataclasses
 import os
 from pathlib import Path
 
-import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from image_messages import image_message
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState
-from processes import DOMAIN, RELIABLE, TAKEN_RELIABLY, Bench, Process, node_process
+from processes import Bench, DOMAIN, node_process, Process, RELIABLE, TAKEN_RELIABLY
+import pytest
 from rcl_interfaces.srv import SetParameters
+import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from std_srvs.srv import Trigger
-
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import PlaceMap, save_map
+from std_srvs.srv import Trigger
 
 LENGTH = 5
 PARAMETERS = {

@@ -1,20 +1,21 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Temporal alignment (LM-DTW): worked examples, and every start bit for bit against the oracle."""
 
 import math
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
 from stavpr_ros.alignment import (
-    SequenceDistances,
-    SequenceSettings,
     align_sequence,
     aligned_index,
     best_match,
     match_sequence,
+    SequenceDistances,
+    SequenceSettings,
 )
 
 DTYPES = [np.float32, np.float64]
@@ -32,7 +33,9 @@ def check_every_start(D, length, beta):
     q, m = oracle.match_sequence(D, beta, D.dtype.type)
     assert matches.distances.dtype == D.dtype
     np.testing.assert_array_equal(matches.distances, q)
-    finite = np.isfinite(q)  # where every path is banned there is nothing whose length could be asked for
+    finite = np.isfinite(
+        q
+    )  # where every path is banned there is nothing whose length could be asked for
     np.testing.assert_array_equal(matches.lengths[finite], m[finite])
     return matches
 
@@ -151,7 +154,15 @@ def test_starts_at_the_end_of_the_map_have_fewer_frames():
 
 @pytest.mark.parametrize(
     ('length', 'beta', 'k'),
-    [(20, 2.0, 40), (25, 2.2, 55), (50, 1.1, 55), (10, 1.1, 11), (10, 1.11, 12), (3, 1.5, 5), (7, 1.05, 8)],
+    [
+        (20, 2.0, 40),
+        (25, 2.2, 55),
+        (50, 1.1, 55),
+        (10, 1.1, 11),
+        (10, 1.11, 12),
+        (3, 1.5, 5),
+        (7, 1.05, 8),
+    ],
 )
 def test_frames_searched(length, beta, k):
     # 2.2 * 25 = 1.1 * 50 = 55.00000000000001 in floating point: 55, not 56
@@ -190,11 +201,20 @@ def matches_of(q, m):
 def test_best_match_by_hand():
     # middles floor((s + s + m - 1) / 2): 0, 2, 2, 5, 4
     best = best_match(matches_of([0.5, 0.3, 0.2, 0.3, 0.2], [1, 4, 1, 5, 1]), 1)
-    assert (best.start, best.length, best.first, best.last, best.middle) == (2, 1, 2, 2, 2)  # first of two .2
+    assert (best.start, best.length, best.first, best.last, best.middle) == (
+        2,
+        1,
+        2,
+        2,
+        2,
+    )  # first of two .2
     assert best.distance == 0.2
     assert (best.second_best_index, best.second_best_distance) == (4, 0.2)  # 4 - 2 > 1
     # more than 2 places away from 2: only middle 5
-    assert best_match(matches_of([0.5, 0.3, 0.2, 0.3, 0.2], [1, 4, 1, 5, 1]), 2).second_best_index == 5
+    assert (
+        best_match(matches_of([0.5, 0.3, 0.2, 0.3, 0.2], [1, 4, 1, 5, 1]), 2).second_best_index
+        == 5
+    )
     nobody = best_match(matches_of([0.5, 0.3, 0.2, 0.3, 0.2], [1, 4, 1, 5, 1]), 3)
     assert nobody.second_best_index == -1
     assert math.isnan(nobody.second_best_distance)
@@ -229,7 +249,11 @@ def test_aligned_index_is_the_floor_of_the_middle():
 def test_every_size_equals_the_oracle(length, beta):
     # hypothesis likes the smallest of everything: this sweep is sure to meet every size and kind of ties
     for n in (1, length - 1, length + 3):
-        for dtype, levels, banned in ((np.float32, 0, 0.0), (np.float32, 4, 0.1), (np.float64, 2, 0.0)):
+        for dtype, levels, banned in (
+            (np.float32, 0, 0.0),
+            (np.float32, 4, 0.1),
+            (np.float64, 2, 0.0),
+        ):
             check_every_start(random_distances(n, length, n, dtype, levels, banned), length, beta)
 
 
@@ -301,7 +325,9 @@ def test_memory_layout_does_not_matter():
     D = random_distances(5, 4, 80, np.float32, 3, 0.0)
     sequence = SequenceSettings(length=4)
     expected = match_sequence(D, sequence).distances
-    np.testing.assert_array_equal(match_sequence(np.asfortranarray(D), sequence).distances, expected)
+    np.testing.assert_array_equal(
+        match_sequence(np.asfortranarray(D), sequence).distances, expected
+    )
     wide = np.repeat(D, 2, axis=1)
     np.testing.assert_array_equal(match_sequence(wide[:, ::2], sequence).distances, expected)
 

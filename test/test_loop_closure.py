@@ -1,12 +1,12 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Loop closure: bounded memory, exclusion by seconds, resets; against a plain loop that forgets nothing."""
 
-import math
 from dataclasses import replace
+import math
 
 import numpy as np
 import pytest
-import torch
-
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
 from stavpr_ros.alignment.settings import VelocitySettings
@@ -17,15 +17,16 @@ from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition import RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import (
+    choose_loop_backend,
     EVICTED,
     LEAST_PLACES,
     LoopCloser,
-    choose_loop_backend,
 )
-from stavpr_ros.recognition.robust.hysteresis import Hysteresis, evidence, score
+from stavpr_ros.recognition.robust.hysteresis import evidence, Hysteresis, score
 from stavpr_ros.recognition.robust.options import PAPER, ROBUST
 from stavpr_ros.recognition.robust.znorm import MEMORY, MIN_DEVIATION, PRIOR
 from stavpr_ros.recognition.route_features import ROOM, RouteFeatures
+import torch
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 SECOND = 10**9

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Maps of images or keyframes; their files: round trip, atomicity, damage of every kind."""
 
 import dataclasses

@@ -1,16 +1,13 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The matcher of the CPU: fused kernels give what the separate functions give; half width is near enough."""
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import oracle
 import pytest
-import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
 from stavpr_ros.alignment import (
-    SequenceSettings,
-    SpatialSettings,
-    VelocitySettings,
     align_sequence,
     best_match,
     best_velocity_match,
@@ -18,7 +15,10 @@ from stavpr_ros.alignment import (
     image_distances,
     match_sequence,
     match_velocities,
+    SequenceSettings,
+    SpatialSettings,
     strip_distances,
+    VelocitySettings,
 )
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.evaluation.evaluate import recognize_all
@@ -32,6 +32,7 @@ from stavpr_ros.recognition.robust.znorm import ZNormalization
 from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
 from stavpr_ros.recognition.sequence_search import LmDtwSearch, VelocitySearch
 from stavpr_ros.sources import open_source
+import torch
 
 # of a number kept in float16, relative; so also of a product of unit-norm features, at most
 ROUNDING = 2.0**-11

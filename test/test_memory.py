@@ -1,20 +1,21 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Features are in memory once: the owner is the matcher, or the loop closer."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
+import subprocess
+import sys
 
 import numpy as np
 import pytest
-import torch
-
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.mapping import GrowingMap, PlaceMap, load_map, open_map, save_map
+from stavpr_ros.mapping import GrowingMap, load_map, open_map, PlaceMap, save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CACHE_LINE
+import torch
 
 LARGEST = (
     1.15  # of resident bytes over bytes of the features; the heap and the window take their part

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Messages of matches, field by field, and drawn images; no node that spins."""
 
 import math

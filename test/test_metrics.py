@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Metrics: by hand, against scikit-learn and against the oracle's plain loops."""
 
 import sys

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Operation loop_closure: a hallway of the data folder, and a synthetic loop with odometry."""
 
 from dataclasses import dataclass

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Services of the node, and its topics besides ~/match: valid and invalid requests."""
 
 from contextlib import contextmanager

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Time: rates, gaps and jumps of stamps, simulated time, bags that loop or pause."""
 
 from builtin_interfaces.msg import Time

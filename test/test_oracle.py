@@ -1,11 +1,13 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The oracle itself against numbers derived by hand, so that it can judge the kernels."""
 
 import math
 
 import numpy as np
 import oracle
-import pytest
 from oracle import GOLDEN, GOLDEN_PATH
+import pytest
 
 
 def test_golden_example_adaptive():
@@ -73,7 +75,8 @@ def test_cosine_distance_by_hand():
 
 
 @pytest.mark.parametrize(
-    ('length', 'beta', 'k'), [(20, 2.0, 40), (25, 2.2, 55), (50, 1.1, 55), (3, 1.5, 5), (7, 1.05, 8)]
+    ('length', 'beta', 'k'),
+    [(20, 2.0, 40), (25, 2.2, 55), (50, 1.1, 55), (3, 1.5, 5), (7, 1.05, 8)],
 )
 def test_frames_searched(length, beta, k):
     # 2.2 * 25 = 55.00000000000001 must not become 56

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The table of parameters: files generated from it, and the settings built from it."""
 
 from dataclasses import fields

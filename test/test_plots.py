@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Plots: written, of a sensible size, with the colors of their contents, also for empty input."""
 
 import subprocess

@@ -1,26 +1,27 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Workarounds for rclpy, and the failures of upstream without them.
 
 A test of upstream that fails means that its workaround can go.
 """
 
+from concurrent.futures import Future, ThreadPoolExecutor
 import threading
 import time
 import warnings
-from concurrent.futures import Future, ThreadPoolExecutor
 
+from processes import DOMAIN, TIMEOUT
 import pytest
 import rclpy
-from processes import DOMAIN, TIMEOUT
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from std_srvs.srv import Trigger
-
 from stavpr_ros.ros import rclpy_workarounds
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, PromptExecutor, repeat_responses
+from std_srvs.srv import Trigger
 
 SPINS = 200  # of at most 50 ms each: until an event counts as missing
 LOST = 'failed to send response (timeout): client will not receive response'

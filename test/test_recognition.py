@@ -1,15 +1,15 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The recognizer frame by frame: the same as the whole matrix at once, and never a false 'place 0'."""
 
 import numpy as np
 import pytest
-import torch
-
 from stavpr_ros.alignment import (
-    SequenceSettings,
-    SpatialSettings,
     align_sequence,
     best_match,
     match_sequence,
+    SequenceSettings,
+    SpatialSettings,
 )
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.evaluation.evaluate import recognize_all
@@ -17,6 +17,7 @@ from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
+import torch
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 

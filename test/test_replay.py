@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The command replay as a process, with a subscriber in this one."""
 
 import os
@@ -9,7 +11,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 
@@ -19,7 +20,6 @@ messages = pytest.importorskip('stavpr_msgs.msg')
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from sensor_msgs.msg import Image  # noqa: E402
-
 from stavpr_ros.ros import transport  # noqa: E402
 
 DOMAIN = 1 + os.getpid() % 100

@@ -1,17 +1,17 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Mode robust: each option by itself, and all of them on real drives that change in speed, season and view."""
 
 import math
 
 import numpy as np
 import pytest
-import torch
-
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-from stavpr_ros.demonstration.street import World, first_drive
+from stavpr_ros.demonstration.street import first_traverse, World
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import best_f1, frame_answers, score_at
-from stavpr_ros.evaluation.offline import recognize_all, window_answers
+from stavpr_ros.evaluation.metrics import best_f1, counts_at, image_matches
+from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.evaluation.warp import warp_indices
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import build_map, extract_features
@@ -21,22 +21,23 @@ from stavpr_ros.recognition.robust.centering import MeanCentering
 from stavpr_ros.recognition.robust.hysteresis import (
     AHEAD,
     CHANCE,
-    FADING,
-    Hysteresis,
     evidence,
     expected_second_best,
+    FADING,
+    Hysteresis,
     score,
 )
 from stavpr_ros.recognition.robust.options import (
     LOOP_THRESHOLD,
+    options_of,
     PAPER,
     ROBUST,
     RobustOptions,
-    options_of,
 )
 from stavpr_ros.recognition.robust.znorm import MEMORY, PRIOR, ZNormalization
 from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
 from stavpr_ros.sources import open_source
+import torch
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 WARPS = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')
@@ -341,9 +342,9 @@ def as_map(features):
 
 def judged(reference, query, truth):
     """Best F1, and the precision at the default threshold."""
-    answers = frame_answers(window_answers(recognize_all(robust(as_map(reference)), query)), 20)
+    answers = image_matches(recognize_all(robust(as_map(reference)), query), 20)
     correct = truth.accepts(answers.places)
-    return best_f1(answers.distances, correct).f1, score_at(
+    return best_f1(answers.distances, correct).f1, counts_at(
         1.0, answers.distances, correct
     ).precision
 
@@ -408,8 +409,8 @@ def test_the_hallway_is_closed(drives, data_folder):
     assert truth.has_match.sum() == 44
     closer = LoopCloser(RecognizerSettings(1.0, mode='robust'), 20, features.settings)
     answers = [closer.update(features[i : i + 1]) for i in range(84)]
-    answered = frame_answers(window_answers(answers), 20)
-    score = score_at(1.0, answered.distances, truth.accepts(answered.places), truth.has_match)
+    answered = image_matches(answers, 20)
+    score = counts_at(1.0, answered.distances, truth.accepts(answered.places), truth.has_match)
     print(f'hallway: precision {score.precision:.3f}, recall {score.recall:.3f}')
     assert score.precision >= 0.95
     assert score.recall >= 0.8
@@ -445,7 +446,7 @@ def test_a_route_that_has_just_begun_closes_no_loops_by_chance():
     extractor = FeatureExtractor()
     for seed in (3, 7, 11):
         images = [
-            frame.image for frame, _ in zip(first_drive(World(seed)), range(130), strict=False)
+            frame.image for frame, _ in zip(first_traverse(World(seed)), range(130), strict=False)
         ]
         features = extractor.extract(images)
         closer = LoopCloser(

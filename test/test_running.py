@@ -1,21 +1,22 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The node as users run it: renamed, with parameters changed under load, and ended at any time."""
 
 import os
 import shutil
 import signal
 
-import numpy as np
-import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from image_messages import image_message
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from processes import RELIABLE, TAKEN_RELIABLY, Bench, Process, node_process
+import numpy as np
+from processes import Bench, node_process, Process, RELIABLE, TAKEN_RELIABLY
+import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
-
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_msgs.srv import LoadMap
 from stavpr_ros.mapping import save_map

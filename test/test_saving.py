@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """A recorded map is saved at the end, and no file of another map is overwritten."""
 
 from pipelines import localizing, process, save, settings_of

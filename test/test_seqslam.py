@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """SeqSLAM: every step by hand, the whole against plain loops, F1 on real traverses."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Bags of every kind: written and read back, real, damaged."""
 
 import hashlib

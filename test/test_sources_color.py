@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Bayer mosaics and YUV to RGB: scenes of one color, ramps, a plain-loop oracle, every size."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Image files and compressed messages to RGB: formats, mosaics, depth, damage, garbage."""
 
 from io import BytesIO

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Raw image messages to RGB: hand-made pixels of every encoding, lying headers, garbage."""
 
 import array

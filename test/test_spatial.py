@@ -1,14 +1,15 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Spatial alignment: worked examples, and every strategy bit for bit against the oracle."""
 
 import math
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
-from stavpr_ros.alignment import SpatialSettings, align_images, image_distances
+from stavpr_ros.alignment import align_images, image_distances, SpatialSettings
 
 ADAPTIVE = SpatialSettings()
 VANILLA = SpatialSettings(strategy='vanilla')
@@ -109,7 +110,9 @@ def test_tie_is_judged_on_the_rounded_sums():
         d = np.array([[1, np.finfo(dtype).eps], [1, 4]], dtype)
         aligned = align_images(d, VANILLA)
         assert path_of(aligned) == [(0, 0), (0, 1), (1, 1)]
-        assert one(d, VANILLA) == dtype(5) / dtype(3)  # taking the minimum over S first gives 5 / 2
+        assert one(d, VANILLA) == dtype(5) / dtype(
+            3
+        )  # taking the minimum over S first gives 5 / 2
 
 
 def test_adaptive_weight_by_hand():
@@ -126,7 +129,9 @@ def test_adaptive_weight_by_hand():
     assert aligned.distance == pytest.approx(0.8 / 3)
     # vanilla: diagonal .2 + .5 = .7, C = 2; sigma = 0 is vanilla
     assert align_images(d, VANILLA).distance == pytest.approx(0.7 / 2)
-    assert align_images(d, SpatialSettings(sigma=0.0)).distance == align_images(d, VANILLA).distance
+    assert (
+        align_images(d, SpatialSettings(sigma=0.0)).distance == align_images(d, VANILLA).distance
+    )
 
 
 def test_diagonal_step_costs_its_weight():
@@ -208,7 +213,9 @@ def test_banned_cells_are_never_used():
 
 def test_xi_of_one_is_the_mean_of_the_diagonal():
     d = np.full((7, 7), 0.0)
-    np.fill_diagonal(d, [1, 2, 3, 4, 5, 6, 7])  # row 4's minimum lies outside, I_4 = 4 and a = 1 all the same
+    np.fill_diagonal(
+        d, [1, 2, 3, 4, 5, 6, 7]
+    )  # row 4's minimum lies outside, I_4 = 4 and a = 1 all the same
     aligned = align_images(d, SpatialSettings(xi=1))
     assert (aligned.weight, aligned.cost, aligned.distance) == (1, 7, 4)
     assert path_of(aligned) == [(i, i) for i in range(7)]
@@ -261,7 +268,9 @@ def test_every_size_equals_the_oracle(W, dtype):
             for xi in {None, 1, (W + 1) // 2, W}:
                 d = random_distances(W, W, 5, dtype, levels)
                 result = image_distances(d, SpatialSettings(strategy=strategy, xi=xi))
-                np.testing.assert_array_equal(result, oracle.image_distances(d, strategy, 1.0, xi, dtype))
+                np.testing.assert_array_equal(
+                    result, oracle.image_distances(d, strategy, 1.0, xi, dtype)
+                )
 
 
 @settings(max_examples=150, deadline=None)
@@ -276,7 +285,9 @@ def test_every_size_equals_the_oracle(W, dtype):
     restriction=st.integers(0, 9),
     banned=st.sampled_from([0.0, 0.0, 0.1, 0.5]),
 )
-def test_image_distances_equal_the_oracle(seed, W, n, dtype, levels, strategy, sigma, restriction, banned):
+def test_image_distances_equal_the_oracle(
+    seed, W, n, dtype, levels, strategy, sigma, restriction, banned
+):
     if strategy == 'sliding_window':
         W = max(W, 4)
     xi = None if restriction == 0 else min(restriction, W)
@@ -306,7 +317,9 @@ def test_block_borders_equal_the_oracle(n, strategy):
     sigma=st.sampled_from([1.0, 0.0, 0.5, 0.3]),
     restriction=st.integers(0, 9),
 )
-def test_alignment_of_a_pair_equals_the_oracle(seed, W, dtype, levels, strategy, sigma, restriction):
+def test_alignment_of_a_pair_equals_the_oracle(
+    seed, W, dtype, levels, strategy, sigma, restriction
+):
     xi = None if restriction == 0 else min(restriction, W)
     spatial = SpatialSettings(strategy=strategy, sigma=sigma, xi=xi)
     d = random_distances(seed, W, 1, dtype, levels)
@@ -329,7 +342,9 @@ def test_answers_do_not_depend_on_the_number_of_threads():
     try:
         for threads in (1, 2):
             numba.set_num_threads(threads)
-            results.append([image_distances(d, spatial) for spatial in (ADAPTIVE, VANILLA, WINDOW)])
+            results.append(
+                [image_distances(d, spatial) for spatial in (ADAPTIVE, VANILLA, WINDOW)]
+            )
     finally:
         numba.set_num_threads(before)
     for alone, together in zip(*results, strict=True):

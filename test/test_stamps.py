@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Gaps and jumps of the clock, from stamps alone."""
 
 from stavpr_ros.pipeline.stamps import StampEvent, StampWatch

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Counts, rates and times of the node, on a clock that the tests move."""
 
 import dataclasses
@@ -7,7 +9,6 @@ import threading
 import tracemalloc
 
 import pytest
-
 from stavpr_ros.pipeline.statistics import RECENT, SHORTEST_SPAN, Statistics
 
 

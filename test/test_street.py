@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The synthetic street: reproducible, geometrically sane, with known ground truth."""
 
 from dataclasses import replace

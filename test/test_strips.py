@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Vertical strips, their norms, and the distances between them, against the oracle."""
 
 from hypothesis import given, settings

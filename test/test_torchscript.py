@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Features of TorchScript files: outputs and inner modules, traced and scripted, errors."""
 
 import numpy as np

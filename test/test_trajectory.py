@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Poses by their stamps: interpolation against formulas, clock jumps, odometry of bags."""
 
 import math

@@ -1,15 +1,16 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Matching at several speeds: worked by hand, against plain loops, and on blocks' borders."""
 
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
+import numpy as np
+import pytest
 from stavpr_ros.alignment import (
-    VelocitySettings,
     best_velocity_match,
     match_velocities,
     trace_velocity,
+    VelocitySettings,
 )
 from stavpr_ros.alignment.cpu import velocity as kernel
 from stavpr_ros.errors import InputError, SettingsError

@@ -1,12 +1,13 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The geometric check: made-up scenes from two viewpoints, pictures that say nothing, and real places."""
 
 import cv2
-import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
-
+import numpy as np
+import pytest
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.recognition.verification import GeometricSettings, GeometricVerifier
 from stavpr_ros.sources import open_source
@@ -93,7 +94,9 @@ def test_pictures_that_say_nothing(method):
 
 
 @pytest.mark.parametrize('method', METHODS)
-@given(shapes=st.tuples(*[st.integers(1, 90)] * 4), kind=st.integers(0, 3), seed=st.integers(0, 99))
+@given(
+    shapes=st.tuples(*[st.integers(1, 90)] * 4), kind=st.integers(0, 3), seed=st.integers(0, 99)
+)
 @hypothesis_settings(max_examples=60)
 def test_no_picture_is_too_much(method, shapes, kind, seed):
     """Any size, noise, stripes and repeated tiles, whose matches are degenerate: a count, no error."""
@@ -189,7 +192,9 @@ def thumbnail(picture, width=192):
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
-@pytest.mark.parametrize(('name', 'recall'), [('gardens_point', 0.7), ('corridor', 0.6), ('hallway', 0.85)])
+@pytest.mark.parametrize(
+    ('name', 'recall'), [('gardens_point', 0.7), ('corridor', 0.6), ('hallway', 0.85)]
+)
 def test_real_places_are_told_from_others(data_folder, name, recall):
     """Thumbnails of the places, as a map keeps them; wrong places are at least twenty away from the right."""
     if name == 'hallway':

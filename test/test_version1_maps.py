@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Maps of format version 1, as robots have them: they load and recognize, and their keys are fixed.
 

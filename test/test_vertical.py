@@ -1,10 +1,10 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Vertical alignment, for cameras that rise and sink: cells of strips first, then strips."""
 
 import numpy as np
 import oracle
 import pytest
-import torch
-
 from stavpr_ros.alignment import SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
@@ -15,6 +15,7 @@ from stavpr_ros.recognition.cpu_matcher import CpuMatcher, cut_cells
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.frame import Frame
+import torch
 
 SETTINGS = FeatureSettings('gradient', GradientSettings(), 5)
 

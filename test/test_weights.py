@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Files of weights: paths, cache, downloads from a local server, hashes, damaged files."""
 
 import hashlib

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The worker: newest items kept, oldest dropped, nothing ends the thread."""
 
 from concurrent.futures import ThreadPoolExecutor

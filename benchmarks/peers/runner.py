@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Runner in the peers' own environment: aligns a sample of starts with one peer on request.
 
@@ -7,11 +9,11 @@ Standard input: a line of JSON for each run, ``{"peer": NAME, "window": FILE.npy
 versions.
 """
 
+from collections.abc import Callable
 import importlib.metadata
 import json
 import sys
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np

@@ -1,21 +1,28 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The paper's mathematics: the distance of two images, and of a window of images to every place of a map."""
 
 from stavpr_ros.alignment.lm_dtw import (
-    SequenceDistances,
-    SequenceMatch,
     align_sequence,
     best_match,
     match_sequence,
+    SequenceDistances,
+    SequenceMatch,
 )
-from stavpr_ros.alignment.path import Alignment, aligned_index
-from stavpr_ros.alignment.settings import STRATEGIES, SequenceSettings, SpatialSettings, VelocitySettings
+from stavpr_ros.alignment.path import aligned_index, Alignment
+from stavpr_ros.alignment.settings import (
+    SequenceSettings,
+    SpatialSettings,
+    STRATEGIES,
+    VelocitySettings,
+)
 from stavpr_ros.alignment.similarity import holistic_distances, strip_distances
 from stavpr_ros.alignment.spatial import align_images, image_distances
 from stavpr_ros.alignment.velocity import (
-    VelocityMatches,
     best_velocity_match,
     match_velocities,
     trace_velocity,
+    VelocityMatches,
 )
 
 __all__ = [

@@ -1,9 +1,10 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Temporal alignment: a window of query images against every place of the map, LM-DTW (section 4)."""
 
 from dataclasses import dataclass
 
 import numpy as np
-
 from stavpr_ros.alignment.path import Alignment, trace
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.checks import float_array, no_nan
@@ -84,7 +85,9 @@ def match_padded(window: np.ndarray, n: int, k: int) -> SequenceDistances:
 def _checked(distances: np.ndarray, settings: SequenceSettings) -> np.ndarray:
     D = float_array(distances, 'image distances', 2)
     if D.shape[0] != settings.length:
-        raise InputError(f'image distances have shape {D.shape}: expected l = {settings.length} rows')
+        raise InputError(
+            f'image distances have shape {D.shape}: expected l = {settings.length} rows'
+        )
     return no_nan(D, 'image distances')
 
 

@@ -1,9 +1,10 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The alignment of one pair, with its warping path."""
 
 from dataclasses import dataclass
 
 import numpy as np
-
 from stavpr_ros.errors import InputError
 
 NO_PATH = np.empty((0, 2), np.int32)

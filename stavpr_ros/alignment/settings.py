@@ -1,10 +1,11 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Settings of the two alignments, in the paper's symbols and with its defaults."""
 
-import math
 from dataclasses import dataclass
+import math
 
 import numpy as np
-
 from stavpr_ros.errors import SettingsError
 
 STRATEGIES = ('adaptive', 'vanilla', 'sliding_window', 'none')
@@ -31,11 +32,15 @@ class SpatialSettings:
 
     def __post_init__(self) -> None:
         if self.strategy not in STRATEGIES:
-            raise SettingsError(f'strategy {self.strategy!r} is unknown: take one of {", ".join(STRATEGIES)}')
+            raise SettingsError(
+                f'strategy {self.strategy!r} is unknown: take one of {", ".join(STRATEGIES)}'
+            )
         if not (math.isfinite(self.sigma) and self.sigma >= 0):
             raise SettingsError(f'sigma = {self.sigma} must be a finite number >= 0')
         if self.xi is not None and not (self.xi >= 1 and float(self.xi).is_integer()):
-            raise SettingsError(f'xi = {self.xi} must be a whole number >= 1, or None for no restriction')
+            raise SettingsError(
+                f'xi = {self.xi} must be a whole number >= 1, or None for no restriction'
+            )
 
         if self.vertical and self.strategy not in ('adaptive', 'vanilla'):
             raise SettingsError(
@@ -47,7 +52,9 @@ class SpatialSettings:
         if self.xi is None:
             return W
         if self.xi > W:
-            raise SettingsError(f'xi = {self.xi} exceeds the number of strips W = {W}: choose 1 <= xi <= {W}')
+            raise SettingsError(
+                f'xi = {self.xi} exceeds the number of strips W = {W}: choose 1 <= xi <= {W}'
+            )
         return int(self.xi)
 
 
@@ -90,7 +97,9 @@ class VelocitySettings:
 
     def __post_init__(self) -> None:
         if not self.speeds or not all(math.isfinite(v) and 0 <= v <= 100 for v in self.speeds):
-            raise SettingsError(f'speeds = {self.speeds} must be one or more numbers from 0 to 100')
+            raise SettingsError(
+                f'speeds = {self.speeds} must be one or more numbers from 0 to 100'
+            )
         if not (math.isfinite(self.penalty) and self.penalty >= 0):
             raise SettingsError(f'penalty = {self.penalty} must be a finite number >= 0')
 

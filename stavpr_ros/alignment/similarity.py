@@ -1,9 +1,10 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Cosine distances between one query image and all map images, as products on the map's device."""
 
 import numpy as np
-import torch
-
 from stavpr_ros.errors import InputError
+import torch
 
 
 def _checked(
@@ -27,7 +28,9 @@ def _checked(
     return query, reference
 
 
-def strip_distances(query: np.ndarray | torch.Tensor, reference: np.ndarray | torch.Tensor) -> torch.Tensor:
+def strip_distances(
+    query: np.ndarray | torch.Tensor, reference: np.ndarray | torch.Tensor
+) -> torch.Tensor:
     """
     Distances of every query strip to every strip of every map image: d[i, j] = 1 - <x_i, y_j>.
 

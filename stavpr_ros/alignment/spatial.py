@@ -1,7 +1,8 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Spatial alignment: the distance of two images from the distances of their vertical strips (section 2)."""
 
 import numpy as np
-
 from stavpr_ros.alignment.path import Alignment, trace
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.checks import float_array, no_nan
@@ -72,7 +73,9 @@ def align_images(d: np.ndarray, settings: SpatialSettings) -> Alignment:
     W = d.shape[0]
     band = settings.band(W)
     if settings.strategy not in ('adaptive', 'vanilla'):
-        raise SettingsError(f'strategy {settings.strategy!r} has no warping path: take adaptive or vanilla')
+        raise SettingsError(
+            f'strategy {settings.strategy!r} has no warping path: take adaptive or vanilla'
+        )
     c = (W + 1) // 2 - 1  # the central strip, ceil(W / 2), 0-based
     low, high = max(0, c - band + 1), min(W, c + band)
     nearest = low + int(np.argmin(d[c, low:high]))

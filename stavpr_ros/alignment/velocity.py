@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 A window against every place of the map at several speeds (beyond the paper).
 
@@ -14,7 +16,6 @@ Start and end are free; linear in the number of places, l x V cells for each.
 from dataclasses import dataclass
 
 import numpy as np
-
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.settings import VelocitySettings
 from stavpr_ros.checks import float_array, no_nan

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """``ros2 run stavpr_ros build_map``: make a reference map from a folder of images or a bag."""
 
 import argparse

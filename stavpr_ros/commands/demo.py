@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """``ros2 run stavpr_ros demo``: from two traverses to matches, numbers and plots, over ROS."""
 
 import argparse
@@ -99,8 +101,7 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
             parser.error('--loop is one traverse: leave --map and --query out')
         if truth == 'identity' or (truth and arguments.loop == SYNTHETIC):
             parser.error(
-                '--loop FOLDER takes a file as --truth; that of the synthetic street is '
-                'known'
+                '--loop FOLDER takes a file as --truth; that of the synthetic street is known'
             )
         if arguments.mode == 'paper' and arguments.threshold is None:
             parser.error('--loop in mode paper needs --threshold')
@@ -112,9 +113,7 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
     if truth and arguments.map is None:
         parser.error('--truth goes with --map and --query')
     if truth not in (None, 'identity'):
-        parser.error(
-            f'--truth {truth}: expected identity; files are for --loop, and for evaluate'
-        )
+        parser.error(f'--truth {truth}: expected identity; files are for --loop, and for evaluate')
 
 
 def _print(text: object) -> None:

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The inputs of the command ``evaluate``: folders, bags, saved maps, data sets, ground truth."""
 
 import argparse

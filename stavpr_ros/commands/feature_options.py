@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Command-line options of the features, generated from each kind's settings."""
 
 import argparse

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """``ros2 run stavpr_ros node``: the place-recognition node."""
 
 import sys

@@ -1,12 +1,14 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """``record``: write matches, or loop closures, to a file, one JSON object per line."""
 
 import argparse
+from collections.abc import Sequence
 import json
 import math
 import sys
 import time
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO, TYPE_CHECKING
 
 from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.signals import obey_signals
@@ -126,7 +128,6 @@ def _write_messages(arguments: argparse.Namespace, file: TextIO, ros_arguments: 
     import rclpy
     from rclpy.exceptions import InvalidTopicNameException
     from rclpy.qos import QoSProfile
-
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
     from stavpr_ros.ros.discovery import Discovery
     from stavpr_ros.ros.process import ros_node, spin_until

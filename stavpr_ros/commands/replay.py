@@ -1,15 +1,15 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """``replay``: publish the images of a bag or folder, at a pace or each after the last result."""
 
 import argparse
+from collections.abc import Callable, Iterator, Sequence
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
 
 import rclpy
 from rclpy.exceptions import InvalidTopicNameException
-from tqdm import tqdm
-
 from stavpr_ros.errors import ImageError, SettingsError, StavprError
 from stavpr_ros.ros.process import own_arguments, ros_node
 from stavpr_ros.ros.replay import NoResultError, NoSubscriberError, Replayer, ReplaySettings
@@ -18,6 +18,7 @@ from stavpr_ros.signals import interrupted, obey_signals
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord
+from tqdm import tqdm
 
 DONE, BAD_INPUT, BAD_USAGE, NO_SUBSCRIBER, NO_RESULT, INTERRUPTED = 0, 1, 2, 3, 4, 130
 FOLDER_RATE = 10.0

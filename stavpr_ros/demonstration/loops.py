@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The result of a loop-closure demonstration, and its plot: the traverse against its own past."""
 
 from dataclasses import dataclass

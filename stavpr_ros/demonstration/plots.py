@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The plots of a localization demonstration: selects the images to show."""
 
 from pathlib import Path

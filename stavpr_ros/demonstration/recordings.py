@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The recordings of a demonstration: a synthetic street, written as bags, or the user's own."""
 
 from collections.abc import Callable, Iterator
@@ -147,9 +149,7 @@ def own_pair(
     if images < sequence_length:
         raise SettingsError(f'{query} has {images} images: the window needs {sequence_length}')
     if identity and images > places:
-        raise SettingsError(
-            f'--truth identity: {images} query images on a map of {places} places'
-        )
+        raise SettingsError(f'--truth identity: {images} query images on a map of {places} places')
     title = f'{Path(query).name} recognized on the map of {Path(reference).name}'
     return TraversePair(first, second, np.arange(images) if identity else None, title)
 

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The plots of the demonstration: the distances of a traverse, as a matrix and over time."""
 
 from collections.abc import Sequence

@@ -1,1 +1,3 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Evaluation: ground truth, metrics, reports, baselines."""

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Ground truth: which places of the map are correct for each query image."""
 
 from dataclasses import dataclass

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Plots of results, drawn by matplotlib without a screen and without the global state of pyplot.
 

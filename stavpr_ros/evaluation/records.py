@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Evaluation of the matches that a node published for one traverse, as ``record`` wrote them."""
 
 from dataclasses import dataclass

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """An evaluation and its surroundings: the numbers of a report, and the examples that it shows."""
 
 from dataclasses import dataclass

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The files of a report: JSON, CSV, plots and the page."""
 
 import csv

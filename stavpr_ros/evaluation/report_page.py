@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The HTML page of a report: one file that needs no server, no network and no other file."""
 
 import base64

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Changed traverses: another speed, a stop, narrower images."""
 
 from collections.abc import Iterator

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Images to local features: backbone, strips, projection; and the record of their settings."""
 
 from collections.abc import Sequence

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Images to the square size of a backbone, and to the batch of numbers of a network."""
 
 from collections.abc import Sequence

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Gaussian random projection (GRP) of local features to fewer dimensions (section 3)."""
 
 from dataclasses import dataclass

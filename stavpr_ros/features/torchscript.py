@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Features of any convolutional network in a TorchScript file: its output or that of an inner layer.
 

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The reference map: build, grow, save and load it; keyframes and trajectories."""
 
 from stavpr_ros.mapping.builder import build_map, extract_features

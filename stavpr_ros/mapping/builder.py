@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Building a map from a sequence of images."""
 
 from collections.abc import Generator, Iterable, Iterator, Sized

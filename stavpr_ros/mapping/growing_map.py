@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """A map that grows by one place at a time."""
 
 from collections.abc import Callable, Sequence

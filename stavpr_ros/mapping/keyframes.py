@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Keyframes: the images of a traverse that become places, by time, motion and image change."""
 
 import dataclasses

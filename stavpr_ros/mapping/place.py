@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """One place of a fixed or growing map."""
 
 from dataclasses import dataclass

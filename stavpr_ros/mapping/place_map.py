@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The reference map: local features, stamps, identifiers, poses, thumbnails of places."""
 
 from dataclasses import dataclass, field

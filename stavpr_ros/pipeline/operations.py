@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The three operations: each updates its places, its recognizer, or both with one image."""
 
 from dataclasses import dataclass, replace

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Draws a query beside the place that it was matched with, fast enough for every frame."""
 
 import cv2

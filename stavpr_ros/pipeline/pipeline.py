@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The pipeline: from one image message to one match; the map and the operation."""
 
 from collections.abc import Iterator

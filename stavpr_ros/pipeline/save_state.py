@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The files of a map, and its recorded places that are in none of them."""
 
 from dataclasses import dataclass, field

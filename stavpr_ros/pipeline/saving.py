@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Saving a recorded map while images are processed; files of other maps are never overwritten."""
 
 from collections.abc import Callable

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Settings of the pipeline and of the node, built from the values of the parameters."""
 
 from collections.abc import Mapping

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Checks the stamps of images for pauses and for clocks that jump back."""
 
 from dataclasses import dataclass

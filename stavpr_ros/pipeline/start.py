@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Start of an operation: all that may fail or takes long, before the pipeline is changed."""
 
 from dataclasses import dataclass

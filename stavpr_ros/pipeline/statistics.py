@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Counts of the node: images, results, drops, and the time of each stage."""
 
 from collections import Counter, deque

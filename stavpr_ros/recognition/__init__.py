@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Recognition, image by image: query window, matcher, match."""
 
 from stavpr_ros.recognition.match import Candidate, Match, Status

@@ -1,9 +1,10 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Candidates of a window: the nearest places after non-maximum suppression."""
 
 import math
 
 import numpy as np
-
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.errors import InputError
 from stavpr_ros.recognition.match import Candidate

@@ -1,14 +1,15 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The matcher on the CPU: one pass over the map for each image, on all cores."""
 
 import numpy as np
-import torch
-
 from stavpr_ros.alignment.cpu import dot
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.alignment.similarity import tiled
 from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
+import torch
 
 CACHE_LINE = 64  # bytes; vectors across two of them are read at half the speed
 

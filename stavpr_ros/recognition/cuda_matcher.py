@@ -1,16 +1,17 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The matcher on a CUDA device, where the features of the map stay."""
 
 from typing import Any
 
 import numpy as np
-import torch
-
 from stavpr_ros.alignment.cuda.compilation import runtime
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.alignment.similarity import holistic_distances
 from stavpr_ros.alignment.spatial import WINDOW
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
+import torch
 
 BLOCK_WORDS = 2**26  # most words of products that lie in memory at a time: 256 MiB
 QUERIES = 32  # most images of a batch whose products are made at once

@@ -1,14 +1,15 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """LM-DTW on a CUDA device: the window lies there, and one small result is copied back for each match."""
 
 from typing import Any
-
-import torch
 
 from stavpr_ros.alignment.cuda.compilation import runtime
 from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch, trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
 from stavpr_ros.recognition.sequence_search import Sequences, WindowMatch
+import torch
 
 
 class CudaLmDtwSearch:

@@ -1,12 +1,12 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Loop closure: the map is the route so far, without its latest images."""
 
-import math
 from collections import deque
 from dataclasses import replace
+import math
 
 import numpy as np
-import torch
-
 from stavpr_ros.alignment.cpu import dot
 from stavpr_ros.alignment.similarity import tiled
 from stavpr_ros.alignment.spatial import adaptive_weights
@@ -16,6 +16,7 @@ from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.match import Match, Status
 from stavpr_ros.recognition.recognizer import RecognizerSettings, SequenceRecognizer
 from stavpr_ros.recognition.route_features import RouteFeatures
+import torch
 
 EVICTED = 8  # the oldest one in so many is evicted at a time
 LEAST_PLACES = 5  # fewer distances have no meaningful mean and deviation

@@ -1,14 +1,15 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The result for one image: its status, the nearest sequence of the map, the matched place."""
 
-import enum
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+import enum
+import math
 
 import numpy as np
-
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
-from stavpr_ros.alignment.path import NO_PATH, aligned_index
+from stavpr_ros.alignment.path import aligned_index, NO_PATH
 
 
 class Status(enum.IntEnum):

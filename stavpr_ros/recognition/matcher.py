@@ -1,12 +1,13 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """A matcher holds the features of a map on one backend and compares images with them."""
 
 from typing import Protocol
 
-import torch
-
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures
+import torch
 
 PRECISIONS = ('float32', 'float16')
 

@@ -1,11 +1,11 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Frame by frame: the distances of the newest image, the nearest sequence of the window, the status."""
 
-import math
 from dataclasses import dataclass, field, replace
+import math
 
 import numpy as np
-import torch
-
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.devices import choose_backend
@@ -17,15 +17,16 @@ from stavpr_ros.recognition.match import Candidate, Match, Status
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust.centering import MeanCentering
 from stavpr_ros.recognition.robust.hysteresis import (
-    Hysteresis,
     evidence,
     expected_second_best,
+    Hysteresis,
     score,
 )
-from stavpr_ros.recognition.robust.options import RobustOptions, options_of
+from stavpr_ros.recognition.robust.options import options_of, RobustOptions
 from stavpr_ros.recognition.robust.znorm import ZNormalization
 from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
 from stavpr_ros.recognition.sequence_search import LmDtwSearch, Search, VelocitySearch, WindowMatch
+import torch
 
 PLACES_TO_START_FROM = 100  # places whose distances to the map start the z-normalization
 

@@ -1,8 +1,9 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Features of a route that grows by one place at a time, mean-centered, in memory once."""
 
-import torch
-
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+import torch
 
 ROOM = 256  # places that there is room for at first; doubled when they are full
 GROWTH = 1.125  # the mean is updated when the route is so much longer

@@ -1,12 +1,13 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The window of the query: one row of image distances, and one stamp, for each of the last l images."""
 
 from collections import deque
 from collections.abc import Callable
 
-import torch
-
 from stavpr_ros.alignment.lm_dtw import padded_width
 from stavpr_ros.checks import no_nan
+import torch
 
 
 class SequenceBuffer:

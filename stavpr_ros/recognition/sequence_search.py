@@ -1,15 +1,16 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Searches over a full window: the nearest sequence of the map, by LM-DTW or by velocity search."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-
 from stavpr_ros.alignment.lm_dtw import (
-    SequenceMatch,
     best_match,
     match_padded,
     padded_width,
+    SequenceMatch,
     trace_sequence,
 )
 from stavpr_ros.alignment.path import NO_PATH

@@ -1,15 +1,16 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """A threshold to start with, from the map alone."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from tqdm import tqdm
-
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from tqdm import tqdm
 
 
 @dataclass(frozen=True)

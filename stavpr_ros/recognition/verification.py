@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Geometric verification: whether two pictures show the same scene from two viewpoints.
 
@@ -5,13 +7,12 @@ Keypoints of both are matched, and the matches counted that one epipolar geometr
 place that looks alike has matches as well, but few that one geometry explains.
 """
 
-import math
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import cv2
 import numpy as np
-
 from stavpr_ros.errors import InputError, SettingsError
 
 METHODS = ('orb', 'sift')

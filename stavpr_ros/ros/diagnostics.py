@@ -1,17 +1,18 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Diagnostics of a node from its health: four statuses with level, cause, remedy, values."""
 
+from collections.abc import Callable
 import math
 import re
 import threading
-from collections.abc import Callable
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from std_msgs.msg import Header
-
-from stavpr_ros.pipeline.statistics import RECENT, Counts
+from stavpr_ros.pipeline.statistics import Counts, RECENT
 from stavpr_ros.ros.health import Health
+from std_msgs.msg import Header
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 

@@ -1,7 +1,9 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Checks that other nodes have discovered this one."""
 
-import time
 from collections.abc import Callable
+import time
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters

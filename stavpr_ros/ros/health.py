@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The health of the node: the state from which its diagnostics are made."""
 
 from dataclasses import dataclass, replace

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The subscriptions: images, raw or compressed, and odometry."""
 
 from collections.abc import Callable

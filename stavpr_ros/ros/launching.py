@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Arguments and node of the launch files, from the table of parameters; a light import."""
 
 from typing import Any

@@ -1,21 +1,22 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Runs the node, a replay and recorders as processes of their own: recognition as on a robot."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, ExitStack
+from dataclasses import dataclass
+from functools import partial
 import json
 import math
 import os
+from pathlib import Path
 import random
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import Any
 
-from ament_index_python.packages import PackageNotFoundError, get_package_prefix
-
+from ament_index_python.packages import get_package_prefix, PackageNotFoundError
 from stavpr_ros.errors import StavprError, UnavailableError
 
 START_TIMEOUT = 180.0  # seconds for the node to load the map and to compile

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The place-recognition node: its life cycle and its parameters."""
 
 from collections.abc import Callable, Mapping

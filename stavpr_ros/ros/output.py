@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The publishers of matches; lifecycle publishers, which publish only while the node is active."""
 
 import math

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Declaration of the parameters on a node."""
 
 from collections.abc import Iterable

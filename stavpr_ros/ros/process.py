@@ -1,9 +1,11 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Start, spinning and end of every executable with a ROS node."""
 
-import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+import os
+import sys
 from typing import TypeVar
 
 import rclpy
@@ -12,7 +14,6 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
-
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.ros.rclpy_workarounds import PromptExecutor
 from stavpr_ros.signals import interrupted, signals_deferred

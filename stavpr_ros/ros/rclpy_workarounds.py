@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Workarounds for rclpy and rmw_fastrtps of ROS 2 Jazzy, each with the upstream change to wait for.
 
@@ -5,13 +7,13 @@ The tests of this module also show the failure of each without its workaround: s
 when upstream is fixed, and the workaround can go.
 """
 
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 import threading
 import time
 import traceback
-import warnings
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
+import warnings
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import Executor, ShutdownException, TimeoutException

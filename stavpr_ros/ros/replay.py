@@ -1,10 +1,12 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Publishes image records at a pace, or each after the result of the one before."""
 
 import array
-import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
+import math
+import time
 from typing import Any
 
 from rclpy.duration import Duration
@@ -12,13 +14,12 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
-from std_msgs.msg import Header
-
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError
 from stavpr_ros.ros.discovery import Discovery
 from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord
+from std_msgs.msg import Header
 
 SECOND = 1_000_000_000
 SPIN_SECONDS = 0.1  # until a signal is noticed

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The configured node: the pipeline on its worker, the subscriptions and the publishers."""
 
 from collections.abc import Callable, Iterator

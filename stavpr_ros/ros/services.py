@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The services of the node; each returns the error as its message."""
 
 from collections.abc import Callable

@@ -1,10 +1,11 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Fast DDS, the default middleware of ROS 2 Jazzy, without dropped images."""
 
 import os
 from pathlib import Path
 
-from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
-
+from ament_index_python.packages import get_package_share_directory, PackageNotFoundError
 from stavpr_ros.errors import UnavailableError
 
 PROFILES_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The images of one topic of a ROS 1 or ROS 2 bag as a sequence, and its odometry."""
 
 from collections.abc import Callable, Iterator

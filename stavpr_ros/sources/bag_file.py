@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Opens bag files of every kind with rosbags, without writing beside them."""
 
 from collections.abc import Callable, Iterator

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Writes image records into a new ROS 2 bag."""
 
 from collections.abc import Iterable

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 The pixels and messages of ROS images to RGB, uint8, shape (height, width, 3), C-contiguous.
 

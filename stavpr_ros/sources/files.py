@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Image files to RGB, uint8, shape (height, width, 3), C-contiguous."""
 
 from collections.abc import Callable

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """A folder of image files as a sequence."""
 
 from collections.abc import Callable, Iterator

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The items of sources: a decoded image, or an image message as recorded."""
 
 from dataclasses import dataclass

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Local features times local features: the cosine distances of one image's strips to all strips of the map.
 
@@ -6,12 +8,11 @@ images are aligned: one frame costs little more than reading the map. In half wi
 as much; products and sums are float32 all the same.
 """
 
-import numba as nb
-import numpy as np
 from llvmlite import ir
+import numba as nb
 from numba.core import types
 from numba.extending import intrinsic, overload
-
+import numpy as np
 from stavpr_ros.alignment.cpu.dtw import align_lanes
 from stavpr_ros.alignment.cpu.dtw_steps import SLOT
 from stavpr_ros.alignment.cpu.simd import LANES, store
@@ -85,7 +86,9 @@ def strip_distances(features, query, d):
     for block in nb.prange((n + IMAGES - 1) // IMAGES):
         first = block * IMAGES
         count = min(IMAGES, n - first)
-        _block_distances(features, query, first, count, d[:, :, first:], np.empty(TILE, np.float32))
+        _block_distances(
+            features, query, first, count, d[:, :, first:], np.empty(TILE, np.float32)
+        )
 
 
 @parallel_kernel
@@ -109,7 +112,11 @@ def image_distances(features, queries, weights, xi, out):
         for x in range(queries.shape[0]):
             _block_distances(features, queries[x], first, count, d, sums)
             for at in range(0, count, LANES):
-                store(lanes, at, align_lanes(d.reshape(-1), at, W * IMAGES, IMAGES, weights, xi, edge))
+                store(
+                    lanes,
+                    at,
+                    align_lanes(d.reshape(-1), at, W * IMAGES, IMAGES, weights, xi, edge),
+                )
             out[x, first : first + count] = lanes[:count]
 
 

@@ -1,9 +1,10 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The distances of one image to many map images from the distances of their strips (section 2)."""
 
 import numba as nb
 import numpy as np
-
-from stavpr_ros.alignment.cpu.dtw_steps import SLOT, open_edge, sweep_row
+from stavpr_ros.alignment.cpu.dtw_steps import open_edge, SLOT, sweep_row
 from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel, parallel_kernel
 

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 The recursion of both alignments, row by row, on all lanes at once.
 
@@ -8,7 +10,6 @@ No ``fastmath``: the answers are the oracle's bit for bit.
 """
 
 import numpy as np
-
 from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel
 
@@ -27,7 +28,9 @@ def open_edge(edge, columns):
 
 
 @kernel
-def step(x, x_diagonal, S_vertical, C_vertical, S_horizontal, C_horizontal, S, C, one, diagonal_cost):
+def step(
+    x, x_diagonal, S_vertical, C_vertical, S_horizontal, C_horizontal, S, C, one, diagonal_cost
+):
     """S and C of one cell from its three predecessors; the last S and C are the diagonal one's."""
     vertical = x + S_vertical
     horizontal = x + S_horizontal

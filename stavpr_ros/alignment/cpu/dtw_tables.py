@@ -1,9 +1,10 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The whole tables of one pair, and the way back through them: what a warping path needs."""
 
 import math
 
 import numpy as np
-
 from stavpr_ros.compilation import kernel
 
 VERTICAL, HORIZONTAL, DIAGONAL = 0, 1, 2

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Vectors of LANES numbers as a type that numba compiles.
 
@@ -12,8 +14,8 @@ The functions here exist in compiled code only.
 import operator
 from typing import Any
 
-import numba as nb
 from llvmlite import binding, ir
+import numba as nb
 from numba.core import types
 from numba.extending import intrinsic, models, overload, register_model
 
@@ -42,7 +44,11 @@ class Mask(types.Type):
         super().__init__(name=f'Mask({LANES})')
 
 
-_ELEMENTS = {types.float32: ir.FloatType(), types.float64: ir.DoubleType(), types.int32: ir.IntType(32)}
+_ELEMENTS = {
+    types.float32: ir.FloatType(),
+    types.float64: ir.DoubleType(),
+    types.int32: ir.IntType(32),
+}
 
 
 @register_model(Vector)
@@ -102,7 +108,9 @@ def splat(typing: Any, number: Any) -> Any:
 @intrinsic
 def select(typing: Any, mask: Any, yes: Any, no: Any) -> Any:
     """The lanes of ``yes`` where the mask is true, of ``no`` elsewhere."""
-    return yes(mask, yes, no), lambda context, builder, signature, arguments: builder.select(*arguments)
+    return yes(mask, yes, no), lambda context, builder, signature, arguments: builder.select(
+        *arguments
+    )
 
 
 def _operation(name: str, whole: str = '') -> Any:

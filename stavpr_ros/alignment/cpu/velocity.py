@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 A window against the map at several speeds: one pass over the map for each, all places at once.
 
@@ -7,7 +9,6 @@ a path, which carries where it came from. A thread takes a block of ends and wha
 
 import numba as nb
 import numpy as np
-
 from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel, parallel_kernel
 
@@ -57,7 +58,9 @@ def _advance(row, step, penalty, guard, here, there, marks):
         at = guard + y - step
         S, first, middle = load(S_old, at), load(first_old, at), load(middle_old, at)
         if step > 0:
-            S, first, middle = _nearer(S, first, middle, S_old, first_old, middle_old, at + 1, extra)
+            S, first, middle = _nearer(
+                S, first, middle, S_old, first_old, middle_old, at + 1, extra
+            )
         S, first, middle = _nearer(S, first, middle, S_old, first_old, middle_old, at - 1, extra)
         store(S_new, guard + y, load(row, y) + S)
         store(first_new, guard + y, first)

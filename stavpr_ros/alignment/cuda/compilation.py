@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 The seam between the kernels and what runs them: a CUDA device, or numba's simulator.
 
@@ -6,16 +8,15 @@ On a device the kernels work on torch's memory and torch's current stream, witho
 CPU tensors: slow, and right. Nothing outside this module knows which of the two it is.
 """
 
+from collections.abc import Callable
 import functools
 import operator
-import warnings
-from collections.abc import Callable
 from typing import Any
-
-import torch
+import warnings
 
 from stavpr_ros.devices import why_no_cuda
 from stavpr_ros.errors import UnavailableError
+import torch
 
 
 @functools.cache

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 The distance of two images from the products of their strips, one thread for each pair (section 2).
 
@@ -10,9 +12,8 @@ import functools
 import math
 from typing import Any
 
-import numpy as np
 from numba import cuda, float32
-
+import numpy as np
 from stavpr_ros.alignment.cuda.compilation import kernel, multiply
 
 BLOCK = 128  # threads of one block
@@ -69,7 +70,11 @@ def spatial_dtw(W: int, xi: int) -> Any:
                     S[j] = ONE - products[top, 0, y]
                 else:
                     d = ONE - products[top + i, j, y]
-                    vertical, horizontal, diagonal = d + S_above, d + S_left, times(a, d) + S_corner
+                    vertical, horizontal, diagonal = (
+                        d + S_above,
+                        d + S_left,
+                        times(a, d) + S_corner,
+                    )
                     straight = horizontal if horizontal < vertical else vertical
                     cost = (C_left if horizontal < vertical else C_above) + ONE
                     C[j] = C_corner + a if diagonal < straight else cost

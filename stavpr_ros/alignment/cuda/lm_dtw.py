@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 LM-DTW with one thread for each start, and the choice of the best start, in one launch (section 4).
 
@@ -15,13 +17,14 @@ memory, and the window is read through the caches. The same kernel, slower.
 import functools
 from typing import Any
 
-import numpy as np
 from numba import cuda, float32, int32
-
+import numpy as np
 from stavpr_ros.alignment.cuda.compilation import device_function, kernel
 
 BLOCK = 128  # starts of one block; a power of 2
-REGISTER_ROWS = 76  # longest window whose state the compiler keeps in registers: 2 l of them and more
+REGISTER_ROWS = (
+    76  # longest window whose state the compiler keeps in registers: 2 l of them and more
+)
 SHARED_BYTES = 46 * 1024  # for the window's columns, of the 48 KiB that every device has
 
 ZERO, ONE, INF = np.float32(0), np.float32(1), np.float32(np.inf)
@@ -63,7 +66,9 @@ def _nearest(block_best, block_start, distances, starts):
 
 
 @device_function
-def _runner_up(middle, apart, k, best_of_start, length_of_start, block_best, block_start, distances, starts):
+def _runner_up(
+    middle, apart, k, best_of_start, length_of_start, block_best, block_start, distances, starts
+):
     """
     Find the nearest start whose midpoint is more than ``apart`` places from ``middle``.
 
@@ -135,7 +140,15 @@ def _select(l: int, k: int) -> Any:
             m = length_of_start[nearest]
             middle = (2 * nearest + m - 1) >> 1
             _runner_up(
-                middle, apart, k, best_of_start, length_of_start, block_best, block_start, distances, starts
+                middle,
+                apart,
+                k,
+                best_of_start,
+                length_of_start,
+                block_best,
+                block_start,
+                distances,
+                starts,
             )
             if t == 0:
                 places[0], places[1] = nearest, m
@@ -221,7 +234,16 @@ def lm_dtw(l: int, k: int, block: int, columns: int | None = None) -> Any:
     stage, sweep, select = _stage(l, block, pitch), _sweep(l), _select(l, k)
 
     def sequences(
-        rows, first, apart, best_of_start, length_of_start, block_best, block_start, finished, places, answer
+        rows,
+        first,
+        apart,
+        best_of_start,
+        length_of_start,
+        block_best,
+        block_start,
+        finished,
+        places,
+        answer,
     ):
         t, left = cuda.threadIdx.x, cuda.blockIdx.x * block
         start, n = left + t, length_of_start.shape[0]

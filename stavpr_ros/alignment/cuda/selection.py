@@ -1,12 +1,13 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """What the kernel chose, in one small buffer: written on the device, copied to the host once."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
-
 from stavpr_ros.alignment.cuda.compilation import Runtime
+import torch
 
 WORDS = 6  # four places and two distances, in front of the window's cells
 
@@ -57,5 +58,11 @@ class SelectionBuffer:
         distance, second_best_distance = self._answer[:2].tolist()
         cells = self._answer[2:].reshape(self._shape)
         return Selection(
-            start, length, distance, second_best_start, second_best_length, second_best_distance, cells
+            start,
+            length,
+            distance,
+            second_best_start,
+            second_best_length,
+            second_best_distance,
+            cells,
         )

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Things that stand or drive in the synthetic street: trees, lamps, signs, cars, vans; in numba.
 

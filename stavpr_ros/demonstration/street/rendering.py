@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 The camera in the synthetic street: rays, light, shadows and fog, in numba.
 

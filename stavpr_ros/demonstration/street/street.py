@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 The layout of a synthetic street: which building, hedge, tree and lamp stands where.
 

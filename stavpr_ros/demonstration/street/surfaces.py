@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Hashes, noise, and the paint of the ground and the sky of the synthetic street, in numba.
 

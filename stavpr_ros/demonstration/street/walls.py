@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The paint of walls, roofs and hedges of the synthetic street, in numba, as in `surfaces`."""
 
 # Numba infers the types of kernels.

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The paper's data sets on disk: the folders of map and query, and their ground truth."""
 
 from dataclasses import dataclass, replace

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The paper's experiments: configurations are columns of a table, data sets with features rows."""
 
 from collections.abc import Sequence

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """The numbers that the paper publishes (section 6 of the method)."""
 
 from dataclasses import dataclass

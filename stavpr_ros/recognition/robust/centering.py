@@ -1,10 +1,11 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Mean centering: features without the part that all images of a traverse share."""
 
 from dataclasses import replace
 
-import torch
-
 from stavpr_ros.features import LocalFeatures
+import torch
 
 PRIOR = 20  # images that the map's mean counts for in the running mean of the query
 PIECE = 8192  # images centered at a time

@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """Options beyond the paper, each a switch against one failure mode; all off is the paper."""
 
 from dataclasses import dataclass, fields

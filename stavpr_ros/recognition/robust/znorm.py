@@ -1,3 +1,5 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
 """
 Z-normalization of image distances, over the map (query) and over time (reference).
 
