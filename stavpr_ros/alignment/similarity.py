@@ -49,26 +49,10 @@ def strip_distances(
         return similarity.neg_().add_(1).view(W, W, n)
     from stavpr_ros.alignment.cpu import dot
 
-    rows = tiled(query[:, None])[0]
+    rows = dot.tiled(query[:, None])[0]
     distances = np.empty((len(rows), W, n), np.float32)
     dot.strip_distances(reference.contiguous().numpy(), rows, distances)
     return torch.from_numpy(distances[:W])
-
-
-def tiled(queries: torch.Tensor) -> np.ndarray:
-    """
-    Lay out the local features of Q images as the kernels of the CPU want them.
-
-    :param queries: shape (W, Q, d), float32.
-    :returns: shape (Q, R, d), R is W rounded up to whole tiles; zeros from row W on.
-    """
-    from stavpr_ros.alignment.cpu.dot import TILE
-
-    W, Q, d = queries.shape
-    # of torch's memory, which starts with a cache line: products are a third faster than on NumPy's
-    rows = torch.zeros((Q, -(-W // TILE) * TILE, d))
-    rows[:, :W] = queries.transpose(0, 1)
-    return rows.numpy()
 
 
 def holistic_distances(

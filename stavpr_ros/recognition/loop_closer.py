@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 from stavpr_ros.alignment.cpu import dot
-from stavpr_ros.alignment.similarity import tiled
 from stavpr_ros.alignment.spatial import adaptive_weights
 from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import SettingsError
@@ -174,7 +173,7 @@ class LoopCloser(SequenceRecognizer):
             return np.empty(0, np.float32)
         out = np.empty((1, self._places), np.float32)
         dot.image_distances(
-            self._route.strips.numpy(), tiled(self._route.newest), self._a, self._band, out
+            self._route.strips.numpy(), dot.tiled(self._route.newest), self._a, self._band, out
         )
         return out[0]
 

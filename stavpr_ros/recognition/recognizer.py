@@ -12,20 +12,31 @@ from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition.candidates import distinct_places, ranked_candidates
-from stavpr_ros.recognition.match import Candidate, Match, Status
+from stavpr_ros.recognition.match import (
+    Candidate,
+    distinct_places,
+    Match,
+    ranked_candidates,
+    Status,
+)
 from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.recognition.robust.centering import MeanCentering
-from stavpr_ros.recognition.robust.hysteresis import (
+from stavpr_ros.recognition.robust import (
     evidence,
     expected_second_best,
     Hysteresis,
+    MeanCentering,
+    options_of,
+    RobustOptions,
     score,
+    ZNormalization,
 )
-from stavpr_ros.recognition.robust.options import options_of, RobustOptions
-from stavpr_ros.recognition.robust.znorm import ZNormalization
-from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
-from stavpr_ros.recognition.sequence_search import LmDtwSearch, Search, VelocitySearch, WindowMatch
+from stavpr_ros.recognition.sequence_search import (
+    LmDtwSearch,
+    Search,
+    SequenceBuffer,
+    VelocitySearch,
+    WindowMatch,
+)
 import torch
 
 PLACES_TO_START_FROM = 100  # places whose distances to the map start the z-normalization
@@ -42,7 +53,7 @@ class RecognizerSettings:
     :param nms_radius: the second best's midpoint is more than so many places from the nearest
         one's.
     :param mode: ``paper``, or ``robust``, with all options of
-        :class:`stavpr_ros.recognition.robust.options.RobustOptions`.
+        :class:`stavpr_ros.recognition.robust.RobustOptions`.
     :param robust_options: another choice of options than the mode's.
     """
 

@@ -13,10 +13,10 @@ import numba as nb
 from numba.core import types
 from numba.extending import intrinsic, overload
 import numpy as np
-from stavpr_ros.alignment.cpu.dtw import align_lanes
-from stavpr_ros.alignment.cpu.dtw_steps import SLOT
+from stavpr_ros.alignment.cpu.dtw import align_lanes, SLOT
 from stavpr_ros.alignment.cpu.simd import LANES, store
 from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
+import torch
 
 TILE = 7  # query strips whose sums stay in registers: all of them, with the paper's W
 IMAGES = 256  # map images a thread takes at a time; a multiple of LANES
@@ -42,6 +42,20 @@ def _overload_widened(x):
     if x is types.int16:
         return lambda x: _from_half(x)  # noqa: PLW0108 numba asks for a function
     return lambda x: x
+
+
+def tiled(queries: torch.Tensor) -> np.ndarray:
+    """
+    Lay out the local features of Q images as the kernels of the CPU want them.
+
+    :param queries: shape (W, Q, d), float32.
+    :returns: shape (Q, R, d), R is W rounded up to whole tiles; zeros from row W on.
+    """
+    W, Q, d = queries.shape
+    # of torch's memory, which starts with a cache line: products are a third faster than on NumPy's
+    rows = torch.zeros((Q, -(-W // TILE) * TILE, d))
+    rows[:, :W] = queries.transpose(0, 1)
+    return rows.numpy()
 
 
 @reassociating_kernel

@@ -4,7 +4,7 @@
 
 import numba as nb
 import numpy as np
-from stavpr_ros.alignment.cpu.dtw_steps import open_edge, SLOT, sweep_four_rows, sweep_row
+from stavpr_ros.alignment.cpu.dtw import open_edge, SLOT, sweep_four_rows, sweep_row
 from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel, parallel_kernel
 
