@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's mathematics: the distance of two images, and of a window of images to every place of a map."""
+"""The paper's mathematics: distances of two images, and of a window to every place of a map."""
 
 from stavpr_ros.alignment.lm_dtw import (
     align_sequence,

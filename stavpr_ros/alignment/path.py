@@ -36,8 +36,8 @@ def trace(d: np.ndarray, weight: float, xi: int, free_end: bool = False) -> Alig
     :param d: distances, shape (rows, columns), float32 or float64.
     :param weight: a of the diagonal steps.
     :param xi: half width of the band, rows + columns for none.
-    :param free_end: end in the cell of the last row with the smallest S / C (the first one on a tie)
-        instead of in the last column.
+    :param free_end: end in the cell of the last row with the smallest S / C (the first one on a
+        tie) instead of in the last column.
     """
     from stavpr_ros.alignment.cpu import dtw
 

@@ -65,7 +65,8 @@ def match_velocities(
     scale = np.ones(n, D.dtype) if scale is None else np.asarray(scale, D.dtype)
     if l < 1 or shift.shape != (n,) or scale.shape != (n,):
         raise InputError(
-            f'window {D.shape}, shift {shift.shape}, scale {scale.shape}: expected (l, n), (n,), (n,), l >= 1'
+            f'window {D.shape}, shift {shift.shape}, scale {scale.shape}: '
+            'expected (l, n), (n,), (n,), l >= 1'
         )
     return match_scaled(D, shift, scale, settings.steps(l), settings.penalty)
 
@@ -74,8 +75,9 @@ def match_scaled(
     window: np.ndarray, shift: np.ndarray, scale: np.ndarray, steps: np.ndarray, penalty: float
 ) -> VelocityMatches:
     """
-    Match a window that is known to be good; nothing is checked or copied (see
-    :func:`match_velocities`).
+    Match a window that is known to be good (see :func:`match_velocities`).
+
+    Nothing is checked or copied.
 
     :param window: shape (l, n or more), C-contiguous.
     :param shift, scale: shape (n,), of the window's type.
@@ -141,7 +143,7 @@ def best_velocity_match(matches: VelocityMatches, nms_radius: int) -> SequenceMa
 
 @kernel
 def _copy_costs(D, shift, scale, low, costs):
-    """Copy (D - shift) * scale of the places from ``low`` into costs (l, width); +inf outside the map."""
+    """Fill costs (l, width): (D - shift) * scale from place ``low`` on, +inf outside the map."""
     n, width = shift.shape[0], costs.shape[1]
     costs[:] = np.inf
     first, last = max(low, 0), min(low + width, n)
@@ -153,7 +155,7 @@ def _copy_costs(D, shift, scale, low, costs):
 
 @kernel
 def _nearer(S, first, middle, S_old, first_old, middle_old, at, extra):
-    """The better of a path so far and one that comes from ``at`` at an extra cost."""
+    """Return the better of a path so far and one that comes from ``at`` at an extra cost."""
     other = load(S_old, at) + extra
     better = other < S
     return (
@@ -203,14 +205,16 @@ def _new_paths(width, guard, dtype):
 @parallel_kernel
 def match_at_velocities(D, shift, scale, steps, penalty, distances, firsts, middles, speeds):
     """
-    The best path to every end.
+    Find the best path to every end.
 
     :param D: window, shape (l, n or more), row = query image, oldest first; +inf bans a pair.
     :param shift, scale: the costs are (D - shift) * scale, shape (n,).
-    :param steps: places that each speed moves on before each row, shape (V, l), int32; steps[:, 0] = 0.
+    :param steps: places that each speed moves on before each row, shape (V, l), int32; steps[:, 0]
+        = 0.
     :param penalty: cost of one place more or less, of D's type.
-    :param distances, firsts, middles, speeds: shape (n,), written: mean cost of a row, penalties included,
-        the place of the first and of the middle row, the speed; int32. +inf where there is no path.
+    :param distances, firsts, middles, speeds: shape (n,), written: mean cost of a row, penalties
+        included, the place of the first and of the middle row, the speed; int32. +inf where there
+        is no path.
     """
     n, (V, l) = shift.shape[0], steps.shape
     reach, longest = 0, 0

@@ -45,7 +45,8 @@ class CpuMatcher:
         if spatial.vertical:
             if features.cells is None:
                 raise InputError(
-                    'vertical alignment needs the cells of the strips: build the map again, without projection'
+                    'vertical alignment needs the cells of the strips: build the map again, '
+                    'without projection'
                 )
             strips = cut_cells(strips, features.cells)
             self._cell_a = adaptive_weights(features.cells[0], spatial, np.dtype(np.float32))

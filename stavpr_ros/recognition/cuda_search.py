@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""LM-DTW on a CUDA device: the window lies there, and one small result is copied back for each match."""
+"""LM-DTW on a CUDA device: the window lies there, one small result a match is copied back."""
 
 from typing import Any
 
@@ -49,7 +49,7 @@ class CudaLmDtwSearch:
         self(0)  # compiles the kernel, so that the first window does not wait for it
 
     def __call__(self, nms_radius: int) -> WindowMatch:
-        """Find the nearest start and its second best on the device, and trace the path on the host."""
+        """Find the nearest start and its second best on the device; trace the path on the host."""
         places = self.buffer.places
         if places == 0:
             return WindowMatch()

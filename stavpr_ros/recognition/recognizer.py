@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Frame by frame: the distances of the newest image, the nearest sequence of the window, the status."""
+"""Frame by frame: distances of the newest image, nearest sequence of the window, status."""
 
 from dataclasses import dataclass, field, replace
 import math
@@ -77,7 +77,8 @@ class RecognizerSettings:
             and self.threshold > 1
         ):
             raise SettingsError(
-                f'threshold = {self.threshold}: distances of mode robust end at 1, the chance level'
+                f'threshold = {self.threshold}: distances of mode robust end at 1, '
+                'the chance level'
             )
 
     @property
@@ -208,7 +209,7 @@ class SequenceRecognizer:
         return Match(status, reason, threshold, self._nearest, self._window.path, relative)
 
     def _scored(self, nearest: SequenceMatch) -> SequenceMatch:
-        """Return the match with scores of mode robust for distances; that of the nearest has memory."""
+        """Return the match with scores of mode robust for distances; the nearest has memory."""
         cost, other = nearest.distance, nearest.second_best_distance
         costs, places = self._window.sequences()
         elsewhere = np.abs(places - nearest.middle) > self._settings.nms_radius
@@ -263,7 +264,7 @@ class PlaceRecognizer(SequenceRecognizer):
             self._search, self._buffer = search, search.buffer
 
     def _distances_to_itself(self, features: LocalFeatures) -> np.ndarray:
-        """Return the distances of some places to all but their neighbors, which are NaN, shape (m, n)."""
+        """Return the distances of some places to all, shape (m, n); NaN to their neighbors."""
         n, radius = len(features), self._settings.nms_radius
         some = np.unique(np.linspace(0, max(n - 1, 0), min(n, PLACES_TO_START_FROM)).astype(int))
         matrix = self._matcher.distance_matrix(features.strips[:, some], features.weights[:, some])

@@ -218,7 +218,7 @@ class ZNormalization:
         )
 
     def evict(self, count: int) -> None:
-        """Drop the oldest places; the others move up, with room for as many new ones behind them."""
+        """Drop the oldest places; the others move up, and new ones have room behind them."""
         self._change_each(
             lambda values, start: np.append(values[count:], np.full(count, start, np.float32))
         )

@@ -111,7 +111,7 @@ class SequenceBuffer:
         self._count += 1
 
     def rows(self) -> torch.Tensor:
-        """Return the window, shape (l, n + padding), float32: a view, contiguous, +inf in the padding."""
+        """Return the window, (l, n + padding), float32, a contiguous view; padding is +inf."""
         return self.memory[self.oldest : self.oldest + self.length]
 
     def clear(self) -> None:
@@ -127,7 +127,7 @@ class SequenceBuffer:
         self.memory[:, :before] = rows[:, :before]
 
     def evict(self, count: int) -> None:
-        """Take the oldest places out; the others move up, and as many new ones have room behind them."""
+        """Drop the oldest places; the others move up, and new ones have room behind them."""
         kept = self.places - count
         self.memory[:, :kept] = self.memory[:, count : self.places].clone()
         self.memory[:, kept : self.places] = torch.inf

@@ -3,10 +3,10 @@
 """
 The recursion of both alignments, row by row, on all lanes at once.
 
-Between rows the *edge* holds S and C of the row above: flat, slot x + 1 is column x, slot 0 the corner
-(-1, -1), whose S = C = 0 makes the first cell an ordinary diagonal step of weight 1. Infinite S mark what
-may not be used. The diagonal is taken only when strictly smallest; vertical wins a tie over horizontal.
-No ``fastmath``: the answers are the oracle's bit for bit.
+Between rows the *edge* holds S and C of the row above: flat, slot x + 1 is column x, slot 0 the
+corner (-1, -1), whose S = C = 0 makes the first cell an ordinary diagonal step of weight 1.
+Infinite S mark what may not be used. The diagonal is taken only when strictly smallest; vertical
+wins a tie over horizontal. No ``fastmath``: the answers are the oracle's bit for bit.
 """
 
 import math
@@ -71,7 +71,7 @@ def sweep_row(d, at, stride, first, last, edge, weight):
 
 @kernel
 def sweep_four_rows(d, at, pitch, columns, edge):
-    """Advance the edge by four rows, ``pitch`` apart, with a = 1; in between, registers hold it."""
+    """Advance the edge, held in registers, by four rows, ``pitch`` apart, with a = 1."""
     one = splat(edge.dtype.type(1))
     S0 = S1 = S2 = S3 = splat(edge.dtype.type(np.inf))
     C0 = C1 = C2 = C3 = one
@@ -95,7 +95,7 @@ def sweep_four_rows(d, at, pitch, columns, edge):
 
 @kernel
 def adaptive_weight(d, at, stride, weights, xi):
-    """The weight a for |I_c - c| of each lane; the row of the central strip c starts at ``at``."""
+    """Return the weight a of each lane; the row of the central strip c starts at ``at``."""
     W = weights.shape[0]
     c = (W + 1) // 2 - 1  # ceil(W / 2), 0-based
     nearest = splat(d.dtype.type(np.inf))
@@ -114,7 +114,7 @@ def align_lanes(d, at, row, column, weights, xi, edge):
     S[W,W] / C[W,W] of LANES neighboring map images, as a vector.
 
     :param d, at, row, column: flat strip distances; cell (i, j) lies at + i * row + j * column.
-    :param weights: a for each |I_c - c|, shape (W,); all 1 for vanilla DTW.
+    :param weights: a for each ``|I_c - c|``, shape (W,); all 1 for vanilla DTW.
     :param xi: half width of the band, W for none.
     :param edge: shape ((W + 1) * SLOT,), scratch.
     """
@@ -175,7 +175,8 @@ def accumulate(d, weight, xi, S, C, step):
     :param d: distances, shape (rows, columns).
     :param weight: the adaptive weight a of a diagonal step.
     :param xi: half width of the band; at least rows + columns for none.
-    :param S, C, step: shape of d, written: accumulated distance, path cost, the step into each cell.
+    :param S, C, step: shape of d, written: accumulated distance, path cost, the step into each
+        cell.
     """
     rows, columns = d.shape
     S[:] = np.inf
@@ -200,7 +201,12 @@ def accumulate(d, weight, xi, S, C, step):
 
 @kernel
 def backtrack(step, row, column, path):
-    """Follow the steps back from (row, column) to (0, 0) into path (rows + columns, 2); return its length."""
+    """
+    Follow the steps back from (row, column) to (0, 0).
+
+    :param path: shape (rows + columns, 2), written.
+    :returns: its length.
+    """
     count = 0
     while True:
         path[count, 0] = row

@@ -13,7 +13,7 @@ BLOCKS = 8  # vectors of starts that a thread takes at a time
 
 @kernel
 def _match_lanes(D, first, l, pitch, k, edge, distances, lengths):
-    """Align the window with LANES starts from ``first``; its rows lie ``pitch`` apart in the flat D."""
+    """Align the window, rows ``pitch`` apart in the flat D, with LANES starts from ``first``."""
     open_edge(edge, k)
     one = splat(D.dtype.type(1))
     fours = l // 4 * 4
