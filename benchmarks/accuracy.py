@@ -33,7 +33,7 @@ from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.robust.options import LOOP_THRESHOLD, THRESHOLD
+from stavpr_ros.recognition.robust import LOOP_THRESHOLD, THRESHOLD
 from stavpr_ros.sources import open_source
 
 MODES = ('paper', 'robust')

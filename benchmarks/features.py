@@ -128,7 +128,7 @@ class FeatureBenchmark:
 
     def _jpeg(self, threads: int) -> None:
         import cv2
-        from stavpr_ros.sources.files import decode_compressed
+        from stavpr_ros.sources.encodings import decode_compressed
 
         options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
         files = [cv2.imencode('.jpg', image[:, :, ::-1], options)[1] for image in self._images]

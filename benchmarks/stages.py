@@ -29,9 +29,8 @@ from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.recognition.robust.centering import MeanCentering
-from stavpr_ros.recognition.robust.znorm import ZNormalization
-from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
+from stavpr_ros.recognition.robust import MeanCentering, ZNormalization
+from stavpr_ros.recognition.sequence_search import SequenceBuffer
 from timing import measure, synchronizer, timed
 import torch
 
@@ -88,9 +87,9 @@ def robust_stages(run: Run, n: int, seed: int) -> None:
     add('reference_znorm', call=reference_znorm, works=[bounds.reference_znorm(sizes)])
     shift, scale = znorm.shift_and_scale(n)
     window = buffer.rows().numpy()
-    search = partial(match_scaled, window, shift, scale, VELOCITY)
-    matches = search()
     steps = VELOCITY.steps(SEQUENCE.length)
+    search = partial(match_scaled, window, shift, scale, steps, VELOCITY.penalty)
+    matches = search()
     add(
         'velocity_search',
         call=search,
@@ -107,7 +106,7 @@ def robust_stages(run: Run, n: int, seed: int) -> None:
 
     def trace() -> np.ndarray:
         costs = (window[:, near] - shift[near]) * scale[near]
-        return trace_velocity(costs, nearest.last - near.start, speed, VELOCITY)
+        return trace_velocity(costs, nearest.last - near.start, steps[speed], VELOCITY.penalty)
 
     width = min(nearest.last + 1, int(steps[speed].sum()) + SEQUENCE.length)
     add('path_trace', call=trace, works=[bounds.path_trace(SEQUENCE.length, width)])

@@ -20,7 +20,7 @@ class SettingsError(StavprError, ValueError):
 
 
 class UnavailableError(StavprError):
-    """Something that was requested by name is not available: a device, an extra, a file of weights."""
+    """Something requested by name is not available: a device, an extra, a file of weights."""
 
 
 class ImageError(StavprError):
@@ -28,9 +28,10 @@ class ImageError(StavprError):
     One image cannot be decoded; the next one may be fine.
 
     :param text: what came, what was expected and what to do.
-    :param kind: what is wrong in a word or two, to count by and to explain each kind only once: ``encoding``
-        (not read), ``depth`` (not a color or gray image), ``size``, ``step``, ``cut off``, ``damaged``,
-        ``too large``, ``unreadable`` (a file), ``features`` (not finite), or just ``image``.
+    :param kind: what is wrong in a word or two, to count by and to explain each kind only once:
+        ``encoding`` (not read), ``depth`` (not a color or gray image), ``size``, ``step``, ``cut
+        off``, ``damaged``, ``too large``, ``unreadable`` (a file), ``features`` (not finite), or
+        just ``image``.
     """
 
     def __init__(self, text: str, *, kind: str = 'image') -> None:

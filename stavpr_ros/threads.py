@@ -18,7 +18,9 @@ def wait_passively() -> None:
 
 def limit_threads(count: int) -> None:
     """
-    Limit torch, numba and OpenCV to so many threads; OpenCV for all, the others for the thread that calls.
+    Limit torch, numba and OpenCV to so many threads.
+
+    OpenCV's limit holds for the process, the others' for the calling thread.
 
     :param count: 0 = as many as they take of themselves.
     """
@@ -35,7 +37,7 @@ def limit_threads(count: int) -> None:
 
 @cache
 def _unlimited() -> tuple[int, int]:
-    """Return how many threads torch and OpenCV take, asked before they are limited for the first time."""
+    """Return how many threads torch and OpenCV take before the first limit."""
     import cv2
     import torch
 

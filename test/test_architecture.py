@@ -7,6 +7,7 @@ from pathlib import Path
 import subprocess
 import sys
 
+from pipelines import message, process, recorded, SECOND
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'stavpr_ros'
@@ -26,6 +27,16 @@ MAY_IMPORT = {
     'ros': set(CORE),
     'commands': {'ros', 'demonstration', 'evaluation', *CORE},
 }
+# On an image's way as well, but not traced: compiled code does not report its calls, and these
+# files of the node run before and after the pipeline, in the executor's and the worker's thread.
+COMPILED = {'alignment/cpu/dtw.py', 'alignment/cpu/simd.py'}
+AROUND_THE_PIPELINE = {
+    'ros/input.py',
+    'ros/runtime.py',
+    'ros/output.py',
+    'pipeline/statistics.py',
+}
+MOST_FILES = 20
 
 
 MODULES = {
@@ -106,3 +117,34 @@ def test_no_two_classes_share_a_name():
             if isinstance(node, ast.ClassDef):
                 found.setdefault(node.name, []).append(module)
     assert {name: modules for name, modules in found.items() if len(modules) > 1} == {}
+
+
+def files_called(function) -> set[str]:
+    """Return the package's files that a call runs through, imports at first use left out."""
+    found = set()
+
+    def note(frame, event, _):
+        path = Path(frame.f_code.co_filename)
+        if event == 'call' and path.is_relative_to(PACKAGE):
+            found.add(path.relative_to(PACKAGE).as_posix())
+
+    sys.setprofile(note)
+    try:
+        function()
+    finally:
+        sys.setprofile(None)
+    return found
+
+
+def test_an_image_passes_through_few_files(route):
+    """In mode robust with gradient features, from the subscription to the published match."""
+    pipeline = recorded(route, 'localization', mode='robust')
+    process(pipeline, route[:10])  # fills the window; modules are imported at first use
+    last = message(route[10])
+    matched = []
+    files = files_called(lambda: matched.append(pipeline.process(last, 11 * SECOND)))
+    assert matched[0].accepted
+    assert all((PACKAGE / name).exists() for name in COMPILED | AROUND_THE_PIPELINE)
+    way = files | COMPILED | AROUND_THE_PIPELINE
+    assert 'recognition/recognizer.py' in files
+    assert len(way) <= MOST_FILES, sorted(way)

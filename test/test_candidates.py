@@ -12,9 +12,8 @@ from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.errors import InputError
 from stavpr_ros.recognition import Candidate, PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.candidates import ranked_candidates
-from stavpr_ros.recognition.robust.hysteresis import evidence, score
-from stavpr_ros.recognition.robust.options import ROBUST
+from stavpr_ros.recognition.match import ranked_candidates
+from stavpr_ros.recognition.robust import evidence, ROBUST, score
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 

@@ -10,17 +10,17 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.features.extractor import cut_strips, normalize
+from stavpr_ros.features.extractor import cut_strips, normalize, resize_square
 from stavpr_ros.features.gradient import (
     _on_threads,
+    _to_polar,
     feature_maps_by_torch,
     FLOOR,
     Gradient,
+    gradient_maps,
     GradientSettings,
     PER_THREAD,
 )
-from stavpr_ros.features.gradient_kernel import _to_polar, gradient_maps
-from stavpr_ros.features.preprocessing import resize_square
 from stavpr_ros.features.registry import RESIZE_METHODS
 import torch
 

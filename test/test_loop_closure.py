@@ -10,7 +10,6 @@ import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
 from stavpr_ros.alignment.settings import VelocitySettings
-from stavpr_ros.alignment.similarity import tiled
 from stavpr_ros.alignment.spatial import adaptive_weights
 from stavpr_ros.alignment.velocity import best_velocity_match, match_velocities
 from stavpr_ros.errors import InputError, SettingsError
@@ -22,9 +21,16 @@ from stavpr_ros.recognition.loop_closer import (
     LEAST_PLACES,
     LoopCloser,
 )
-from stavpr_ros.recognition.robust.hysteresis import evidence, Hysteresis, score
-from stavpr_ros.recognition.robust.options import PAPER, ROBUST
-from stavpr_ros.recognition.robust.znorm import MEMORY, MIN_DEVIATION, PRIOR
+from stavpr_ros.recognition.robust import (
+    evidence,
+    Hysteresis,
+    MEMORY,
+    MIN_DEVIATION,
+    PAPER,
+    PRIOR,
+    ROBUST,
+    score,
+)
 from stavpr_ros.recognition.route_features import ROOM, RouteFeatures
 import torch
 
@@ -96,7 +102,7 @@ class PlainCloser:
         out = np.empty((1, last), np.float32)
         dot.image_distances(
             self.all[:, :last].contiguous().numpy(),
-            tiled(self.all[:, image : image + 1]),
+            dot.tiled(self.all[:, image : image + 1]),
             self.a,
             7,
             out,

@@ -10,16 +10,15 @@ import pytest
 from stavpr_ros.alignment import (
     align_sequence,
     best_match,
-    best_velocity_match,
     holistic_distances,
     image_distances,
     match_sequence,
-    match_velocities,
     SequenceSettings,
     SpatialSettings,
     strip_distances,
     VelocitySettings,
 )
+from stavpr_ros.alignment.velocity import best_velocity_match, match_velocities
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
@@ -28,9 +27,8 @@ from stavpr_ros.mapping import build_map, extract_features
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.recognition.robust.znorm import ZNormalization
-from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
-from stavpr_ros.recognition.sequence_search import LmDtwSearch, VelocitySearch
+from stavpr_ros.recognition.robust import ZNormalization
+from stavpr_ros.recognition.sequence_search import LmDtwSearch, SequenceBuffer, VelocitySearch
 from stavpr_ros.sources import open_source
 import torch
 

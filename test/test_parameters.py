@@ -22,7 +22,7 @@ from stavpr_ros.parameters import (
 )
 from stavpr_ros.pipeline import node_settings, NodeSettings, OPERATIONS, PipelineSettings
 from stavpr_ros.recognition.matcher import PRECISIONS
-from stavpr_ros.recognition.robust.options import MODES
+from stavpr_ros.recognition.robust import MODES
 from stavpr_ros.recognition.verification import METHODS
 import yaml
 

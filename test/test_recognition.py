@@ -16,7 +16,7 @@ from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
+from stavpr_ros.recognition.sequence_search import SequenceBuffer
 import torch
 
 SHORT = SequenceSettings(length=5, beta=2.0)

@@ -9,32 +9,32 @@ import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.demonstration.street import first_traverse, World
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
+from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.metrics import best_f1, counts_at, image_matches
-from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.evaluation.warp import warp_indices
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import build_map, extract_features
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
-from stavpr_ros.recognition.robust.centering import MeanCentering
-from stavpr_ros.recognition.robust.hysteresis import (
+from stavpr_ros.recognition.robust import (
     AHEAD,
     CHANCE,
     evidence,
     expected_second_best,
     FADING,
     Hysteresis,
-    score,
-)
-from stavpr_ros.recognition.robust.options import (
     LOOP_THRESHOLD,
+    MeanCentering,
+    MEMORY,
     options_of,
     PAPER,
+    PRIOR,
     ROBUST,
     RobustOptions,
+    score,
+    ZNormalization,
 )
-from stavpr_ros.recognition.robust.znorm import MEMORY, PRIOR, ZNormalization
 from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
 from stavpr_ros.sources import open_source
 import torch

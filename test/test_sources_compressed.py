@@ -14,8 +14,11 @@ from PIL import Image
 import pytest
 from stavpr_ros.errors import ImageError
 from stavpr_ros.sources import files, open_source
-from stavpr_ros.sources.encodings import decode_compressed_message, decode_message
-from stavpr_ros.sources.files import decode_compressed
+from stavpr_ros.sources.encodings import (
+    decode_compressed,
+    decode_compressed_message,
+    decode_message,
+)
 
 # the color at each pixel of the top-left 2x2, in reading order
 PATTERNS = {'rggb': (0, 1, 1, 2), 'bggr': (2, 1, 1, 0), 'gbrg': (1, 2, 0, 1), 'grbg': (1, 0, 2, 1)}

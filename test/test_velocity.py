@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from stavpr_ros.alignment import (
+from stavpr_ros.alignment import velocity as kernel
+from stavpr_ros.alignment import VelocitySettings
+from stavpr_ros.alignment.velocity import (
     best_velocity_match,
     match_velocities,
     trace_velocity,
-    VelocitySettings,
 )
-from stavpr_ros.alignment.cpu import velocity as kernel
 from stavpr_ros.errors import InputError, SettingsError
 
 INF = np.inf
@@ -57,7 +57,9 @@ def test_by_hand():
     assert (matches.firsts[4], matches.middles[4], matches.speeds[4]) == (0, 2, 1)
     assert matches.distances[3] == 2
     assert (matches.firsts[3], matches.middles[3], matches.speeds[3]) == (0, 2, 0)
-    np.testing.assert_array_equal(trace_velocity(costs, 4, 1, chosen), [[0, 0], [1, 2], [2, 4]])
+    np.testing.assert_array_equal(
+        trace_velocity(costs, 4, chosen.steps(3)[1], chosen.penalty), [[0, 0], [1, 2], [2, 4]]
+    )
     nearest = best_velocity_match(matches, 0)
     assert (nearest.first, nearest.last, nearest.middle, nearest.distance) == (0, 4, 2, 0)
     assert nearest.second_best_index != 2
@@ -99,7 +101,7 @@ def test_against_plain_loops(seed, l, n, levels, speeds, penalty, banned, dtype)
             continue  # of equal paths any may be taken
         found = (matches.firsts[end], matches.middles[end], matches.speeds[end])
         assert found == (first, middle, speed)
-        traced = trace_velocity(costs, end, speed, chosen)
+        traced = trace_velocity(costs, end, chosen.steps(len(costs))[speed], chosen.penalty)
         np.testing.assert_array_equal(traced[:, 1], path)
 
 

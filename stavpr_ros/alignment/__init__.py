@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's mathematics: the distance of two images, and of a window of images to every place of a map."""
+"""The paper's mathematics: distances of two images, and of a window to every place of a map."""
 
 from stavpr_ros.alignment.lm_dtw import (
     align_sequence,
@@ -18,12 +18,6 @@ from stavpr_ros.alignment.settings import (
 )
 from stavpr_ros.alignment.similarity import holistic_distances, strip_distances
 from stavpr_ros.alignment.spatial import align_images, image_distances
-from stavpr_ros.alignment.velocity import (
-    best_velocity_match,
-    match_velocities,
-    trace_velocity,
-    VelocityMatches,
-)
 
 __all__ = [
     'STRATEGIES',
@@ -32,17 +26,13 @@ __all__ = [
     'SequenceMatch',
     'SequenceSettings',
     'SpatialSettings',
-    'VelocityMatches',
     'VelocitySettings',
     'align_images',
     'align_sequence',
     'aligned_index',
     'best_match',
-    'best_velocity_match',
     'holistic_distances',
     'image_distances',
     'match_sequence',
-    'match_velocities',
     'strip_distances',
-    'trace_velocity',
 ]

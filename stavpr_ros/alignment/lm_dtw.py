@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Temporal alignment: a window of query images against every place of the map, LM-DTW (section 4)."""
+"""Temporal alignment: a window against every place of the map, LM-DTW (section 4)."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,8 @@ class SequenceDistances:
     The best sequence from every start.
 
     :param distances: q_m of each start, shape (n,); +inf where no sequence is possible.
-    :param lengths: its number of map images m, shape (n,), int32; it spans s .. s + m - 1. 0 where none.
+    :param lengths: its number of map images m, shape (n,), int32; it spans s .. s + m - 1. 0 where
+        none.
     """
 
     distances: np.ndarray
@@ -36,8 +37,8 @@ class SequenceMatch:
     The nearest sequence of the map, indices 0-based.
 
     :param first, last: its first and last map image.
-    :param middle: the matched place: floor((first + last) / 2), or where a path says so itself, the place of
-        the window's middle image.
+    :param middle: the matched place: floor((first + last) / 2), or in the velocity search the
+        place of the window's middle image.
     :param distance: its q_m.
     :param second_best_index: midpoint of the nearest sequence outside the nms_radius; -1 if none.
     :param second_best_distance: its distance; NaN if none.
@@ -62,7 +63,7 @@ class SequenceMatch:
 
 
 def padded_width(n: int, k: int) -> int:
-    """Columns that the kernel wants for n starts: whole blocks of lanes, and the last start's k images."""
+    """Return the kernel's columns for n starts: whole vectors, and the last start's k images."""
     from stavpr_ros.alignment.cpu.simd import LANES
 
     return -(-n // LANES) * LANES + k - 1
@@ -95,8 +96,8 @@ def match_sequence(distances: np.ndarray, settings: SequenceSettings) -> Sequenc
     """
     Find the best map sequence from every start.
 
-    :param distances: image distances D, shape (l, n), float32 or float64; row = query image, oldest
-        first. +inf bans a pair.
+    :param distances: image distances D, shape (l, n), float32 or float64; row = query image,
+        oldest first. +inf bans a pair.
     :returns: distance and length for each of the n starts.
     :raises InputError: wrong shape or type, NaN.
     """
@@ -113,7 +114,8 @@ def align_sequence(distances: np.ndarray, start: int, settings: SequenceSettings
 
     :param distances: image distances D, shape (l, n).
     :param start: 0-based start s.
-    :returns: path of (query index, map index), both 0-based, map index counted from the map's start.
+    :returns: path of (query index, map index), both 0-based, map index counted from the map's
+        start.
     :raises InputError: wrong shape or type, NaN, a start outside the map.
     """
     D = _checked(distances, settings)
@@ -123,7 +125,7 @@ def align_sequence(distances: np.ndarray, start: int, settings: SequenceSettings
 
 
 def trace_sequence(window: np.ndarray, start: int, k: int) -> Alignment:
-    """Trace the path of one start in a window that is known to be good (see :func:`align_sequence`)."""
+    """Trace the path of one start in a checked window (see :func:`align_sequence`)."""
     costs = np.ascontiguousarray(window[:, start : start + k])
     alignment = trace(costs, 1.0, sum(costs.shape), free_end=True)
     alignment.path[:, 1] += start
@@ -132,9 +134,11 @@ def trace_sequence(window: np.ndarray, start: int, k: int) -> Alignment:
 
 def best_match(matches: SequenceDistances, nms_radius: int) -> SequenceMatch | None:
     """
-    Return the nearest sequence (the lowest start on a tie) and the second best; None if there is none.
+    Return the nearest sequence and its second best.
 
-    :param nms_radius: the second best's midpoint is more than so many places from the nearest one's.
+    :param nms_radius: the second best's midpoint is more than so many places from the nearest
+        one's.
+    :returns: the lowest start on a tie; None if there is no sequence.
     """
     from stavpr_ros.alignment.cpu.lm_dtw import nearest_elsewhere
 

@@ -36,19 +36,19 @@ def trace(d: np.ndarray, weight: float, xi: int, free_end: bool = False) -> Alig
     :param d: distances, shape (rows, columns), float32 or float64.
     :param weight: a of the diagonal steps.
     :param xi: half width of the band, rows + columns for none.
-    :param free_end: end in the cell of the last row with the smallest S / C (the first one on a tie)
-        instead of in the last column.
+    :param free_end: end in the cell of the last row with the smallest S / C (the first one on a
+        tie) instead of in the last column.
     """
-    from stavpr_ros.alignment.cpu import dtw_tables
+    from stavpr_ros.alignment.cpu import dtw
 
     rows, columns = d.shape
     S, C = np.empty_like(d), np.empty_like(d)
     step = np.zeros(d.shape, np.int8)
     a = d.dtype.type(weight)
-    dtw_tables.accumulate(d, a, xi, S, C, step)
+    dtw.accumulate(d, a, xi, S, C, step)
     end = int(np.argmin(S[-1] / C[-1])) if free_end else columns - 1
     path = np.empty((rows + columns, 2), np.int32)
-    count = dtw_tables.backtrack(step, rows - 1, end, path)
+    count = dtw.backtrack(step, rows - 1, end, path)
     accumulated, cost = S[-1, end], C[-1, end]
     return Alignment(
         distance=float(accumulated / cost),

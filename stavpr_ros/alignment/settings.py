@@ -18,11 +18,12 @@ class SpatialSettings:
 
     :param strategy: ``adaptive`` (weight a on diagonal steps), ``vanilla`` DTW (a = 1),
         ``sliding_window`` (the best four strips in a row), ``none`` (whole images, no alignment).
-    :param sigma: how strongly the viewpoint change raises a = sqrt(1 + sigma |I_c - c|); >= 0.
-    :param xi: restricted alignment: strips i and j with |i - j| >= xi are never aligned;
+    :param sigma: how strongly the viewpoint change raises ``a = sqrt(1 + sigma |I_c - c|)``; >= 0.
+    :param xi: restricted alignment: strips i and j with ``|i - j| >= xi`` are never aligned;
         1 <= xi <= W, None = no restriction.
-    :param vertical: the distance of two strips is that of their cells, aligned from top to bottom in the same
-        way (the paper's remark on drones), instead of their cosine distance; ``adaptive``, ``vanilla``.
+    :param vertical: the distance of two strips is that of their cells, aligned from top to bottom
+        in the same way (the paper's remark on drones), instead of their cosine distance;
+        ``adaptive``, ``vanilla``.
     """
 
     strategy: str = 'adaptive'
@@ -78,7 +79,7 @@ class SequenceSettings:
 
     @property
     def k(self) -> int:
-        """Map images seen by one start: ceil(beta l), safe against binary fractions (1.1 * 50 is 55)."""
+        """Map images seen by one start: ceil(beta l), which is 55 for 1.1 * 50 as well."""
         return math.ceil(self.beta * self.length - 1e-9)
 
 
@@ -88,8 +89,8 @@ class VelocitySettings:
     How a window of query images is matched with the map at several speeds.
 
     :param speeds: places of the map that the query passes an image; each finite and >= 0.
-    :param penalty: cost of moving on by one place more or less than the speed's, in the unit of the
-        distances; >= 0.
+    :param penalty: cost of moving on by one place more or less than the speed's, in the unit of
+        the distances; >= 0.
     """
 
     speeds: tuple[float, ...] = (0.0, 0.5, 0.75, 1.0, 1.33, 2.0)
@@ -104,6 +105,6 @@ class VelocitySettings:
             raise SettingsError(f'penalty = {self.penalty} must be a finite number >= 0')
 
     def steps(self, length: int) -> np.ndarray:
-        """Places that each speed moves on before each of the window's images, shape (V, l), int32."""
+        """Return the places that each speed moves on before each image, shape (V, l), int32."""
         line = np.floor(np.outer(self.speeds, np.arange(length)) + 0.5).astype(np.int32)
         return np.diff(line, axis=1, prepend=0)

@@ -22,8 +22,8 @@ def _checked(
         )
     if query.shape[0] != reference.shape[0] or query.shape[1] != reference.shape[2]:
         raise InputError(
-            f'query strips {tuple(query.shape)} do not fit reference strips {tuple(reference.shape)}: '
-            'W and d must be equal'
+            f'query strips {tuple(query.shape)} do not fit reference strips '
+            f'{tuple(reference.shape)}: W and d must be equal'
         )
     return query, reference
 
@@ -38,8 +38,9 @@ def strip_distances(
 
     :param query: unit-norm local features of one image, shape (W, d), float32.
     :param reference: those of the map, strip-major, shape (W, n, d), float32.
-    :returns: shape (W, W, n), float32, on the reference's device; d[i, j, y] is query strip i against
-        strip j of map image y. Not clipped: after a random projection slightly outside [0, 1].
+    :returns: shape (W, W, n), float32, on the reference's device; d[i, j, y] is query strip i
+        against strip j of map image y. Not clipped: after a random projection slightly outside [0,
+        1].
     :raises InputError: shapes that do not fit.
     """
     query, reference = _checked(query, reference)
@@ -49,26 +50,10 @@ def strip_distances(
         return similarity.neg_().add_(1).view(W, W, n)
     from stavpr_ros.alignment.cpu import dot
 
-    rows = tiled(query[:, None])[0]
+    rows = dot.tiled(query[:, None])[0]
     distances = np.empty((len(rows), W, n), np.float32)
     dot.strip_distances(reference.contiguous().numpy(), rows, distances)
     return torch.from_numpy(distances[:W])
-
-
-def tiled(queries: torch.Tensor) -> np.ndarray:
-    """
-    Lay out the local features of Q images as the kernels of the CPU want them.
-
-    :param queries: shape (W, Q, d), float32.
-    :returns: shape (Q, R, d), R is W rounded up to whole tiles; zeros from row W on.
-    """
-    from stavpr_ros.alignment.cpu.dot import TILE
-
-    W, Q, d = queries.shape
-    # of torch's memory, which starts with a cache line: products are a third faster than on NumPy's
-    rows = torch.zeros((Q, -(-W // TILE) * TILE, d))
-    rows[:, :W] = queries.transpose(0, 1)
-    return rows.numpy()
 
 
 def holistic_distances(
@@ -95,7 +80,8 @@ def holistic_distances(
     reference_weights = torch.as_tensor(reference_weights).to(reference.device)
     if query_weights.shape != query.shape[:1] or reference_weights.shape != reference.shape[:2]:
         raise InputError(
-            f'weights have shapes {tuple(query_weights.shape)} and {tuple(reference_weights.shape)}: '
+            f'weights have shapes {tuple(query_weights.shape)} and '
+            f'{tuple(reference_weights.shape)}: '
             f'expected {tuple(query.shape[:1])} and {tuple(reference.shape[:2])}'
         )
     weighted = query * query_weights[:, None]

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Spatial alignment: the distance of two images from the distances of their vertical strips (section 2)."""
+"""Spatial alignment: the distance of two images from those of their strips (section 2)."""
 
 import numpy as np
 from stavpr_ros.alignment.path import Alignment, trace
@@ -12,7 +12,11 @@ WINDOW = 4  # strips in the sliding window, as in the paper's comparison
 
 
 def adaptive_weights(W: int, settings: SpatialSettings, dtype: np.dtype) -> np.ndarray:
-    """Return a = sqrt(1 + sigma |I_c - c|) for |I_c - c| = 0 .. W-1, in the arithmetic of the kernel."""
+    """
+    Return the weights a = sqrt(1 + sigma x) for the viewpoint changes x = 0 .. W-1.
+
+    In the arithmetic of the kernel: of type ``dtype``.
+    """
     if settings.strategy != 'adaptive':
         return np.ones(W, dtype)
     return np.sqrt(dtype.type(1) + dtype.type(settings.sigma) * np.arange(W).astype(dtype))
@@ -31,9 +35,10 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
     """
     Distances of one query image to n map images.
 
-    :param d: strip distances, shape (W, W, n), float32 or float64; row = query strip. +inf bans a pair.
-    :param settings: strategy ``adaptive``, ``vanilla`` or ``sliding_window``. ``none`` is no function of
-        d: see :func:`stavpr_ros.alignment.holistic_distances`.
+    :param d: strip distances, shape (W, W, n), float32 or float64; row = query strip. +inf bans a
+        pair.
+    :param settings: strategy ``adaptive``, ``vanilla`` or ``sliding_window``. ``none`` is no
+        function of d: see :func:`stavpr_ros.alignment.holistic_distances`.
     :returns: shape (n,), of d's type.
     :raises InputError: wrong shape or type, NaN, fewer strips than the sliding window has.
     :raises SettingsError: xi > W, or the strategy ``none``.

@@ -159,7 +159,7 @@ def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair
 
 
 def _threshold(place_map: 'PlaceMap', mode: str, given: float | None) -> float:
-    from stavpr_ros.recognition.robust.options import THRESHOLD
+    from stavpr_ros.recognition.robust import THRESHOLD
     from stavpr_ros.recognition.threshold import suggest_threshold
 
     if given is not None:
@@ -222,7 +222,7 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
     """Find the loop closures of one traverse."""
     from stavpr_ros.commands.feature_options import make_extractor
     from stavpr_ros.demonstration.loops import draw_loops, read_result
-    from stavpr_ros.recognition.robust.options import LOOP_THRESHOLD
+    from stavpr_ros.recognition.robust import LOOP_THRESHOLD
     from stavpr_ros.ros.live import run_loop_closure
 
     exclude = arguments.exclude_places or EXCLUDE_PLACES

@@ -209,7 +209,7 @@ def recognizer_settings(arguments: argparse.Namespace) -> 'RecognizerSettings':
 
 def _default_threshold(mode: str) -> float | None:
     """Return the default threshold of a mode; the paper publishes none."""
-    from stavpr_ros.recognition.robust.options import THRESHOLD
+    from stavpr_ros.recognition.robust import THRESHOLD
 
     return THRESHOLD if mode == 'robust' else None
 

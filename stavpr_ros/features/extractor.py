@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import json
 from typing import Any
 
+import cv2
 import numpy as np
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, SettingsError
 from stavpr_ros.features.projection import Projection
@@ -199,6 +200,21 @@ class FeatureExtractor:
         if self._projection is not None:
             strips, cells = self._projection.apply(strips), None
         return LocalFeatures(*normalize(strips), self.settings, cells)
+
+
+def resize_square(image: np.ndarray, size: int, method: str) -> np.ndarray:
+    """
+    Resize without keeping the aspect and without cropping.
+
+    :param image: shape (h, w) or (h, w, 3), uint8.
+    :param method: ``bilinear``, as for the paper's networks; ``area`` averages where it shrinks,
+        so that fine texture does not alias.
+    :returns: shape (size, size) or (size, size, 3), uint8.
+    """
+    shrinks = image.shape[0] >= size and image.shape[1] >= size
+    averages = method == 'area' and shrinks
+    interpolation = cv2.INTER_AREA if averages else cv2.INTER_LINEAR
+    return cv2.resize(image, (size, size), interpolation=interpolation)
 
 
 def cut_strips(feature_maps: torch.Tensor, W: int) -> torch.Tensor:

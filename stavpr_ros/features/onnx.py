@@ -14,7 +14,7 @@ from types import ModuleType
 
 import numpy as np
 from stavpr_ros.errors import SettingsError, UnavailableError
-from stavpr_ros.features.preprocessing import resize_square
+from stavpr_ros.features.extractor import resize_square
 from stavpr_ros.features.registry import OnnxSettings
 from stavpr_ros.features.weights import open_weights
 import torch

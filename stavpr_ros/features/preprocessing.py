@@ -1,28 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images to the square size of a backbone, and to the batch of numbers of a network."""
+"""Images to the batch of numbers of a network."""
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
+from stavpr_ros.features.extractor import resize_square
 from stavpr_ros.features.registry import IMAGENET_MEAN, IMAGENET_STD
 import torch
-
-
-def resize_square(image: np.ndarray, size: int, method: str) -> np.ndarray:
-    """
-    Resize without keeping the aspect and without cropping.
-
-    :param image: shape (h, w) or (h, w, 3), uint8.
-    :param method: ``bilinear``, as for the paper's networks; ``area`` averages where it shrinks,
-        so that fine texture does not alias.
-    :returns: shape (size, size) or (size, size, 3), uint8.
-    """
-    shrinks = image.shape[0] >= size and image.shape[1] >= size
-    averages = method == 'area' and shrinks
-    interpolation = cv2.INTER_AREA if averages else cv2.INTER_LINEAR
-    return cv2.resize(image, (size, size), interpolation=interpolation)
 
 
 class BatchMaker:
@@ -30,7 +15,7 @@ class BatchMaker:
     Resizes images and standardizes their channels: ``(scale * value - mean) / std``.
 
     :param size: side of the square, pixels.
-    :param resize: method, see :func:`resize_square`.
+    :param resize: method, see :func:`stavpr_ros.features.extractor.resize_square`.
     :param mean: of each channel, in the order of the network's input.
     :param std: likewise.
     :param bgr: the network's input is blue, green, red.

@@ -15,7 +15,7 @@ from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.loop_closer import least_limit
-from stavpr_ros.recognition.robust.options import LOOP_THRESHOLD, options_of, THRESHOLD
+from stavpr_ros.recognition.robust import LOOP_THRESHOLD, options_of, THRESHOLD
 from stavpr_ros.recognition.verification import GeometricSettings
 
 OPERATIONS = ('localization', 'mapping', 'loop_closure')

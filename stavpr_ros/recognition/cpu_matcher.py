@@ -5,7 +5,6 @@
 import numpy as np
 from stavpr_ros.alignment.cpu import dot
 from stavpr_ros.alignment.settings import SpatialSettings
-from stavpr_ros.alignment.similarity import tiled
 from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
@@ -46,7 +45,8 @@ class CpuMatcher:
         if spatial.vertical:
             if features.cells is None:
                 raise InputError(
-                    'vertical alignment needs the cells of the strips: build the map again, without projection'
+                    'vertical alignment needs the cells of the strips: build the map again, '
+                    'without projection'
                 )
             strips = cut_cells(strips, features.cells)
             self._cell_a = adaptive_weights(features.cells[0], spatial, np.dtype(np.float32))
@@ -70,7 +70,9 @@ class CpuMatcher:
 
     def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Return the distances of Q images to every place, (Q, n)."""
-        queries = tiled(strips if self._cells is None else cut_cells(strips.cpu(), self._cells))
+        queries = dot.tiled(
+            strips if self._cells is None else cut_cells(strips.cpu(), self._cells)
+        )
         out = np.empty((len(queries), self.places), np.float32)
         if self._cells is not None:
             dot.vertical_image_distances(

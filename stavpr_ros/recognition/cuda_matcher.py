@@ -65,7 +65,7 @@ class CudaMatcher:
             self._kernel = dtw.spatial_dtw(W, band)
 
     def _warm_up(self) -> None:
-        """Compile the kernel and load the libraries now, so that the first image does not wait for them."""
+        """Compile the kernel and load the libraries before the first image."""
         W, _, d = self._strips.shape
         self.distances(torch.zeros(W, d), torch.zeros(W))
 
@@ -107,7 +107,7 @@ class CudaMatcher:
         return out
 
     def _align(self, queries: torch.Tensor, first_query: int, out: Any) -> None:
-        """Write the rows of some queries, in pieces of the map that keep the products' block small."""
+        """Write the rows of some queries, a piece of the map at a time: products stay small."""
         W, n, _ = self._strips.shape
         vectors = queries.reshape(len(queries) * W, -1).to(self._strips.dtype)
         places = min(n, max(1, BLOCK_WORDS // (len(vectors) * W)))
@@ -122,7 +122,7 @@ class CudaMatcher:
             )
 
     def _products(self, vectors: torch.Tensor, first: int, last: int) -> Any:
-        """Multiply query strips by those of some places: (Q W, W, last - first), as the kernels take it."""
+        """Multiply query strips by those of some places: (Q W, W, last - first), for kernels."""
         W, n, d = self._strips.shape
         rows = len(vectors)
         if (
@@ -139,7 +139,7 @@ class CudaMatcher:
         return view
 
     def _space(self, shape: tuple[int, ...], order: tuple[int, ...]) -> tuple[torch.Tensor, Any]:
-        """Return memory of a shape and the kernel's view of it; that of the last call if it fits."""
+        """Return memory of a shape and the kernel's view of it; the last call's if it fits."""
         if self._workspace is None or self._workspace[0].shape != shape:
             self._workspace = None  # freed before the next is taken
             block = torch.empty(shape, device=self._strips.device)

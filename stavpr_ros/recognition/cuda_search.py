@@ -1,14 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""LM-DTW on a CUDA device: the window lies there, and one small result is copied back for each match."""
+"""LM-DTW on a CUDA device: the window lies there, one small result a match is copied back."""
 
 from typing import Any
 
 from stavpr_ros.alignment.cuda.compilation import runtime
 from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch, trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings
-from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
-from stavpr_ros.recognition.sequence_search import Sequences, WindowMatch
+from stavpr_ros.recognition.sequence_search import SequenceBuffer, Sequences, WindowMatch
 import torch
 
 
@@ -50,7 +49,7 @@ class CudaLmDtwSearch:
         self(0)  # compiles the kernel, so that the first window does not wait for it
 
     def __call__(self, nms_radius: int) -> WindowMatch:
-        """Find the nearest start and its second best on the device, and trace the path on the host."""
+        """Find the nearest start and its second best on the device; trace the path on the host."""
         places = self.buffer.places
         if places == 0:
             return WindowMatch()

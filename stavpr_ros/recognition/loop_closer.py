@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 from stavpr_ros.alignment.cpu import dot
-from stavpr_ros.alignment.similarity import tiled
 from stavpr_ros.alignment.spatial import adaptive_weights
 from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import SettingsError
@@ -83,12 +82,9 @@ class LoopCloser(SequenceRecognizer):
         self._route = RouteFeatures(
             feature_settings, settings.applied_options.mean_centering, limit
         )
-        self._young: deque[int] = (
-            deque()
-        )  # stamps of the latest places, not yet old enough in seconds
-        self._places = (
-            0  # held places that the newest image may be matched with: the oldest so many
-        )
+        # stamps of the latest places, not yet old enough in seconds
+        self._young: deque[int] = deque()
+        self._places = 0  # the newest image may be matched with so many of the oldest places
 
     def __len__(self) -> int:
         """Return the number of places that are held; ``first + len`` images have come."""
@@ -105,7 +101,7 @@ class LoopCloser(SequenceRecognizer):
         return self._limit
 
     def features(self) -> LocalFeatures:
-        """Return the features of the places held, see :meth:`RouteFeatures.original`; strips (W, n, d)."""
+        """Return the features of the places held, strips (W, n, d), as they came."""
         return self._route.original()
 
     def reset(self) -> None:
@@ -161,7 +157,7 @@ class LoopCloser(SequenceRecognizer):
         self._places = max(0, route.count - max(self._exclude, self._count_young(stamp)))
 
     def _count_young(self, stamp: int) -> int:
-        """Count the latest places, the newest included, that are too young for an image of this stamp."""
+        """Count the latest places, the newest included, that are too young for this stamp."""
         young = self._young
         # a place whose stamp is unknown is as old as the one before it
         while young and (not young[0] or (stamp and stamp - young[0] >= self._exclude_ns)):
@@ -169,18 +165,18 @@ class LoopCloser(SequenceRecognizer):
         return len(young) if stamp else 0
 
     def _distances(self) -> np.ndarray:
-        """Return the distances of the newest image to the places it may be matched with, if not too few."""
+        """Return the distances of the newest image to its places; none if they are too few."""
         if self._places < LEAST_PLACES:
             return np.empty(0, np.float32)
         out = np.empty((1, self._places), np.float32)
         dot.image_distances(
-            self._route.strips.numpy(), tiled(self._route.newest), self._a, self._band, out
+            self._route.strips.numpy(), dot.tiled(self._route.newest), self._a, self._band, out
         )
         return out[0]
 
 
 def least_limit(exclude: int, length: int) -> int:
-    """Return the smallest limit: after an eviction, a window's sequence at twice its speed fits in."""
+    """Return the smallest limit: after an eviction, a sequence at twice the speed fits in."""
     return -(-EVICTED * (exclude + 2 * length) // (EVICTED - 1))
 
 

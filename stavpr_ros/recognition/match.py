@@ -10,6 +10,8 @@ import math
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.path import aligned_index, NO_PATH
+from stavpr_ros.errors import InputError
+from stavpr_ros.recognition.robust import evidence, score
 
 
 class Status(enum.IntEnum):
@@ -56,7 +58,7 @@ class Match:
     :param sequence: the nearest sequence of the map, accepted or not; None where there is none.
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
     :param relative: distances are scores of mode robust, with memory and with the chance level at
-        1 (:mod:`stavpr_ros.recognition.robust.hysteresis`).
+        1 (:mod:`stavpr_ros.recognition.robust`).
     :param window_stamps: stamps (ns) of the images in the window, oldest first, this one the last.
     :param image_index: place of a growing map that this image has become, -1 = none.
     :param inliers: of the geometric verification, -1 = not verified.
@@ -103,7 +105,7 @@ class Match:
 
         In mode paper, q_m of LM-DTW: a mean image distance of this window alone. In mode robust
         (``relative``), a score with memory from 0 (certain) to 1 (chance level): see
-        :mod:`stavpr_ros.recognition.robust.hysteresis`. Successive scores are correlated, since
+        :mod:`stavpr_ros.recognition.robust`. Successive scores are correlated, since
             hysteresis keeps
         strong evidence for some images; they are not independent measurements.
         """
@@ -120,3 +122,59 @@ class Match:
     def first_image_index(self) -> int:
         """Place of the window's first image on a route that grows with every image, -1 = none."""
         return self.image_index - len(self.window_stamps) + 1 if self.image_index >= 0 else -1
+
+
+def ranked_candidates(
+    nearest: SequenceMatch | None,
+    sequences: tuple[np.ndarray, np.ndarray],
+    count: int,
+    nms_radius: int,
+    relative: bool,
+) -> list[Candidate]:
+    """
+    Rank places by non-maximum suppression: around a place that is taken no other one is.
+
+    The first is the nearest sequence, the second its second best. O(count x n).
+
+    :param nearest: the nearest sequence as it was matched; None if there is none.
+    :param sequences: costs of all sequences, shape (n,), +inf where there is none, and their
+        places, shape (n,), whole numbers, in any order; of equal costs the first is taken.
+    :param count: most candidates, at least 0.
+    :param nms_radius: candidates are more than so many places from each other.
+    :param relative: the distance of the nearest is a score of mode robust; those of the others are
+        then scores of their evidence against the nearest.
+    :raises InputError: count below 0.
+    """
+    if count < 0:
+        raise InputError(f'count = {count} candidates: expected at least 0')
+    if nearest is None or not count:
+        return []
+    costs, places = sequences[0].copy(), sequences[1]
+    best = float(costs.min())
+    found = [Candidate(nearest.middle, nearest.distance)]
+    while len(found) < count:
+        costs[np.abs(places - found[-1].place) <= nms_radius] = np.inf
+        at = int(np.argmin(costs))
+        cost = float(costs[at])
+        if math.isinf(cost):
+            break
+        distance = score(evidence(cost, best)) if relative else cost
+        found.append(Candidate(int(places[at]), distance))
+    return found
+
+
+def distinct_places(
+    distances: np.ndarray, places: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the nearest distinct places, nearest first (the lowest index on a tie).
+
+    :param distances: of each sequence, shape (m,); +inf where there is none.
+    :param places: its middle, shape (m,).
+    :returns: places and distances, at most ``count`` of each.
+    """
+    order = np.argsort(distances, kind='stable')
+    order = order[np.isfinite(distances[order])]
+    _, first = np.unique(places[order], return_index=True)
+    order = order[np.sort(first)[:count]]
+    return places[order].astype(np.int64), distances[order]

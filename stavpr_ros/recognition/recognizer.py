@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Frame by frame: the distances of the newest image, the nearest sequence of the window, the status."""
+"""Frame by frame: distances of the newest image, nearest sequence of the window, status."""
 
 from dataclasses import dataclass, field, replace
 import math
@@ -12,20 +12,31 @@ from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition.candidates import distinct_places, ranked_candidates
-from stavpr_ros.recognition.match import Candidate, Match, Status
+from stavpr_ros.recognition.match import (
+    Candidate,
+    distinct_places,
+    Match,
+    ranked_candidates,
+    Status,
+)
 from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.recognition.robust.centering import MeanCentering
-from stavpr_ros.recognition.robust.hysteresis import (
+from stavpr_ros.recognition.robust import (
     evidence,
     expected_second_best,
     Hysteresis,
+    MeanCentering,
+    options_of,
+    RobustOptions,
     score,
+    ZNormalization,
 )
-from stavpr_ros.recognition.robust.options import options_of, RobustOptions
-from stavpr_ros.recognition.robust.znorm import ZNormalization
-from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
-from stavpr_ros.recognition.sequence_search import LmDtwSearch, Search, VelocitySearch, WindowMatch
+from stavpr_ros.recognition.sequence_search import (
+    LmDtwSearch,
+    Search,
+    SequenceBuffer,
+    VelocitySearch,
+    WindowMatch,
+)
 import torch
 
 PLACES_TO_START_FROM = 100  # places whose distances to the map start the z-normalization
@@ -42,7 +53,7 @@ class RecognizerSettings:
     :param nms_radius: the second best's midpoint is more than so many places from the nearest
         one's.
     :param mode: ``paper``, or ``robust``, with all options of
-        :class:`stavpr_ros.recognition.robust.options.RobustOptions`.
+        :class:`stavpr_ros.recognition.robust.RobustOptions`.
     :param robust_options: another choice of options than the mode's.
     """
 
@@ -66,7 +77,8 @@ class RecognizerSettings:
             and self.threshold > 1
         ):
             raise SettingsError(
-                f'threshold = {self.threshold}: distances of mode robust end at 1, the chance level'
+                f'threshold = {self.threshold}: distances of mode robust end at 1, '
+                'the chance level'
             )
 
     @property
@@ -197,7 +209,7 @@ class SequenceRecognizer:
         return Match(status, reason, threshold, self._nearest, self._window.path, relative)
 
     def _scored(self, nearest: SequenceMatch) -> SequenceMatch:
-        """Return the match with scores of mode robust for distances; that of the nearest has memory."""
+        """Return the match with scores of mode robust for distances; the nearest has memory."""
         cost, other = nearest.distance, nearest.second_best_distance
         costs, places = self._window.sequences()
         elsewhere = np.abs(places - nearest.middle) > self._settings.nms_radius
@@ -252,7 +264,7 @@ class PlaceRecognizer(SequenceRecognizer):
             self._search, self._buffer = search, search.buffer
 
     def _distances_to_itself(self, features: LocalFeatures) -> np.ndarray:
-        """Return the distances of some places to all but their neighbors, which are NaN, shape (m, n)."""
+        """Return the distances of some places to all, shape (m, n); NaN to their neighbors."""
         n, radius = len(features), self._settings.nms_radius
         some = np.unique(np.linspace(0, max(n - 1, 0), min(n, PLACES_TO_START_FROM)).astype(int))
         matrix = self._matcher.distance_matrix(features.strips[:, some], features.weights[:, some])

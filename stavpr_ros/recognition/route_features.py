@@ -66,7 +66,7 @@ class RouteFeatures:
         return LocalFeatures(strips, self._weights[:, :n].clone(), self._settings, self._cells)
 
     def append(self, features: LocalFeatures) -> bool:
-        """Append the features of one image, strips (W, 1, d); return whether room was made for it."""
+        """Append the features of one image, strips (W, 1, d); return whether memory grew."""
         strips = features.strips.cpu()
         grows = self.count == self.room
         if grows:
@@ -124,7 +124,7 @@ class RouteFeatures:
                 self._sum[j] -= norms @ self.strips[j, piece] + (norms > 0).sum() * self._mean[j]
 
     def _move_mean(self, first: int) -> None:
-        """Subtract the present mean instead of the previous one; places from ``first`` on become the first."""
+        """Subtract the present mean instead of the previous one; ``first`` becomes place 0."""
         mean = (self._sum / self.count).float()
         self._center(first, 0, self._mean - mean)
         self._mean = mean

@@ -1,7 +1,8 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Searches over a full window: the nearest sequence of the map, by LM-DTW or by velocity search."""
+"""The window of the query, and the nearest sequence of the map to it."""
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -16,10 +17,122 @@ from stavpr_ros.alignment.lm_dtw import (
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.alignment.settings import VelocitySettings
 from stavpr_ros.alignment.velocity import best_velocity_match, match_scaled, trace_velocity
-from stavpr_ros.recognition.robust.znorm import MIN_DEVIATION, ZNormalization
-from stavpr_ros.recognition.sequence_buffer import SequenceBuffer
+from stavpr_ros.checks import no_nan
+from stavpr_ros.recognition.robust import MIN_DEVIATION, ZNormalization
+import torch
 
 Sequences = tuple[np.ndarray, np.ndarray]
+
+
+class SequenceBuffer:
+    """
+    A ring of the last l rows that always lies contiguous in memory, oldest row first.
+
+    Every row is written twice, l rows apart, so that the last l rows are one slice of the memory.
+    Rows are checked when they are pushed; the searches over the buffer trust them.
+
+    :param length: rows l.
+    :param places: places n of the map.
+    :param k: places that one start of LM-DTW sees.
+    :param row_width: words from row to row for n places and k; the padding that a kernel needs
+        behind the places is +inf.
+    :param device: of the memory.
+    """
+
+    def __init__(
+        self,
+        length: int,
+        places: int,
+        k: int,
+        row_width: Callable[[int, int], int] = padded_width,
+        device: torch.device | str = 'cpu',
+    ) -> None:
+        self.length, self.k = int(length), k
+        self._row_width = row_width
+        self._first = self._known = self._count = 0
+        self._stamps: deque[int] = deque(maxlen=self.length)
+        self._allocate(places, torch.device(device))
+
+    def _allocate(self, places: int, device: torch.device) -> None:
+        self.places = places
+        self.memory = torch.full(
+            (2 * self.length, self._row_width(places, self.k)), torch.inf, device=device
+        )
+        twice = self.memory.view(2, self.length, -1)
+        self._slots = [twice[:, slot, :places] for slot in range(self.length)]
+
+    def __len__(self) -> int:
+        return min(self._count, self.length)
+
+    @property
+    def full(self) -> bool:
+        """As many rows as the window is long have been pushed."""
+        return self._count >= self.length
+
+    @property
+    def stamps(self) -> tuple[int, ...]:
+        """Stamps of the images in the window, ns, oldest first."""
+        return tuple(self._stamps)
+
+    @property
+    def first(self) -> int:
+        """Index of the first place that is not evicted: the number of evicted places."""
+        return self._first
+
+    @property
+    def known(self) -> int:
+        """Places with an entry in any row of the window; all others are +inf."""
+        return self._known
+
+    @property
+    def oldest(self) -> int:
+        """Row of ``memory`` where the window begins."""
+        return self._count % self.length
+
+    def push(self, row: torch.Tensor, stamp: int = 0) -> None:
+        """
+        Add the distances of the newest image and drop the oldest.
+
+        :param row: shape (m,), float32, of the first m <= n places; the others become +inf. On the
+            buffer's device.
+        :param stamp: of the image, ns; 0 = unknown.
+        :raises InputError: NaN or -inf in the row; the buffer is unchanged. Not checked on a CUDA
+            device, which would have to be waited for.
+        """
+        if not row.is_cuda and not float(row.sum()) > -torch.inf:
+            no_nan(row.numpy(), 'image distances')
+        slot, m = self._slots[self._count % self.length], len(row)
+        if m == self.places:
+            slot.copy_(row)
+        else:
+            slot[:, :m], slot[:, m:] = row, torch.inf
+        self._known = max(self._known, m)
+        self._stamps.append(stamp)
+        self._count += 1
+
+    def rows(self) -> torch.Tensor:
+        """Return the window, (l, n + padding), float32, a contiguous view; padding is +inf."""
+        return self.memory[self.oldest : self.oldest + self.length]
+
+    def clear(self) -> None:
+        """Empty the window."""
+        self.memory.fill_(torch.inf)
+        self._stamps.clear()
+        self._known = self._count = 0
+
+    def grow(self, places: int) -> None:
+        """Make room for more places; in the rows of the window they are +inf."""
+        rows, before = self.memory, self.places
+        self._allocate(places, rows.device)
+        self.memory[:, :before] = rows[:, :before]
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up, and new ones have room behind them."""
+        kept = self.places - count
+        self.memory[:, :kept] = self.memory[:, count : self.places].clone()
+        self.memory[:, kept : self.places] = torch.inf
+        self._known = max(0, self._known - count)
+        self._first += count
 
 
 def _no_sequences() -> Sequences:
@@ -92,11 +205,10 @@ class VelocitySearch:
         settings: VelocitySettings | None = None,
     ) -> None:
         self.buffer, self._znorm = buffer, znorm
-        self._settings = settings or VelocitySettings()
-        steps = self._settings.steps(buffer.length)
-        self._reach = (
-            int(steps.sum(axis=1).max()) + buffer.length
-        )  # most places that a path passes
+        settings = settings or VelocitySettings()
+        self._steps, self._penalty = settings.steps(buffer.length), settings.penalty
+        # most places that a path passes
+        self._reach = int(self._steps.sum(axis=1).max()) + buffer.length
 
     def __call__(self, nms_radius: int) -> WindowMatch:
         rows, n, first = self.buffer.rows().numpy(), self.buffer.known, self.buffer.first
@@ -104,14 +216,14 @@ class VelocitySearch:
         if not (self._znorm.query or self._znorm.reference):
             known = rows[:, :n][np.isfinite(rows[:, :n])]
             scale = scale / np.float32(max(known.std() if known.size else 0, MIN_DEVIATION))
-        matches = match_scaled(rows, shift, scale, self._settings)
+        matches = match_scaled(rows, shift, scale, self._steps, self._penalty)
         nearest = best_velocity_match(matches, nms_radius)
         path = NO_PATH
         if nearest is not None:
             near = slice(max(0, nearest.last - self._reach), nearest.last + 1)
             costs = (rows[:, near] - shift[near]) * scale[near]
-            velocity = int(matches.speeds[nearest.last])
-            path = trace_velocity(costs, nearest.last - near.start, velocity, self._settings)
+            steps = self._steps[matches.speeds[nearest.last]]
+            path = trace_velocity(costs, nearest.last - near.start, steps, self._penalty)
             path[:, 1] += near.start
         return _renumbered(
             nearest, path, lambda: (matches.distances, matches.middles + first), first

@@ -29,8 +29,9 @@ class ThresholdSuggestion:
 
 def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np.ndarray:
     """
-    Alter an image as another day and another lane might: shifted, lit and exposed otherwise,
-    duller, noisy.
+    Alter an image as another day and another lane might.
+
+    It is shifted, lit and exposed otherwise, duller, noisy.
 
     :param image: RGB (h, w, 3) uint8.
     :param variant: 0..3: shifted to one side or the other, darker or brighter.
@@ -83,10 +84,8 @@ def suggest_threshold(
     for variant, start in enumerate(
         tqdm(starts, desc='threshold', unit='window', disable=None if progress else True)
     ):
-        pictures = [place_map.thumbnail(place) for place in range(start, start + l)]
-        altered = [
-            harder_look(picture, variant, rng) for picture in pictures if picture is not None
-        ]
+        images = [place_map.thumbnail(place) for place in range(start, start + l)]
+        altered = [harder_look(image, variant, rng) for image in images if image is not None]
         features = extractor.extract(altered)
         window = recognizer.distances(features)
         window[:, max(0, start - l) : start + 2 * l] = np.inf

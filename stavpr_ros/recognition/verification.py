@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Geometric verification: whether two pictures show the same scene from two viewpoints.
+Geometric verification: whether two images show the same scene from two viewpoints.
 
 Keypoints of both are matched, and the matches counted that one epipolar geometry explains. A wrong
 place that looks alike has matches as well, but few that one geometry explains.
@@ -19,14 +19,14 @@ METHODS = ('orb', 'sift')
 LEAST_MATCHES = 8  # a fundamental matrix fits any seven
 ITERATIONS = 2000
 CONFIDENCE = 0.999
-LOWEST = 32  # rows of a picture below which keypoints have no room, and some detectors fail
-TALLEST = 4  # a picture is brought to at most so many times its width
+LOWEST = 32  # rows of an image below which keypoints have no room, and some detectors fail
+TALLEST = 4  # an image is brought to at most so many times its width
 
 
 @dataclass(frozen=True)
 class GeometricSettings:
     """
-    How two pictures are checked against each other.
+    How two images are checked against each other.
 
     The defaults belong together: more features, a ratio nearer to 1 and more pixels let more
     matches of wrong places through, and ``min_inliers`` has to rise with them. For ``sift``, 20
@@ -34,10 +34,10 @@ class GeometricSettings:
 
     :param method: keypoints: ``orb`` (fast) or ``sift`` (slower, fewer matches).
     :param min_inliers: matches that one geometry must explain; at least 8.
-    :param features: most keypoints a picture; at least 8.
+    :param features: most keypoints an image; at least 8.
     :param ratio: a match is this much nearer than the second nearest, in (0, 1].
     :param pixels: how far a match may lie off the geometry, in pixels at ``width``.
-    :param width: pictures are brought to this width before, in pixels; at least 32.
+    :param width: images are brought to this width before, in pixels; at least 32.
     """
 
     method: str = 'orb'
@@ -55,7 +55,8 @@ class GeometricSettings:
         for name, value in (('min_inliers', self.min_inliers), ('features', self.features)):
             if value < LEAST_MATCHES:
                 raise SettingsError(
-                    f'{name} = {value} must be at least {LEAST_MATCHES}: a fundamental matrix fits any seven'
+                    f'{name} = {value} must be at least {LEAST_MATCHES}: a fundamental matrix '
+                    'fits any seven'
                 )
         if not 0 < self.ratio <= 1:
             raise SettingsError(f'ratio = {self.ratio} must lie above 0 and be at most 1')
@@ -67,7 +68,7 @@ class GeometricSettings:
 
 @dataclass(frozen=True)
 class _Keypoints:
-    """Those of a picture: where they are, (m, 2), pixels at the common width, and descriptors (m, ...)."""
+    """Those of an image: points (m, 2), pixels at the common width, and descriptors (m, ...)."""
 
     points: np.ndarray
     descriptors: np.ndarray
@@ -75,9 +76,9 @@ class _Keypoints:
 
 class GeometricVerifier:
     """
-    Counts the matches of two pictures that one geometry explains. Belongs to one thread.
+    Counts the matches of two images that one geometry explains. Belongs to one thread.
 
-    The same pictures give the same count. The keypoints of the last query are kept, so that one
+    The same images give the same count. The keypoints of the last query are kept, so that one
     image is checked against several places at little more than the places' cost.
 
     :param settings: see :class:`GeometricSettings`.
@@ -94,10 +95,10 @@ class GeometricVerifier:
 
     def inliers(self, query: np.ndarray, place: np.ndarray) -> int:
         """
-        Count the matches that one geometry explains; 0 for pictures that have too few.
+        Count the matches that one geometry explains; 0 for images that have too few.
 
         :param query, place: RGB, each (h, w, 3) uint8, of any size.
-        :raises InputError: no such pictures.
+        :raises InputError: no such images.
         """
         gray = self._small_gray(query, 'query')
         other = self._detected(self._small_gray(place, 'place'))
@@ -113,7 +114,7 @@ class GeometricVerifier:
         return _explained(keypoints.points[mine], other.points[theirs], self.settings.pixels)
 
     def _small_gray(self, image: np.ndarray, name: str) -> np.ndarray:
-        """Return a picture at the common width, (h, w) uint8."""
+        """Return an image at the common width, (h, w) uint8."""
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
             raise InputError(
                 f'{name} is {image.dtype} {image.shape}: expected RGB (h, w, 3) uint8'
@@ -135,7 +136,7 @@ class GeometricVerifier:
         return _Keypoints(np.array([point.pt for point in keypoints], np.float32), descriptors)
 
     def _matches(self, mine: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs of keypoints, each other's nearest and clearly so: two arrays (m,) of their numbers."""
+        """Pair the keypoints that are each other's clear nearest; two arrays (m,) of indices."""
         how = (
             (cv2.CV_32S, cv2.NORM_HAMMING)
             if self.settings.method == 'orb'
@@ -159,11 +160,11 @@ def _detector(settings: GeometricSettings) -> Any:
 
 
 def _explained(points: np.ndarray, others: np.ndarray, pixels: float) -> int:
-    """Matches (m, 2) with (m, 2) that the best fundamental matrix explains; also those of a flat scene."""
+    """Count matches that the best fundamental matrix explains; also those of a flat scene."""
     try:
         _, mask = cv2.findFundamentalMat(
             points, others, cv2.USAC_MAGSAC, pixels, CONFIDENCE, ITERATIONS
         )
-    except cv2.error:  # how it says of some matches, many in one point, that no matrix fits
+    except cv2.error:  # no matrix fits: many of the matches in one point
         return 0
     return 0 if mask is None else int(np.count_nonzero(mask))

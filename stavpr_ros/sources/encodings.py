@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 from stavpr_ros.errors import ImageError
-from stavpr_ros.sources.files import check_pixels, convert, decode_file, flat_bytes
+from stavpr_ros.sources import files
 
 _MEASUREMENTS = re.compile(r'(8S|16S|32[SUF]|64[SUF])C\d*')
 """Encodings of depth images, vectors and other measurements, without brightness."""
@@ -47,6 +47,17 @@ class Encoding:
     to_rgb: Callable[[np.ndarray], np.ndarray]
     block: tuple[int, int] = (1, 1)
     chroma_rows: float = 0
+
+
+def convert(code: int, pixels: np.ndarray) -> np.ndarray:
+    """
+    Convert with one of OpenCV's codes.
+
+    :param code: ``cv2.COLOR_...2RGB``.
+    :param pixels: uint8, shape (rows, width, channels); rows may be apart.
+    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
+    """
+    return np.asarray(cv2.cvtColor(pixels, code))
 
 
 def copy(pixels: np.ndarray) -> np.ndarray:
@@ -127,9 +138,8 @@ ENCODINGS: dict[str, Encoding] = {
     '8UC1': Encoding(1, 1, _FROM_GRAY),
     '8UC3': Encoding(3, 1, _FROM_BGR),
     '8UC4': Encoding(4, 1, _FROM_BGRA),
-    '16UC1': Encoding(
-        1, 2, _FROM_GRAY
-    ),  # industrial cameras mean gray by it; depth cameras do not
+    # industrial cameras mean gray by it; depth cameras do not
+    '16UC1': Encoding(1, 2, _FROM_GRAY),
     '16UC3': Encoding(3, 2, _FROM_BGR),
     '16UC4': Encoding(4, 2, _FROM_BGRA),
     'bayer_rggb8': Encoding(1, 1, _FROM_RGGB),
@@ -193,7 +203,8 @@ def decode_image(
             'or more; the image is cut off',
             kind='cut off',
         )
-    check_pixels(width, height)  # last: a wrong header fails the checks above
+    if width * height > files.MAX_PIXELS:  # last: a wrong header fails the checks above
+        raise files.too_large(width, height)
     values = width * layout.channels
     if layout.value_bytes == 1:
         strides = (step, layout.channels, 1)
@@ -227,6 +238,21 @@ def decode_message(message: Any) -> np.ndarray:
     )
 
 
+def decode_compressed(data: Any) -> np.ndarray:
+    """
+    Decode the bytes of an image file: JPEG, PNG, BMP, TIFF, PNM, WebP.
+
+    Gray, 16 bit and transparent images become RGB uint8 too; a rotation in the EXIF data is
+    applied.
+
+    :param data: the file's bytes: anything with the buffer protocol.
+    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
+    :raises ImageError: not such a file, damaged, cut off, or of more than
+        :data:`stavpr_ros.sources.files.MAX_PIXELS` pixels.
+    """
+    return files.decode_file(flat_bytes(data))
+
+
 def decode_compressed_message(message: Any) -> np.ndarray:
     """
     Decode a ``sensor_msgs/CompressedImage``.
@@ -246,7 +272,7 @@ def decode_compressed_message(message: Any) -> np.ndarray:
             kind='depth',
         )
     try:
-        return decode_file(flat_bytes(message.data), _demosaic_of(message.format))
+        return files.decode_file(flat_bytes(message.data), _demosaic_of(message.format))
     except ImageError as error:
         raise ImageError(f'format {message.format!r}: {error}', kind=error.kind) from error
 
@@ -264,6 +290,14 @@ def _demosaic_of(transport: str) -> Callable[[np.ndarray], np.ndarray] | None:
     if layout is None or not compressed or target.strip() not in {'', original.strip()}:
         return None
     return layout.to_rgb
+
+
+def flat_bytes(data: Any) -> np.ndarray:
+    """View any buffer as bytes, shape (size,); an array that is not contiguous is copied."""
+    if isinstance(data, np.ndarray):
+        return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
+    view = memoryview(data)
+    return np.frombuffer(view, np.uint8) if view.nbytes else np.empty(0, np.uint8)
 
 
 def _layout(encoding: str) -> Encoding:

@@ -5,7 +5,6 @@
 from collections.abc import Callable
 from io import BytesIO
 import re
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,21 +22,6 @@ COMPRESSED_FORMATS = ('JPEG', 'PNG', 'BMP', 'TIFF', 'PPM', 'WEBP')
 """The supported files, in Pillow's names."""
 
 
-def decode_compressed(data: Any) -> np.ndarray:
-    """
-    Decode the bytes of an image file: JPEG, PNG, BMP, TIFF, PNM, WebP.
-
-    Gray, 16 bit and transparent images become RGB uint8 too; a rotation in the EXIF data is
-    applied.
-
-    :param data: the file's bytes: anything with the buffer protocol.
-    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
-    :raises ImageError: not such a file, damaged, cut off, or of more than :data:`MAX_PIXELS`
-        pixels.
-    """
-    return decode_file(flat_bytes(data))
-
-
 def decode_file(
     flat: np.ndarray, demosaic: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> np.ndarray:
@@ -48,29 +32,19 @@ def decode_file(
     :param demosaic: converts a gray image (height, width), a Bayer mosaic, to RGB; not called if
         the file has color.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
-    :raises ImageError: see :func:`decode_compressed`.
+    :raises ImageError: not such a file, damaged, cut off, or of more than :data:`MAX_PIXELS`
+        pixels.
     """
     mode = _check_file(flat)
     try:
         # Pillow's modes of one channel: L of 8 bits, I or I;16 of more
         if demosaic is not None and (mode == 'L' or mode.startswith('I')):
             return demosaic(_unpack(flat, cv2.IMREAD_GRAYSCALE))
-        return convert(cv2.COLOR_BGR2RGB, _unpack(flat, cv2.IMREAD_COLOR))
+        return np.asarray(cv2.cvtColor(_unpack(flat, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))
     except cv2.error as error:
         raise ImageError(
             f'compressed image of {flat.size} bytes is damaged: {error}', kind='damaged'
         ) from error
-
-
-def convert(code: int, pixels: np.ndarray) -> np.ndarray:
-    """
-    Convert with one of OpenCV's codes.
-
-    :param code: ``cv2.COLOR_...2RGB``.
-    :param pixels: uint8, shape (rows, width, channels); rows may be apart.
-    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
-    """
-    return np.asarray(cv2.cvtColor(pixels, code))
 
 
 def _unpack(flat: np.ndarray, mode: int) -> np.ndarray:
@@ -82,15 +56,6 @@ def _unpack(flat: np.ndarray, mode: int) -> np.ndarray:
             kind='damaged',
         )
     return np.asarray(image)
-
-
-def check_pixels(width: int, height: int) -> None:
-    """Reject an image of more than :data:`MAX_PIXELS` pixels."""
-    if width * height > MAX_PIXELS:
-        raise ImageError(
-            f'image of {width}x{height} pixels: expected at most {MAX_PIXELS}; scale it down',
-            kind='too large',
-        )
 
 
 def _check_file(flat: np.ndarray) -> str:
@@ -109,7 +74,8 @@ def _check_file(flat: np.ndarray) -> str:
             f'{", ".join(COMPRESSED_FORMATS)}: {error}',
             kind='damaged',
         ) from error
-    check_pixels(width, height)
+    if width * height > MAX_PIXELS:
+        raise too_large(width, height)
     if kind in ('JPEG', 'MPO'):  # MPO: several images, the first is read
         _check_end_of_jpeg(flat.tobytes())
     return mode
@@ -131,9 +97,9 @@ def _check_end_of_jpeg(data: bytes) -> None:
     )
 
 
-def flat_bytes(data: Any) -> np.ndarray:
-    """View any buffer as bytes, shape (size,); an array that is not contiguous is copied."""
-    if isinstance(data, np.ndarray):
-        return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
-    view = memoryview(data)
-    return np.frombuffer(view, np.uint8) if view.nbytes else np.empty(0, np.uint8)
+def too_large(width: int, height: int) -> ImageError:
+    """Return the error of an image of more than :data:`MAX_PIXELS` pixels."""
+    return ImageError(
+        f'image of {width}x{height} pixels: expected at most {MAX_PIXELS}; scale it down',
+        kind='too large',
+    )

@@ -9,7 +9,7 @@ import re
 
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, SourceError
-from stavpr_ros.sources.files import decode_compressed
+from stavpr_ros.sources.encodings import decode_compressed
 from stavpr_ros.sources.frame import Frame, ImageRecord
 
 SUFFIXES = frozenset({'.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'})

@@ -1,19 +1,101 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The distances of one image to many map images from the distances of their strips (section 2)."""
+"""
+The recursion of both alignments, row by row, on all lanes at once.
+
+Between rows the *edge* holds S and C of the row above: flat, slot x + 1 is column x, slot 0 the
+corner (-1, -1), whose S = C = 0 makes the first cell an ordinary diagonal step of weight 1.
+Infinite S mark what may not be used. The diagonal is taken only when strictly smallest; vertical
+wins a tie over horizontal. No ``fastmath``: the answers are the oracle's bit for bit.
+"""
+
+import math
 
 import numba as nb
 import numpy as np
-from stavpr_ros.alignment.cpu.dtw_steps import open_edge, SLOT, sweep_row
 from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel, parallel_kernel
 
+SLOT = 2 * LANES  # S, then C
+VERTICAL, HORIZONTAL, DIAGONAL = 0, 1, 2
 BLOCKS = 16  # vectors of map images that a thread takes at a time
 
 
 @kernel
+def open_edge(edge, columns):
+    """Make the edge above the first row."""
+    zero = splat(edge.dtype.type(0))
+    infinity = splat(edge.dtype.type(np.inf))
+    for slot in range(columns + 1):
+        store(edge, slot * SLOT, infinity)
+        store(edge, slot * SLOT + LANES, zero)
+    store(edge, 0, zero)
+
+
+@kernel
+def step(
+    x, x_diagonal, S_vertical, C_vertical, S_horizontal, C_horizontal, S, C, one, diagonal_cost
+):
+    """S and C of one cell from its three predecessors; the last S and C are the diagonal one's."""
+    vertical = x + S_vertical
+    horizontal = x + S_horizontal
+    diagonal = x_diagonal + S
+    sideways = horizontal < vertical
+    straight = select(sideways, horizontal, vertical)
+    cost = select(sideways, C_horizontal, C_vertical) + one
+    slanted = diagonal < straight
+    return select(slanted, diagonal, straight), select(slanted, C + diagonal_cost, cost)
+
+
+@kernel
+def sweep_row(d, at, stride, first, last, edge, weight):
+    """
+    Advance the edge by one row, columns first..last-1.
+
+    :param d, at, stride: flat distances; column x of the row lies at + x * stride.
+    :param weight: vector, what a diagonal step multiplies x with and costs.
+    """
+    one = splat(edge.dtype.type(1))
+    S, C = splat(edge.dtype.type(np.inf)), one
+    S_corner, C_corner = load(edge, first * SLOT), load(edge, first * SLOT + LANES)
+    store(edge, 0, S)  # the corner serves the first row only
+    for x in range(first, last):
+        slot = (x + 1) * SLOT
+        S_above, C_above = load(edge, slot), load(edge, slot + LANES)
+        cell = load(d, at + x * stride)
+        S, C = step(cell, weight * cell, S_above, C_above, S, C, S_corner, C_corner, one, weight)
+        S_corner, C_corner = S_above, C_above
+        store(edge, slot, S)
+        store(edge, slot + LANES, C)
+
+
+@kernel
+def sweep_four_rows(d, at, pitch, columns, edge):
+    """Advance the edge, held in registers, by four rows, ``pitch`` apart, with a = 1."""
+    one = splat(edge.dtype.type(1))
+    S0 = S1 = S2 = S3 = splat(edge.dtype.type(np.inf))
+    C0 = C1 = C2 = C3 = one
+    S, C = load(edge, 0), load(edge, LANES)
+    store(edge, 0, S0)  # the corner serves the first row only
+    for x in range(columns):
+        slot = (x + 1) * SLOT
+        S_above, C_above = load(edge, slot), load(edge, slot + LANES)
+        cell = load(d, at + x)
+        Sa, Ca = step(cell, cell, S_above, C_above, S0, C0, S, C, one, one)
+        cell = load(d, at + pitch + x)
+        Sb, Cb = step(cell, cell, Sa, Ca, S1, C1, S0, C0, one, one)
+        cell = load(d, at + 2 * pitch + x)
+        Sc, Cc = step(cell, cell, Sb, Cb, S2, C2, S1, C1, one, one)
+        cell = load(d, at + 3 * pitch + x)
+        Sd, Cd = step(cell, cell, Sc, Cc, S3, C3, S2, C2, one, one)
+        S, C, S0, C0, S1, C1, S2, C2, S3, C3 = S_above, C_above, Sa, Ca, Sb, Cb, Sc, Cc, Sd, Cd
+        store(edge, slot, S3)
+        store(edge, slot + LANES, C3)
+
+
+@kernel
 def adaptive_weight(d, at, stride, weights, xi):
-    """The weight a for |I_c - c| of each lane; the row of the central strip c starts at ``at``."""
+    """Return the weight a of each lane; the row of the central strip c starts at ``at``."""
     W = weights.shape[0]
     c = (W + 1) // 2 - 1  # ceil(W / 2), 0-based
     nearest = splat(d.dtype.type(np.inf))
@@ -32,7 +114,7 @@ def align_lanes(d, at, row, column, weights, xi, edge):
     S[W,W] / C[W,W] of LANES neighboring map images, as a vector.
 
     :param d, at, row, column: flat strip distances; cell (i, j) lies at + i * row + j * column.
-    :param weights: a for each |I_c - c|, shape (W,); all 1 for vanilla DTW.
+    :param weights: a for each ``|I_c - c|``, shape (W,); all 1 for vanilla DTW.
     :param xi: half width of the band, W for none.
     :param edge: shape ((W + 1) * SLOT,), scratch.
     """
@@ -83,3 +165,57 @@ def sliding_window(d, width, xi, out):
                         total += d[p + t, q + t, y]
                     best = min(best, total / d.dtype.type(width))
         out[y] = best
+
+
+@kernel
+def accumulate(d, weight, xi, S, C, step):
+    """
+    Fill the whole tables of one pair, for its warping path.
+
+    :param d: distances, shape (rows, columns).
+    :param weight: the adaptive weight a of a diagonal step.
+    :param xi: half width of the band; at least rows + columns for none.
+    :param S, C, step: shape of d, written: accumulated distance, path cost, the step into each
+        cell.
+    """
+    rows, columns = d.shape
+    S[:] = np.inf
+    C[:] = 1
+    for i in range(rows):
+        for j in range(columns):
+            if abs(i - j) >= xi:
+                continue
+            if i == 0 and j == 0:
+                S[0, 0] = d[0, 0]
+                continue
+            vertical = d[i, j] + S[i - 1, j] if i > 0 else math.inf
+            horizontal = d[i, j] + S[i, j - 1] if j > 0 else math.inf
+            diagonal = weight * d[i, j] + S[i - 1, j - 1] if i > 0 and j > 0 else math.inf
+            if diagonal < vertical and diagonal < horizontal:
+                S[i, j], C[i, j], step[i, j] = diagonal, C[i - 1, j - 1] + weight, DIAGONAL
+            elif i > 0 and (j == 0 or vertical <= horizontal):
+                S[i, j], C[i, j], step[i, j] = vertical, C[i - 1, j] + 1, VERTICAL
+            else:
+                S[i, j], C[i, j], step[i, j] = horizontal, C[i, j - 1] + 1, HORIZONTAL
+
+
+@kernel
+def backtrack(step, row, column, path):
+    """
+    Follow the steps back from (row, column) to (0, 0).
+
+    :param path: shape (rows + columns, 2), written.
+    :returns: its length.
+    """
+    count = 0
+    while True:
+        path[count, 0] = row
+        path[count, 1] = column
+        count += 1
+        if row == 0 and column == 0:
+            return count
+        taken = step[row, column]
+        if taken != HORIZONTAL:
+            row -= 1
+        if taken != VERTICAL:
+            column -= 1

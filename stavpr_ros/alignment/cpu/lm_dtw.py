@@ -4,7 +4,7 @@
 
 import numba as nb
 import numpy as np
-from stavpr_ros.alignment.cpu.dtw_steps import open_edge, SLOT, sweep_four_rows, sweep_row
+from stavpr_ros.alignment.cpu.dtw import open_edge, SLOT, sweep_four_rows, sweep_row
 from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel, parallel_kernel
 
@@ -13,7 +13,7 @@ BLOCKS = 8  # vectors of starts that a thread takes at a time
 
 @kernel
 def _match_lanes(D, first, l, pitch, k, edge, distances, lengths):
-    """Align the window with LANES starts from ``first``; its rows lie ``pitch`` apart in the flat D."""
+    """Align the window, rows ``pitch`` apart in the flat D, with LANES starts from ``first``."""
     open_edge(edge, k)
     one = splat(D.dtype.type(1))
     fours = l // 4 * 4

@@ -3,10 +3,11 @@
 """
 Vectors of LANES numbers as a type that numba compiles.
 
-Both recursions run over *lanes*: neighboring map images (or starts) side by side in one SIMD register.
-Left to the compiler, such loops are vectorized at some sizes and not at others, an order of magnitude
-apart; written with vectors they are what they say, on every processor. In a kernel ``+ * / <`` work on
-vectors as on numbers; ``<`` gives a mask for :func:`select`. IEEE arithmetic, nothing is reordered.
+Both recursions run over *lanes*: neighboring map images (or starts) side by side in one SIMD
+register. Left to the compiler, such loops are vectorized at some sizes and not at others, an order
+of magnitude apart; written with vectors they are what they say, on every processor. In a kernel
+``+ * / <`` work on vectors as on numbers; ``<`` gives a mask for :func:`select`. IEEE arithmetic,
+nothing is reordered.
 
 The functions here exist in compiled code only.
 """
@@ -71,7 +72,7 @@ def _pointer(context: Any, builder: Any, array_type: Any, array: Any, offset: An
 
 @intrinsic
 def load(typing: Any, array: Any, offset: Any) -> Any:
-    """LANES neighbors of a flat array, from ``offset``; they need not be aligned."""
+    """Read LANES neighbors of a flat array, from ``offset``, in any alignment."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = _pointer(context, builder, signature.args[0], *arguments)
@@ -94,7 +95,7 @@ def store(typing: Any, array: Any, offset: Any, vector: Any) -> Any:
 
 @intrinsic
 def splat(typing: Any, number: Any) -> Any:
-    """One number on all lanes."""
+    """Put one number on all lanes."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         empty = ir.Constant(ir.VectorType(arguments[0].type, LANES), ir.Undefined)
@@ -107,14 +108,14 @@ def splat(typing: Any, number: Any) -> Any:
 
 @intrinsic
 def select(typing: Any, mask: Any, yes: Any, no: Any) -> Any:
-    """The lanes of ``yes`` where the mask is true, of ``no`` elsewhere."""
+    """Take the lanes of ``yes`` where the mask is true, of ``no`` elsewhere."""
     return yes(mask, yes, no), lambda context, builder, signature, arguments: builder.select(
         *arguments
     )
 
 
 def _operation(name: str, whole: str = '') -> Any:
-    """An operator on two vectors as one instruction; ``whole`` names the one for whole numbers."""
+    """Make an operator on two vectors of one instruction, ``whole`` for whole numbers."""
 
     @intrinsic
     def operation(typing: Any, left: Any, right: Any) -> Any:

@@ -4,8 +4,8 @@
 The seam between the kernels and what runs them: a CUDA device, or numba's simulator.
 
 On a device the kernels work on torch's memory and torch's current stream, without copies. With
-``NUMBA_ENABLE_CUDASIM=1`` in the environment before numba is imported, numba runs them in Python on torch's
-CPU tensors: slow, and right. Nothing outside this module knows which of the two it is.
+``NUMBA_ENABLE_CUDASIM=1`` in the environment before numba is imported, numba runs them in Python
+on torch's CPU tensors: slow, and right. Nothing outside this module knows which of the two it is.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ import torch
 
 @functools.cache
 def simulated() -> bool:
-    """Tell whether numba.cuda is the simulator in this process."""
+    """Return whether numba.cuda is the simulator in this process."""
     from numba import cuda
 
     return bool(cuda.config.ENABLE_CUDASIM)
@@ -31,8 +31,8 @@ def kernel(function: Callable[..., None]) -> Any:
     """
     Make a kernel of a function: compiled at its first launch.
 
-    On a device without link-time optimization, so that the machine code is the one that the registers are
-    counted of (benchmarks/cuda_registers.py).
+    On a device without link-time optimization, so that the machine code is the one that the
+    registers are counted of (benchmarks/cuda_registers.py).
     """
     from numba import cuda
 
@@ -50,9 +50,9 @@ def multiply() -> Callable[..., Any]:
     """
     Return the product that is rounded before anything is added to it, as on the CPU.
 
-    The compiler contracts ``a * x + S`` to a fused multiply-add, which rounds once (numba has no option
-    against it, and ``fastmath=False`` is none). This product is never contracted: answers stay equal bit for
-    bit. Kernels bind it to a name and call that.
+    The compiler contracts ``a * x + S`` to a fused multiply-add, which rounds once (numba has no
+    option against it, and ``fastmath=False`` is none). This product is never contracted: answers
+    stay equal bit for bit. Kernels bind it to a name and call that.
     """
     if simulated():
         return operator.mul
@@ -66,8 +66,8 @@ def _resident_class() -> Any:
     """
     Make the class of arguments that lie on the device and stay there.
 
-    At every launch numba asks each array anew where it lies: 8 us an array, which for nine of them is
-    most of a launch's time. These remember the answer (1 us).
+    At every launch numba asks each array anew where it lies: 8 us an array, which for nine of them
+    is most of a launch's time. These remember the answer (1 us).
     """
     from numba import cuda
 
@@ -95,7 +95,7 @@ class Device:
         self._launches: dict[tuple[Any, ...], Any] = {}
 
     def array(self, tensor: torch.Tensor) -> Any:
-        """Return the tensor as kernels take it: the same memory. Making one takes longer than a launch."""
+        """Return the view of a tensor for kernels; it takes longer to make than a launch."""
         from numba import cuda
 
         return _resident_class()(cuda.as_cuda_array(tensor, sync=False))
@@ -132,7 +132,7 @@ class Device:
 
 
 class Simulator:
-    """Numba's simulator: kernels in Python over torch's CPU tensors; the same methods as a device."""
+    """Numba's simulator: kernels in Python over torch's CPU tensors, methods of a device."""
 
     torch_device = torch.device('cpu')
     half_products = False

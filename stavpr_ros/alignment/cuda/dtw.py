@@ -3,9 +3,10 @@
 """
 The distance of two images from the products of their strips, one thread for each pair (section 2).
 
-The strip distances d = 1 - product are made here, so that the products are read once and never rewritten.
-A thread goes through the W x W cells row by row with S and C of one row in registers: W and the band are
-constants of the compiled kernel, every loop is unrolled. Neighboring threads read neighboring places.
+The strip distances d = 1 - product are made here, so that the products are read once and never
+rewritten. A thread goes through the W x W cells row by row with S and C of one row in registers: W
+and the band are constants of the compiled kernel, every loop is unrolled. Neighboring threads read
+neighboring places.
 """
 
 import functools
@@ -28,11 +29,10 @@ def spatial_dtw(W: int, xi: int) -> Any:
 
     The kernel's grid is (blocks over the places, queries).
 
-    - ``products``: similarities, shape (queries W, W, places), float32, of any strides; [q W + i, j, y] is
-      strip i of query q against strip j of place y. Cells outside the band are not read.
-    - ``sigma``: float32, 0 for vanilla DTW.
-    - ``first_query``, ``first_place``: where these are in ``out``.
-    - ``out``: image distances, shape (all queries, all places), float32, written.
+    - ``products``: similarities, shape (queries W, W, places), float32, of any strides; [q W + i,
+    j, y] is strip i of query q against strip j of place y. Cells outside the band are not read. -
+    ``sigma``: float32, 0 for vanilla DTW. - ``first_query``, ``first_place``: where these are in
+    ``out``. - ``out``: image distances, shape (all queries, all places), float32, written.
 
     :param W: number of strips.
     :param xi: half width of the band, W for none.

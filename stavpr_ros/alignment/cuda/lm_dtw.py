@@ -3,15 +3,16 @@
 """
 LM-DTW with one thread for each start, and the choice of the best start, in one launch (section 4).
 
-A thread sweeps the k columns that its start sees, each from the window's first row to its last, with S and C
-of the column before in registers: l is a constant of the compiled kernel and the loop over the rows is
-unrolled. All starts of a block share the window's columns through shared memory, read once, and neighboring
-threads read neighboring words. A cell has the three sums of the CPU twin, compared in another order:
-first the diagonal against the horizontal one, neither of which waits for the cell above, then the better of
-them against the vertical one. Only one addition and one comparison are left on the way down a column.
+A thread sweeps the k columns that its start sees, each from the window's first row to its last,
+with S and C of the column before in registers: l is a constant of the compiled kernel and the loop
+over the rows is unrolled. All starts of a block share the window's columns through shared memory,
+read once, and neighboring threads read neighboring words. A cell has the three sums of the CPU
+twin, compared in another order: first the diagonal against the horizontal one, neither of which
+waits for the cell above, then the better of them against the vertical one. Only one addition and
+one comparison are left on the way down a column.
 
-Windows of more than ``REGISTER_ROWS`` rows do not fit into the registers: there S and C are arrays in local
-memory, and the window is read through the caches. The same kernel, slower.
+Windows of more than ``REGISTER_ROWS`` rows do not fit into the registers: there S and C are arrays
+in local memory, and the window is read through the caches. The same kernel, slower.
 """
 
 import functools
@@ -38,7 +39,7 @@ def row_pitch(n: int, k: int, block: int) -> int:
 
 @device_function
 def _smallest(distance, start, distances, starts):
-    """Leave the block's smallest distance, and its lowest start, in the first words of shared memory."""
+    """Reduce the block to its smallest distance and lowest start, first in shared memory."""
     t = cuda.threadIdx.x
     cuda.syncthreads()
     distances[t] = distance
@@ -72,8 +73,8 @@ def _runner_up(
     """
     Find the nearest start whose midpoint is more than ``apart`` places from ``middle``.
 
-    A midpoint lies in s .. s + k - 1. Blocks of which every start is far enough answer with their best one;
-    only in the others, a narrow range, each start is looked at.
+    A midpoint lies in s .. s + k - 1. Blocks of which every start is far enough answer with their
+    best one; only in the others, a narrow range, each start is looked at.
     """
     t, threads = cuda.threadIdx.x, cuda.blockDim.x
     n = length_of_start.shape[0]
@@ -94,10 +95,10 @@ def _runner_up(
 @device_function
 def _last_block(best, start, block_best, block_start, finished, distances, starts):
     """
-    Reduce the block and tell all its threads whether it is the last one to get here.
+    Reduce the block; return in all its threads whether it is the last one to arrive.
 
-    What the other blocks wrote is visible to the last one: their fences come before their tickets, and its
-    own comes after its ticket.
+    What the other blocks wrote is visible to the last one: their fences come before their tickets,
+    and its own comes after its ticket.
     """
     t = cuda.threadIdx.x
     _smallest(best, start, distances, starts)
@@ -163,7 +164,7 @@ def _select(l: int, k: int) -> Any:
 
 
 def _stage(l: int, block: int, pitch: int) -> Any:
-    """Compile the load of columns into shared memory, ``pitch`` at most, by all threads of a block."""
+    """Compile the load of ``pitch`` columns at most into shared memory, by a whole block."""
 
     def stage(rows, first, left, words, tile):
         cuda.syncthreads()
@@ -198,7 +199,7 @@ def _sweep(l: int) -> Any:
 
 
 def staged_columns(l: int, k: int, block: int) -> int:
-    """Columns that a block sweeps between two loads of shared memory; 0: the window is not staged."""
+    """Return the columns between two loads of shared memory; 0: the window is not staged."""
     return min(k, SHARED_BYTES // (4 * l) - block + 1) if l <= REGISTER_ROWS else 0
 
 
@@ -209,17 +210,16 @@ def lm_dtw(l: int, k: int, block: int, columns: int | None = None) -> Any:
 
     The grid is (blocks of starts, 1); every block has ``block`` threads. The kernel's arguments:
 
-    - ``rows``: image distances, shape (at least first + l, row_pitch(n, k, block)), float32, +inf from column
-      n on; the window is the l rows from ``first``, oldest first.
-    - ``apart``: the second best's midpoint is more than so many places from the nearest one's.
-    - ``best_of_start``, ``length_of_start``: q_m and m of each start, shape (n,), float32 and int32,
-      written; +inf and 0 where no path is finite.
-    - ``block_best``, ``block_start``: for the kernel's own use, shape (blocks,), float32 and int32.
-    - ``finished``: shape (1,), int32, 0 before the first launch; every launch leaves 0.
-    - ``places``: shape (4,), int32, written: the nearest start and its m, the second best's start and its m;
-      start -1 for none.
-    - ``answer``: shape (2 + l k,), float32, written: the distances of both (+inf for none), and the l x k
-      cells of the window that the nearest start sees.
+    - ``rows``: image distances, shape (at least first + l, row_pitch(n, k, block)), float32, +inf
+    from column n on; the window is the l rows from ``first``, oldest first. - ``apart``: the
+    second best's midpoint is more than so many places from the nearest one's. - ``best_of_start``,
+    ``length_of_start``: q_m and m of each start, shape (n,), float32 and int32, written; +inf and
+    0 where no path is finite. - ``block_best``, ``block_start``: for the kernel's own use, shape
+    (blocks,), float32 and int32. - ``finished``: shape (1,), int32, 0 before the first launch;
+    every launch leaves 0. - ``places``: shape (4,), int32, written: the nearest start and its m,
+    the second best's start and its m; start -1 for none. - ``answer``: shape (2 + l k,), float32,
+    written: the distances of both (+inf for none), and the l x k cells of the window that the
+    nearest start sees.
 
     :param l: rows of the window.
     :param k: columns that one start sees.
@@ -273,8 +273,8 @@ def lm_dtw(l: int, k: int, block: int, columns: int | None = None) -> Any:
             length_of_start[start] = length
         if _last_block(best, int32(start), block_best, block_start, finished, distances, starts):
             select(
-                rows, first, apart, best_of_start, length_of_start, block_best, block_start, places, answer,
-                distances, starts,
+                rows, first, apart, best_of_start, length_of_start, block_best, block_start,
+                places, answer, distances, starts,
             )  # fmt: skip
             if t == 0:
                 finished[0] = 0

@@ -19,9 +19,10 @@ class Selection:
 
     :param start, length: the nearest start s and its m; -1 and undefined where no path is finite.
     :param distance: its q_m.
-    :param second_best_start, second_best_length, second_best_distance: the same of the second best; -1 for none.
-    :param cells: what the nearest start sees of the window, shape (l, k), float32, +inf past the map's end;
-        valid until the next fetch.
+    :param second_best_start, second_best_length, second_best_distance: the same of the second
+        best; -1 for none.
+    :param cells: what the nearest start sees of the window, shape (l, k), float32, +inf past the
+        map's end; valid until the next fetch.
     """
 
     start: int

@@ -15,7 +15,7 @@ from stavpr_ros.evaluation.seqslam import seqslam, SeqSlamSettings
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.recognition import RecognizerSettings
-from stavpr_ros.recognition.robust.options import PAPER, ROBUST, RobustOptions
+from stavpr_ros.recognition.robust import PAPER, ROBUST, RobustOptions
 
 W = 7
 GRP, XI = 512, 3  # the paper's random projection and restricted alignment

@@ -1,0 +1,330 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Mode robust: options beyond the paper, each a switch against one failure mode.
+
+Everything is causal: only images that have arrived count. With hysteresis the score has memory,
+and successive scores are correlated.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+import math
+
+import numpy as np
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.features import LocalFeatures
+import torch
+
+MODES = ('paper', 'robust')
+THRESHOLD = 1.0  # of mode robust; smaller is stricter
+# For loop closure, where every image is a query and a false match bends a map.
+LOOP_THRESHOLD = 0.8
+PRIOR = 20  # images that the statistics of the map count for in those of the query
+PIECE = 8192  # images centered at a time
+MEMORY = 150  # rows after which old ones fade
+MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
+# The evidence that windows from unknown places show as well, in deviations: at most one in thirty
+# of them shows more on every pair of data sets that was tried.
+CHANCE = -2.2
+# The best of few sequences is far away: on a short map, or at the start of a route, every window
+# would have a large margin. The second best is then taken to be at least as near as the best of
+# many in windows from unknown places.
+FEW_SEQUENCES = 20
+USUAL_SECOND_BEST = -0.8
+FADING = 0.05  # deviations that evidence loses with each image
+BACK, AHEAD = 1, 3  # places that the matched place may move with each image of a track
+
+
+@dataclass(frozen=True)
+class RobustOptions:
+    """
+    Failure modes of the paper's method and their mitigations.
+
+    :param mean_centering: subtract the mean of the map's features from its features, and the
+        running mean of the query from the query's: the part shared by all images distinguishes no
+        places.
+    :param query_znorm: z-normalize the distances of an image to all places: some images are far
+        from all.
+    :param reference_znorm: z-normalize the distances of a place to the latest images, against
+        hubness: some places are near to all images.
+    :param velocity_search: match windows along lines of several velocities
+        (:mod:`stavpr_ros.alignment.velocity`) instead of by LM-DTW, where one place may absorb a
+        window.
+    :param second_best_margin: score the nearest sequence by its margin to the second best as well.
+    :param hysteresis: keep evidence for some images while the matched place moves on steadily;
+        needs ``second_best_margin``.
+    """
+
+    mean_centering: bool = True
+    query_znorm: bool = True
+    reference_znorm: bool = True
+    velocity_search: bool = True
+    second_best_margin: bool = True
+    hysteresis: bool = True
+
+    @property
+    def any(self) -> bool:
+        """At least one is on."""
+        return any(getattr(self, field.name) for field in fields(self))
+
+    def without(self, *names: str) -> 'RobustOptions':
+        """
+        Return these options with some switched off.
+
+        :raises SettingsError: no option of that name.
+        """
+        return self._with(names, False)
+
+    @staticmethod
+    def only(*names: str) -> 'RobustOptions':
+        """
+        Return some options alone.
+
+        :raises SettingsError: no option of that name.
+        """
+        return PAPER._with(names, True)
+
+    def _with(self, names: tuple[str, ...], on: bool) -> 'RobustOptions':
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        for name in names:
+            if name not in values:
+                raise SettingsError(f'option {name!r} is unknown: take one of {", ".join(values)}')
+            values[name] = on
+        return RobustOptions(**values)
+
+
+PAPER = RobustOptions(False, False, False, False, False, False)
+ROBUST = RobustOptions()
+
+
+def options_of(mode: str) -> RobustOptions:
+    """
+    Return the options of a mode.
+
+    :raises SettingsError: no such mode.
+    """
+    if mode not in MODES:
+        raise SettingsError(f'mode {mode!r} is unknown: take one of {", ".join(MODES)}')
+    return ROBUST if mode == 'robust' else PAPER
+
+
+class MeanCentering:
+    """
+    Subtracts the part of the features that all images of a traverse share.
+
+    Features have unit norm again afterwards; zero features stay zero.
+
+    :param features: those of the map, strips (W, n, d).
+    """
+
+    def __init__(self, features: LocalFeatures) -> None:
+        self._mean = features.strips.sum(dim=1) / max(len(features), 1)  # (W, d)
+        self.reset()
+
+    def reset(self) -> None:
+        """Drop the images of the query."""
+        # float64: in float32, the images of a long traverse would be rounded away
+        self._sum, self._count = self._mean.double() * PRIOR, PRIOR
+
+    def places(self, features: LocalFeatures) -> LocalFeatures:
+        """Return features of the map, or of single images, less the map's mean."""
+        return replace(features, strips=without_mean(features.strips, self._mean))
+
+    def next_query(self, strips: torch.Tensor) -> torch.Tensor:
+        """
+        Return the next image's features less the query's running mean, it included.
+
+        :param strips: shape (W, d); the same is returned.
+        """
+        strips = strips.to(self._mean.device)
+        self._sum = self._sum + strips
+        self._count += 1
+        return without_mean(strips[:, None], (self._sum / self._count).float())[:, 0]
+
+
+def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
+    """
+    Return unit-norm (W, n, d) less (W, d).
+
+    A piece of one strip after the other, for little memory.
+    """
+    out = torch.empty_like(strips, memory_format=torch.contiguous_format)
+    for j in range(len(strips)):
+        for whole, piece in zip(strips[j].split(PIECE), out[j].split(PIECE), strict=True):
+            torch.sub(whole, mean[j], out=piece)
+            piece.mul_(whole.any(dim=1, keepdim=True))
+            piece.div_(piece.norm(dim=1, keepdim=True).clamp_(min=1e-12))
+    return out
+
+
+class ZNormalization:
+    """
+    Z-normalization of image distances, over the map (query) and over time (reference).
+
+    Query z-normalization brings a row, the distances of one image to all places, to mean 0 and
+    standard deviation 1. Reference z-normalization does the same for each place over the latest
+    rows; its running mean and variance start from the distances of the map to itself.
+
+    :param places: number of places n.
+    :param query: normalize rows.
+    :param reference: normalize places.
+    """
+
+    def __init__(self, places: int, query: bool = True, reference: bool = True) -> None:
+        self.query, self.reference = query, reference
+        self._start = np.zeros(places, np.float32), np.ones(places, np.float32)
+        self.reset()
+
+    def start_from(self, rows: np.ndarray) -> None:
+        """
+        Start from the distances of the map to itself.
+
+        :param rows: distances of some places to all, shape (m, n), float32; NaN where they are
+            neighbors. Written over: copies of all of them would stay in the heap of the process.
+        """
+        n = len(self._mean)
+        count, total, squares = np.zeros(n, np.int64), np.zeros(n, np.float32), np.zeros(n)
+        for row in rows:
+            row[:] = self.normalized(row)
+            count += np.isfinite(row)
+            total += np.nan_to_num(row, posinf=0, neginf=0)
+        usable = count > 1
+        if not usable.any():
+            return
+        mean = total / np.maximum(count, 1)
+        if not usable.all():
+            known = rows[np.isfinite(rows)]
+            mean[~usable] = known.mean()
+        for row in rows:
+            squares += np.where(np.isfinite(row), (row - mean) ** 2, 0)
+        variance = squares / np.maximum(count, 1)
+        if not usable.all():
+            variance[~usable] = known.var()
+        variance[variance <= 0] = 1
+        self._start = mean.astype(np.float32), variance.astype(np.float32)
+        self.reset()
+
+    def reset(self) -> None:
+        """Drop the rows observed so far; the start stays."""
+        self._mean, self._variance = (values.copy() for values in self._start)
+        self._count = np.full(len(self._mean), PRIOR, np.float32)
+
+    def grow(self, places: int) -> None:
+        """Make room for more places, which start with mean 0 and deviation 1."""
+        more = places - len(self._mean)
+        self._change_each(
+            lambda values, start: np.append(values, np.full(more, start, np.float32))
+        )
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up, and new ones have room behind them."""
+        self._change_each(
+            lambda values, start: np.append(values[count:], np.full(count, start, np.float32))
+        )
+
+    def _change_each(self, change: Callable[[np.ndarray, float], np.ndarray]) -> None:
+        """Change every array of one value a place; ``start`` is the value of a new place."""
+        self._start = change(self._start[0], 0), change(self._start[1], 1)
+        self._mean, self._variance = change(self._mean, 0), change(self._variance, 1)
+        self._count = change(self._count, PRIOR)
+
+    def normalized(self, row: np.ndarray) -> np.ndarray:
+        """Return a row with mean 0 and deviation 1 of its finite entries, shape (n,), float32."""
+        known = row[np.isfinite(row)] if self.query else row[:0]
+        if not known.size:
+            return row
+        return (row - known.mean()) / np.float32(max(known.std(), MIN_DEVIATION))
+
+    def observe(self, row: np.ndarray) -> None:
+        """Add a row, normalized if rows are, to the statistics of the first m <= n places."""
+        if not self.reference:
+            return
+        n = len(row)
+        mean, variance, count = self._mean[:n], self._variance[:n], self._count[:n]
+        np.minimum(count + 1, MEMORY, out=count)
+        off = row - mean
+        mean += off / count
+        variance += (off * (row - mean) - variance) / count
+
+    def shift_and_scale(self, places: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return mean and reciprocal deviation of the first places.
+
+        :returns: shape (places,) each; the mean is a view.
+        """
+        if not self.reference:
+            return np.zeros(places, np.float32), np.ones(places, np.float32)
+        return self._mean[:places], 1 / np.sqrt(np.maximum(self._variance[:places], 1e-6))
+
+    def scaled(self, rows: np.ndarray) -> np.ndarray:
+        """
+        Return rows with reference z-normalization, if it is on.
+
+        :param rows: of the first m places, shape (..., m); the same is returned.
+        """
+        if not self.reference:
+            return rows
+        shift, scale = self.shift_and_scale(rows.shape[-1])
+        return (rows - shift) * scale
+
+
+def evidence(cost: float, other: float) -> float:
+    """
+    Return the cost of a sequence plus its margin to another one, in deviations; lower is better.
+
+    A sequence is scored by its mean z-normalized distance and its margin to the second best.
+
+    :param cost: mean z-normalized distance of the sequence.
+    :param other: that of the nearest sequence elsewhere; NaN if there is none.
+    """
+    return 2 * cost - (0.0 if math.isnan(other) else other)
+
+
+def expected_second_best(other: float, sequences: int) -> float:
+    """
+    Return the cost that a second best should be expected to have.
+
+    :param other: that of the nearest sequence elsewhere; NaN if there is none.
+    :param sequences: number of sequences elsewhere.
+    """
+    if sequences >= FEW_SEQUENCES:
+        return other
+    return USUAL_SECOND_BEST if math.isnan(other) else min(other, USUAL_SECOND_BEST)
+
+
+def score(value: float) -> float:
+    """
+    Map evidence to 0 (certain) .. 1 (chance level), the same scale on every route.
+
+    1 is as near as windows from unknown places come; beyond it nothing is distinguished.
+    """
+    return min(1.0, math.exp(min(value - CHANCE, 0) / 2))
+
+
+class Hysteresis:
+    """
+    Evidence with memory.
+
+    Strong evidence of earlier windows lasts, fading, while the matched place moves on steadily.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Drop the track."""
+        self._middle: int | None = None
+        self._evidence = math.inf
+
+    def follow(self, middle: int, value: float) -> float:
+        """
+        Return the evidence for the place of the newest window, that of its track included.
+
+        :param middle: the place.
+        :param value: the evidence of this window alone.
+        """
+        if self._middle is not None and -BACK <= middle - self._middle <= AHEAD:
+            value = min(value, self._evidence + FADING)
+        self._middle, self._evidence = middle, value
+        return value

@@ -1,3 +1,0 @@
-# Copyright 2026 The stavpr_ros authors
-# SPDX-License-Identifier: Apache-2.0
-"""Mode robust: options, centering, z-normalization, hysteresis."""
