@@ -49,6 +49,7 @@ class Pipeline:
         self._extractor: FeatureExtractor | None = None
         self._operation: Operation | None = None
         self._name = operation
+        self._threshold = settings.applied_threshold(operation)
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
         self._last: Match | None = None
@@ -71,7 +72,7 @@ class Pipeline:
     @property
     def threshold(self) -> float | None:
         """The threshold in force, None = not set."""
-        return self._settings.applied_threshold(self._name)
+        return self._threshold
 
     @property
     def places(self) -> PlaceMap | GrowingMap | None:
@@ -137,7 +138,7 @@ class Pipeline:
         """
         settings, name = settings or self._settings, operation or self._name
         settings.require_operation(name)
-        threshold, before = settings.applied_threshold(name), self.threshold
+        threshold, before = settings.applied_threshold(name), self._threshold
         if loaded is not None or name != self._name:
             self._require_no_loss(name, loaded)
             self._start(name, settings, loaded)
@@ -145,7 +146,7 @@ class Pipeline:
             if before is None:
                 self.reset()  # images since then are not in the window
             self._operation.recognizer.set_threshold(threshold)
-        self._settings = settings
+        self._settings, self._threshold = settings, threshold
         self._keyframes.settings = settings.keyframes
         self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
 

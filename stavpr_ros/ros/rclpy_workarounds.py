@@ -143,6 +143,16 @@ class ManagedNode(LifecycleNodeMixin, Node):
         """Label of the life-cycle state."""
         return str(self._state_machine.current_state[1])
 
+    @property
+    def parameter_overrides(self) -> list[str]:
+        """
+        Names of the parameters that were given, declared or not.
+
+        No upstream issue was found: rclpy ignores those that no one declares, and has no public
+        way to list them.
+        """
+        return list(self._parameter_overrides)
+
     def advance(self, trigger: Callable[[], TransitionCallbackReturn]) -> bool:
         """
         Make a transition, such as ``trigger_configure``; return whether it succeeded.
