@@ -52,8 +52,7 @@ class PlaceRecognitionNode(ManagedNode):
     THREADS = 4
 
     def __init__(self, **options: Any) -> None:
-        # one change at a time: transitions, parameters, map, operation
-        self._lock = threading.RLock()
+        self._lock = threading.RLock()  # one change of state, parameters or map at a time
         super().__init__('stavpr', **options)
         for warning in unknown_parameters(self.parameter_overrides):
             self.get_logger().warning(warning)
@@ -64,7 +63,7 @@ class PlaceRecognitionNode(ManagedNode):
         self.statistics = Statistics()
         self.problem = ''  # why the last transition failed
         self._map_info = MapInfoPublisher(self)
-        self._services = Services(self, lambda: self.runtime, self.load_map, self.set_operation)
+        self._served = Services(self, lambda: self.runtime, self.load_map, self.set_operation)
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         backwards = JumpThreshold(
@@ -99,12 +98,8 @@ class PlaceRecognitionNode(ManagedNode):
         """
         if self._runtime is None:
             because = f' ({self.problem})' if self.problem else ''
-            ended = self.state == 'finalized'
-            remedy = (
-                'start it anew'
-                if ended
-                else 'configure it first, `ros2 lifecycle set NODE configure`'
-            )
+            configure = 'configure it first, `ros2 lifecycle set NODE configure`'
+            remedy = 'start it anew' if self.state == 'finalized' else configure
             raise StavprError(f'the node is {self.state}{because}: {remedy}')
         return self._runtime
 
@@ -178,13 +173,10 @@ class PlaceRecognitionNode(ManagedNode):
     def _configure(self) -> None:
         # a service may have changed the operation
         self._settings = settings = self._settings_with({})
-        self._log_backend()
+        self.get_logger().info(settings.pipeline.backend_summary(settings.operation))
         require_writable(settings.save_path)
         if settings.map_path:
-            loading = MapInfo(
-                operation=settings.operation, state='loading', path=settings.map_path
-            )
-            self._map_info.publish(lambda: loading)
+            self._publish_map_info('loading', settings.map_path)
         self._runtime = Runtime(self, settings, self.statistics, self._publish_map_info)
         if missing := self._runtime.pipeline.missing:
             self.get_logger().warning(f'waiting, no image can be matched: {missing}')
@@ -209,18 +201,13 @@ class PlaceRecognitionNode(ManagedNode):
                 runtime.close()
                 del runtime
             if self._map_info.last is not None:
-                none = MapInfo(operation=self._settings.operation, state='none')
-                self._map_info.publish(lambda: none)
+                self._publish_map_info('none')
         gc.unfreeze()
         # runtime and worker refer to each other: without it, the map would stay in memory
         gc.collect()
         import torch
 
         torch.cuda.empty_cache()
-
-    def _log_backend(self) -> None:
-        settings = self._settings
-        self.get_logger().info(settings.pipeline.backend_summary(settings.operation))
 
     # parameters, map and operation
 
@@ -254,7 +241,7 @@ class PlaceRecognitionNode(ManagedNode):
             runtime, settings = self.runtime, self._settings_with({'operation': operation})
             runtime.change(settings)
             self._settings = settings
-            self._log_backend()
+            self.get_logger().info(settings.pipeline.backend_summary(operation))
             self._publish_map_info()
 
     def _settings_with(self, changes: Mapping[str, Any]) -> NodeSettings:
@@ -266,11 +253,7 @@ class PlaceRecognitionNode(ManagedNode):
 
     def _validate_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Check all parameters together; change nothing."""
-        changes = {
-            parameter.name: parameter.value
-            for parameter in parameters
-            if parameter.name in BY_NAME
-        }
+        changes = {row.name: row.value for row in parameters if row.name in BY_NAME}
         try:
             if changes:
                 with self._lock:
@@ -280,12 +263,9 @@ class PlaceRecognitionNode(ManagedNode):
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _require_valid(self, changes: dict[str, Any]) -> None:
-        changes = {
-            name: value
-            for name, value in changes.items()
-            if value != self.get_parameter(name).value
-        }
+    def _require_valid(self, values: dict[str, Any]) -> None:
+        current = {name: self.get_parameter(name).value for name in values}
+        changes = {name: value for name, value in values.items() if value != current[name]}
         if self._runtime is not None:
             require_changeable(changes, self.state)
         settings = self._settings_with(changes)
@@ -311,12 +291,8 @@ class PlaceRecognitionNode(ManagedNode):
     def _apply_verbosity(self, verbosity: str) -> None:
         """Set the log level; that of --log-level stays until the parameter is changed."""
         if verbosity != self._verbosity:
-            level = (
-                LoggingSeverity.UNSET
-                if verbosity == 'default'
-                else LoggingSeverity[verbosity.upper()]
-            )
-            self.get_logger().set_level(level)
+            name = 'UNSET' if verbosity == 'default' else verbosity.upper()
+            self.get_logger().set_level(LoggingSeverity[name])
         self._verbosity = verbosity
 
     def _on_clock_jump(self, jump: Any) -> None:
@@ -336,9 +312,13 @@ class PlaceRecognitionNode(ManagedNode):
         runtime = self._runtime
         return health if runtime is None else runtime.add_to(health)
 
-    def _publish_map_info(self) -> None:
+    def _publish_map_info(self, state: str = '', path: str = '') -> None:
+        """Publish the state of a node that is not configured, or '' = the map in use, if any."""
+
         def describe() -> MapInfo | None:
             runtime = self._runtime
+            if state:
+                return MapInfo(operation=self._settings.operation, state=state, path=path)
             return None if runtime is None else runtime.map_info()
 
         self._map_info.publish(describe)
@@ -348,8 +328,7 @@ class PlaceRecognitionNode(ManagedNode):
         self._diagnostics.stop()
         timeout = 0.2 if self.ending.is_set() else STOP_TIMEOUT + 1  # spin_until has waited before
         self.ending.set()
-        # the lock may be held by a thread that loads a large map or compiles: the end does not
-        # wait for it
+        # a thread that loads a large map or compiles may hold the lock: the end does not wait
         if self._lock.acquire(timeout=timeout):
             try:
                 self._free()
