@@ -43,9 +43,8 @@ class Pipeline:
 
     def __init__(self, settings: PipelineSettings, operation: str = 'localization') -> None:
         self._settings = settings
-        self._map: PlaceMap | None = (
-            None  # of localization, or of loop closure for its kind of features
-        )
+        # of localization, or of loop closure for its kind of features
+        self._map: PlaceMap | None = None
         self._extractor: FeatureExtractor | None = None
         self._operation: Operation | None = None
         self._name = operation
@@ -201,7 +200,7 @@ class Pipeline:
         :param pose: of the camera, from odometry, shape (7,), or None.
         :raises InputError: an invalid pose; nothing is changed then.
         """
-        threshold = math.nan if self.threshold is None else self.threshold
+        threshold = math.nan if self._threshold is None else self._threshold
         pose = None if pose is None else checked_pose(pose)
         if self._operation is None or self.missing:
             return Match(Status.NOT_READY, self.missing, threshold, cause='not ready')
@@ -213,10 +212,8 @@ class Pipeline:
         try:
             match = self._process(self._operation, stages, message, stamp, pose)
         except StavprError as error:
-            cause = (
-                f'invalid: {error.kind if isinstance(error, ImageError) else type(error).__name__}'
-            )
-            match = Match(Status.INVALID_IMAGE, str(error), cause=cause)
+            kind = error.kind if isinstance(error, ImageError) else type(error).__name__
+            match = Match(Status.INVALID_IMAGE, str(error), cause=f'invalid: {kind}')
         return replace(match, threshold=threshold, stages=stages)
 
     def _process(
@@ -244,14 +241,10 @@ class Pipeline:
             return replace(match, image=image)
         with _timed(stages, 'verification'):
             match = self._verified(match, image, operation.places)
-        listed = self.list_candidates and match.sequence is not None
-        self._last = replace(
-            match,
-            image=image,
-            candidates=tuple(operation.recognizer.ranked(self._settings.candidates))
-            if listed
-            else (),
-        )
+        if self.list_candidates and match.sequence is not None:
+            candidates = tuple(operation.recognizer.ranked(self._settings.candidates))
+            match = replace(match, candidates=candidates)
+        self._last = replace(match, image=image)
         return self._last
 
     def _verified(self, match: Match, image: np.ndarray, places: PlaceMap | GrowingMap) -> Match:
@@ -262,10 +255,8 @@ class Pipeline:
         if thumbnail is None:
             reason = 'geometric check: the map has no thumbnails; build it with thumbnails'
             return replace(match, status=Status.NO_MATCH, reason=reason)
-        inliers, least = (
-            self._verifier.inliers(image, thumbnail),
-            self._verifier.settings.min_inliers,
-        )
+        inliers = self._verifier.inliers(image, thumbnail)
+        least = self._verifier.settings.min_inliers
         if inliers >= least:
             return replace(match, inliers=inliers)
         reason = (
@@ -278,11 +269,8 @@ class Pipeline:
         place_map, extractor = self._places_as_map(), self.extractor
         save_state = self._map_save_state if place_map is self._map else self.save_state
         if loaded is not None:
-            place_map, extractor, save_state = (
-                loaded.places,
-                loaded.extractor,
-                SaveState(loaded.path),
-            )
+            place_map, extractor = loaded.places, loaded.extractor
+            save_state = SaveState(loaded.path)
         operation = start_operation(name, settings, place_map, extractor)
         # in mapping, the growing map holds it
         self._map = None if name == 'mapping' else place_map

@@ -139,9 +139,8 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
         if hasattr(node, 'ending'):
             node.ending.set()
         if isinstance(executor, PromptExecutor):
-            executor.finish(
-                END_SECONDS
-            )  # shutdown takes the entities from under running callbacks
+            # shutdown takes the entities from under running callbacks
+            executor.finish(END_SECONDS)
         executor.shutdown()
 
 

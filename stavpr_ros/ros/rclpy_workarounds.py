@@ -26,9 +26,8 @@ from rclpy.service import Service
 START_POLL = 0.0005  # seconds between two checks whether a thread has begun a callback
 RESPONSE_LOST = 'failed to send response'  # part of rclpy's warning
 RESPONSE_TIMEOUT = 3.5  # seconds of attempts; callbacks have a little more when the process ends
-RESPONSE_PAUSE = (
-    0.05  # seconds between attempts; an attempt takes 0.1 s and blocks all other threads
-)
+# seconds between attempts; an attempt takes 0.1 s and blocks all other threads
+RESPONSE_PAUSE = 0.05
 
 _warning_filters = threading.Lock()  # they belong to the process
 
@@ -101,10 +100,8 @@ def repeat_responses(service: Service) -> None:
                 warnings.filterwarnings('error', RESPONSE_LOST, RuntimeWarning)
                 try:
                     return send(response, header)
-                except (
-                    RuntimeWarning,
-                    SystemError,
-                ) as error:  # the latter from C++, caused by the former
+                # the latter from C++, caused by the former
+                except (RuntimeWarning, SystemError) as error:
                     if RESPONSE_LOST not in str(error.__cause__ or error):
                         raise
             time.sleep(RESPONSE_PAUSE)

@@ -155,10 +155,8 @@ class Runtime:
         self.worker.run(lambda: self.pipeline.change(settings.pipeline, settings.operation))
         self.settings = settings
         if self.images is not None:
-            self.images.max_rate, self.images.stamps.gap = (
-                settings.max_rate,
-                settings.max_stamp_gap,
-            )
+            self.images.max_rate = settings.max_rate
+            self.images.stamps.gap = settings.max_stamp_gap
             try:
                 self._update_odometry()
             except SettingsError as error:
