@@ -42,13 +42,13 @@ class NodeParameter:
 
     @property
     def constraints(self) -> str:
-        """Choices, and when the parameter can be set."""
+        """Return the choices, and when the parameter can be set."""
         allowed = ['one of: ' + ', '.join(self.choices)] if self.choices else []
         return '; '.join([*allowed, f'can be set {WHEN[self.when]}'])
 
     @property
     def range(self) -> str:
-        """The bounds, '' = none."""
+        """Return the bounds, empty = none."""
         return f'{self.bounds[0]:g} ... {self.bounds[1]:g}' if self.bounds else ''
 
 

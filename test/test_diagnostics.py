@@ -126,8 +126,8 @@ MISSING_PUBLISHER = (
 SILENT = 'there, but silent; check for a paused bag or a camera that is off'
 INFO = "compare 'ros2 topic info --verbose /camera/image'"
 LOST = (
-    '1 image lost in transport in the last 10 s: give the publisher a bigger shared-memory '
-    "segment (README, 'If images are lost')"
+    '1 image lost in transport in the last 10 s: give the publisher more shared memory '
+    '(docs/troubleshooting.md, images are lost)'
 )
 ODOMETRY = 'start it, compare its topic and its stamps'
 REFUSED = {'incompatible': 1, 'remedy': 'set reliability'}

@@ -60,57 +60,57 @@ class Pipeline:
 
     @property
     def settings(self) -> PipelineSettings:
-        """The settings in force."""
+        """Return the settings in force."""
         return self._settings
 
     @property
     def operation(self) -> str:
-        """The name of the operation."""
+        """Return the name of the operation."""
         return self._name
 
     @property
     def threshold(self) -> float | None:
-        """The threshold in force, None = not set."""
+        """Return the threshold in force, None = not set."""
         return self._threshold
 
     @property
     def places(self) -> PlaceMap | GrowingMap | None:
-        """The map, or the recorded route."""
+        """Return the map, or the recorded route."""
         operation = self._operation  # once: other threads read this while the worker changes it
         return operation.places if operation else self._map
 
     @property
     def path(self) -> str:
-        """File that the places in use were loaded from or last saved to, '' = none."""
+        """Return the file that the places in use were loaded from or last saved to, '' = none."""
         return self.save_state.path
 
     @property
     def unsaved(self) -> int:
-        """Places in use that are in no file."""
+        """Return the number of places in use that are in no file."""
         return min(self.save_state.unsaved, len(self.places or ()))
 
     @property
     def extractor(self) -> FeatureExtractor | None:
-        """The feature extractor."""
+        """Return the feature extractor."""
         operation = self._operation
         return operation.extractor if operation else self._extractor
 
     @property
     def map_state(self) -> str:
-        """``none``, ``loaded``, ``growing`` or ``full``."""
+        """Return one of ``none``, ``loaded``, ``growing`` or ``full``."""
         if self._name == 'localization':
             return 'loaded' if self._map is not None else 'none'
         return 'full' if self._is_full(self._operation) else 'growing'
 
     @property
     def window_fill(self) -> int:
-        """Images in the window of the recognizer."""
+        """Return the number of images in the window of the recognizer."""
         operation = self._operation
         return operation.recognizer.window_fill if operation and operation.recognizer else 0
 
     @property
     def missing(self) -> str:
-        """Why no match is possible yet; empty when nothing is missing."""
+        """Return why no match is possible yet; empty when nothing is missing."""
         if self._name == 'localization' and self._map is None:
             return NO_MAP
         if self._name != 'mapping' and self.threshold is None:

@@ -57,12 +57,12 @@ class Health:
 
     @property
     def map_path(self) -> str:
-        """File of the map that is loaded or in use; empty = none."""
+        """Return the file of the map that is loaded or in use; empty = none."""
         return self.loading or self.map_info.path
 
     @property
     def backend(self) -> str:
-        """Backend of the image distances."""
+        """Return the backend of the image distances."""
         return self.settings.pipeline.matching_backend(self.settings.operation)
 
 
@@ -87,7 +87,7 @@ def input_findings(health: Health) -> list[Finding]:
         findings.append((WARN, f'{refused}, while images of others arrive: {_qos_remedy(health)}'))
     findings += _invalid(counts)
     if lost := counts.recent_drops.get('lost in transport', 0):
-        remedy = "give the publisher a bigger shared-memory segment (README, 'If images are lost')"
+        remedy = 'give the publisher more shared memory (docs/troubleshooting.md, images are lost)'
         findings.append((WARN, f'{_of(lost, "image")} lost in transport {recent}: {remedy}'))
     if health.odometry in ('stale', 'never'):
         state = 'was never received' if health.odometry == 'never' else 'has stopped'

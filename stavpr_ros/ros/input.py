@@ -188,7 +188,7 @@ class Worker:
 
     @property
     def waiting(self) -> int:
-        """Number of waiting items."""
+        """Return the number of waiting items."""
         return len(self._items)
 
     def put(self, item: Any) -> Any | None:

@@ -86,13 +86,13 @@ class PlaceRecognitionNode(ManagedNode):
 
     @property
     def settings(self) -> NodeSettings:
-        """The settings in force."""
+        """Return the settings in force."""
         return self._settings
 
     @property
     def runtime(self) -> Runtime:
         """
-        The runtime.
+        Return the runtime.
 
         :raises StavprError: the node is not configured.
         """

@@ -137,13 +137,13 @@ class ManagedNode(LifecycleNodeMixin, Node):
 
     @property
     def state(self) -> str:
-        """Label of the life-cycle state."""
+        """Return the label of the life-cycle state."""
         return str(self._state_machine.current_state[1])
 
     @property
     def parameter_overrides(self) -> list[str]:
         """
-        Names of the parameters that were given, declared or not.
+        Return the names of the parameters that were given, declared or not.
 
         No upstream issue was found: rclpy ignores those that no one declares, and has no public
         way to list them.

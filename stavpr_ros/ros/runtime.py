@@ -81,7 +81,7 @@ class Runtime:
 
     @property
     def pipeline(self) -> Pipeline:
-        """The pipeline; only the worker may change it."""
+        """Return the pipeline; only the worker may change it."""
         assert self._pipeline is not None
         return self._pipeline
 
