@@ -100,8 +100,7 @@ def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
     from rclpy.qos import qos_profile_sensor_data, QoSProfile
     from sensor_msgs.msg import Image
     from stavpr_msgs.msg import PlaceMatch
-    from stavpr_ros.ros.discovery import Discovery
-    from stavpr_ros.ros.process import ros_node, spin_until
+    from stavpr_ros.ros.process import Discovery, ros_node, spin_until
 
     matches = Latencies()
     messages = image_messages(arguments.height, arguments.width)
@@ -158,7 +157,7 @@ def main() -> None:
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
     from stavpr_ros.ros.live import executable, private_domain
-    from stavpr_ros.ros.transport import prepare_transport
+    from stavpr_ros.ros.process import prepare_transport
 
     environment = private_domain()
     os.environ.update(environment)

@@ -9,14 +9,18 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
-from stavpr_ros.pipeline.statistics import Counts, StageTime
+from stavpr_msgs.msg import MapInfo
+from stavpr_ros.parameters import PARAMETERS
+from stavpr_ros.pipeline import node_settings
+from stavpr_ros.pipeline.statistics import ImageCounts, StageTime
 from stavpr_ros.ros.diagnostics import diagnostic_array
 from stavpr_ros.ros.health import Health
+from stavpr_ros.ros.input import InputStatus
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 PARTS = ('input', 'map', 'recognition', 'processing')
 
-COUNTS = Counts(
+COUNTS = ImageCounts(
     uptime=100.0,
     received=3000,
     answered=2990,
@@ -33,39 +37,42 @@ COUNTS = Counts(
     total=StageTime(12.5, 24.0),
     work=StageTime(11.5, 22.25),
 )
+SETTINGS = {row.name: row.default for row in PARAMETERS} | {'backend': 'cpu', 'threshold': 1.0}
 HEALTH = Health(
-    counts=COUNTS,
     state='active',
-    topic='/camera/image',
-    transport='raw',
-    publishers=1,
-    queue=0,
-    queue_size=4,
+    settings=node_settings(SETTINGS),
+    counts=COUNTS,
+    map_info=MapInfo(path='route.map', state='loaded', places=1000, features='gradient'),
+    input=InputStatus(topic='/camera/image', publishers=1),
     window=20,
-    length=20,
-    operation='localization',
-    mode='robust',
-    map_path='route.map',
-    map_state='loaded',
-    places=1000,
-    max_places=20000,
-    features='gradient',
-    backend='cpu',
-    device='2 cores',
-    precision='float32',
-    threshold=1.0,
 )
 
 
+def changed(health, changes):
+    """Return the health with changes of its fields, or of its counts, map, input or settings."""
+    parts = {
+        'counts': replace(health.counts, **chosen(changes, ImageCounts.__dataclass_fields__)),
+        'input': replace(health.input, **chosen(changes, InputStatus.__dataclass_fields__)),
+        'map_info': MapInfo(
+            path=changes.get('map_path', health.map_info.path),
+            state=changes.get('map_state', health.map_info.state),
+            places=changes.get('places', health.map_info.places),
+            features=health.map_info.features,
+        ),
+        'settings': node_settings(SETTINGS | chosen(changes, SETTINGS)),
+    }
+    return replace(health, **parts, **chosen(changes, Health.__dataclass_fields__))
+
+
+def chosen(changes, names):
+    return {name: value for name, value in changes.items() if name in names}
+
+
 def status(part, health=HEALTH, **changes):
-    """Return one status, and the levels of the others; changes are of the counts or the health."""
-    fields = Counts.__dataclass_fields__
-    counts = replace(health.counts, **{k: v for k, v in changes.items() if k in fields})
-    changes = {k: v for k, v in changes.items() if k not in fields}
-    health = replace(health, counts=counts, **changes)
-    statuses = diagnostic_array(health, '/robot/stavpr', Time(sec=7, nanosec=8)).status
-    levels = {s.name.split(': ')[1]: s.level for s in statuses}
-    found = next(s for s in statuses if s.name == f'robot/stavpr: {part}')
+    """Return one status, and the levels of the others, after changes of the health."""
+    statuses = diagnostic_array(changed(health, changes), '/robot/stavpr', Time(sec=7, nanosec=8))
+    levels = {s.name.split(': ')[1]: s.level for s in statuses.status}
+    found = next(s for s in statuses.status if s.name == f'robot/stavpr: {part}')
     others = {name: level for name, level in levels.items() if name != part}
     return found, others
 
@@ -85,7 +92,7 @@ def test_array_of_a_node_is_stamped_named_and_serializable():
     array = diagnostic_array(HEALTH, '/robot/stavpr', Time(sec=7, nanosec=8))
     assert (array.header.stamp.sec, array.header.stamp.nanosec) == (7, 8)
     assert [s.name for s in array.status] == [f'robot/stavpr: {part}' for part in PARTS]
-    assert {s.hardware_id for s in array.status} == {'2 cores'}
+    assert {s.hardware_id for s in array.status} == {'CPU'}
     assert deserialize_message(serialize_message(array), DiagnosticArray) == array
 
 
@@ -119,8 +126,8 @@ MISSING_PUBLISHER = (
 SILENT = 'there, but silent; check for a paused bag or a camera that is off'
 INFO = "compare 'ros2 topic info --verbose /camera/image'"
 LOST = (
-    '1 image lost in transport in the last 10 s: give the publisher a bigger shared-memory '
-    "segment (README, 'If images are lost')"
+    '1 image lost in transport in the last 10 s: give the publisher more shared memory '
+    '(docs/troubleshooting.md, images are lost)'
 )
 ODOMETRY = 'start it, compare its topic and its stamps'
 REFUSED = {'incompatible': 1, 'remedy': 'set reliability'}
@@ -399,7 +406,9 @@ def test_values_of_recognition_are_complete():
         'statuses_no_match': '971',
         'statuses_match': '2000',
     }
-    nothing = values('recognition', place=-1, distance=math.nan, threshold=None, status='')
+    nothing = values(
+        'recognition', mode='paper', threshold=-1.0, place=-1, distance=math.nan, status=''
+    )
     assert {
         nothing[key] for key in ('last_place', 'last_distance', 'threshold', 'last_status')
     } == {'none'}
@@ -417,7 +426,7 @@ def test_values_of_processing_are_complete():
         'queue': '0',
         'queue_size': '4',
         'backend': 'cpu',
-        'device': '2 cores',
+        'device': 'CPU',
         'precision': 'float32',
         'dropped_queue_full': '6',
         'dropped_queue_full_10s': '2',

@@ -18,9 +18,10 @@ from stavpr_msgs.msg import LoopClosure, PlaceMatch
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap
+from stavpr_ros.pipeline import overlay
 from stavpr_ros.recognition import Candidate, Match, Status
 from stavpr_ros.ros import output
-from stavpr_ros.ros.messages import (
+from stavpr_ros.ros.output import (
     candidates_message,
     image_message,
     loop_closure_message,
@@ -28,10 +29,10 @@ from stavpr_ros.ros.messages import (
     match_message,
     matched_pose_message,
     nanoseconds,
-    odometry_pose,
     pose_message,
     time_message,
 )
+from stavpr_ros.ros.subscriptions import odometry_pose
 from std_msgs.msg import Header
 
 SECOND = 10**9
@@ -333,10 +334,10 @@ def test_match_image_shows_status_place_and_distance(monkeypatch, extractor, fea
         texts.append((thumbnail is not None, text, is_match))
         assert shown is query
 
-    monkeypatch.setattr(output, 'match_image', draw)
-    output.draw_match(accepted(image=query, inliers=20), route)
-    output.draw_match(rejected(image=query), route)
-    output.draw_match(Match(Status.SKIPPED, 'because', image=query), None)
+    monkeypatch.setattr(overlay, 'match_image', draw)
+    overlay.draw_match(accepted(image=query, inliers=20), route)
+    overlay.draw_match(rejected(image=query), route)
+    overlay.draw_match(Match(Status.SKIPPED, 'because', image=query), None)
     assert texts == [
         (False, 'match: place 35, distance 0.250 (threshold 0.300), 20 inliers', True),
         (True, 'no match: place 32, distance 0.250 (threshold 0.300)', False),

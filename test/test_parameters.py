@@ -7,19 +7,13 @@ from pathlib import Path
 import subprocess
 import sys
 
+from parameter_files import configuration_yaml, documentation_markdown
 import pytest
 from stavpr_ros.alignment.settings import STRATEGIES
 from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features.registry import KINDS
-from stavpr_ros.parameters import (
-    BASIC,
-    BY_NAME,
-    configuration_yaml,
-    documentation_markdown,
-    GROUPS,
-    PARAMETERS,
-)
+from stavpr_ros.parameters import BASIC, BY_NAME, GROUPS, PARAMETERS
 from stavpr_ros.pipeline import node_settings, NodeSettings, OPERATIONS, PipelineSettings
 from stavpr_ros.recognition.matcher import PRECISIONS
 from stavpr_ros.recognition.robust import MODES
@@ -27,7 +21,7 @@ from stavpr_ros.recognition.verification import METHODS
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
-REMEDY = 'generate it: python3 -m stavpr_ros.parameters'
+REMEDY = 'generate it: python3 tools/parameter_files.py'
 DEFAULTS = {row.name: row.default for row in PARAMETERS}
 
 
@@ -126,7 +120,7 @@ def test_a_value_reaches_its_setting(name, value, attribute, expected):
     ],
 )
 def test_invalid_values_are_rejected_by_name(values, words, monkeypatch):
-    monkeypatch.setattr('stavpr_ros.pipeline.settings.choose_backend', lambda wish: wish)
+    monkeypatch.setattr('stavpr_ros.pipeline.settings.choose_backend', lambda requested: requested)
     with pytest.raises(SettingsError, match=words):
         node_settings(DEFAULTS | values)
 
@@ -146,7 +140,8 @@ def test_backend_summary_names_the_device_of_each_stage(
 ):
     module = 'stavpr_ros.pipeline.settings'
     monkeypatch.setattr(
-        f'{module}.choose_backend', lambda wish: available if wish == 'auto' else wish
+        f'{module}.choose_backend',
+        lambda requested: available if requested == 'auto' else requested,
     )
     monkeypatch.setattr(
         f'{module}.why_no_cuda', lambda: '' if available == 'cuda' else 'no device'

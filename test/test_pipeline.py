@@ -29,6 +29,7 @@ from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import load_map, place_at, place_thumbnail, save_map
 from stavpr_ros.pipeline import OPERATIONS, Pipeline, read_map
+from stavpr_ros.pipeline.start import start_operation
 from stavpr_ros.recognition import PlaceRecognizer, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 import torch
@@ -294,6 +295,15 @@ def test_a_failed_change_of_operation_changes_nothing(map_file, route):
 def test_loop_closure_rejects_cuda_and_float16(changes, words):
     with pytest.raises(SettingsError, match=words):
         Pipeline(settings_of(**changes), 'loop_closure')
+
+
+def test_loop_closure_with_backend_auto_starts_where_cuda_is_available(monkeypatch):
+    for module in ('settings', 'start'):
+        name = f'stavpr_ros.pipeline.{module}.choose_backend'
+        monkeypatch.setattr(name, lambda requested: 'cuda' if requested == 'auto' else requested)
+    settings = settings_of(backend='auto')
+    operation = start_operation('loop_closure', settings, None, FeatureExtractor())
+    assert operation.name == 'loop_closure'
 
 
 @pytest.mark.parametrize('operation', OPERATIONS)

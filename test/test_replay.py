@@ -20,7 +20,7 @@ messages = pytest.importorskip('stavpr_msgs.msg')
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from sensor_msgs.msg import Image  # noqa: E402
-from stavpr_ros.ros import transport  # noqa: E402
+from stavpr_ros.ros import process  # noqa: E402
 
 DOMAIN = 1 + os.getpid() % 100
 COMMAND = [sys.executable, '-m', 'stavpr_ros.commands.replay']
@@ -268,11 +268,11 @@ def test_replay_of_real_bags_publishes_their_encodings(data_folder, subscribe):
 
 
 def test_transport_profile_of_the_user_is_kept(monkeypatch):
-    monkeypatch.delenv(transport.PROFILES_VARIABLE, raising=False)
-    transport.prepare_transport()
-    profile = ElementTree.parse(os.environ[transport.PROFILES_VARIABLE])
+    monkeypatch.delenv(process.PROFILES_VARIABLE, raising=False)
+    process.prepare_transport()
+    profile = ElementTree.parse(os.environ[process.PROFILES_VARIABLE])
     assert int(profile.find('.//{*}segment_size').text) == 32 * 2**20
     assert {kind.text for kind in profile.iterfind('.//{*}type')} == {'SHM', 'UDPv4'}
-    monkeypatch.setenv(transport.PROFILES_VARIABLE, 'my_own.xml')
-    transport.prepare_transport()
-    assert os.environ[transport.PROFILES_VARIABLE] == 'my_own.xml'
+    monkeypatch.setenv(process.PROFILES_VARIABLE, 'my_own.xml')
+    process.prepare_transport()
+    assert os.environ[process.PROFILES_VARIABLE] == 'my_own.xml'

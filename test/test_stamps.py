@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gaps and jumps of the clock, from stamps alone."""
 
-from stavpr_ros.pipeline.stamps import StampEvent, StampWatch
+from stavpr_ros.pipeline.statistics import StampEvent, StampWatch
 
 MS = 1_000_000
 START = 1_700_000_000_000 * MS  # a camera's clock today: only whole numbers have exact differences

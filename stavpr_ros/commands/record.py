@@ -129,8 +129,7 @@ def _write_messages(arguments: argparse.Namespace, file: TextIO, ros_arguments: 
     from rclpy.exceptions import InvalidTopicNameException
     from rclpy.qos import QoSProfile
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
-    from stavpr_ros.ros.discovery import Discovery
-    from stavpr_ros.ros.process import ros_node, spin_until
+    from stavpr_ros.ros.process import Discovery, ros_node, spin_until
 
     written = 0
     kinds: dict[str, Any] = {

@@ -11,9 +11,8 @@ import time
 import rclpy
 from rclpy.exceptions import InvalidTopicNameException
 from stavpr_ros.errors import ImageError, SettingsError, StavprError
-from stavpr_ros.ros.process import own_arguments, ros_node
+from stavpr_ros.ros.process import own_arguments, prepare_transport, ros_node
 from stavpr_ros.ros.replay import NoResultError, NoSubscriberError, Replayer, ReplaySettings
-from stavpr_ros.ros.transport import prepare_transport
 from stavpr_ros.signals import interrupted, obey_signals
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.folder import FolderSource

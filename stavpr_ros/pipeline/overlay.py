@@ -2,12 +2,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draws a query beside the place that it was matched with, fast enough for every frame."""
 
+import math
+
 import cv2
 import numpy as np
 from stavpr_ros.errors import InputError
+from stavpr_ros.mapping import GrowingMap, place_thumbnail, PlaceMap
+from stavpr_ros.recognition import Match
 
 RIGHT, NO_MATCH = (46, 125, 80), (200, 150, 40)  # RGB
 _INK, _PAPER, _EMPTY = (32, 34, 38), (250, 250, 248), (226, 226, 222)
+
+
+def draw_match(match: Match, places: PlaceMap | GrowingMap | None) -> np.ndarray:
+    """
+    Draw an image beside its nearest place, with status and distance.
+
+    :returns: RGB, uint8.
+    """
+    assert match.image is not None
+    if match.sequence is None or places is None:
+        return match_image(
+            match.image, None, f'{match.status.label} {match.reason}'.strip(), False
+        )
+    place = match.newest_index if match.accepted else match.sequence.middle
+    text = f'{match.status.label}: place {place}, distance {match.distance:.3f}'
+    if not math.isnan(match.threshold):
+        text += f' (threshold {match.threshold:.3f})'
+    if match.inliers >= 0:
+        text += f', {match.inliers} inliers'
+    return match_image(match.image, place_thumbnail(places, place), text, match.accepted)
 
 
 def match_image(

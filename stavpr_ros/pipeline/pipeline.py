@@ -43,12 +43,12 @@ class Pipeline:
 
     def __init__(self, settings: PipelineSettings, operation: str = 'localization') -> None:
         self._settings = settings
-        self._map: PlaceMap | None = (
-            None  # of localization, or of loop closure for its kind of features
-        )
+        # of localization, or of loop closure for its kind of features
+        self._map: PlaceMap | None = None
         self._extractor: FeatureExtractor | None = None
         self._operation: Operation | None = None
         self._name = operation
+        self._threshold = settings.applied_threshold(operation)
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
         self._last: Match | None = None
@@ -60,57 +60,57 @@ class Pipeline:
 
     @property
     def settings(self) -> PipelineSettings:
-        """The settings in force."""
+        """Return the settings in force."""
         return self._settings
 
     @property
     def operation(self) -> str:
-        """The name of the operation."""
+        """Return the name of the operation."""
         return self._name
 
     @property
     def threshold(self) -> float | None:
-        """The threshold in force, None = not set."""
-        return self._settings.applied_threshold(self._name)
+        """Return the threshold in force, None = not set."""
+        return self._threshold
 
     @property
     def places(self) -> PlaceMap | GrowingMap | None:
-        """The map, or the recorded route."""
+        """Return the map, or the recorded route."""
         operation = self._operation  # once: other threads read this while the worker changes it
         return operation.places if operation else self._map
 
     @property
     def path(self) -> str:
-        """File that the places in use were loaded from or last saved to, '' = none."""
+        """Return the file that the places in use were loaded from or last saved to, '' = none."""
         return self.save_state.path
 
     @property
     def unsaved(self) -> int:
-        """Places in use that are in no file."""
+        """Return the number of places in use that are in no file."""
         return min(self.save_state.unsaved, len(self.places or ()))
 
     @property
     def extractor(self) -> FeatureExtractor | None:
-        """The feature extractor."""
+        """Return the feature extractor."""
         operation = self._operation
         return operation.extractor if operation else self._extractor
 
     @property
     def map_state(self) -> str:
-        """``none``, ``loaded``, ``growing`` or ``full``."""
+        """Return one of ``none``, ``loaded``, ``growing`` or ``full``."""
         if self._name == 'localization':
             return 'loaded' if self._map is not None else 'none'
         return 'full' if self._is_full(self._operation) else 'growing'
 
     @property
     def window_fill(self) -> int:
-        """Images in the window of the recognizer."""
+        """Return the number of images in the window of the recognizer."""
         operation = self._operation
         return operation.recognizer.window_fill if operation and operation.recognizer else 0
 
     @property
     def missing(self) -> str:
-        """Why no match is possible yet; empty when nothing is missing."""
+        """Return why no match is possible yet; empty when nothing is missing."""
         if self._name == 'localization' and self._map is None:
             return NO_MAP
         if self._name != 'mapping' and self.threshold is None:
@@ -137,7 +137,7 @@ class Pipeline:
         """
         settings, name = settings or self._settings, operation or self._name
         settings.require_operation(name)
-        threshold, before = settings.applied_threshold(name), self.threshold
+        threshold, before = settings.applied_threshold(name), self._threshold
         if loaded is not None or name != self._name:
             self._require_no_loss(name, loaded)
             self._start(name, settings, loaded)
@@ -145,7 +145,7 @@ class Pipeline:
             if before is None:
                 self.reset()  # images since then are not in the window
             self._operation.recognizer.set_threshold(threshold)
-        self._settings = settings
+        self._settings, self._threshold = settings, threshold
         self._keyframes.settings = settings.keyframes
         self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
 
@@ -200,7 +200,7 @@ class Pipeline:
         :param pose: of the camera, from odometry, shape (7,), or None.
         :raises InputError: an invalid pose; nothing is changed then.
         """
-        threshold = math.nan if self.threshold is None else self.threshold
+        threshold = math.nan if self._threshold is None else self._threshold
         pose = None if pose is None else checked_pose(pose)
         if self._operation is None or self.missing:
             return Match(Status.NOT_READY, self.missing, threshold, cause='not ready')
@@ -212,10 +212,8 @@ class Pipeline:
         try:
             match = self._process(self._operation, stages, message, stamp, pose)
         except StavprError as error:
-            cause = (
-                f'invalid: {error.kind if isinstance(error, ImageError) else type(error).__name__}'
-            )
-            match = Match(Status.INVALID_IMAGE, str(error), cause=cause)
+            kind = error.kind if isinstance(error, ImageError) else type(error).__name__
+            match = Match(Status.INVALID_IMAGE, str(error), cause=f'invalid: {kind}')
         return replace(match, threshold=threshold, stages=stages)
 
     def _process(
@@ -243,14 +241,10 @@ class Pipeline:
             return replace(match, image=image)
         with _timed(stages, 'verification'):
             match = self._verified(match, image, operation.places)
-        listed = self.list_candidates and match.sequence is not None
-        self._last = replace(
-            match,
-            image=image,
-            candidates=tuple(operation.recognizer.ranked(self._settings.candidates))
-            if listed
-            else (),
-        )
+        if self.list_candidates and match.sequence is not None:
+            candidates = tuple(operation.recognizer.ranked(self._settings.candidates))
+            match = replace(match, candidates=candidates)
+        self._last = replace(match, image=image)
         return self._last
 
     def _verified(self, match: Match, image: np.ndarray, places: PlaceMap | GrowingMap) -> Match:
@@ -261,10 +255,8 @@ class Pipeline:
         if thumbnail is None:
             reason = 'geometric check: the map has no thumbnails; build it with thumbnails'
             return replace(match, status=Status.NO_MATCH, reason=reason)
-        inliers, least = (
-            self._verifier.inliers(image, thumbnail),
-            self._verifier.settings.min_inliers,
-        )
+        inliers = self._verifier.inliers(image, thumbnail)
+        least = self._verifier.settings.min_inliers
         if inliers >= least:
             return replace(match, inliers=inliers)
         reason = (
@@ -277,11 +269,8 @@ class Pipeline:
         place_map, extractor = self._places_as_map(), self.extractor
         save_state = self._map_save_state if place_map is self._map else self.save_state
         if loaded is not None:
-            place_map, extractor, save_state = (
-                loaded.places,
-                loaded.extractor,
-                SaveState(loaded.path),
-            )
+            place_map, extractor = loaded.places, loaded.extractor
+            save_state = SaveState(loaded.path)
         operation = start_operation(name, settings, place_map, extractor)
         # in mapping, the growing map holds it
         self._map = None if name == 'mapping' else place_map

@@ -29,7 +29,7 @@ class SaveState:
 
     @property
     def unsaved(self) -> int:
-        """Number of recorded places that are in no file."""
+        """Return the number of recorded places that are in no file."""
         return self.recorded - self.saved
 
     def owns(self, path: str) -> bool:

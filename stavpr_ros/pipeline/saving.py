@@ -54,9 +54,8 @@ def save_recorded_map(
         if pipeline.unsaved:
             log.error('the map is not saved: the worker is still busy at the end of the node')
     except Exception as error:  # any error: the node must end, and the loss must be logged
-        log.error(
-            f'the map is not saved: {error if isinstance(error, StavprError) else repr(error)}'
-        )
+        cause = str(error) if isinstance(error, StavprError) else repr(error)
+        log.error(f'the map is not saved: {cause}')
 
 
 def _free_name(path: str, state: SaveState) -> str:

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Counts of the node: images, results, drops, and the time of each stage."""
+"""ImageCounts of the node: images, results, drops, gaps of the stamps, time of each stage."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import math
 import threading
 import time
-from typing import Generic, TypeVar
+from typing import Generic, Literal, TypeVar
 
 RECENT = 10
 """Length of the window behind rates, recent counts and times [s]."""
@@ -20,6 +20,10 @@ Shortest time over which a rate is taken [s], so that two images of a burst are 
 
 WAITING = 'waiting'
 """The stage before the worker takes an image: part of the total, not of the work."""
+
+NANOSECONDS = 1_000_000_000
+REORDERING_SECONDS = 0.1
+"""Images less than this out of order were reordered on the way, as on best-effort links."""
 
 Value = TypeVar('Value')
 
@@ -33,7 +37,7 @@ class StageTime:
 
 
 @dataclass(frozen=True)
-class Counts:
+class ImageCounts:
     """
     All counts at one moment. 'Recent' is the last ``RECENT`` seconds.
 
@@ -113,7 +117,7 @@ class _Recent(Generic[Value]):
 
 class Statistics:
     """
-    Counts events; every method may be called from any thread. Only recent events are kept.
+    ImageCounts events; every method may be called from any thread. Only recent events are kept.
 
     :param clock: returns seconds that never go back.
     """
@@ -127,7 +131,7 @@ class Statistics:
         """Set all counts to zero."""
         with self._lock:
             self._start = self._clock()
-            self._counts = Counts()
+            self._counts = ImageCounts()
             self._drops: Counter[str] = Counter()
             self._statuses: Counter[str] = Counter()
             self._received: _Recent[None] = _Recent()
@@ -185,7 +189,7 @@ class Statistics:
                 longest_jump_back=max(self._counts.longest_jump_back, seconds),
             )
 
-    def counts(self) -> Counts:
+    def counts(self) -> ImageCounts:
         """Return all counts; later events do not change them."""
         with self._lock:
             now = self._clock()
@@ -209,6 +213,54 @@ class Statistics:
 
     def _count(self, **changes: object) -> None:
         self._counts = replace(self._counts, **changes)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class StampEvent:
+    """
+    An irregularity between two stamps.
+
+    :param kind: ``'gap'``: a pause; ``'jump back'``: an earlier stamp, as when a bag starts again.
+    :param seconds: length of the gap or of the jump; above 0.
+    """
+
+    kind: Literal['gap', 'jump back']
+    seconds: float
+
+
+class StampWatch:
+    """
+    Compares each stamp with the newest one; for one thread, while any may set ``gap``.
+
+    :param gap: longer pauses are reported [s]; 0 = none is.
+    """
+
+    def __init__(self, gap: float) -> None:
+        self.gap = gap
+        self._newest = 0
+
+    def see(self, stamp: int) -> StampEvent | None:
+        """
+        Take the next stamp and return its irregularity, if any.
+
+        A reordered image does not move the newest stamp back: otherwise the image after it would
+        seem to come after a gap.
+
+        :param stamp: nanoseconds; 0 = unknown, ignored.
+        """
+        if stamp == 0:
+            return None
+        newest, self._newest = self._newest, stamp
+        if newest == 0:
+            return None
+        ahead = (stamp - newest) / NANOSECONDS
+        if ahead <= -REORDERING_SECONDS:
+            return StampEvent('jump back', -ahead)
+        if ahead < 0:
+            self._newest = newest
+        elif 0 < self.gap < ahead:
+            return StampEvent('gap', ahead)
+        return None
 
 
 def _sum(counted: Iterable[tuple[str, int]]) -> dict[str, int]:

@@ -1,87 +1,52 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The subscriptions: images, raw or compressed, and odometry."""
+"""The subscription to images, and the worker: one thread does the heavy work."""
 
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import CancelledError, Future, wait
+from dataclasses import dataclass
 import threading
 import time
-from typing import Any
+import traceback
+from typing import Any, TypeVar
 
-from nav_msgs.msg import Odometry
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
-from rclpy.exceptions import ParameterException
+from rclpy.event_handler import UnsupportedEventTypeError
+from rclpy.logging import get_logger
 from rclpy.node import Node
-from rclpy.qos import (
-    qos_check_compatible,
-    qos_policy_name_from_kind,
-    QoSCompatibility,
-    QoSPolicyKind,
-    QoSProfile,
-    ReliabilityPolicy,
-)
-from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.qos import qos_check_compatible, qos_policy_name_from_kind, QoSCompatibility
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
-from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.mapping.trajectory import Trajectory
+from stavpr_ros.errors import StavprError
 from stavpr_ros.pipeline import NodeSettings
-from stavpr_ros.pipeline.stamps import StampWatch
-from stavpr_ros.pipeline.statistics import Statistics
-from stavpr_ros.ros.messages import nanoseconds, odometry_pose
+from stavpr_ros.pipeline.statistics import StampWatch, Statistics
+from stavpr_ros.ros.output import nanoseconds
+from stavpr_ros.ros.subscriptions import qos_remedy, subscribe
 
-_REMEDIES = {
-    'RELIABILITY': 'set qos_overrides.{topic}.subscription.reliability to best_effort, or make '
-    'the publisher reliable',
-    'DURABILITY': 'set qos_overrides.{topic}.subscription.durability to volatile, or make the '
-    'publisher transient local',
-}
-OVERRIDABLE = (
-    QoSPolicyKind.HISTORY,
-    QoSPolicyKind.DEPTH,
-    QoSPolicyKind.RELIABILITY,
-    QoSPolicyKind.DURABILITY,
-)
+STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end: `ros2 launch` kills after 5
+
+END_POLL = 0.2  # seconds until a waiting caller detects the end of the node
+
+Result = TypeVar('Result')
 
 
-def qos_remedy(topic: str, policy: str) -> str:
-    """Return the remedy for a publisher with an incompatible quality of service."""
-    remedy = _REMEDIES.get(policy, f'make the publisher offer at least the requested {policy}')
-    return f'a publisher of {topic} offers another {policy.lower()}: ' + remedy.format(topic=topic)
-
-
-def _subscribe(
-    node: Node,
-    message_type: type,
-    topic: str,
-    callback: Callable[[Any], None],
-    depth: int,
-    **events: Callable[[Any], None],
-) -> Subscription:
+@dataclass(frozen=True)
+class InputStatus:
     """
-    Subscribe with sensor-data QoS, in a callback group of its own; qos_overrides change the QoS.
+    The topic of the images and its publishers.
 
-    :raises SettingsError: invalid qos_overrides.
+    :param topic: after remapping.
+    :param publishers: of the topic, of any QoS and type; ``incompatible``: those that are not
+        received because of their QoS.
+    :param mistyped: other message types on the topic; empty = none.
+    :param remedy: for the incompatible publishers.
     """
-    try:
-        return node.create_subscription(
-            message_type,
-            topic,
-            callback,
-            # an equal copy of qos_profile_sensor_data: rclpy writes overrides into its argument
-            QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT),
-            callback_group=MutuallyExclusiveCallbackGroup(),
-            event_callbacks=SubscriptionEventCallbacks(**events),
-            qos_overriding_options=QoSOverridingOptions(OVERRIDABLE),
-        )
-    except UnsupportedEventTypeError:
-        raise
-    except (RuntimeError, ParameterException) as error:
-        name = node.resolve_topic_name(topic)
-        raise SettingsError(
-            f'cannot subscribe to {name}: {error}; correct qos_overrides.{name}.subscription and '
-            'start again'
-        ) from error
+
+    topic: str = ''
+    publishers: int = 0
+    incompatible: int = 0
+    mistyped: str = ''
+    remedy: str = ''
 
 
 class ImageInput:
@@ -124,26 +89,18 @@ class ImageInput:
         self.topic = node.resolve_topic_name(name)  # before events, which come on another thread
         self._subscription = self._subscribe(message_type, name)
 
-    @property
-    def publishers(self) -> int:
-        """Number of publishers of the topic, compatible or not."""
-        return self._node.count_publishers(self.topic)
-
-    @property
-    def incompatible(self) -> int:
-        """Number of publishers of the topic with an incompatible QoS."""
+    def status(self) -> InputStatus:
+        """Return the topic and its publishers, for the diagnostics."""
+        infos = self._node.get_publishers_info_by_topic(self.topic)
         requested = self._subscription.qos_profile
-        return sum(
+        incompatible = sum(
             qos_check_compatible(info.qos_profile, requested)[0] == QoSCompatibility.ERROR
-            for info in self._node.get_publishers_info_by_topic(self.topic)
+            for info in infos
             if info.topic_type == self._type
         )
-
-    @property
-    def mistyped(self) -> str:
-        """Other message types on the topic, which the middleware does not report."""
-        infos = self._node.get_publishers_info_by_topic(self.topic)
-        return ', '.join(sorted({info.topic_type for info in infos} - {self._type}))
+        # the middleware does not report other types
+        mistyped = ', '.join(sorted({info.topic_type for info in infos} - {self._type}))
+        return InputStatus(self.topic, len(infos), incompatible, mistyped, self.remedy)
 
     def close(self) -> None:
         """Unsubscribe from images, including one that another thread has just taken."""
@@ -154,10 +111,10 @@ class ImageInput:
     def _subscribe(self, message_type: type, topic: str) -> Subscription:
         events = {'incompatible_qos': self._on_incompatible, 'message_lost': self._on_lost}
         try:
-            return _subscribe(self._node, message_type, topic, self.on_image, 5, **events)
+            return subscribe(self._node, message_type, topic, self.on_image, 5, **events)
         except UnsupportedEventTypeError:  # not every middleware reports lost messages
             del events['message_lost']
-            return _subscribe(self._node, message_type, topic, self.on_image, 5, **events)
+            return subscribe(self._node, message_type, topic, self.on_image, 5, **events)
 
     def _on_incompatible(self, event: Any) -> None:
         self.remedy = qos_remedy(self.topic, qos_policy_name_from_kind(event.last_policy_kind))
@@ -205,38 +162,128 @@ class ImageInput:
         return ''
 
 
-class OdometryInput:
+class Worker:
     """
-    The subscription to odometry, on the topic ``odom``.
+    A thread that processes items; when the queue is full, the oldest item is dropped.
 
-    :param timeout: seconds for which the newest pose is valid.
+    Calls, such as a change of the map, run on the same thread before the next item: objects that
+    the thread owns need no lock.
 
-    ``frame`` is the frame of the poses.
+    :param process: called with each item.
+    :param capacity: maximum number of waiting items.
+    :param ending: set when callers must not wait any longer.
     """
 
-    def __init__(self, node: Node, timeout: float) -> None:
-        self.trajectory = Trajectory(timeout)
-        self._node, self._timeout = node, timeout
-        self._arrived: float | None = None
-        self.frame = ''
-        self._subscription = _subscribe(node, Odometry, 'odom', self._on_odometry, 50)
+    def __init__(
+        self, process: Callable[[Any], None], capacity: int, ending: threading.Event
+    ) -> None:
+        self._process, self._capacity, self._ending = process, capacity, ending
+        self._items: deque[Any] = deque()
+        self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
+        self._running: Future[Any] | None = None
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name='recognition', daemon=True)
+        self._thread.start()
 
-    def freshness(self) -> str:
-        """Return ``fresh``, ``stale`` or ``never``, for the diagnostics."""
-        if self._arrived is None:
-            return 'never'
-        return 'fresh' if time.monotonic() - self._arrived < max(2.0, self._timeout) else 'stale'
+    @property
+    def waiting(self) -> int:
+        """Return the number of waiting items."""
+        return len(self._items)
 
-    def close(self) -> None:
-        """Unsubscribe from odometry."""
-        self._node.destroy_subscription(self._subscription)
+    def put(self, item: Any) -> Any | None:
+        """Enqueue an item; return the item that was dropped for it, if any."""
+        with self._changed:
+            dropped = self._items.popleft() if len(self._items) >= self._capacity else None
+            self._items.append(item)
+            self._changed.notify()
+        return dropped
 
-    def _on_odometry(self, message: Odometry) -> None:
+    def clear(self) -> list[Any]:
+        """Remove the waiting items and return them."""
+        with self._changed:
+            items = list(self._items)
+            self._items.clear()
+        return items
+
+    def call(self, function: Callable[[], Any]) -> Future[Any]:
+        """Call a function on the thread; after :meth:`stop`, the future is cancelled."""
+        future: Future[Any] = Future()
+        with self._changed:
+            if self._stopping:
+                future.cancel()
+            else:
+                self._calls.append((future, function))
+                self._changed.notify()
+        return future
+
+    def run(self, function: Callable[[], Result]) -> Result:
+        """
+        Call a function on the thread and return its result.
+
+        :raises StavprError: the thread was stopped, or the node ends, before the call is done.
+        """
+        future = self.call(function)
+        while not future.done():
+            wait([future], END_POLL)
+            if self._ending.is_set() and not future.done():
+                raise StavprError('the node ends')
         try:
-            self.trajectory.add(nanoseconds(message.header.stamp), odometry_pose(message))
-        except InputError as error:
-            self._node.get_logger().warning(
-                f'odometry rejected: {error}', throttle_duration_sec=10.0
+            return future.result()
+        except CancelledError:
+            raise StavprError('the node is no longer configured') from None
+        except TimeoutError as error:  # abandoned by stop()
+            raise StavprError(str(error)) from error
+
+    def stop(self) -> bool:
+        """
+        Finish the work in progress, cancel the rest, and end the thread or abandon it.
+
+        :returns: whether the thread has ended.
+        """
+        with self._changed:
+            self._stopping = True
+            self._changed.notify()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(STOP_TIMEOUT)
+        for future, _ in self._calls:
+            future.cancel()
+        if self._thread.is_alive() and self._running is not None and not self._running.done():
+            self._running.set_exception(
+                TimeoutError(f'the node ended; not done within {STOP_TIMEOUT:g} s')
             )
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._stopping or self._items or self._calls)
+                if self._stopping:
+                    return
+                call = self._calls.popleft() if self._calls else None
+                item = None if call else self._items.popleft()
+            if call is None:
+                self._process_safely(item)
+            else:
+                self._call(*call)
+
+    def _call(self, future: Future[Any], function: Callable[[], Any]) -> None:
+        self._running = future
+        try:
+            result, error = function(), None
+        except Exception as raised:  # handed to the caller
+            result, error = None, raised
+        self._running = None
+        if future.done():  # abandoned by stop()
             return
-        self._arrived, self.frame = time.monotonic(), message.header.frame_id
+        if error is None:
+            future.set_result(result)
+        else:
+            future.set_exception(error)
+
+    def _process_safely(self, item: Any) -> None:
+        """Process an item; an error must not end the thread, and with it all later items."""
+        try:
+            self._process(item)
+        except Exception:
+            get_logger('stavpr_worker').error(f'an item was lost: {traceback.format_exc()}')

@@ -15,26 +15,25 @@ from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.timer import Timer
 from stavpr_msgs.msg import MapInfo
-from stavpr_ros.errors import SettingsError, SourceError, StavprError
-from stavpr_ros.output_file import require_room
+from stavpr_ros.errors import StavprError
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
-from stavpr_ros.ros.health import Health, node_health
-from stavpr_ros.ros.parameters import declare_parameters, unknown_parameters
+from stavpr_ros.ros.health import Health
+from stavpr_ros.ros.input import STOP_TIMEOUT
+from stavpr_ros.ros.output import MapInfoPublisher
+from stavpr_ros.ros.parameters import (
+    declare_parameters,
+    require_changeable,
+    require_writable,
+    unknown_parameters,
+)
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.runtime import Runtime
 from stavpr_ros.ros.services import Services
-from stavpr_ros.ros.worker import STOP_TIMEOUT
-
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# Parameters that are read when the node is configured, and the services that change them
-# afterwards.
-CHANGED_BY_SERVICE = {'map_path': 'load_map', 'operation': 'set_operation'}
 
 
 class PlaceRecognitionNode(ManagedNode):
@@ -53,10 +52,9 @@ class PlaceRecognitionNode(ManagedNode):
     THREADS = 4
 
     def __init__(self, **options: Any) -> None:
-        # one change at a time: transitions, parameters, map, operation
-        self._lock = threading.RLock()
+        self._lock = threading.RLock()  # one change of state, parameters or map at a time
         super().__init__('stavpr', **options)
-        for warning in unknown_parameters(self._parameter_overrides):
+        for warning in unknown_parameters(self.parameter_overrides):
             self.get_logger().warning(warning)
         self._settings = node_settings(declare_parameters(self))
         self._verbosity = 'default'
@@ -64,11 +62,8 @@ class PlaceRecognitionNode(ManagedNode):
         self._runtime: Runtime | None = None
         self.statistics = Statistics()
         self.problem = ''  # why the last transition failed
-        self._map_info = self.create_publisher(MapInfo, '~/map_info', LATCHED)
-        self._last_map_info: MapInfo | None = None
-        # messages are published in the order of the changes
-        self._map_info_lock = threading.RLock()
-        self._served = Services(self)
+        self._map_info = MapInfoPublisher(self)
+        self._served = Services(self, lambda: self.runtime, self.load_map, self.set_operation)
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         backwards = JumpThreshold(
@@ -91,29 +86,20 @@ class PlaceRecognitionNode(ManagedNode):
 
     @property
     def settings(self) -> NodeSettings:
-        """The settings in force."""
+        """Return the settings in force."""
         return self._settings
-
-    @property
-    def configured(self) -> Runtime | None:
-        """The runtime, None while the node is not configured."""
-        return self._runtime
 
     @property
     def runtime(self) -> Runtime:
         """
-        The runtime.
+        Return the runtime.
 
         :raises StavprError: the node is not configured.
         """
         if self._runtime is None:
             because = f' ({self.problem})' if self.problem else ''
-            ended = self.state == 'finalized'
-            remedy = (
-                'start it anew'
-                if ended
-                else 'configure it first, `ros2 lifecycle set NODE configure`'
-            )
+            configure = 'configure it first, `ros2 lifecycle set NODE configure`'
+            remedy = 'start it anew' if self.state == 'finalized' else configure
             raise StavprError(f'the node is {self.state}{because}: {remedy}')
         return self._runtime
 
@@ -187,16 +173,14 @@ class PlaceRecognitionNode(ManagedNode):
     def _configure(self) -> None:
         # a service may have changed the operation
         self._settings = settings = self._settings_with({})
-        self._log_backend()
-        _require_writable(settings.save_path)
+        self.get_logger().info(settings.pipeline.backend_summary(settings.operation))
+        require_writable(settings.save_path)
         if settings.map_path:
-            self._publish_map_info(
-                MapInfo(operation=settings.operation, state='loading', path=settings.map_path)
-            )
-        self._runtime = Runtime(self, settings, self.statistics, self.publish_map_info)
+            self._publish_map_info('loading', settings.map_path)
+        self._runtime = Runtime(self, settings, self.statistics, self._publish_map_info)
         if missing := self._runtime.pipeline.missing:
             self.get_logger().warning(f'waiting, no image can be matched: {missing}')
-        self.publish_map_info()
+        self._publish_map_info()
         # objects of the map and the model are permanent: scanning them again and again takes the
         # garbage collector half a second each time, during an image
         gc.collect()
@@ -216,18 +200,14 @@ class PlaceRecognitionNode(ManagedNode):
             if runtime is not None:
                 runtime.close()
                 del runtime
-            if self._last_map_info is not None:
-                self._publish_map_info(MapInfo(operation=self._settings.operation, state='none'))
+            if self._map_info.last is not None:
+                self._publish_map_info('none')
         gc.unfreeze()
         # runtime and worker refer to each other: without it, the map would stay in memory
         gc.collect()
         import torch
 
         torch.cuda.empty_cache()
-
-    def _log_backend(self) -> None:
-        settings = self._settings
-        self.get_logger().info(settings.pipeline.backend_summary(settings.operation))
 
     # parameters, map and operation
 
@@ -261,8 +241,8 @@ class PlaceRecognitionNode(ManagedNode):
             runtime, settings = self.runtime, self._settings_with({'operation': operation})
             runtime.change(settings)
             self._settings = settings
-            self._log_backend()
-            self.publish_map_info()
+            self.get_logger().info(settings.pipeline.backend_summary(operation))
+            self._publish_map_info()
 
     def _settings_with(self, changes: Mapping[str, Any]) -> NodeSettings:
         """Return the settings after a change of parameters; the operation in force stays."""
@@ -273,11 +253,7 @@ class PlaceRecognitionNode(ManagedNode):
 
     def _validate_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Check all parameters together; change nothing."""
-        changes = {
-            parameter.name: parameter.value
-            for parameter in parameters
-            if parameter.name in BY_NAME
-        }
+        changes = {row.name: row.value for row in parameters if row.name in BY_NAME}
         try:
             if changes:
                 with self._lock:
@@ -287,28 +263,14 @@ class PlaceRecognitionNode(ManagedNode):
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _require_valid(self, changes: dict[str, Any]) -> None:
-        changes = {
-            name: value
-            for name, value in changes.items()
-            if value != self.get_parameter(name).value
-        }
+    def _require_valid(self, values: dict[str, Any]) -> None:
+        current = {name: self.get_parameter(name).value for name in values}
+        changes = {name: value for name, value in values.items() if value != current[name]}
         if self._runtime is not None:
-            for name, service in CHANGED_BY_SERVICE.items():
-                if name in changes:
-                    raise SettingsError(
-                        f'{name} is read when the node is configured, it is {self.state}: call '
-                        f'the service ~/{service}'
-                    )
-            if fixed := [name for name in changes if BY_NAME[name].when != 'live']:
-                raise SettingsError(
-                    f'{", ".join(fixed)} can be set only while the node is unconfigured, it is '
-                    f'{self.state}: clean it up first (`ros2 lifecycle set NODE deactivate`, '
-                    'then cleanup)'
-                )
+            require_changeable(changes, self.state)
         settings = self._settings_with(changes)
         if settings.save_path != self._settings.save_path:
-            _require_writable(settings.save_path)
+            require_writable(settings.save_path)
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         """Apply validated parameters; try to start again where the last try failed."""
@@ -322,19 +284,15 @@ class PlaceRecognitionNode(ManagedNode):
                     self._runtime.change(self._settings)
                 except StavprError as error:  # the node ends
                     self.get_logger().error(f'parameters not applied: {error}')
-                self.publish_map_info()
+                self._publish_map_info()
             elif self._start is not None and self.problem and self.state == 'unconfigured':
                 self._start.reset()
 
     def _apply_verbosity(self, verbosity: str) -> None:
         """Set the log level; that of --log-level stays until the parameter is changed."""
         if verbosity != self._verbosity:
-            level = (
-                LoggingSeverity.UNSET
-                if verbosity == 'default'
-                else LoggingSeverity[verbosity.upper()]
-            )
-            self.get_logger().set_level(level)
+            name = 'UNSET' if verbosity == 'default' else verbosity.upper()
+            self.get_logger().set_level(LoggingSeverity[name])
         self._verbosity = verbosity
 
     def _on_clock_jump(self, jump: Any) -> None:
@@ -343,35 +301,34 @@ class PlaceRecognitionNode(ManagedNode):
             runtime.restart(f'the clock jumped back by {-jump.delta.nanoseconds / 1e9:.3f} s')
 
     def _health(self) -> Health:
-        self.publish_map_info()
-        counts = self.statistics.counts()
-        return node_health(self.state, self.problem, self._settings, counts, self._runtime)
+        self._publish_map_info()
+        health = Health(
+            state=self.state,
+            problem=self.problem,
+            settings=self._settings,
+            counts=self.statistics.counts(),
+            map_info=self._map_info.last or MapInfo(state='none'),
+        )
+        runtime = self._runtime
+        return health if runtime is None else runtime.add_to(health)
 
-    # ~/map_info, and the end
+    def _publish_map_info(self, state: str = '', path: str = '') -> None:
+        """Publish the state of a node that is not configured, or '' = the map in use, if any."""
 
-    def publish_map_info(self) -> None:
-        """Publish ``~/map_info`` if it has changed."""
-        with self._map_info_lock:
+        def describe() -> MapInfo | None:
             runtime = self._runtime
-            if runtime is not None:
-                self._publish_map_info(runtime.map_info())
+            if state:
+                return MapInfo(operation=self._settings.operation, state=state, path=path)
+            return None if runtime is None else runtime.map_info()
 
-    def _publish_map_info(self, info: MapInfo) -> None:
-        with self._map_info_lock:
-            info.header.stamp = self.get_clock().now().to_msg()
-            last, self._last_map_info = self._last_map_info, info
-            if last is not None:
-                last.header = info.header  # a new stamp alone is no change
-            if last != info and self.context.ok():
-                self._map_info.publish(info)
+        self._map_info.publish(describe)
 
     def destroy_node(self) -> None:
         """End the worker, save a recorded map, log the counts, and destroy the node."""
         self._diagnostics.stop()
         timeout = 0.2 if self.ending.is_set() else STOP_TIMEOUT + 1  # spin_until has waited before
         self.ending.set()
-        # the lock may be held by a thread that loads a large map or compiles: the end does not
-        # wait for it
+        # a thread that loads a large map or compiles may hold the lock: the end does not wait
         if self._lock.acquire(timeout=timeout):
             try:
                 self._free()
@@ -390,12 +347,3 @@ class PlaceRecognitionNode(ManagedNode):
             f'{counts.received} images received, {counts.answered} processed{drops}'
         )
         super().destroy_node()
-
-
-def _require_writable(save_path: str) -> None:
-    """Reject a file that cannot be written before a recorded map would be lost."""
-    try:
-        if save_path:
-            require_room(save_path)
-    except SourceError as error:
-        raise SettingsError(f'save_path: {error}') from error

@@ -1,32 +1,240 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The publishers of matches; lifecycle publishers, which publish only while the node is active."""
+"""The messages of results, and their publishers."""
 
+import array
+from collections.abc import Callable
 import math
+import threading
 from typing import Any
 
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 import numpy as np
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.qos import qos_policy_name_from_kind, QoSProfile, ReliabilityPolicy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, qos_policy_name_from_kind, QoSProfile, ReliabilityPolicy
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
-from stavpr_msgs.msg import LoopClosure, PlaceCandidates, PlaceMatch
-from stavpr_ros.mapping import GrowingMap, place_thumbnail, PlaceMap
-from stavpr_ros.pipeline.overlay import match_image
-from stavpr_ros.recognition import Match
-from stavpr_ros.ros.messages import (
-    candidates_message,
-    image_message,
-    loop_closure_message,
-    match_message,
-    matched_pose_message,
+from stavpr_msgs.msg import (
+    AlignedPair,
+    AlignedPlaces,
+    LoopClosure,
+    MapInfo,
+    PlaceCandidate,
+    PlaceCandidates,
+    PlaceMatch,
 )
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import GrowingMap, place_at, PlaceMap
+from stavpr_ros.mapping.map_file import VERSION
+from stavpr_ros.pipeline.overlay import draw_match
+from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from std_msgs.msg import Float32, Header, Int32
 
 DEPTH = 50  # matches kept for slower subscribers
 IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+SECOND = 1_000_000_000
+MIN_VARIANCE = 0.01  # of a pose: (0.1 m)^2 and (0.1 rad)^2
+
+
+def time_message(nanoseconds: int) -> Time:
+    """Return a time as a message; 0 means unknown."""
+    return Time(sec=int(nanoseconds) // SECOND, nanosec=int(nanoseconds) % SECOND)
+
+
+def nanoseconds(time: Time) -> int:
+    """Return a time in nanoseconds."""
+    return int(time.sec) * SECOND + int(time.nanosec)
+
+
+def pose_message(pose: np.ndarray) -> Pose:
+    """Return x y z and quaternion x y z w, shape (7,), as a message."""
+    message = Pose()
+    message.position.x, message.position.y, message.position.z = map(float, pose[:3])
+    o = message.orientation
+    o.x, o.y, o.z, o.w = map(float, pose[3:])
+    return message
+
+
+def match_message(
+    header: Header, match: Match, places: PlaceMap | GrowingMap | None = None
+) -> PlaceMatch:
+    """
+    Return the message of a match.
+
+    :param header: of the image.
+    :param places: the map that the indices of the match refer to.
+    """
+    message = PlaceMatch(
+        header=header,
+        status=match.status,
+        reason=match.reason,
+        place_index=match.place_index,
+        newest_index=match.image_index if match.status is Status.MAPPED else match.newest_index,
+        distance=match.distance,
+        threshold=match.threshold,
+        sequence_first=-1,
+        sequence_last=-1,
+        sequence_middle=-1,
+        window_first=header.stamp,
+        window_middle=header.stamp,
+        window_last=header.stamp,
+        second_best_index=-1,
+        second_best_distance=math.nan,
+        inliers=match.inliers,
+    )
+    if match.window_stamps:
+        stamps = match.window_stamps
+        message.window_first = time_message(stamps[0])
+        message.window_middle = time_message(stamps[(len(stamps) - 1) // 2])
+    if match.sequence is not None:
+        sequence = match.sequence
+        message.sequence_first, message.sequence_last = sequence.first, sequence.last
+        message.sequence_middle = sequence.middle
+        message.path = [AlignedPair(query_index=q, place_index=m) for q, m in match.path.tolist()]
+        message.second_best_index = sequence.second_best_index
+        message.second_best_distance = sequence.second_best_distance
+    if match.accepted and places is not None:
+        place, newest = place_at(places, match.place_index), place_at(places, match.newest_index)
+        message.place_stamp, message.place_id = time_message(place.stamp), place.identifier
+        message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
+    return message
+
+
+def candidates_message(
+    header: Header, match: Match, places: PlaceMap | GrowingMap | None
+) -> PlaceCandidates | None:
+    """Return the message of the candidates of a match, None without any."""
+    if not match.candidates or places is None:
+        return None
+    message = PlaceCandidates(header=header, threshold=match.threshold)
+    for candidate in match.candidates:
+        place = place_at(places, candidate.place)
+        message.candidates.append(
+            PlaceCandidate(
+                place_index=candidate.place,
+                distance=candidate.distance,
+                place_stamp=time_message(place.stamp),
+                place_id=place.identifier,
+            )
+        )
+    return message
+
+
+def loop_closure_message(
+    header: Header, match: Match, route: PlaceMap | GrowingMap | None
+) -> LoopClosure | None:
+    """Return the loop closure of a match on a growing route, None for any other match."""
+    first = match.first_image_index
+    if not match.accepted or first < 0 or route is None:
+        return None
+    pairs = [
+        AlignedPlaces(
+            query_index=first + q,
+            query_stamp=time_message(place_at(route, first + q).stamp),
+            place_index=m,
+            place_stamp=time_message(place_at(route, m).stamp),
+        )
+        for q, m in match.path.tolist()
+    ]
+    middle = first + (len(match.window_stamps) - 1) // 2
+    query, place = place_at(route, middle), place_at(route, match.place_index)
+    message = LoopClosure(
+        header=header,
+        query_index=middle,
+        query_stamp=time_message(query.stamp),
+        place_index=match.place_index,
+        place_stamp=time_message(place.stamp),
+        distance=match.distance,
+        threshold=match.threshold,
+        inliers=match.inliers,
+        pairs=pairs,
+    )
+    if query.pose is not None and place.pose is not None:
+        message.has_poses = True
+        message.query_pose, message.place_pose = pose_message(query.pose), pose_message(place.pose)
+    return message
+
+
+def matched_pose_message(
+    header: Header, match: Match, places: PlaceMap | GrowingMap | None, frame: str
+) -> PoseWithCovarianceStamped | None:
+    """
+    Return the pose of the place of the newest image; None without a match or a known pose.
+
+    The covariance is diagonal: the variance of each coordinate over the poses of the two places
+    before and after it, since a match may be off by a place, and at least (0.1 m)^2 and (0.1
+    rad)^2. Rotations are rotation vectors about the axes of the map. Place recognition does not
+    observe a lateral offset of the camera from the mapped route; the covariance does not include
+    it.
+
+    :param frame: of the poses of the map.
+    """
+    if not match.accepted or places is None:
+        return None
+    newest = match.newest_index
+    pose = place_at(places, newest).pose
+    if pose is None:
+        return None
+    first = places.first if isinstance(places, GrowingMap) else 0
+    around = range(max(first, newest - 2), min(first + len(places), newest + 3))
+    near = np.array(
+        [near for near in (place_at(places, i).pose for i in around) if near is not None]
+    )
+    turns = Rotation.from_quat(near[:, 3:]) * Rotation.from_quat(pose[3:]).inv()
+    variances = np.append(np.var(near[:, :3], axis=0), np.var(turns.as_rotvec(), axis=0))
+    message = PoseWithCovarianceStamped()
+    message.header.stamp, message.header.frame_id = header.stamp, frame
+    message.pose.pose = pose_message(pose)
+    message.pose.covariance[::7] = np.maximum(variances, MIN_VARIANCE)
+    return message
+
+
+def image_message(header: Header, image: np.ndarray) -> Image:
+    """Return an image, RGB (h, w, 3) uint8, as a message."""
+    height, width = image.shape[:2]
+    message = Image(header=header, height=height, width=width, encoding='rgb8', step=width * 3)
+    message.data = array.array('B', np.ascontiguousarray(image).tobytes())
+    return message
+
+
+def map_info_message(
+    operation: str,
+    state: str,
+    path: str,
+    places: PlaceMap | GrowingMap | None,
+    extractor: FeatureExtractor | None,
+    stamp: Time,
+) -> MapInfo:
+    """
+    Return the description of the map in use.
+
+    :param state: see the message.
+    """
+    message = MapInfo(
+        header=Header(stamp=stamp),
+        operation=operation,
+        state=state,
+        path=path,
+        format_version=VERSION,
+    )
+    if extractor is not None:
+        settings = extractor.settings
+        message.features, message.settings = settings.kind, settings.to_json()
+        message.strips = settings.strips
+        message.projected = settings.projection is not None
+    if places is not None:
+        message.places = len(places)
+        if len(places):
+            message.dimension = places.dimension
+        message.has_stamps, message.has_ids = places.has_stamps, places.has_ids
+        message.has_poses = places.has_poses
+        message.has_thumbnails = any(places.thumbnails)
+    return message
 
 
 class Output:
@@ -115,21 +323,24 @@ class Output:
             self._node.destroy_lifecycle_publisher(publisher)
 
 
-def draw_match(match: Match, places: PlaceMap | GrowingMap | None) -> np.ndarray:
-    """
-    Draw an image beside its nearest place, with status and distance.
+class MapInfoPublisher:
+    """Publishes ``~/map_info`` when it has changed, in the order of the changes."""
 
-    :returns: RGB, uint8.
-    """
-    assert match.image is not None
-    if match.sequence is None or places is None:
-        return match_image(
-            match.image, None, f'{match.status.label} {match.reason}'.strip(), False
-        )
-    place = match.newest_index if match.accepted else match.sequence.middle
-    text = f'{match.status.label}: place {place}, distance {match.distance:.3f}'
-    if not math.isnan(match.threshold):
-        text += f' (threshold {match.threshold:.3f})'
-    if match.inliers >= 0:
-        text += f', {match.inliers} inliers'
-    return match_image(match.image, place_thumbnail(places, place), text, match.accepted)
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._publisher = node.create_publisher(MapInfo, '~/map_info', LATCHED)
+        self._lock = threading.RLock()
+        self.last: MapInfo | None = None
+
+    def publish(self, describe: Callable[[], MapInfo | None]) -> None:
+        """Publish the description if it differs from the last one; None = there is none."""
+        with self._lock:
+            info = describe()
+            if info is None:
+                return
+            info.header.stamp = self._node.get_clock().now().to_msg()
+            last, self.last = self.last, info
+            if last is not None:
+                last.header = info.header  # a new stamp alone is no change
+            if last != info and self._node.context.ok():
+                self._publisher.publish(info)

@@ -1,16 +1,19 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Declaration of the parameters on a node."""
+"""Declaration of the parameters on a node, and the rules for their changes."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 import difflib
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
+from stavpr_ros.errors import SettingsError, SourceError
+from stavpr_ros.output_file import require_room
 from stavpr_ros.parameters import BY_NAME, NodeParameter, PARAMETERS
 
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+_CHANGED_BY_SERVICE = {'map_path': 'load_map', 'operation': 'set_operation'}
 
 
 def descriptor(row: NodeParameter) -> ParameterDescriptor:
@@ -50,3 +53,38 @@ def unknown_parameters(given: Iterable[str]) -> list[str]:
         hint = f': did you mean {near[0]}?' if near else ': see `ros2 param list`'
         warnings.append(f'parameter {name!r} is unknown{hint}')
     return warnings
+
+
+def require_changeable(changes: Mapping[str, Any], state: str) -> None:
+    """
+    Reject parameters that cannot be changed once the node is configured.
+
+    :param changes: name to value, those that differ from the current values.
+    :param state: label of the life-cycle state.
+    :raises SettingsError: names the parameters and the remedy.
+    """
+    for name, service in _CHANGED_BY_SERVICE.items():
+        if name in changes:
+            raise SettingsError(
+                f'{name} is read when the node is configured, it is {state}: call the service '
+                f'~/{service}'
+            )
+    if fixed := [name for name in changes if BY_NAME[name].when != 'live']:
+        raise SettingsError(
+            f'{", ".join(fixed)} can be set only while the node is unconfigured, it is {state}: '
+            'clean it up first (`ros2 lifecycle set NODE deactivate`, then cleanup)'
+        )
+
+
+def require_writable(save_path: str) -> None:
+    """
+    Reject a file that cannot be written, before a recorded map would be lost.
+
+    :param save_path: '' = no file.
+    :raises SettingsError: names the parameter.
+    """
+    try:
+        if save_path:
+            require_room(save_path)
+    except SourceError as error:
+        raise SettingsError(f'save_path: {error}') from error

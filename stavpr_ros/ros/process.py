@@ -1,27 +1,65 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Start, spinning and end of every executable with a ROS node."""
+"""Transport, start, spinning, discovery and end of every executable with a ROS node."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 import os
+from pathlib import Path
 import sys
-from typing import TypeVar
+import time
+from typing import Any, TypeVar
 
+from ament_index_python.packages import get_package_share_directory, PackageNotFoundError
+from rcl_interfaces.srv import GetParameters
 import rclpy
+from rclpy.client import Client
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.ros.rclpy_workarounds import PromptExecutor
 from stavpr_ros.signals import interrupted, signals_deferred
 
 SPIN_SECONDS = 0.2  # until a signal is noticed
 END_SECONDS = 4.0  # for running callbacks at the end; the node's worker takes 3 of them
+SERVICE_SECONDS = 2.0
+"""Time in which a node shows its parameter service; some tools have none."""
+
+PROFILES_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+"""Read by Fast DDS 2.14, which ignores the ``FASTDDS_`` spelling of later versions."""
+
+PROFILES_FILE = 'config/fastdds_large_images.xml'
 
 AnyNode = TypeVar('AnyNode', bound=Node)
+
+
+def prepare_transport() -> None:
+    """
+    Give this process shared memory that holds images; to be called before ``rclpy.init``.
+
+    The default segment of 512 KiB is smaller than one 640x480 color image, and the publisher's
+    segment is the one that counts. A profile set by the user stays; other middlewares ignore it.
+
+    :raises UnavailableError: the package's share folder is not found.
+    """
+    if os.environ.get(PROFILES_VARIABLE):
+        return
+    try:
+        profiles = Path(get_package_share_directory('stavpr_ros')) / PROFILES_FILE
+    except PackageNotFoundError as error:
+        raise UnavailableError(
+            'the package stavpr_ros is not installed (no entry in AMENT_PREFIX_PATH): expected '
+            f'its share folder with {PROFILES_FILE}; build it, source local_setup.bash'
+        ) from error
+    if not profiles.is_file():
+        raise UnavailableError(
+            f'{profiles} is missing: expected it in the installed package; build again'
+        )
+    os.environ[PROFILES_VARIABLE] = str(profiles)
 
 
 @contextmanager
@@ -101,7 +139,62 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
         if hasattr(node, 'ending'):
             node.ending.set()
         if isinstance(executor, PromptExecutor):
-            executor.finish(
-                END_SECONDS
-            )  # shutdown takes the entities from under running callbacks
+            # shutdown takes the entities from under running callbacks
+            executor.finish(END_SECONDS)
         executor.shutdown()
+
+
+class Discovery:
+    """
+    Finds out when the nodes at the other end of our topics have discovered us.
+
+    A matched endpoint on our side does not imply a matched one on theirs, and DDS does not report
+    it. But endpoints are announced in order, those of a request after those made before: a node
+    that responds to a request has discovered our topics. Nodes serve parameter requests by
+    default.
+
+    :param node: ours, with its publishers and subscriptions made; the caller spins it.
+    :param endpoints: returns the other endpoints, as ``get_publishers_info_by_topic`` does.
+    :param timeout: seconds after which discovery counts as done.
+    """
+
+    def __init__(
+        self, node: Node, endpoints: Callable[[], list[Any]], timeout: float = 10.0
+    ) -> None:
+        self._node, self._endpoints = node, endpoints
+        self._timeout = max(SERVICE_SECONDS, timeout)
+        self._clients: dict[str, Client] = {}
+        self._responses: dict[str, Future] = {}
+        self._start: float | None = None
+
+    def restart(self) -> None:
+        """Request new responses."""
+        self._responses.clear()
+        self._start = None
+
+    def done(self) -> bool:
+        """Return whether all nodes have responded, or need not; to be called while spinning."""
+        if self._start is None:
+            self._start = time.monotonic()
+        names = self._names()
+        for name in names - self._responses.keys():
+            self._request(name)
+        requested = [self._responses[name] for name in names if name in self._responses]
+        waited = time.monotonic() - self._start
+        if not all(response.done() for response in requested):
+            return waited > self._timeout
+        return (bool(names) and len(requested) == len(names)) or waited > SERVICE_SECONDS
+
+    def _request(self, name: str) -> None:
+        if name not in self._clients:
+            self._clients[name] = self._node.create_client(GetParameters, f'{name}/get_parameters')
+        if self._clients[name].service_is_ready():
+            self._responses[name] = self._clients[name].call_async(GetParameters.Request())
+
+    def _names(self) -> set[str]:
+        """Return the full names of the nodes at the other end, as far as they are known."""
+        return {
+            f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+            for info in self._endpoints()
+            if not info.node_name.startswith('_NODE_NAME_UNKNOWN')
+        }

@@ -26,9 +26,8 @@ from rclpy.service import Service
 START_POLL = 0.0005  # seconds between two checks whether a thread has begun a callback
 RESPONSE_LOST = 'failed to send response'  # part of rclpy's warning
 RESPONSE_TIMEOUT = 3.5  # seconds of attempts; callbacks have a little more when the process ends
-RESPONSE_PAUSE = (
-    0.05  # seconds between attempts; an attempt takes 0.1 s and blocks all other threads
-)
+# seconds between attempts; an attempt takes 0.1 s and blocks all other threads
+RESPONSE_PAUSE = 0.05
 
 _warning_filters = threading.Lock()  # they belong to the process
 
@@ -101,10 +100,8 @@ def repeat_responses(service: Service) -> None:
                 warnings.filterwarnings('error', RESPONSE_LOST, RuntimeWarning)
                 try:
                     return send(response, header)
-                except (
-                    RuntimeWarning,
-                    SystemError,
-                ) as error:  # the latter from C++, caused by the former
+                # the latter from C++, caused by the former
+                except (RuntimeWarning, SystemError) as error:
                     if RESPONSE_LOST not in str(error.__cause__ or error):
                         raise
             time.sleep(RESPONSE_PAUSE)
@@ -140,8 +137,18 @@ class ManagedNode(LifecycleNodeMixin, Node):
 
     @property
     def state(self) -> str:
-        """Label of the life-cycle state."""
+        """Return the label of the life-cycle state."""
         return str(self._state_machine.current_state[1])
+
+    @property
+    def parameter_overrides(self) -> list[str]:
+        """
+        Return the names of the parameters that were given, declared or not.
+
+        No upstream issue was found: rclpy ignores those that no one declares, and has no public
+        way to list them.
+        """
+        return list(self._parameter_overrides)
 
     def advance(self, trigger: Callable[[], TransitionCallbackReturn]) -> bool:
         """

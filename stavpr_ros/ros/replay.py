@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError
-from stavpr_ros.ros.discovery import Discovery
+from stavpr_ros.ros.process import Discovery
 from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord
 from std_msgs.msg import Header

@@ -17,11 +17,11 @@ from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.saving import save_recorded_map
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
-from stavpr_ros.ros.input import ImageInput, OdometryInput
-from stavpr_ros.ros.messages import map_info_message, nanoseconds
-from stavpr_ros.ros.output import Output
+from stavpr_ros.ros.health import Health
+from stavpr_ros.ros.input import ImageInput, InputStatus, STOP_TIMEOUT, Worker
+from stavpr_ros.ros.output import map_info_message, nanoseconds, Output
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
-from stavpr_ros.ros.worker import STOP_TIMEOUT, Worker
+from stavpr_ros.ros.subscriptions import OdometryInput
 from stavpr_ros.threads import limit_threads
 from std_msgs.msg import Header
 
@@ -59,8 +59,8 @@ class Runtime:
         statistics: Statistics,
         on_map_change: Callable[[], None],
     ) -> None:
-        self._node, self._settings, self._statistics = node, settings, statistics
-        self._on_map_change = on_map_change
+        self._node, self.settings, self._statistics = node, settings, statistics
+        self.on_map_change = on_map_change
         self.images: ImageInput | None = None
         self.odometry: OdometryInput | None = None
         self._epoch = self._pipeline_epoch = 0
@@ -81,13 +81,13 @@ class Runtime:
 
     @property
     def pipeline(self) -> Pipeline:
-        """The pipeline; only the worker may change it."""
+        """Return the pipeline; only the worker may change it."""
         assert self._pipeline is not None
         return self._pipeline
 
     def _make_pipeline(self) -> Pipeline:
-        limit_threads(self._settings.threads)
-        return Pipeline(self._settings.pipeline, self._settings.operation)
+        limit_threads(self.settings.threads)
+        return Pipeline(self.settings.pipeline, self.settings.operation)
 
     # life cycle
 
@@ -96,7 +96,7 @@ class Runtime:
         self.reset()
         self._update_odometry()
         self.images = ImageInput(
-            self._node, self._settings, self._statistics, self._enqueue, self._reject, self.restart
+            self._node, self.settings, self._statistics, self._enqueue, self._reject, self.restart
         )
 
     def deactivate(self) -> None:
@@ -121,7 +121,7 @@ class Runtime:
     def _save(self, on_worker: Callable[[Callable[[], Any]], Any]) -> None:
         if self._pipeline is not None:
             log = self._node.get_logger()
-            save_recorded_map(self._pipeline, on_worker, self._settings.save_path, log)
+            save_recorded_map(self._pipeline, on_worker, self.settings.save_path, log)
 
     def _unsubscribe(self) -> None:
         for subscription in (self.images, self.odometry):
@@ -134,9 +134,9 @@ class Runtime:
 
     def _update_odometry(self) -> None:
         """Subscribe to odometry while it is needed."""
-        needed = self._settings.needs_odometry
+        needed = self.settings.needs_odometry
         if needed and self.odometry is None:
-            self.odometry = OdometryInput(self._node, self._settings.odometry_timeout)
+            self.odometry = OdometryInput(self._node, self.settings.odometry_timeout)
         elif not needed and self.odometry is not None:
             self.odometry.close()
             self.odometry = None
@@ -153,12 +153,10 @@ class Runtime:
         :raises StavprError: the operation cannot be changed; nothing is changed then.
         """
         self.worker.run(lambda: self.pipeline.change(settings.pipeline, settings.operation))
-        self._settings = settings
+        self.settings = settings
         if self.images is not None:
-            self.images.max_rate, self.images.stamps.gap = (
-                settings.max_rate,
-                settings.max_stamp_gap,
-            )
+            self.images.max_rate = settings.max_rate
+            self.images.stamps.gap = settings.max_stamp_gap
             try:
                 self._update_odometry()
             except SettingsError as error:
@@ -172,7 +170,7 @@ class Runtime:
         :raises StavprError: an invalid file, model or setting; the old map stays in use.
         """
         with self._loading(path):
-            loaded = read_map(path, self._settings.pipeline)
+            loaded = read_map(path, self.settings.pipeline)
             self.worker.run(lambda: self.pipeline.change(loaded=loaded))
         places = loaded.places
         self._node.get_logger().info(
@@ -184,7 +182,7 @@ class Runtime:
     def _loading(self, path: str) -> Iterator[None]:
         with self._load_lock:
             self.loading, self.problem = path, ''
-            self._on_map_change()
+            self.on_map_change()
             try:
                 yield
             except Exception as error:
@@ -192,7 +190,7 @@ class Runtime:
                 raise
             finally:
                 self.loading = ''
-                self._on_map_change()
+                self.on_map_change()
 
     def restart(self, reason: str) -> None:
         """Empty the window before the images that arrive from now on."""
@@ -223,6 +221,21 @@ class Runtime:
             pipeline.places,
             pipeline.extractor,
             self._node.get_clock().now().to_msg(),
+        )
+
+    def add_to(self, health: Health) -> Health:
+        """Return the health of the node with the queue, the window and the subscriptions."""
+        pipeline, images, odometry = self.pipeline, self.images, self.odometry
+        needs_poses = pipeline.settings.keyframes.needs_poses  # otherwise poses are optional
+        return replace(
+            health,
+            problem=health.problem or self.problem,
+            loading=self.loading,
+            input=InputStatus() if images is None else images.status(),
+            odometry=odometry.freshness() if odometry is not None and needs_poses else '',
+            queue=self.worker.waiting,
+            window=pipeline.window_fill,
+            missing=pipeline.missing,
         )
 
     # images
@@ -264,7 +277,7 @@ class Runtime:
         header = item.message.header
         stamp = nanoseconds(header.stamp)
         odometry = self.odometry  # another thread may unsubscribe
-        pose, frame = None, self._settings.map_frame
+        pose, frame = None, self.settings.map_frame
         if odometry is not None:
             pose = odometry.trajectory.at(stamp)
             if self.pipeline.operation != 'localization':  # places have the poses of the odometry

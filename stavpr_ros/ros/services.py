@@ -3,44 +3,17 @@
 """The services of the node; each returns the error as its message."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
-from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.saving import write_map
-from stavpr_ros.ros.messages import candidates_message, match_message
+from stavpr_ros.ros.output import candidates_message, match_message
 from stavpr_ros.ros.rclpy_workarounds import repeat_responses
 from stavpr_ros.ros.runtime import Runtime
 from std_srvs.srv import Trigger
-
-
-class ServedNode(Protocol):
-    """The node of the services."""
-
-    @property
-    def runtime(self) -> Runtime:
-        """The runtime; raises StavprError while the node is not configured."""
-
-    @property
-    def settings(self) -> NodeSettings:
-        """The settings in force."""
-
-    def load_map(self, path: str) -> None:
-        """Load a map and use it."""
-
-    def set_operation(self, operation: str) -> None:
-        """Change the operation."""
-
-    def publish_map_info(self) -> None:
-        """Publish ``~/map_info``."""
-
-    def get_logger(self) -> Any:
-        """Return the logger."""
-
-    def create_service(self, *arguments: Any, **options: Any) -> Any:
-        """Create a service."""
 
 
 class Services:
@@ -48,10 +21,22 @@ class Services:
     Serves ``~/load_map``, ``~/save_map``, ``~/reset``, ``~/relocalize`` and ``~/set_operation``.
 
     They share a callback group of their own: a long request delays neither images nor diagnostics.
+
+    :param node: their node.
+    :param runtime: returns the runtime; raises StavprError while the node is not configured.
+    :param load_map: loads a map and uses it.
+    :param set_operation: changes the operation.
     """
 
-    def __init__(self, node: ServedNode) -> None:
-        self._node = node
+    def __init__(
+        self,
+        node: Node,
+        runtime: Callable[[], Runtime],
+        load_map: Callable[[str], None],
+        set_operation: Callable[[str], None],
+    ) -> None:
+        self._logger = node.get_logger()
+        self._runtime, self._load, self._operate = runtime, load_map, set_operation
         group = MutuallyExclusiveCallbackGroup()
         for kind, name, serve in (
             (LoadMap, 'load_map', self._load_map),
@@ -72,16 +57,14 @@ class Services:
 
         def callback(request: Any, response: Any) -> Any:
             try:
-                response.message = serve(self._node.runtime, request, response)
+                response.message = serve(self._runtime(), request, response)
                 response.success = True
             except StavprError as error:
                 response.success, response.message = False, str(error)
-                self._node.get_logger().warning(f'{name} failed: {error}')
-            except (
-                Exception
-            ) as error:  # the worker was stopped, or a defect: the client must get a response
+                self._logger.warning(f'{name} failed: {error}')
+            except Exception as error:  # a defect: the client must get a response all the same
                 response.success, response.message = False, f'{type(error).__name__}: {error}'
-                self._node.get_logger().error(f'{name} failed: {response.message}')
+                self._logger.error(f'{name} failed: {response.message}')
             return response
 
         return callback
@@ -89,18 +72,18 @@ class Services:
     def _load_map(self, runtime: Runtime, request: Any, response: Any) -> str:
         if not request.path:
             raise StavprError("path = '' is no file: set the path of the map")
-        self._node.load_map(request.path)
+        self._load(request.path)
         response.map = runtime.map_info()
         return f'{response.map.places} places from {request.path}'
 
     def _save_map(self, runtime: Runtime, request: Any, response: Any) -> str:
-        path = request.path or self._node.settings.save_path or runtime.pipeline.path
+        path = request.path or runtime.settings.save_path or runtime.pipeline.path
         if not path:
             raise StavprError(
                 "path = '', save_path is not set, and the map has no file: set a path"
             )
         response.places = write_map(runtime.pipeline, runtime.worker.run, path, request.overwrite)
-        self._node.publish_map_info()
+        runtime.on_map_change()
         return f'{response.places} places to {path}'
 
     def _reset(self, runtime: Runtime, request: Any, response: Any) -> str:
@@ -108,7 +91,7 @@ class Services:
         return 'the window is empty'
 
     def _relocalize(self, runtime: Runtime, request: Any, response: Any) -> str:
-        count = request.count or self._node.settings.pipeline.candidates
+        count = request.count or runtime.settings.pipeline.candidates
 
         def relocalize() -> None:
             # messages are made on the worker: a growing route may evict places before the next
@@ -123,5 +106,5 @@ class Services:
         return response.match.reason or f'place {response.match.place_index}'
 
     def _set_operation(self, runtime: Runtime, request: Any, response: Any) -> str:
-        self._node.set_operation(request.operation)
+        self._operate(request.operation)
         return f'operation {request.operation}'
