@@ -49,8 +49,13 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
     """Measure all stages of all sizes."""
-    from stages import device_retrieval, feature_stages, memory_problem
-    from stages import paper_stages, robust_stages
+    from stages import (
+        device_retrieval,
+        feature_stages,
+        memory_problem,
+        paper_stages,
+        robust_stages,
+    )
     import torch
 
     for n in options.sizes:

@@ -30,7 +30,6 @@ from results import PeerTime, Row
 from run import Peer, Run
 import stages
 from stavpr_ros.alignment import match_sequence, SequenceDistances
-from stavpr_ros.alignment.settings import VelocitySettings
 import targets
 import timing
 from timing import Timing
@@ -273,8 +272,8 @@ def test_sequence_peers_with_other_results_are_rejected():
     window = data.make_window(20, 100, 0)
     ours = match_sequence(window, stages.SEQUENCE)
     assert stages.sequence_peers(Run('cpu'), window, ours)[0].name == 'prange'
+    wrong = SequenceDistances(ours.distances, ours.lengths + 1)
     with pytest.raises(AssertionError):
-        wrong = SequenceDistances(ours.distances, ours.lengths + 1)
         stages.sequence_peers(Run('cpu'), window, wrong)
 
 
