@@ -40,7 +40,7 @@ def run(monkeypatch, capsys):
     """Run the ``main`` of a command's module in this process, which keeps its signal handlers."""
 
     def run_main(command, *arguments):
-        monkeypatch.setattr(command, 'obey_signals', lambda: None)
+        monkeypatch.setattr('stavpr_ros.commands.program.obey_signals', lambda: None)
         try:
             code = command.main([str(argument) for argument in arguments])
         except SystemExit as ended:  # of argparse

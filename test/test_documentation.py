@@ -29,7 +29,7 @@ def write_images(folder: Path, count: int, seed: int) -> None:
 
 @pytest.fixture(scope='module')
 def workspace(tmp_path_factory) -> Path:
-    """A folder with the images and ground truth that the examples name."""
+    """Write a folder with the images and ground truth that the examples name."""
     folder = tmp_path_factory.mktemp('workspace')
     for name, seed in (('monday', 0), ('tuesday', 0), ('another_town', 7)):
         write_images(folder / name, 40, seed)
