@@ -30,7 +30,7 @@ help: ## list the targets (the default)
 	@echo 'Names and values:'
 	@echo '  PYTHON=python3.12          the Python to use, 3.11 to 3.13 (default: python3)'
 	@echo '  TORCH_INDEX=URL            package index for torch, for example one of CPU wheels'
-	@echo '  EXTRAS="onnx cuda"         optional packages: onnx, cuda, evaluation, dev, docs'
+	@echo '  EXTRAS="onnx cuda"         optional packages: onnx, cuda, evaluation, bench, dev, docs'
 	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your folders of images, bags or saved maps'
 	@echo '  LOOP=PATH                  demo: your sequence with loops, or synthetic for the street'
 	@echo '  ARGS="..."                 options for the program of the target (test: pytest)'
@@ -63,6 +63,7 @@ lint: development ## check style and types with ruff and mypy
 docs: development ## build the documentation into docs/_build; warnings are errors
 	@$(RUN) sphinx-build -E -W --keep-going -q -b html docs docs/_build
 
+bench bench-quick: override EXTRAS += bench
 bench: build ## measure speed and memory beside lower bounds and peers (ARGS=)
 	@$(RUN) python benchmarks/matching.py $(ARGS)
 
@@ -80,8 +81,8 @@ shell: build ## open a bash in which the built packages are found
 clean: ## remove build/ install/ log/ docs/_build/
 	@rm -rf build install log docs/_build
 
-distclean: clean ## also remove .venv, .venv-peers and the caches of tools
-	@rm -rf .venv .venv-peers .pytest_cache .mypy_cache .ruff_cache .hypothesis
+distclean: clean ## also remove .venv and the caches of tools
+	@rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 development:

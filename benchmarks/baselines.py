@@ -1,15 +1,11 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Plain programs of the same mathematics: LM-DTW and velocity search with prange, the oracle."""
+"""Plain programs of the same mathematics: LM-DTW and velocity search with prange, DTW."""
 
 from collections.abc import Callable
 from functools import lru_cache
-import importlib.util
-import sys
-from types import ModuleType
 
 import numpy as np
-from results import ROOT
 
 
 @lru_cache
@@ -89,17 +85,13 @@ def prange_velocities() -> Callable[[np.ndarray, np.ndarray, np.float32], np.nda
     return search
 
 
-@lru_cache
-def oracle() -> ModuleType:
-    """Load test/oracle.py, the method in plain loops."""
-    path = ROOT / 'test' / 'oracle.py'
-    spec = importlib.util.spec_from_file_location('stavpr_oracle', path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # needed by its dataclasses
-    spec.loader.exec_module(module)
-    return module
+def accumulated(costs: np.ndarray) -> float:
+    """Return the accumulated cost of the last cell of dynamic time warping, in float64."""
+    S = np.full((costs.shape[0] + 1, costs.shape[1] + 1), np.inf)
+    S[0, 0] = 0
+    for i, j in np.ndindex(costs.shape):
+        S[i + 1, j + 1] = costs[i, j] + min(S[i, j], S[i, j + 1], S[i + 1, j])
+    return float(S[-1, -1])
 
 
 def sample(n: int, k: int, count: int) -> list[int]:

@@ -8,7 +8,6 @@ benchmarks/matching.py``. Method and tables: benchmarks/README.md.
 """
 
 import argparse
-from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 import sys
@@ -18,7 +17,6 @@ from typing import TYPE_CHECKING
 from results import RESULTS
 
 if TYPE_CHECKING:
-    from peer_process import Peers
     from run import Run
 
 SIZES = (2_000, 20_000, 100_000)
@@ -30,57 +28,23 @@ BUSY = 0.5  # load average above which results are not repeatable
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
-    parser.add_argument('--device', choices=('cpu', 'cuda'), default='cpu')
-    parser.add_argument(
-        '--quick', action='store_true', help=f'up to {QUICK_LIMIT:,} places, fewer runs'
-    )
-    parser.add_argument('--sizes', type=int, nargs='+', default=SIZES, metavar='N', help='places')
-    parser.add_argument(
-        '--dimensions',
-        type=int,
-        nargs='+',
-        default=DIMENSIONS,
-        metavar='D',
-        help='of a local feature',
-    )
-    parser.add_argument('--precisions', nargs='+', metavar='DTYPE', help='of the map (all)')
-    parser.add_argument(
-        '--seconds', type=float, help='duration of one measurement (0.5; quick: 0.15)'
-    )
-    parser.add_argument('--memory', type=float, default=12, help='most GB to use (%(default)s)')
-    parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument(
-        '--no-peers', action='store_true', help='without librosa and tslearn (.venv-peers)'
-    )
-    parser.add_argument(
-        '--no-memory', action='store_true', help='without the memory of the pipeline'
-    )
-    parser.add_argument(
-        '--commit', default='', help='name of the measured commit, outside a git checkout'
-    )
-    parser.add_argument(
-        '--output', type=Path, default=RESULTS, help='folder of the results (%(default)s)'
-    )
+    add = parser.add_argument
+    add('--device', choices=('cpu', 'cuda'), default='cpu')
+    add('--quick', action='store_true', help=f'up to {QUICK_LIMIT:,} places, fewer runs')
+    add('--sizes', type=int, nargs='+', default=SIZES, metavar='N', help='places')
+    add('--dimensions', type=int, nargs='+', default=DIMENSIONS, metavar='D', help='of a feature')
+    add('--precisions', nargs='+', metavar='DTYPE', help='of the map (all)')
+    add('--seconds', type=float, help='duration of one measurement (0.5; quick: 0.15)')
+    add('--memory', type=float, default=12, help='most GB to use (%(default)s)')
+    add('--seed', type=int, default=0)
+    add('--no-memory', action='store_true', help='without the memory of the pipeline')
+    add('--commit', default='', help='name of the measured commit, outside a git checkout')
+    add('--output', type=Path, default=RESULTS, help='folder of the results (%(default)s)')
     options = parser.parse_args(arguments)
     if options.quick:
         options.sizes = [n for n in options.sizes if n <= QUICK_LIMIT]
     options.seconds = options.seconds or (0.15 if options.quick else 0.5)
     return options
-
-
-def open_peers(stack: ExitStack, run: 'Run', refused: bool) -> 'Peers | None':
-    """Start the peers of the other environment; None, and recorded reasons, where that fails."""
-    from peer_process import Peers, PeersMissingError
-
-    reason = '--no-peers'
-    try:
-        if not refused:
-            return stack.enter_context(Peers())
-    except PeersMissingError as error:
-        reason = f'no environment for the peers: {error}'
-    for name in ('librosa', 'tslearn'):
-        run.skip(name, 0, 0, reason)
-    return None
 
 
 def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
@@ -106,12 +70,10 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
                 problem = f'out of memory: {str(error).splitlines()[0]}'
             if problem:
                 run.skip('frame', n, d, problem)
-    with ExitStack() as stack:
-        processes = open_peers(stack, run, options.no_peers)
-        for n in options.sizes:
-            paper_stages(run, n, options.seed, processes)
-            if run.device == 'cuda':
-                device_retrieval(run, n, options.seed)
+    for n in options.sizes:
+        paper_stages(run, n, options.seed)
+        if run.device == 'cuda':
+            device_retrieval(run, n, options.seed)
 
 
 def main(arguments: list[str] | None = None) -> int:

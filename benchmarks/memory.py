@@ -174,7 +174,8 @@ def main(arguments: list[str]) -> None:
     from stavpr_ros.threads import wait_passively
 
     wait_passively()
-    KINDS['synthetic'] = 'memory:Synthetic'
+    KINDS['synthetic'] = (SyntheticSettings, 'synthetic:Synthetic')
+    sys.modules['stavpr_ros.features.synthetic'] = sys.modules[__name__]
     operation, mode, precision, n, d, folder = arguments
     run = (operation, mode, precision)
     run_pipeline(*run, SMALL, int(d), Path(folder))

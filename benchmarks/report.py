@@ -20,10 +20,11 @@ ROBUST_STAGES = (
     'selection',
     'path_trace',
 )
+SIZES = ('stage', 'mode', 'n', 'd', 'precision')  # head of a row's first cells
 OUTCOME = {True: 'reached', False: '**not reached**', None: 'not measured'}
 
 
-def _sizes(row: Row) -> list[str]:
+def _sizes(row: Row | Target) -> list[str]:
     return [row.stage, row.mode or 'both', f'{row.n:,}', str(row.d or '-'), row.precision]
 
 
@@ -51,17 +52,7 @@ def frame_section(rows: Sequence[Row]) -> list[str]:
             for s in (*parts, sum(parts), row.median_s, row.spread_s, row.lower_bound_s)
         ]
         lines.append([*_sizes(row)[2:], *texts, number_text(row.ratio)])
-    head = (
-        'n',
-        'd',
-        'precision',
-        *ROBUST_STAGES,
-        'sum',
-        'frame',
-        'spread',
-        'lower bound',
-        'ratio',
-    )
+    head = (*SIZES[2:], *ROBUST_STAGES, 'sum', 'frame', 'spread', 'lower bound', 'ratio')
     return ['## A frame in mode robust (the default), stage by stage', '', *table(head, lines)]
 
 
@@ -97,22 +88,10 @@ def target_section(
     lines = []
     for target in (target for target in targets if target.device == device):
         found = target.found(rows)
-        sizes = [
-            target.stage,
-            target.mode or 'both',
-            f'{target.n:,}',
-            str(target.d or '-'),
-            target.precision,
-        ]
         outcome = OUTCOME[None if found is None else target.reached(found)]
-        values = [
-            target.value,
-            number_text(found),
-            f'{target.relation} {target.wanted:g}',
-            outcome,
-        ]
-        lines.append([*sizes, *values])
-    head = ('stage', 'mode', 'n', 'd', 'precision', 'value', 'measured', 'wanted', '')
+        wanted = f'{target.relation} {target.wanted:g}'
+        lines.append([*_sizes(target), target.value, number_text(found), wanted, outcome])
+    head = (*SIZES, 'value', 'measured', 'wanted', '')
     return ['## Targets', '', *table(head, lines)]
 
 
@@ -124,19 +103,8 @@ def stage_section(rows: Sequence[Row]) -> list[str]:
         texts = [seconds_text(s) for s in (row.median_s, row.spread_s)]
         texts += [str(row.runs), seconds_text(row.lower_bound_s), number_text(row.ratio)]
         lines.append([*_sizes(row), *texts, number_text(cells / 1e9 if cells else None)])
-    head = (
-        'stage',
-        'mode',
-        'n',
-        'd',
-        'precision',
-        'median',
-        'spread',
-        'runs',
-        'lower bound',
-        'ratio',
-    )
-    return ['## All stages', '', *table((*head, 'G cells/s'), lines)]
+    head = (*SIZES, 'median', 'spread', 'runs', 'lower bound', 'ratio', 'G cells/s')
+    return ['## All stages', '', *table(head, lines)]
 
 
 def peer_section(rows: Sequence[Row]) -> list[str]:
@@ -148,19 +116,7 @@ def peer_section(rows: Sequence[Row]) -> list[str]:
         note = peer.note + ('; a part of the work' if peer.partial else '')
         lines.append([*_sizes(row), peer.name, *times, number_text(peer.ratio), note])
     whole = [peer.ratio for _, peer in pairs if not peer.partial]
-    head = (
-        'stage',
-        'mode',
-        'n',
-        'd',
-        'precision',
-        'peer',
-        'ours',
-        'peer',
-        'spread',
-        'peer / ours',
-        '',
-    )
+    head = (*SIZES, 'peer', 'ours', 'peer', 'spread', 'peer / ours', '')
     lost = f'{sum(ratio < 1 for ratio in whole)} of {len(whole)} lost'
     return [f'## Beside peers ({lost})', '', *table(head, lines)]
 
@@ -194,5 +150,5 @@ def report(
         *stage_section(rows),
         *peer_section(rows),
         *peak_section(peaks),
-        *(['## Left out', '', *table(('stage or peer', 'n', 'd', 'reason'), left_out)]),
+        *('## Left out', '', *table(('stage or peer', 'n', 'd', 'reason'), left_out)),
     ]

@@ -8,13 +8,12 @@ import gc
 from itertools import cycle
 from typing import Any
 
-from baselines import oracle, prange, prange_velocities, sample
+from baselines import accumulated, prange, prange_velocities, sample
 from data import free_bytes, make_features, make_window
 import lower_bounds as bounds
 from lower_bounds import Sizes
 import numpy as np
 from peaks import slower_than_float32
-from peer_process import Peers
 from run import Peer, Run
 from stavpr_ros.alignment.lm_dtw import (
     best_match,
@@ -35,21 +34,12 @@ from timing import measure, synchronizer, timed
 import torch
 
 MODES = ('robust', 'paper')  # the default first
-SEQUENCE, SPATIAL, VELOCITY, NMS_RADIUS = (
-    SequenceSettings(),
-    SpatialSettings(),
-    VelocitySettings(),
-    20,
-)
+SEQUENCE, SPATIAL, VELOCITY = SequenceSettings(), SpatialSettings(), VelocitySettings()
+NMS_RADIUS = 20
 STRIPS = 7
 FRAMES = 20  # of the distance matrix
 MATRIX_PLACES = 20_000  # most places of the distance matrix
-ORACLE_STARTS, ENDS_CHECKED = 3, 3
-PEER_STARTS = {'librosa': 500, 'tslearn': 20}
-PEER_NOTES = {
-    'librosa': 'one core; S of every cell in float64, no path length C, so neither q_m nor m',
-    'tslearn': 'one core; S of every cell in float64, path to (l, k); no free end on the last row',
-}
+LIBROSA_STARTS, ENDS_CHECKED = 500, 3
 Call = Callable[[], Any]
 
 
@@ -125,7 +115,7 @@ def _prange_velocities(costs: np.ndarray, steps: np.ndarray, expected: np.ndarra
 # ------------------------------------------------ on windows of distances, mode paper
 
 
-def paper_stages(run: Run, n: int, seed: int, processes: Peers | None) -> None:
+def paper_stages(run: Run, n: int, seed: int) -> None:
     """Measure the stages of mode paper that follow the image distances."""
     add = partial(run.measure, size=(n, 0), mode='paper')
     window = make_window(SEQUENCE.length, n, seed)
@@ -138,7 +128,7 @@ def paper_stages(run: Run, n: int, seed: int, processes: Peers | None) -> None:
         'lm_dtw',
         call=kernel,
         works=[bounds.lm_dtw(sizes)],
-        peers=sequence_peers(window, matches, processes),
+        peers=sequence_peers(run, window, matches),
         extra={'cells': n * SEQUENCE.length * SEQUENCE.k},
     )
     select = partial(best_match, matches, NMS_RADIUS)
@@ -161,15 +151,15 @@ def device_retrieval(run: Run, n: int, seed: int) -> None:
     run.measure('retrieval', (n, 0), partial(search, NMS_RADIUS), works, mode='paper')
 
 
-def sequence_peers(
-    window: np.ndarray, ours: SequenceDistances, processes: Peers | None
-) -> list[Peer]:
-    """Return all peers of LM-DTW on the same window; their results must be ours."""
-    found = [_prange_peer(window, ours), _oracle_peer(window, ours)]
-    for name in PEER_STARTS if processes else ():
-        assert processes
-        found.append(_process_peer(processes, name, window))
-    return found
+def sequence_peers(run: Run, window: np.ndarray, ours: SequenceDistances) -> list[Peer]:
+    """Return the peers of LM-DTW on the same window; their results must be ours."""
+    found = [_prange_peer(window, ours)]
+    try:
+        from librosa.sequence import dtw  # type: ignore[import-not-found]
+    except ImportError:
+        run.skip('librosa', 0, 0, 'not installed (requirements/bench.txt)')
+        return found
+    return [*found, librosa_peer(window, dtw)]
 
 
 def _prange_peer(window: np.ndarray, ours: SequenceDistances) -> Peer:
@@ -182,30 +172,21 @@ def _prange_peer(window: np.ndarray, ours: SequenceDistances) -> Peer:
     return Peer('prange', timed(call), 'plain numba, all cores; the same results bit for bit')
 
 
-def _oracle_peer(window: np.ndarray, ours: SequenceDistances) -> Peer:
-    n, beta, align = window.shape[1], SEQUENCE.beta, oracle().align_sequence
-    starts = sample(n, SEQUENCE.k, ORACLE_STARTS)
-    for start in starts:
-        aligned = align(window, start, beta, np.float32)
-        np.testing.assert_equal(ours.distances[start], aligned.distance)
-        np.testing.assert_equal(ours.lengths[start], aligned.path[-1][1] - start + 1)
-    job = timed(lambda: [align(window, start, beta, np.float32) for start in starts])
-    note = f'test/oracle.py, Python loops, one core; {len(starts)} starts, scaled'
-    return Peer('oracle', lambda: job() * n / len(starts), note)
+def librosa_peer(window: np.ndarray, dtw: Callable[..., np.ndarray]) -> Peer:
+    """
+    Return librosa as a peer; the sums that it accumulates must be those of plain loops.
 
-
-def _process_peer(peers: Peers, name: str, window: np.ndarray) -> Peer:
-    """Return a peer of the other environment; it must accumulate the oracle's sums."""
-    path, n, k = peers.put(window), window.shape[1], SEQUENCE.k
-    starts = sample(n, k, PEER_STARTS[name])
-    few = starts[:ENDS_CHECKED]
-    for start, end in zip(few, peers.run(name, path, few, k)['ends'], strict=True):
-        expected = float(
-            oracle().accumulate(window[:, start : start + k], 1, np.float64).S[-1][-1]
-        )
-        np.testing.assert_allclose(end, expected, rtol=1e-6, err_msg=f'{name}, start {start}')
-    note = f'version {peers.versions[name]}, {PEER_NOTES[name]}; {len(starts)} starts, scaled'
-    return Peer(name, lambda: peers.run(name, path, starts, k)['seconds'] * n / len(starts), note)
+    :param dtw: ``librosa.sequence.dtw``.
+    """
+    n, k = window.shape[1], SEQUENCE.k
+    starts = sample(n, k, LIBROSA_STARTS)
+    costs = [window[:, start : start + k].copy() for start in starts]  # not timed
+    for start, matrix in zip(starts[:ENDS_CHECKED], costs, strict=False):
+        end = dtw(C=matrix, backtrack=False)[-1, -1]
+        np.testing.assert_allclose(end, accumulated(matrix), 1e-6, err_msg=f'start {start}')
+    job = timed(lambda: [dtw(C=matrix, backtrack=False) for matrix in costs])
+    note = 'one core; S of every cell in float64, no path length C, so neither q_m nor m; '
+    return Peer('librosa', lambda: job() * n / len(starts), f'{note}{len(starts)} starts, scaled')
 
 
 # ------------------------------------------------ on maps of features
@@ -220,19 +201,15 @@ def feature_stages(run: Run, n: int, d: int, precisions: Sequence[str], seed: in
     run.measure('mean_centering', size, centered, [bounds.mean_centering(sizes)], mode='robust')
     for precision in precisions:
         peers = products(run, places, queries[:1], precision)
-        matcher, batch = (
-            make_matcher(places, SPATIAL, run.device, precision),
-            queries.to(run.device),
-        )
+        matcher = make_matcher(places, SPATIAL, run.device, precision)
+        batch = queries.to(run.device)
         call = partial(matcher.distances, batch.strips[:, 0].contiguous(), batch.weights[:, 0])
         works = [bounds.product(sizes, precision), bounds.spatial_alignment(sizes)]
         run.measure('image_distances', size, call, works, peers, precision)
         if n <= MATRIX_PLACES:
             call = partial(matcher.distance_matrix, batch.strips, batch.weights)
-            works = [
-                bounds.product(sizes, precision, FRAMES),
-                bounds.spatial_alignment(sizes, FRAMES),
-            ]
+            works = [bounds.product(sizes, precision, FRAMES)]
+            works += [bounds.spatial_alignment(sizes, FRAMES)]
             many = products(run, places, queries, precision)
             run.measure('distance_matrix', size, call, works, many, precision)
         del matcher, call

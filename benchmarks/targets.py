@@ -64,29 +64,19 @@ class Target:
         return found <= self.wanted if self.relation == '<=' else found >= self.wanted
 
 
+CELLS, PRANGE, LIBROSA = 'cells per second', 'times plain prange', 'times librosa'
+PRODUCT, BOUND = 'over the float32 product', 'over the lower bound'
 TARGETS = (
-    Target('cpu', 'lm_dtw', 'paper', 20_000, 0, 'float32', 'cells per second', '>=', 2.5e9),
-    Target('cpu', 'lm_dtw', 'paper', 20_000, 0, 'float32', 'times plain prange', '>=', 8),
-    Target('cpu', 'lm_dtw', 'paper', 20_000, 0, 'float32', 'times librosa', '>=', 100),
-    Target('cpu', 'lm_dtw', 'paper', 100_000, 0, 'float32', 'cells per second', '>=', 2.5e9),
-    Target('cpu', 'lm_dtw', 'paper', 100_000, 0, 'float32', 'times plain prange', '>=', 8),
-    Target('cpu', 'lm_dtw', 'paper', 100_000, 0, 'float32', 'times librosa', '>=', 100),
-    Target(
-        'cpu', 'distance_matrix', '', 2_000, 512, 'float32', 'over the float32 product', '<=', 1.25
-    ),
-    Target(
-        'cpu',
-        'distance_matrix',
-        '',
-        20_000,
-        512,
-        'float32',
-        'over the float32 product',
-        '<=',
-        1.25,
-    ),
-    Target('cpu', 'frame', 'paper', 20_000, 512, 'float32', 'over the lower bound', '<=', 1.5),
-    Target('cpu', 'frame', 'paper', 20_000, 512, 'float16', 'over the float32 product', '<=', 0.6),
+    Target('cpu', 'lm_dtw', 'paper', 20_000, 0, 'float32', CELLS, '>=', 2.5e9),
+    Target('cpu', 'lm_dtw', 'paper', 20_000, 0, 'float32', PRANGE, '>=', 8),
+    Target('cpu', 'lm_dtw', 'paper', 20_000, 0, 'float32', LIBROSA, '>=', 100),
+    Target('cpu', 'lm_dtw', 'paper', 100_000, 0, 'float32', CELLS, '>=', 2.5e9),
+    Target('cpu', 'lm_dtw', 'paper', 100_000, 0, 'float32', PRANGE, '>=', 8),
+    Target('cpu', 'lm_dtw', 'paper', 100_000, 0, 'float32', LIBROSA, '>=', 100),
+    Target('cpu', 'distance_matrix', '', 2_000, 512, 'float32', PRODUCT, '<=', 1.25),
+    Target('cpu', 'distance_matrix', '', 20_000, 512, 'float32', PRODUCT, '<=', 1.25),
+    Target('cpu', 'frame', 'paper', 20_000, 512, 'float32', BOUND, '<=', 1.5),
+    Target('cpu', 'frame', 'paper', 20_000, 512, 'float16', PRODUCT, '<=', 0.6),
     Target('cpu', 'frame', 'paper', 100_000, 512, 'float16', 'seconds', '<=', 0.1),
     Target('cuda', 'distance_matrix', '', 2_000, 512, 'float32', 'seconds', '<=', 3e-4),
     Target('cuda', 'retrieval', 'paper', 2_000, 0, 'float32', 'seconds', '<=', 1e-4),

@@ -18,7 +18,7 @@ def write_images(folder, images):
 
 def runner(command, monkeypatch, capsys):
     """Return a function that runs a command in this process: exit code, output, errors."""
-    monkeypatch.setattr(command, 'obey_signals', lambda: None)
+    monkeypatch.setattr('stavpr_ros.commands.program.obey_signals', lambda: None)
 
     def run(*arguments):
         try:

@@ -15,11 +15,9 @@ import numpy as np
 from processes import executable, Process, TIMEOUT
 import pytest
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure, PlaceMatch
-from stavpr_ros.commands import build_map, demo, record
+from stavpr_ros.commands import build_map, demo
 from stavpr_ros.commands.record import loop_closure_record, match_record
-from stavpr_ros.demonstration.loops import choose_closures, read_result
-from stavpr_ros.demonstration.recordings import remove_earlier_bag, TOPIC
-from stavpr_ros.errors import SourceError
+from stavpr_ros.demonstration.loops import read_result
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.records import evaluate_records
 from stavpr_ros.mapping import load_map
@@ -42,7 +40,7 @@ def run(monkeypatch, capsys):
     """Run the ``main`` of a command's module in this process, which keeps its signal handlers."""
 
     def run_main(command, *arguments):
-        monkeypatch.setattr(command, 'obey_signals', lambda: None)
+        monkeypatch.setattr('stavpr_ros.commands.program.obey_signals', lambda: None)
         try:
             code = command.main([str(argument) for argument in arguments])
         except SystemExit as ended:  # of argparse
@@ -142,15 +140,6 @@ def test_build_map_with_odometry_sets_poses(run, tmp_path):
     assert 'topics of that type are /odom' in result.err
 
 
-def test_build_map_with_odometry_of_another_clock_fails(run, tmp_path):
-    stamps = [SECOND, 2 * SECOND]
-    bag = write_odometry(tmp_path / 'bag', stamps, images=image_records(3, 100))
-    result = run(build_map, '--input', bag, '--output', tmp_path / 'map', '--odometry', '/odom')
-    assert result.code == 1
-    assert 'one clock' in result.err
-    assert not (tmp_path / 'map').exists()
-
-
 @pytest.mark.parametrize(
     ('options', 'code', 'word'),
     [
@@ -176,14 +165,6 @@ def test_build_map_with_wrong_option_names_it(run, traverse, tmp_path, options, 
     assert result.code == code
     assert word in result.err
     assert (tmp_path / 'map.stavpr').exists() is (code == 0)
-
-
-def test_build_map_with_unwritable_output_fails_first(run, tmp_path):
-    """The input is not read before."""
-    for output, words in ((tmp_path, 'name a file in it'), (tmp_path / 'no' / 'map', 'make it')):
-        result = run(build_map, '--input', '/missing', '--output', output)
-        assert result.code == 1
-        assert words in result.err
 
 
 @pytest.mark.parametrize(
@@ -230,12 +211,6 @@ def test_record_of_invalid_topic_fails(tmp_path):
     assert result.returncode == 2
     assert 'record: Invalid topic name' in result.stderr
     assert 'Traceback' not in result.stderr
-
-
-def test_record_interrupted_before_start_exits_with_130(run, tmp_path, monkeypatch):
-    monkeypatch.setattr('stavpr_ros.ros.process.own_arguments', interrupt)
-    result = run(record, '--output', tmp_path / 'x')
-    assert (result.code, result.err) == (130, 'record: interrupted\n')
 
 
 def test_loop_closure_record_is_plain_json():
@@ -307,17 +282,6 @@ def test_demo_with_foreign_folder_keeps_it(run, tmp_path, options, name):
     assert result.code == 1
     assert f'{name} exists and is no bag of an earlier demo' in result.err
     assert photo.exists()
-
-
-def test_remove_earlier_bag_removes_only_bags(tmp_path):
-    bag = tmp_path / 'loop'
-    remove_earlier_bag(bag)
-    write_bag(bag, TOPIC, image_records(1))
-    remove_earlier_bag(bag)
-    assert not bag.exists()
-    bag.touch()
-    with pytest.raises(SourceError, match='cannot be replaced'):
-        remove_earlier_bag(bag)
 
 
 def test_demo_on_bag_and_folder_reports_matches(run, traverse, tmp_path):
@@ -419,16 +383,6 @@ def test_read_result_counts_images_not_places():
     assert read_result(statuses, [], None, 2).summary() == (
         '0 loop closures in 6 images (1 too similar to the last)'
     )
-
-
-def test_choose_closures_shows_few_wrong_ones():
-    correct = np.arange(20) % 5 > 0  # wrong: 0 5 10 15
-    chosen = choose_closures(20, correct)
-    assert [i for i in chosen if not correct[i]] == [0, 15]
-    assert len(chosen) == 8
-    assert {1, 19} <= set(chosen)
-    assert choose_closures(3, np.zeros(3, bool)) == [0, 1, 2]
-    assert choose_closures(0, None) == []
 
 
 def plain_match(status, place=-1):

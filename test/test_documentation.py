@@ -2,17 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The documentation: its examples run, its names exist, its numbers are those of the results."""
 
+import contextlib
 import json
 from pathlib import Path
 import re
 import shlex
-import subprocess
-import sys
 
 from conftest import route_images
 import cv2
 import pytest
-from stavpr_ros.commands.stavpr import COMMANDS
+from stavpr_ros.commands import stavpr
 from stavpr_ros.parameters import PARAMETERS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -29,7 +28,7 @@ def write_images(folder: Path, count: int, seed: int) -> None:
 
 @pytest.fixture(scope='module')
 def workspace(tmp_path_factory) -> Path:
-    """A folder with the images and ground truth that the examples name."""
+    """Write a folder with the images and ground truth that the examples name."""
     folder = tmp_path_factory.mktemp('workspace')
     for name, seed in (('monday', 0), ('tuesday', 0), ('another_town', 7)):
         write_images(folder / name, 40, seed)
@@ -53,48 +52,55 @@ def documented_commands() -> list[list[str]]:
                 words = [word.removeprefix('$bin/') for word in words if word != '&']
                 if words[:3] == ['ros2', 'run', 'stavpr_ros']:
                     words = words[3:]
-                if words and words[0] in COMMANDS and words[0] != 'node':
+                if words and words[0] in stavpr.COMMANDS and words[0] != 'node':
                     found.append(words)
     return found
 
 
-def test_readme_python_example_runs(workspace):
+@pytest.fixture
+def run(workspace, monkeypatch, capsys):
+    """Run something in the folder of the examples, in this process; return what it prints."""
+    monkeypatch.chdir(workspace)
+    monkeypatch.setattr('stavpr_ros.signals.signal.signal', lambda *_: None)
+
+    def printed(work, *arguments):
+        with contextlib.suppress(SystemExit):  # of --help
+            work(*arguments)
+        return capsys.readouterr().out
+
+    return printed
+
+
+def test_readme_python_example_runs(run):
     (example,) = code_blocks(ROOT / 'README.md', 'python')
-    done = subprocess.run(
-        [sys.executable, '-c', example], cwd=workspace, capture_output=True, text=True, check=True
-    )
-    lines = done.stdout.splitlines()
+    lines = run(exec, example, {'__name__': '__main__'}).splitlines()
     assert len(lines) == 40
     assert lines[0].startswith('0 WARMING_UP -1 nan')
     assert [line.split()[1] for line in lines[30:]] == ['MATCH'] * 10
 
 
-def test_build_map_and_evaluate_examples_run(workspace):
-    python = [sys.executable, '-m', 'stavpr_ros.commands.stavpr']
+def test_build_map_and_evaluate_examples_run(run, workspace):
     examples = [
-        ['build_map', '--input', 'monday/', '--output', 'monday.stavpr'],
-        ['evaluate', '--map', 'summer/', '--query', 'winter/', '--warp', 'vary', '--crop-map']
-        + ['0.3', '--crop-query', '0.1', '--json', 'result.json'],
-        ['evaluate', '--map', 'monday/', '--query', 'tuesday/', '--truth', 'pairs.csv']
-        + ['--unknown', 'another_town/', '--json', 'unknown.json'],
+        'build_map --input monday/ --output monday.stavpr',
+        'evaluate --map summer/ --query winter/ --warp vary --crop-map 0.3 --crop-query 0.1 '
+        '--json result.json',
+        'evaluate --map monday/ --query tuesday/ --truth pairs.csv --unknown another_town/ '
+        '--json unknown.json',
     ]
     documented = documented_commands()
-    for words in examples:
+    for words in map(str.split, examples):
         assert any(words[: len(given)] == given for given in documented), f'undocumented: {words}'
-        subprocess.run([*python, *words], cwd=workspace, capture_output=True, check=True)
+        run(stavpr.main, words)
     assert json.loads((workspace / 'result.json').read_text())['settings']['mode'] == 'robust'
+    assert json.loads((workspace / 'unknown.json').read_text())['unknown_images'] == 40
     assert (workspace / 'monday.stavpr').stat().st_size > 0
 
 
-def test_documented_options_exist():
+def test_documented_options_exist(run):
     commands = documented_commands()
     assert len(commands) > 8
-    helps: dict[str, str] = {}
+    helps = {name: run(stavpr.main, [name, '--help']) for name in {words[0] for words in commands}}
     for name, *words in commands:
-        if name not in helps:
-            program = [sys.executable, '-m', 'stavpr_ros.commands.stavpr', name, '--help']
-            done = subprocess.run(program, capture_output=True, text=True, check=True)
-            helps[name] = done.stdout
         for word in words:
             if word.startswith('--') and word != '--ros-args':
                 assert re.search(rf'{re.escape(word)}\b', helps[name]), f'{name} has no {word}'

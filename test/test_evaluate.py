@@ -5,7 +5,6 @@
 import csv
 import os
 import re
-import sys
 
 from conftest import route_images
 import cv2
@@ -124,17 +123,6 @@ def test_evaluate_numbers_are_those_of_the_recognizer(folders, numbers, options,
     ends = slice(3, PLACES // 2 - 4)
     inner = best_f1(matches.distances[ends], correct[ends])
     assert found['sequence_without_ends']['f1'] == inner.f1
-
-
-def test_evaluate_repeated_gives_the_same_numbers_in_the_default_mode(folders, numbers):
-    options = [*pair(folders), '--projection', 64]
-    first, second = numbers(*options), numbers(*options)
-    assert first.pop('times').keys() == second.pop('times').keys()
-    assert first == second
-    assert first['settings']['mode'] == 'robust'
-    default = first['default_threshold']  # mode robust has one
-    assert 0 <= default['f1'] <= first['sequence']['f1']
-    assert default['threshold'] > 0
 
 
 def test_evaluate_with_unknown_images_counts_false_alarms(folders, numbers):
@@ -395,17 +383,6 @@ def test_evaluate_of_inputs_that_do_not_fit_fails(folders, run, tmp_path):
     assert not folder.exists()
 
 
-@pytest.mark.parametrize(
-    ('module', 'package'), [('sklearn.metrics', 'scikit-learn'), ('jinja2', 'jinja2')]
-)
-def test_evaluate_without_a_package_of_the_extra_fails(
-    folders, run, monkeypatch, tmp_path, module, package
-):
-    monkeypatch.setitem(sys.modules, module, None)
-    code, _, errors = run(*pair(folders), '--output', tmp_path / 'out')
-    assert (code, f'pip install {package}' in errors) == (1, True)
-
-
 # ---------------------------------------------------------------------------------- real data
 
 
@@ -416,14 +393,6 @@ def test_evaluate_on_gardens_point_gives_the_measured_f1(data_folder, numbers):
     assert paper['sequence']['f1'] == pytest.approx(0.754, abs=0.02)
     assert robust['sequence']['f1'] > 0.95
     assert robust['sequence']['recall_at_5'] >= robust['sequence']['recall_at_1'] > 0.95
-
-
-def test_evaluate_on_corridor_gives_the_measured_f1(data_folder, numbers):
-    folder = data_folder / 'corridor'
-    options = ['--truth', folder / 'ground_truth.csv']
-    found = numbers('--map', folder / 'ref', '--query', folder / 'query', *options)
-    assert found['sequence']['queries_with_match'] == 111
-    assert found['sequence']['f1'] > 0.9
 
 
 def test_evaluate_of_loop_closures_in_the_hallway_gives_the_measured_recall(data_folder, numbers):

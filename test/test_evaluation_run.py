@@ -8,7 +8,6 @@ from stavpr_ros.alignment import SequenceMatch, SequenceSettings
 from stavpr_ros.errors import InputError
 from stavpr_ros.evaluation import evaluate as module
 from stavpr_ros.evaluation.evaluate import (
-    centered_images,
     evaluate_traverse,
     recognize_traverse,
     ReducedDistances,
@@ -82,13 +81,6 @@ def test_recognize_traverse_reduces_distances_to_block_minima(monkeypatch, small
     reduced = recognize_traverse(online, small_map.features[:4], 3, settings).distances
     assert reduced.block == (2, 2)
     assert reduced.values.tolist() == [[3, 7], [2, 1]]
-
-
-def test_centered_images_leave_out_half_a_window_at_both_ends():
-    assert centered_images(200, 20) == slice(9, 190)
-    assert centered_images(5, 5) == slice(2, 3)
-    with pytest.raises(InputError, match='at least l = 6'):
-        centered_images(5, 6)
 
 
 def results_of(places, scores):

@@ -49,14 +49,6 @@ def test_accepts_minus_one_is_false_after_an_accepted_last_place():
     assert truth.accepts(np.array([4, -1])).tolist() == [True, False]
 
 
-def test_from_pairs_without_pairs_accepts_nothing():
-    truth = by_hand([], 2, 3)
-    assert truth.accepts(np.array([0, -1])).tolist() == [False, False]
-    assert truth.has_match.tolist() == [False, False]
-    assert truth.middles.tolist() == [-1, -1]
-    assert not truth.matrix().any()
-
-
 @pytest.mark.parametrize(
     'places',
     [
@@ -89,15 +81,6 @@ def test_widened_stays_within_query_and_map():
     for wrong in (-1, 0.5):
         with pytest.raises(InputError, match='tolerance'):
             by_hand().widened(wrong)
-
-
-def test_select_by_hand():
-    truth = by_hand().select(np.array([2, 0, 1, 0]))
-    assert (truth.N, truth.n) == (4, 5)
-    assert truth.pairs.tolist() == [[0, 4], [1, 1], [1, 2], [3, 1], [3, 2]]
-    for wrong in ([3], [-1], [], [0.5]):
-        with pytest.raises(InputError, match='indices'):
-            by_hand().select(np.array(wrong))
 
 
 def test_select_equals_the_rows_of_the_matrix():
@@ -216,11 +199,6 @@ def test_from_file_reads_arrays(tmp_path, array):
         ]
 
 
-def test_from_file_reads_an_array_with_a_place_a_query(tmp_path):
-    np.save(tmp_path / 'truth.npy', np.array([1, -1, 4]))
-    assert GroundTruth.from_file(tmp_path / 'truth.npy', 3, 5).pairs.tolist() == [[0, 1], [2, 4]]
-
-
 @pytest.mark.parametrize(
     ('array', 'message'),
     [
@@ -286,14 +264,6 @@ def test_from_file_of_a_missing_or_damaged_file_raises(tmp_path, name):
         GroundTruth.from_file(tmp_path / name, 3, 5)
 
 
-def test_from_file_of_several_arrays_raises(tmp_path):
-    np.savez(tmp_path / 'truth.npz', hard=MATRIX, soft=MATRIX)
-    with pytest.raises(
-        SourceError, match='holds hard, soft: expected one array, or one called truth'
-    ):
-        GroundTruth.from_file(tmp_path / 'truth.npz', 3, 5)
-
-
 # ---------------------------------------------------------------------------------- poses
 
 
@@ -357,18 +327,6 @@ def test_from_poses_never_accepts_places_with_unknown_pose():
         assert truth.n == 3
     with pytest.raises(InputError, match=r'2 of 3 query images have no pose \(0, 2\)'):
         GroundTruth.from_poses(np.array([unknown, pose(5), unknown]), places, 1)
-
-
-@pytest.mark.parametrize('wrong', [np.zeros((2, 3)), np.zeros((2, 7)), np.full((2, 7), np.nan)])
-def test_from_poses_of_invalid_poses_raises(wrong):
-    with pytest.raises(InputError, match='map poses'):
-        GroundTruth.from_poses(np.array([pose()]), wrong, 1)
-
-
-def test_from_poses_with_invalid_limits_raises():
-    for meters, degrees in [(-1, None), (1, -1), (float('nan'), None)]:
-        with pytest.raises(InputError, match='meters'):
-            GroundTruth.from_poses(np.array([pose()]), np.array([pose()]), meters, degrees)
 
 
 # ---------------------------------------------------------------------------------- real files

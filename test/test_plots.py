@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plots: written, of a sensible size, with the colors of their contents, also for empty input."""
 
-import subprocess
-import sys
-
 import cv2
 import numpy as np
 import pytest
@@ -83,29 +80,12 @@ def test_match_overview_frames_pairs_in_the_color_of_their_outcome(path):
     assert all(colors_of(path, GREEN, RED, AMBER, GRAY))
 
 
-def test_match_overview_of_no_pairs_is_written(path):
-    match_overview(path, [])
-    colors_of(path, spread=1.0)
-
-
-def test_match_pair_with_unknown_outcome_raises():
-    with pytest.raises(InputError, match="outcome is 'good'"):
-        MatchPair(image(1), None, '', 'good')
-
-
 def test_distance_matrix_shows_matches_and_ground_truth(path, results):
     distances, matched, truth, *_ = results
     distance_matrix(path, distances, matched, truth, 2)
     assert all(colors_of(path, BRIGHT_GREEN, BRIGHT_RED, YELLOW))
     distance_matrix(path, distances, matched, None)
     assert colors_of(path, (79, 179, 255), BRIGHT_GREEN, YELLOW) == [True, False, False]
-
-
-@pytest.mark.parametrize('fill', [0.5, np.nan, np.inf])
-def test_distance_matrix_without_contrast_or_match_is_written(path, fill):
-    none = np.full(8, -1)
-    distance_matrix(path, np.full((8, 6), fill), none, none)
-    colors_of(path)
 
 
 def test_reduced_matrix_returns_where_its_axes_are(path):
@@ -141,19 +121,6 @@ def test_plots_of_arrays_that_do_not_fit_raise(path, results):
         warping_path(path, np.zeros((0, 4)), np.zeros((0, 2)))
 
 
-def test_distance_over_time_shows_threshold_and_outcomes(path, results):
-    *_, truth, best, outcomes = results
-    distance_over_time(path, best, THRESHOLD, outcomes, truth < 0)
-    assert all(colors_of(path, BLUE, GREEN))
-
-
-@pytest.mark.parametrize('count', [0, 5])
-def test_distance_over_time_without_distances_is_written(path, count):
-    nothing = np.full(count, np.nan)
-    distance_over_time(path, nothing, np.nan, ['no match'] * count, np.zeros(count, bool))
-    colors_of(path)
-
-
 def test_precision_recall_draws_each_curve_and_its_best_point(path):
     recall = np.linspace(0, 1, 20)
     curves = {
@@ -181,14 +148,6 @@ def test_distance_histogram_shows_groups_and_threshold(path):
     colors_of(path, spread=1.0)
 
 
-def test_warping_path_with_and_without_a_path(path):
-    window = np.random.default_rng(1).random((20, 40))
-    warping_path(path, window, np.stack([np.arange(20), np.arange(20)], axis=1), 100)
-    assert colors_of(path, BRIGHT_GREEN) == [True]
-    warping_path(path, window, np.zeros((0, 2), int))
-    assert colors_of(path, BRIGHT_GREEN) == [False]
-
-
 def test_demo_sheet_with_and_without_matches(path, results):
     distances, matched, truth, best, outcomes = results
     demo_sheet(
@@ -212,21 +171,8 @@ def test_match_image_puts_query_and_place_side_by_side(accepted, color):
     assert np.all(query == 50)
 
 
-def test_match_image_without_a_place_or_with_a_long_text_keeps_its_shape():
-    shape = match_image(image(50), image(9), '', True).shape
-    assert match_image(image(50), None, 'x' * 500, False).shape == shape
-
-
 def test_match_image_of_no_rgb_image_raises():
     with pytest.raises(InputError, match=r'query has shape \(4, 4\)'):
         match_image(np.zeros((4, 4), np.uint8), None, '', True)
     with pytest.raises(InputError, match='place has shape'):
         match_image(image(1), np.zeros((4, 4, 3), np.float32), '', True)
-
-
-def test_importing_plots_does_not_import_matplotlib():
-    code = (
-        'import sys; import stavpr_ros.evaluation.plots, stavpr_ros.pipeline.overlay; '
-        'sys.exit("matplotlib" in sys.modules)'
-    )
-    assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0

@@ -8,14 +8,12 @@ from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.evaluation.metrics import best_f1
 from stavpr_ros.evaluation.paper.datasets import open_dataset
 from stavpr_ros.evaluation.seqslam import (
-    differences,
     enhance_contrast,
     match_differences,
     preprocess,
     seqslam,
     SeqSlamSettings,
 )
-from stavpr_ros.sources.frame import Frame
 
 SMALL = SeqSlamSettings(width=4, height=2, patch=2)
 
@@ -31,27 +29,12 @@ def test_preprocess_patches_by_hand():
     )
 
 
-def test_preprocess_shrinks_by_area_and_converts_to_gray():
-    gray = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8)
-    large = np.kron(gray, np.ones((3, 3), np.uint8))
-    color = np.stack([large] * 3, axis=2)
-    expected = preprocess([gray], SMALL)
-    np.testing.assert_array_equal(preprocess([large], SMALL), expected)
-    np.testing.assert_array_equal(preprocess([Frame(color, 0, '')], SMALL), expected)
-
-
 def test_preprocess_weights_red_more_than_blue():
     gray = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8) * 40
     color = np.stack(
         [gray, gray * 0, 200 - gray], axis=2
     )  # red as the gray image, blue against it
     np.testing.assert_allclose(preprocess([color], SMALL), preprocess([gray], SMALL), atol=0.05)
-
-
-def test_differences_are_mean_absolute_differences():
-    queries = np.array([[0, 0, 0, 0], [1, 2, 3, 4]], np.float32)
-    places = np.array([[1, -1, 1, -1], [1, 2, 3, 4], [0, 0, 0, 2]], np.float32)
-    np.testing.assert_allclose(differences(queries, places), [[1, 2.5, 0.5], [2.5, 0, 2]])
 
 
 def test_enhance_contrast_by_hand():
@@ -72,21 +55,6 @@ def test_lines_at_three_speeds_by_hand():
     assert settings.lines.tolist() == [[0, 1, 1, 2, 2], [0, 1, 2, 3, 4], [0, 2, 3, 5, 6]]
     assert len(SeqSlamSettings().lines) == 5  # 0.8, 0.9, 1.0, 1.1, 1.2
     assert SeqSlamSettings().lines[:, -1].tolist() == [15, 17, 19, 21, 23]
-
-
-def test_match_differences_of_a_fast_query_by_hand():
-    """
-    Three queries, six places; the query is twice as fast and begins at place 1.
-
-    In every row one difference is 0 and five are 6: mean 5, deviation sqrt 5 over the map, so 0
-    becomes -sqrt 5 and 6 becomes 1 / sqrt 5. The line 1, 3, 5 has -sqrt 5 on the mean.
-    """
-    settings = SeqSlamSettings(length=3, slowest=1, fastest=2, speed_step=1, contrast_window=12)
-    D = np.full((3, 6), 6.0)
-    D[[0, 1, 2], [1, 3, 5]] = 0
-    places, scores = match_differences(D, settings)
-    assert places.tolist() == [1, 3, 5]
-    np.testing.assert_allclose(scores, -np.sqrt(5))
 
 
 def test_match_differences_ends_come_from_the_outer_windows():
@@ -176,14 +144,6 @@ def test_match_differences_without_a_window_or_line_is_none():
     )  # all lines alike: the first one
     assert places.tolist() == SeqSlamSettings().lines[0].tolist()
     assert scores.tolist() == [0] * 20
-
-
-@pytest.mark.parametrize(
-    'D', [np.zeros(3), np.zeros((2, 2), int), np.array([[np.nan]]), np.array([[np.inf]])]
-)
-def test_match_differences_of_invalid_arrays_raises(D):
-    with pytest.raises(InputError, match='differences'):
-        match_differences(D, SeqSlamSettings())
 
 
 def test_seqslam_of_invalid_images_raises():

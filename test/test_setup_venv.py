@@ -113,27 +113,7 @@ def test_machine_without_tools_lists_all_of_them(tmp_path, monkeypatch):
     assert 'mycc' not in text
 
 
-def test_machine_problems_stop_the_set_up(recorder, monkeypatch, capsys):
-    monkeypatch.setattr(setup_venv, 'machine_problems', lambda: ['no cmake', 'no compiler'])
-    assert setup_venv.main(['build']) == 1
-    assert '  * no cmake\n  * no compiler' in capsys.readouterr().err
-    assert not recorder.commands
-
-
 # Inputs and stamps
-
-
-def test_digest_depends_on_names_and_contents(checkout):
-    folder = checkout / 'stavpr_ros'
-    (folder / '__pycache__').mkdir()
-    (folder / 'x.py').write_text('1')
-    before = setup_venv.digest([folder, checkout / 'missing'])
-    (folder / '__pycache__' / 'x.pyc').touch()
-    assert setup_venv.digest([folder]) == before
-    (folder / 'x.py').rename(folder / 'y.py')
-    renamed = setup_venv.digest([folder])
-    (folder / 'y.py').write_text('2')
-    assert len({before, renamed, setup_venv.digest([folder])}) == 3
 
 
 def test_extras_are_added_and_kept(recorder):
@@ -212,26 +192,6 @@ def test_interrupted_build_continues_and_a_finished_one_runs_nothing(recorder):
     assert recorder.run('build') == ['venv', 'pip', 'stavpr_msgs']
     recorder.fails = ''
     assert recorder.run('build') == ['stavpr_msgs', 'stavpr_ros']
-    assert recorder.run('build') == []
-
-
-def test_changed_interpreter_builds_anew_even_after_a_failure(recorder, monkeypatch):
-    recorder.run('build')
-    recorder.fails = 'pip'
-    with monkeypatch.context() as other:
-        other.setattr(sys, 'base_prefix', '/other')
-        assert recorder.run('build') == ['venv', 'pip']
-    recorder.fails = ''
-    assert recorder.run('build') == ['venv', 'pip']
-    monkeypatch.setattr(sys, 'base_prefix', '/other')
-    assert recorder.run('build') == ['venv', 'pip', 'stavpr_msgs', 'stavpr_ros']
-
-
-def test_failed_extra_leaves_the_environment_in_use(recorder):
-    recorder.run('build')
-    recorder.fails = 'pip'
-    assert setup_venv.main(['build', '--with', 'evaluation']) == 1
-    recorder.fails = ''
     assert recorder.run('build') == []
 
 
@@ -346,15 +306,9 @@ def test_requirements_are_pinned_exactly():
         assert [pin for pin in pins if not re.fullmatch(r'[\w.\[\]-]+==[\w.]+', pin)] == []
 
 
-def test_sources_of_a_build_exist():
-    sources = [name for names in setup_venv.SOURCES.values() for name in names]
-    assert [name for name in sources if not (ROOT / name).exists()] == []
-
-
 @pytest.mark.parametrize(
     ('arguments', 'expected'),
     [
-        (['demo', 'LOOP=synthetic'], r'/demo +--loop *$'),
         (['demo', 'LOOP=walk'], r'/demo +--loop "\$LOOP" *$'),
         (['demo', 'MAP=a', 'QUERY=b', 'ARGS=-v'], r'/demo --map "\$MAP" --query "\$QUERY" +-v$'),
         (['evaluate', 'EXTRAS=onnx', 'MAP=a', 'QUERY=b'], r'--with onnx evaluation\n'),

@@ -4,8 +4,8 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.errors import ImageError, SettingsError
-from stavpr_ros.evaluation.warp import cropped, CroppedSource, KINDS, STOP, warp_indices
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.evaluation.warp import cropped, STOP, warp_indices
 from stavpr_ros.sources.frame import Frame
 
 
@@ -46,16 +46,6 @@ def test_warp_indices_vary_between_half_and_double_speed():
     assert indices[-1] <= 1999 < indices[-1] + 3
 
 
-@pytest.mark.parametrize('kind', KINDS)
-def test_warp_indices_ascend_within_the_traverse(kind):
-    for n in (1, 2, 59, 200):
-        indices = warp_indices(n, kind)
-        assert indices.dtype == np.int64
-        assert indices[0] == 0
-        assert indices[-1] < n
-        assert (np.diff(indices) >= 0).all()
-
-
 def test_warp_indices_of_unknown_kind_or_no_image_raise():
     with pytest.raises(SettingsError, match=r'take one of 2x, 1\.5x, 0\.7x, 0\.5x, vary, stop'):
         warp_indices(10, '3x')
@@ -83,27 +73,9 @@ def test_cropped_images_by_hand():
     assert source[0].image.shape == (2, 10, 3)
 
 
-def test_cropped_source_can_be_read_again():
-    source = CroppedSource([Frame(columns(10), 0, '')] * 3, 0.5, 0)
-    assert len(source) == 3
-    assert [len(list(source)) for _ in range(2)] == [3, 3]
-
-
-def test_cropped_by_nothing_is_the_source():
-    source = [Frame(columns(4), 0, '')]
-    assert cropped(source, 0, 0) is source
-    assert cropped(source, 0.25, 0) is not source
-    assert cropped(source, 0, 0.25) is not source
-
-
 @pytest.mark.parametrize(
     'fractions', [(-0.1, 0), (0, -0.1), (0.5, 0.5), (1, 0), (float('nan'), 0)]
 )
 def test_cropped_by_invalid_fractions_raises(fractions):
     with pytest.raises(SettingsError, match='fractions >= 0'):
         cropped([], *fractions)
-
-
-def test_cropped_image_without_columns_raises():
-    with pytest.raises(ImageError, match='b is 1 pixels wide'):
-        list(cropped([Frame(columns(1), 0, 'b')], 0.6, 0.3))

@@ -9,10 +9,9 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
-from stavpr_ros.errors import ImageError, SettingsError, SourceError, StavprError
+from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.output_file import require_room
-from stavpr_ros.signals import obey_signals
-from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,11 +37,8 @@ exit codes: 0 the map is written; 1 it is not (the reason is printed, an earlier
 def _parser() -> argparse.ArgumentParser:
     from stavpr_ros.commands.feature_options import add_feature_options
 
-    parser = argparse.ArgumentParser(
-        prog='build_map',
-        description='Build a reference map: one place for each image or keyframe.',
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = make_parser(
+        'build_map', 'Build a reference map: one place for each image or keyframe.', EPILOG
     )
     parser.add_argument(
         '--input', required=True, metavar='FOLDER|BAG', help='images, or a ROS 1 or ROS 2 bag'
@@ -238,10 +234,10 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
-    obey_signals()
-    wait_passively()
     state = 'nothing was written'
-    try:
+
+    def work() -> None:
+        nonlocal state
         arguments = _parser().parse_args(args)
         from stavpr_ros.mapping import save_map
 
@@ -249,13 +245,8 @@ def main(args: list[str] | None = None) -> int:
         save_map(place_map, arguments.output)
         state = f'{arguments.output} is written, without a suggested threshold'
         _report(place_map, arguments.output)
-    except StavprError as error:
-        print(f'build_map: {error}', file=sys.stderr)
-        return 2 if isinstance(error, SettingsError) else 1
-    except KeyboardInterrupt:
-        print(f'build_map: interrupted, {state}', file=sys.stderr)
-        return 130
-    return 0
+
+    return run_program('build_map', work, lambda: f'interrupted, {state}')
 
 
 if __name__ == '__main__':

@@ -8,9 +8,8 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import InputError, SettingsError, SourceError, StavprError
-from stavpr_ros.signals import obey_signals
-from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
     from stavpr_ros.demonstration.recordings import LoopTraverse, TraversePair
@@ -45,12 +44,7 @@ exit codes: 0 done, 1 something failed (the reason is printed), 2 usage, 130 int
 def _parser() -> argparse.ArgumentParser:
     from stavpr_ros.commands.feature_options import add_feature_options
 
-    parser = argparse.ArgumentParser(
-        prog='demo',
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser('demo', DESCRIPTION, EPILOG)
     add = parser.add_argument
     add('--output', default='demo_output', metavar='FOLDER', help='output folder (%(default)s)')
     add('--map', metavar='FOLDER|BAG', help='first traverse: the map is built from it')
@@ -266,20 +260,14 @@ def _report(number: str, summary: str, plot: Path) -> None:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
-    obey_signals()
-    wait_passively()
-    try:
+
+    def work() -> None:
         parser = _parser()
         arguments = parser.parse_args(args)
         _check(parser, arguments)
         _run(arguments)
-    except StavprError as error:
-        print(f'demo: {error}', file=sys.stderr)
-        return 2 if isinstance(error, SettingsError) else 1
-    except KeyboardInterrupt:
-        print('demo: interrupted', file=sys.stderr)
-        return 130
-    return 0
+
+    return run_program('demo', work)
 
 
 if __name__ == '__main__':

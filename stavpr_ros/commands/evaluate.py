@@ -8,10 +8,9 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
-from stavpr_ros.errors import SettingsError, SourceError, StavprError
+from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import require_room
-from stavpr_ros.signals import obey_signals
-from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
     from stavpr_ros.commands.evaluate_sequences import Sequences
@@ -53,12 +52,7 @@ exit codes: 0 done, 1 failed (the reason is printed), 2 usage, 130 interrupted
 def _parser() -> argparse.ArgumentParser:
     from stavpr_ros.commands.feature_options import add_feature_options
 
-    parser = argparse.ArgumentParser(
-        prog='evaluate',
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser('evaluate', DESCRIPTION, EPILOG)
     add = parser.add_argument_group('sequences').add_argument
     add('--map', metavar='FOLDER|BAG|MAP', help='first traverse: images, a bag or a saved map')
     add('--query', metavar='FOLDER|BAG|MAP', help='second traverse: the same')
@@ -109,43 +103,21 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     from stavpr_ros.alignment.settings import STRATEGIES
 
     add = parser.add_argument_group('method').add_argument
-    add(
-        '--mode',
-        choices=('paper', 'robust'),
-        default='robust',
-        help='paper: as published; robust: with mitigations of failure modes (%(default)s)',
-    )
-    add(
-        '--sequence-length',
-        type=int,
-        default=20,
-        metavar='L',
-        help='images in a window (%(default)s)',
-    )
+    mode = 'paper: as published; robust: with mitigations of failure modes (%(default)s)'
+    add('--mode', choices=('paper', 'robust'), default='robust', help=mode)
+    length = 'images in a window (%(default)s)'
+    add('--sequence-length', type=int, default=20, metavar='L', help=length)
     add('--beta', type=float, default=2.0, help='places per image of a window (%(default)g)')
-    add(
-        '--strategy',
-        choices=STRATEGIES,
-        default='adaptive',
-        help='spatial alignment (%(default)s)',
-    )
+    spatial = 'spatial alignment (%(default)s)'
+    add('--strategy', choices=STRATEGIES, default='adaptive', help=spatial)
     add('--sigma', type=float, default=1.0, help='of the adaptive weight (%(default)g)')
     add('--xi', type=int, help='restricted alignment: largest shift in strips (none)')
     add('--vertical', action='store_true', help='align the cells of two strips vertically first')
-    add(
-        '--nms-radius',
-        type=int,
-        default=20,
-        metavar='PLACES',
-        help='other candidates are farther from the match than this (%(default)s)',
-    )
+    radius = 'other candidates are farther from the match than this (%(default)s)'
+    add('--nms-radius', type=int, default=20, metavar='PLACES', help=radius)
     add('--backend', choices=('auto', 'cpu', 'cuda'), default='cpu', help='(%(default)s)')
-    add(
-        '--precision',
-        choices=('float32', 'float16'),
-        default='float32',
-        help='of the map (%(default)s)',
-    )
+    precision = 'of the map (%(default)s)'
+    add('--precision', choices=('float32', 'float16'), default='float32', help=precision)
 
 
 def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
@@ -333,22 +305,16 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
-    obey_signals()
-    wait_passively()
-    try:
+
+    def work() -> None:
         parser = _parser()
         # None = not given: a saved map decides these then
         given = argparse.Namespace(features=None, strips=None, seed=None)
         arguments = parser.parse_args(args, given)
         _check(parser, arguments)
         _run(arguments)
-    except StavprError as error:
-        print(f'evaluate: {error}', file=sys.stderr)
-        return 2 if isinstance(error, SettingsError) else 1
-    except KeyboardInterrupt:
-        print('evaluate: interrupted', file=sys.stderr)
-        return 130
-    return 0
+
+    return run_program('evaluate', work)
 
 
 if __name__ == '__main__':

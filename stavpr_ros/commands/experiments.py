@@ -9,10 +9,9 @@ import shlex
 import sys
 from typing import Any, TYPE_CHECKING
 
-from stavpr_ros.errors import SettingsError, SourceError, StavprError
+from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.output_file import require_room
-from stavpr_ros.signals import obey_signals
-from stavpr_ros.threads import wait_passively
 
 if TYPE_CHECKING:
     from stavpr_ros.evaluation.metrics import Metrics
@@ -55,12 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     from stavpr_ros.commands.feature_options import add_feature_options
     from stavpr_ros.evaluation.paper.experiments import PRESETS, SWEEPS
 
-    parser = argparse.ArgumentParser(
-        prog='experiments',
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser('experiments', DESCRIPTION, EPILOG)
     parser.add_argument('experiment', choices=(*PRESETS, 'sweep'), help='see below')
     parser.add_argument('--data', metavar='FOLDER', help='the folder that holds the data sets')
     parser.add_argument(
@@ -253,18 +247,9 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
-    obey_signals()
-    wait_passively()
-    try:
-        # None = not given
-        _run(_parser().parse_args(args, argparse.Namespace(features=None)))
-    except StavprError as error:
-        print(f'experiments: {error}', file=sys.stderr)
-        return 2 if isinstance(error, SettingsError) else 1
-    except KeyboardInterrupt:
-        print('experiments: interrupted', file=sys.stderr)
-        return 130
-    return 0
+    # None = not given
+    given = argparse.Namespace(features=None)
+    return run_program('experiments', lambda: _run(_parser().parse_args(args, given)))
 
 
 if __name__ == '__main__':

@@ -32,32 +32,15 @@ def _converter(example: Any) -> Any:
 
 def add_feature_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--features``, the general options and ``--KIND-NAME`` for each setting of a kind."""
-    group = parser.add_argument_group('features')
-    group.add_argument(
-        '--features',
-        choices=list(KINDS),
-        default='gradient',
-        help='kind of features (%(default)s)',
-    )
-    group.add_argument(
-        '--strips',
-        type=int,
-        default=7,
-        metavar='W',
-        help='vertical strips of an image (%(default)s)',
-    )
-    group.add_argument(
-        '--projection',
-        type=int,
-        metavar='D',
-        help='random projection of each strip to D dimensions (none)',
-    )
-    group.add_argument(
-        '--seed', type=int, default=0, help='of the random projection (%(default)s)'
-    )
-    group.add_argument(
-        '--device', default='auto', choices=DEVICES, help='where features are computed'
-    )
+    add = parser.add_argument_group('features').add_argument
+    kind_help = 'kind of features (%(default)s)'
+    add('--features', choices=list(KINDS), default='gradient', help=kind_help)
+    strips = 'vertical strips of an image (%(default)s)'
+    add('--strips', type=int, default=7, metavar='W', help=strips)
+    projection = 'random projection of each strip to D dimensions (none)'
+    add('--projection', type=int, metavar='D', help=projection)
+    add('--seed', type=int, default=0, help='of the random projection (%(default)s)')
+    add('--device', default='auto', choices=DEVICES, help='where features are computed')
     for kind in KINDS:
         group = parser.add_argument_group(f'features {kind}')
         for row in dataclasses.fields(settings_class(kind)):
@@ -65,7 +48,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
             example = '' if required else row.default
             default = 'required' if required else str(example).strip('()') or 'none'
             group.add_argument(
-                f'--{kind}-{row.name.replace("_", "-")}',
+                _option(kind, row.name),
                 type=_converter(example),
                 metavar=row.name.upper(),
                 help=f'{row.metadata["help"]} ({default})'.replace('%', '%%'),
@@ -92,11 +75,15 @@ def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':
 
 def kind_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the values of the options ``--KIND-NAME``, by option; None = not given."""
-    rows = [(kind, row.name) for kind in KINDS for row in dataclasses.fields(settings_class(kind))]
     return {
-        f'--{kind}-{name.replace("_", "-")}': getattr(arguments, f'{kind}_{name}')
-        for kind, name in rows
+        _option(kind, row.name): getattr(arguments, f'{kind}_{row.name}')
+        for kind in KINDS
+        for row in dataclasses.fields(settings_class(kind))
     }
+
+
+def _option(kind: str, name: str) -> str:
+    return f'--{kind}-{name.replace("_", "-")}'
 
 
 def _backbone_settings(arguments: argparse.Namespace) -> Any:
@@ -105,24 +92,22 @@ def _backbone_settings(arguments: argparse.Namespace) -> Any:
 
     :raises SettingsError: an option of this kind is missing, or one of another kind was given.
     """
-    given: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
-    for kind, values in given.items():
-        for row in dataclasses.fields(settings_class(kind)):
-            value = getattr(arguments, f'{kind}_{row.name}')
-            if value is not None:
-                values[row.name] = value
-    for kind, values in given.items():
-        if values and kind != arguments.features:
-            name = f'--{kind}-' + next(iter(values)).replace('_', '-')
+    kind = arguments.features
+    rows = dataclasses.fields(settings_class(kind))
+    own = {_option(kind, row.name) for row in rows}
+    for option, value in kind_options(arguments).items():
+        if value is not None and option not in own:
+            other = next(other for other in KINDS if option.startswith(f'--{other}-'))
             raise SettingsError(
-                f'{name} was given with --features {arguments.features}: give --features {kind}'
+                f'{option} was given with --features {kind}: give --features {other}'
             )
-    chosen = settings_class(arguments.features)
+    values = {row.name: getattr(arguments, f'{kind}_{row.name}') for row in rows}
     missing = [
-        f'--{arguments.features}-{row.name.replace("_", "-")}'
-        for row in dataclasses.fields(chosen)
-        if row.default is dataclasses.MISSING and row.name not in given[arguments.features]
+        _option(kind, row.name)
+        for row in rows
+        if row.default is dataclasses.MISSING and values[row.name] is None
     ]
     if missing:
-        raise SettingsError(f'--features {arguments.features} needs {" and ".join(missing)}')
-    return chosen(**given[arguments.features])
+        raise SettingsError(f'--features {kind} needs {" and ".join(missing)}')
+    given = {name: value for name, value in values.items() if value is not None}
+    return settings_class(kind)(**given)

@@ -10,24 +10,18 @@ import sys
 import time
 from typing import Any, TextIO, TYPE_CHECKING
 
-from stavpr_ros.errors import SettingsError, StavprError
-from stavpr_ros.signals import obey_signals
+from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.errors import SettingsError, SourceError
 
 if TYPE_CHECKING:
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
 
+# The constants of stavpr_msgs/PlaceMatch in the order of their values. recognition.Status has the
+# same names, but its package imports torch.
 STATUSES = (
-    'WARMING_UP',
-    'NO_MATCH',
-    'MATCH',
-    'INVALID_IMAGE',
-    'NOT_READY',
-    'DROPPED',
-    'SKIPPED',
-    'MAPPED',
+    *('WARMING_UP', 'NO_MATCH', 'MATCH', 'INVALID_IMAGE'),
+    *('NOT_READY', 'DROPPED', 'SKIPPED', 'MAPPED'),
 )
-"""Names of the constants of ``stavpr_msgs/PlaceMatch``, in the order of their values."""
-
 MATCHES, LOOP_CLOSURES = 'matches', 'loop closures'
 TOPICS = {MATCHES: '/stavpr/match', LOOP_CLOSURES: '/stavpr/loop_closure'}
 
@@ -79,34 +73,23 @@ def _pose(pose: Any) -> list[float]:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
-    obey_signals()
-    try:
-        return _run(sys.argv[1:] if args is None else args)
-    except (OSError, StavprError) as error:
-        print(f'record: {error}', file=sys.stderr)
-        return 2 if isinstance(error, SettingsError) else 1
-    except KeyboardInterrupt:
-        print('record: interrupted', file=sys.stderr)
-        return 130
+    return run_program('record', lambda: _run(sys.argv[1:] if args is None else args))
 
 
-def _run(given: list[str]) -> int:
+def _run(given: list[str]) -> None:
     from stavpr_ros.ros.process import own_arguments
 
     arguments = _parser().parse_args(own_arguments(given))
-    with open(arguments.output, 'w') as file:
-        written = _write_messages(arguments, file, given)
+    try:
+        with open(arguments.output, 'w') as file:
+            written = _write_messages(arguments, file, given)
+    except OSError as error:
+        raise SourceError(f'{arguments.output} cannot be written: {error}') from error
     print(f'{written} {arguments.kind} written to {arguments.output}')
-    return 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='record',
-        description=__doc__.partition(': ')[2],
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser('record', __doc__.partition(': ')[2], EPILOG)
     parser.add_argument(
         '--output', required=True, metavar='FILE', help='the file to write (JSON lines)'
     )

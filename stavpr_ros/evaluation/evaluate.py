@@ -120,7 +120,7 @@ class Evaluation:
 
     @property
     def centered(self) -> slice:
-        """The images that have a window centered on them."""
+        """Return the images that have a window centered on them."""
         return centered_images(len(self.results.single), self.sequence_length)
 
     def false_alarm_rate(self, kind: str, threshold: float | None = None) -> float | None:

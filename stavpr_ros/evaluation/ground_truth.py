@@ -139,7 +139,7 @@ class GroundTruth:
 
     @property
     def pairs(self) -> np.ndarray:
-        """Accepted pairs (query, place), sorted, shape (M, 2), int64."""
+        """Return the sorted accepted pairs of query and place, shape (M, 2), int64."""
         return np.stack([self.keys // self.n, self.keys % self.n], axis=1)
 
     @cached_property
@@ -149,7 +149,7 @@ class GroundTruth:
 
     @cached_property
     def middles(self) -> np.ndarray:
-        """The middle one of each query's accepted places, shape (N,), int64; -1 = none."""
+        """Return the middle one of each query's accepted places, shape (N,), int64; -1 = none."""
         found = np.full(self.N, -1, np.int64)
         ends = np.cumsum(self._counts)
         at = (2 * ends - self._counts - 1) // 2

@@ -24,7 +24,7 @@ RANKS = (1, 5, 10, 20)  # k of recall@k
 
 
 @dataclass(frozen=True)
-class Counts:
+class ConfusionCounts:
     """
     Counts at one threshold.
 
@@ -82,7 +82,7 @@ class Ranking:
 
     @property
     def best(self) -> np.ndarray:
-        """The first place of each query, shape (N,); -1 = none."""
+        """Return the first place of each query, shape (N,); -1 = none."""
         return self.places[:, 0]
 
 
@@ -140,7 +140,7 @@ class Metrics:
 
     queries: int
     with_match: int
-    best: Counts
+    best: ConfusionCounts
     average_precision: float
     recall_at: dict[int, float]
     recall_at_full_precision: float
@@ -175,7 +175,7 @@ def counts_at(
     distances: np.ndarray,
     correct: np.ndarray,
     has_match: np.ndarray | None = None,
-) -> Counts:
+) -> ConfusionCounts:
     """
     Count at one threshold.
 
@@ -189,7 +189,7 @@ def counts_at(
 
 def sweep(
     distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None
-) -> list[Counts]:
+) -> list[ConfusionCounts]:
     """
     Count at every threshold that changes the counts, from rejecting all to accepting all.
 
@@ -205,7 +205,7 @@ def sweep(
 
 def best_f1(
     distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None
-) -> Counts:
+) -> ConfusionCounts:
     """Return the counts of the threshold with the best F1, the lowest on a tie."""
     return max(sweep(distances, correct, has_match), key=lambda counts: counts.f1)
 
@@ -225,14 +225,16 @@ def _checked(
 
 def _counts(
     thresholds: np.ndarray, distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray
-) -> list[Counts]:
+) -> list[ConfusionCounts]:
     order = np.argsort(distances)  # NaN last, as +inf
     accepted = np.searchsorted(distances[order], thresholds)  # below, not at the threshold
     true_positives = np.append(0, np.cumsum(correct[order]))[accepted]
     in_map = np.append(0, np.cumsum(has_match[order]))
     false_negatives = in_map[-1] - in_map[accepted]
     columns = (thresholds, true_positives, accepted - true_positives, false_negatives)
-    return [Counts(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+    return [
+        ConfusionCounts(*row) for row in zip(*(column.tolist() for column in columns), strict=True)
+    ]
 
 
 def image_matches(matches: Sequence[Match], length: int) -> ImageMatches:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
-from stavpr_ros.evaluation.metrics import Counts, counts_at, image_matches, ImageMatches
+from stavpr_ros.evaluation.metrics import ConfusionCounts, counts_at, image_matches, ImageMatches
 from stavpr_ros.recognition import Match, Status
 
 IN_WINDOW = ('WARMING_UP', 'NO_MATCH', 'MATCH')  # statuses of images that enter the window
@@ -31,24 +31,24 @@ class TraverseEvaluation:
     accepted: np.ndarray
     true_places: np.ndarray | None
     tolerance: int
-    counts: Counts | None
+    counts: ConfusionCounts | None
     seconds: np.ndarray
 
     @property
     def matched(self) -> np.ndarray:
-        """Accepted place of each image, -1 = none, shape (N,)."""
+        """Return the accepted place of each image, -1 = none, shape (N,)."""
         return np.where(self.accepted, self.matches.places, -1)
 
     @property
     def correct(self) -> np.ndarray | None:
-        """Accepted and within the tolerance of the ground truth, shape (N,), bool."""
+        """Return which are accepted and within the tolerance, shape (N,), bool."""
         if self.true_places is None:
             return None
         return self.accepted & self.matches.within(self.true_places, self.tolerance)
 
     @property
     def headline(self) -> str:
-        """The result in a line."""
+        """Return the result in a line."""
         line = f'{np.count_nonzero(self.accepted)} of {len(self.accepted)} images matched'
         if self.counts is not None:
             c = self.counts

@@ -150,12 +150,12 @@ class World:
 
     @cached_property
     def street(self) -> Street:
-        """The street of the first traverse."""
+        """Return the street of the first traverse."""
         return make_street(self.seed, self.length)
 
     @cached_property
     def detour(self) -> Street:
-        """The street of the detour, entered and left by sharp turns."""
+        """Return the street of the detour, entered and left by sharp turns."""
         return make_street(self.seed + 50_021, self.detour_length)
 
 
