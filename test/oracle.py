@@ -1,11 +1,11 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The method in plain loops, written from its description alone; every kernel is held against this file.
+The method in plain loops, written from its description alone: the reference of every kernel.
 
-Nothing here is fast and nothing is shared with the package. Each function takes a dtype: numpy scalars round
-every single operation to it, so a kernel that does the same arithmetic in float32 must give the same bits.
-Indices going in and out are 0-based; comments quote the 1-based formulae of the method.
+Nothing here is fast and nothing is shared with the package. Each function takes a dtype: numpy
+scalars round every single operation to it, so a kernel with the same arithmetic in float32 must
+return the same bits. Indices are 0-based; comments quote the 1-based formulae of the method.
 """
 
 from dataclasses import dataclass
@@ -305,43 +305,6 @@ def aligned_index(path: Cells, query_index: int) -> int:
 
 
 # ------------------------------------------------ evaluation (section 6)
-
-
-def answers_by_sequence(
-    D: Array, length: int, beta: float, dtype: type = np.float64
-) -> list[tuple[int, Any]]:
-    """
-    Place and score of every query frame of D (N, n), by windows that slide by one frame.
-
-    Frames that no window is centered on take their place off the first or last window's warping path, and its
-    distance as their score.
-    """
-    N = D.shape[0]
-    places: list[tuple[int, Any]] = [(-1, dtype(np.inf))] * N
-    windows = range(N - length + 1)
-    for t in windows:
-        q, m = match_sequence(D[t : t + length], beta, dtype)
-        answer = best_match(q, m, 0)
-        if answer is None:
-            continue
-        places[middle(t, t + length - 1)] = (answer.middle, answer.distance)
-        path = align_sequence(D[t : t + length], answer.start, beta, dtype).path
-        if t == windows[0]:
-            for frame in range(middle(t, t + length - 1)):
-                places[frame] = (aligned_index(path, frame - t), answer.distance)
-        if t == windows[-1]:
-            for frame in range(middle(t, t + length - 1) + 1, N):
-                places[frame] = (aligned_index(path, frame - t), answer.distance)
-    return places
-
-
-def answers_by_image(D: Array) -> list[tuple[int, Any]]:
-    """Without temporal alignment: the nearest map frame and its distance."""
-    places = []
-    for row in D:
-        nearest = _first_minimum(row, range(len(row)))
-        places.append((-1, np.inf) if nearest is None else (nearest, row[nearest]))
-    return places
 
 
 def best_f1(places: list[tuple[int, Any]], truth: list[list[int]], tolerance: int) -> float:
