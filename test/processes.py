@@ -78,12 +78,10 @@ class Process:
         print(self.output())  # which pytest shows when the test has failed
 
 
-def node_process(log: Path, **parameters: object) -> Process:
-    """Start the node with parameters."""
-    options = [
-        option for name, value in parameters.items() for option in ('-p', f'{name}:={value}')
-    ]
-    return Process(log, 'node', '--ros-args', *options)
+def node_process(log: Path, *options: str, **parameters: object) -> Process:
+    """Start the node with options of ROS and parameters."""
+    values = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
+    return Process(log, 'node', '--ros-args', *options, *values)
 
 
 class Bench:

@@ -122,9 +122,9 @@ def test_incompatible_publishers_are_reported(robot, start, publish, route):
     unreliable = publish(Image, 'image')
     robot.node.destroy_publisher(robot.publisher)
     remedy = f'set {RELIABILITY} to best_effort, or make the publisher reliable'
-    robot.until_diagnosed('input', ERROR, f'1 publisher refused for QoS: {remedy}')
-    offers = 'images are not received: a publisher of /image offers another reliability: '
-    robot.until_logged(offers + remedy)
+    offers = f'a publisher of /image offers another reliability: {remedy}'
+    robot.until_diagnosed('input', ERROR, f'1 publisher refused for QoS: {offers}')
+    robot.until_logged(f'images are not received: {offers}')
     robot.publish_anew()
     robot.wait_for_node()
 
