@@ -3,7 +3,6 @@
 """Fixtures: the folder of real data, synthetic images and maps."""
 
 from collections import OrderedDict
-from functools import partial
 import os
 from pathlib import Path
 
@@ -59,13 +58,13 @@ def small_map(route):
 
 
 @pytest.fixture(scope='module')
-def bench():
-    """Yield a ROS node beside the tested one, with the QoS of a camera."""
-    from processes import Bench
+def robot():
+    """Yield a robot with a camera: a ROS node beside the tested one."""
+    from robot import Robot
 
-    bench = Bench()
-    yield bench
-    bench.close()
+    robot = Robot()
+    yield robot
+    robot.close()
 
 
 @pytest.fixture(scope='module')
@@ -78,27 +77,24 @@ def map_file(small_map, tmp_path_factory) -> str:
     return str(path)
 
 
-@pytest.fixture(scope='module')
-def start(map_file):
-    """Start a node on it, with more options of the command line."""
-    from camera import start_node
-
-    return partial(start_node, Path(map_file).parent)
-
-
-@pytest.fixture(scope='class')
-def stream(bench, process):
-    """Images for the node that a module's ``process`` runs."""
-    from camera import Camera
-
-    return Camera(bench, bench.publisher)
-
-
 @pytest.fixture
-def camera(stream):
-    """Return the same, with an empty window."""
-    stream.reset()
-    return stream
+def start(robot, map_file):
+    """Start a node in this process that localizes on the map; it ends with the test."""
+    from robot import NodeThread
+
+    started = []
+
+    def start(*arguments, wait=True, **parameters):
+        robot.forget()
+        started.append(NodeThread(arguments, {'map_path': map_file} | parameters))
+        if wait:
+            robot.wait_for_node()
+        return started[-1].node
+
+    yield start
+    for each in started:
+        each.end()
+    robot.wait_for_nobody()
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ import rclpy
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
@@ -77,12 +78,10 @@ class Process:
         print(self.output())  # which pytest shows when the test has failed
 
 
-def node_process(log: Path, **parameters: object) -> Process:
-    """Start the node with parameters."""
-    options = [
-        option for name, value in parameters.items() for option in ('-p', f'{name}:={value}')
-    ]
-    return Process(log, 'node', '--ros-args', *options)
+def node_process(log: Path, *options: str, **parameters: object) -> Process:
+    """Start the node with options of ROS and parameters."""
+    values = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
+    return Process(log, 'node', '--ros-args', *options, *values)
 
 
 class Bench:
@@ -114,25 +113,28 @@ class Bench:
             assert time.monotonic() < end, f'{what}: not within {TIMEOUT:g} s'
             self.executor.spin_once(timeout_sec=0.05)
 
-    def wait_for_node(self) -> None:
+    def wait_for_node(self, publisher: Publisher | None = None, kind: type = Image) -> None:
         """
         Wait until the node receives images and its matches arrive.
 
         A matched publisher does not imply a matched subscriber on the other side, and a
         best-effort one loses earlier images: so empty images are sent until one has a match.
+
+        :param publisher: another one than that of the bench, of messages of a kind.
         """
-        self.until(lambda: self.publisher.get_subscription_count() > 0, 'the node')
+        publisher = publisher or self.publisher
+        self.until(lambda: publisher.get_subscription_count() > 0, 'the node')
         before, sent = len(self.answers), 0
-        probe = Image()
+        probe = kind()
         probe.header.frame_id = 'probe'
         while len(self.answers) == before:
             sent += 1
             assert sent < 2 * TIMEOUT
             probe.header.stamp.nanosec = sent
-            self.publisher.publish(probe)
+            publisher.publish(probe)
             self.executor.spin_once(timeout_sec=0.5)
         self.until(
-            lambda: self.answers[-1].header.stamp.nanosec == sent, 'the answer to the last probe'
+            lambda: self.answers[-1].header.stamp.nanosec == sent, 'the match of the last probe'
         )
         self.probes = len(self.answers) - before
 
@@ -145,29 +147,13 @@ class Bench:
         """Wait until no node subscribes to the images."""
         self.until(lambda: self.publisher.get_subscription_count() == 0, 'the node to be gone')
 
-    def ask(self, image: Image) -> PlaceMatch:
+    def ask(self, image: Any, publisher: Publisher | None = None) -> PlaceMatch:
         """Publish one image and return its match."""
         before = len(self.answers)
-        self.publisher.publish(image)
-        self.until(lambda: len(self.answers) > before, 'an answer')
+        (publisher or self.publisher).publish(image)
+        self.until(lambda: len(self.answers) > before, 'a match')
         assert len(self.answers) == before + 1
         return self.answers[-1]
-
-    def ask_until_answered(self, image: Image) -> PlaceMatch:
-        """Publish one image and return its match, while others may arrive."""
-        found: list[PlaceMatch] = []
-        again = time.monotonic()
-
-        def answered() -> bool:
-            nonlocal again
-            found[:] = [a for a in self.answers if a.header == image.header]
-            if not found and time.monotonic() >= again:  # best effort may lose it
-                self.publisher.publish(image)
-                again = time.monotonic() + 5.0
-            return bool(found)
-
-        self.until(answered, 'the answer to this image')
-        return found[0]
 
     def call(self, kind: type, name: str, **fields: object) -> Any:
         """Call a service of the node, such as ``reset``, and return its response."""
