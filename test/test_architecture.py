@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The house keeps its order: who may import whom, and how light the package is to import."""
+"""The order of the package: imports between folders, cycles, and the files on an image's way."""
 
 import ast
 from pathlib import Path
@@ -60,7 +60,7 @@ def imported_modules(path: Path) -> set[str]:
 
 
 def on_a_cycle(arrows: dict[str, set[str]]) -> list[str]:
-    """Nodes left when those without an arrow out, or without one in, are taken away again and again."""
+    """Return the nodes left when those without an arrow out, or in, are removed repeatedly."""
     left = set(arrows)
     while True:
         targets = {target for node in left for target in arrows[node] if target != node}
@@ -102,7 +102,7 @@ def test_cycles_are_found():
 
 
 def test_modules_import_each_other_in_no_circle():
-    """Also by imports within functions; what a package's __init__ passes on counts as its module's."""
+    """Also by imports in functions; a name that an __init__ passes on counts as its module's."""
     arrows = {
         module: {other for other in imported_modules(path) if other in MODULES and other != module}
         for module, path in MODULES.items()

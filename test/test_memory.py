@@ -17,9 +17,8 @@ from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CACHE_LINE
 import torch
 
-LARGEST = (
-    1.15  # of resident bytes over bytes of the features; the heap and the window take their part
-)
+# Of resident bytes over bytes of the features; the heap and the window take their part.
+LARGEST = 1.15
 
 
 @pytest.fixture
@@ -117,7 +116,9 @@ from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.mapping import GrowingMap, open_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.threads import limit_threads
 
+limit_threads(1)
 owner, mode, precision, large, small = sys.argv[1:]
 settings = RecognizerSettings(1.0, mode=mode)
 
@@ -130,7 +131,9 @@ def held(path):
     if owner == 'recognizer':
         one = PlaceRecognizer(place_map, settings, 'cpu', precision)
     else:
-        one = LoopCloser(settings, 20, place_map.settings, limit=len(place_map))
+        # few places to match: matching takes time and no memory
+        exclude = len(place_map) * 3 // 4
+        one = LoopCloser(settings, exclude, place_map.settings, limit=len(place_map))
         route = GrowingMap(place_map.settings, None, len(place_map), held_features=one.features)
     features = place_map.features[:]
     for i in range(21 if owner == 'recognizer' else len(features)):
@@ -160,12 +163,12 @@ def random_map(path, places, dimension):
 
 @pytest.fixture(scope='module')
 def maps(tmp_path_factory):
-    """Maps of 143 MB and 86 MB, and a small one."""
+    """Save maps of 143 MB and 86 MB, and a small one."""
     folder = tmp_path_factory.mktemp('maps')
     return {
         'recognizer': random_map(folder / 'places', 5000, 1024),
         'closer': random_map(folder / 'route', 1500, 2048),
-        'small': random_map(folder / 'small', 300, 64),
+        'small': random_map(folder / 'small', 400, 64),
     }
 
 

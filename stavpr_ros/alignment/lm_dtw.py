@@ -36,7 +36,8 @@ class SequenceMatch:
     """
     The nearest sequence of the map, indices 0-based.
 
-    :param first, last: its first and last map image.
+    :param first: its first map image.
+    :param last: its last map image.
     :param middle: the matched place: floor((first + last) / 2), or in the velocity search the
         place of the window's middle image.
     :param distance: its q_m.
@@ -53,12 +54,12 @@ class SequenceMatch:
 
     @property
     def start(self) -> int:
-        """The start s, 0-based: the same as ``first``."""
+        """Return the start s, 0-based: the same as ``first``."""
         return self.first
 
     @property
     def length(self) -> int:
-        """The number of map images m."""
+        """Return the number of map images m."""
         return self.last - self.first + 1
 
 

@@ -209,12 +209,13 @@ def match_at_velocities(D, shift, scale, steps, penalty, distances, firsts, midd
 
     :param D: window, shape (l, n or more), row = query image, oldest first; +inf bans a pair.
     :param shift, scale: the costs are (D - shift) * scale, shape (n,).
-    :param steps: places that each speed moves on before each row, shape (V, l), int32; steps[:, 0]
-        = 0.
+    :param steps: places that each speed moves on before each row, shape (V, l), int32, first 0.
     :param penalty: cost of one place more or less, of D's type.
-    :param distances, firsts, middles, speeds: shape (n,), written: mean cost of a row, penalties
-        included, the place of the first and of the middle row, the speed; int32. +inf where there
+    :param distances: mean cost of a row, penalties included, shape (n,), written; +inf where there
         is no path.
+    :param firsts: the place of the first row, shape (n,), int32, written.
+    :param middles: the place of the middle row, likewise.
+    :param speeds: the speed, likewise.
     """
     n, (V, l) = shift.shape[0], steps.shape
     reach, longest = 0, 0

@@ -79,7 +79,7 @@ class LocalFeatures:
 
     @property
     def dimension(self) -> int:
-        """Number d of dimensions of a strip."""
+        """Return the number d of dimensions of a strip."""
         return self.strips.shape[2]
 
     def __getitem__(self, images: slice) -> 'LocalFeatures':
@@ -177,7 +177,7 @@ class FeatureExtractor:
 
     @property
     def projection(self) -> Projection | None:
-        """The random projection of the features, if any."""
+        """Return the random projection of the features, if any."""
         return self._projection
 
     def extract(self, images: Sequence[np.ndarray]) -> LocalFeatures:

@@ -40,7 +40,7 @@ class PublishedFile:
 
     @property
     def name(self) -> str:
-        """The name of the file."""
+        """Return the name of the file."""
         return self.address.rsplit('/', 1)[-1]
 
 

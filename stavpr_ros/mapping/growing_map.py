@@ -86,7 +86,7 @@ class GrowingMap:
 
     @property
     def first(self) -> int:
-        """Number of places evicted so far: the number of the oldest kept place."""
+        """Return the number of places evicted so far: the number of the oldest kept place."""
         return self._first
 
     @property
@@ -97,7 +97,7 @@ class GrowingMap:
     @property
     def features(self) -> LocalFeatures:
         """
-        The features of all places, strips (W, n, d): a view, valid until the map changes.
+        Return the features of all places, strips (W, n, d): a view, valid until the map changes.
 
         Where another object holds the features, a copy.
         """
@@ -127,22 +127,22 @@ class GrowingMap:
 
     @property
     def thumbnails(self) -> Sequence[bytes]:
-        """A small JPEG of each place, an empty one = none: not a copy."""
+        """Return a small JPEG of each place, an empty one = none: not a copy."""
         return self._thumbnails
 
     @property
     def has_stamps(self) -> bool:
-        """Some place has a stamp."""
+        """Return whether some place has a stamp."""
         return bool(np.any(self.stamps))
 
     @property
     def has_ids(self) -> bool:
-        """Some place has an external identifier."""
+        """Return whether some place has an external identifier."""
         return any(self._ids)
 
     @property
     def has_poses(self) -> bool:
-        """Some place has a pose."""
+        """Return whether some place has a pose."""
         return bool(np.isfinite(self.poses).any())
 
     @property

@@ -54,7 +54,7 @@ class KeyframeSettings:
 
     @property
     def needs_poses(self) -> bool:
-        """The rule of motion is on."""
+        """Return whether the rule of motion is on."""
         return bool(self.distance or self.angle)
 
 

@@ -174,17 +174,17 @@ class StoredFeatures(LocalFeatures):
 
     @property
     def dimension(self) -> int:
-        """Number d of dimensions of a strip."""
+        """Return the number d of dimensions of a strip."""
         return self._shape[2]
 
     @property
     def strips(self) -> torch.Tensor:
-        """The features, read from the file; shape (W, n, d), float32."""
+        """Return the features, read from the file; shape (W, n, d), float32."""
         return torch.from_numpy(self._read('strips'))
 
     @property
     def weights(self) -> torch.Tensor:
-        """The norm of each strip over that of all, read from the file; shape (W, n), float32."""
+        """Return the norm of each strip over that of all, read from the file; (W, n), float32."""
         return torch.from_numpy(self._read('weights'))
 
     def to(self, device: str | torch.device) -> LocalFeatures:

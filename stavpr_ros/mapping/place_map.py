@@ -57,12 +57,12 @@ class PlaceMap:
 
     @property
     def settings(self) -> FeatureSettings:
-        """The settings of the features."""
+        """Return the settings of the features."""
         return self.features.settings
 
     @property
     def dimension(self) -> int:
-        """Number d of dimensions of a strip."""
+        """Return the number d of dimensions of a strip."""
         return self.features.dimension
 
     @cached_property

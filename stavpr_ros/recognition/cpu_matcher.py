@@ -61,7 +61,7 @@ class CpuMatcher:
 
     @property
     def places(self) -> int:
-        """Number of places n."""
+        """Return the number of places n."""
         return self._map.shape[1]
 
     def distances(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:

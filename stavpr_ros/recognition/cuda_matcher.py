@@ -71,7 +71,7 @@ class CudaMatcher:
 
     @property
     def places(self) -> int:
-        """Number of places n of the map."""
+        """Return the number of places n of the map."""
         return self._strips.shape[1]
 
     def distances(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:

@@ -92,7 +92,7 @@ class LoopCloser(SequenceRecognizer):
 
     @property
     def first(self) -> int:
-        """The oldest place that is held: the number of evicted places."""
+        """Return the oldest place that is held: the number of evicted places."""
         return self._buffer.first
 
     @property

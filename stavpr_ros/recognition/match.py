@@ -28,7 +28,7 @@ class Status(enum.IntEnum):
 
     @property
     def label(self) -> str:
-        """The name for people: ``no match``."""
+        """Return the name for people: ``no match``."""
         return self.name.lower().replace('_', ' ')
 
 
@@ -90,12 +90,12 @@ class Match:
 
     @property
     def place_index(self) -> int:
-        """The matched place, the middle of the matched sequence; -1 unless matched."""
+        """Return the matched place, the middle of the matched sequence; -1 unless matched."""
         return self.sequence.middle if self.sequence and self.accepted else -1
 
     @property
     def newest_index(self) -> int:
-        """The place aligned with the newest image; -1 unless matched."""
+        """Return the place aligned with the newest image; -1 unless matched."""
         return aligned_index(self.path, int(self.path[-1, 0])) if self.accepted else -1
 
     @property
@@ -105,15 +105,14 @@ class Match:
 
         In mode paper, q_m of LM-DTW: a mean image distance of this window alone. In mode robust
         (``relative``), a score with memory from 0 (certain) to 1 (chance level): see
-        :mod:`stavpr_ros.recognition.robust`. Successive scores are correlated, since
-            hysteresis keeps
-        strong evidence for some images; they are not independent measurements.
+        :mod:`stavpr_ros.recognition.robust`. Successive scores are correlated, since hysteresis
+        keeps strong evidence for some images; they are not independent measurements.
         """
         return self.sequence.distance if self.sequence else math.nan
 
     @property
     def score(self) -> float:
-        """The distance, +inf without a sequence or where it is not below the chance level."""
+        """Return the distance; +inf without a sequence, or not below the chance level."""
         if self.sequence is None or (self.relative and self.sequence.distance >= 1):
             return math.inf
         return self.sequence.distance

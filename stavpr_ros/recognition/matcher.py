@@ -21,7 +21,7 @@ class Matcher(Protocol):
 
     @property
     def places(self) -> int:
-        """Number of places n."""
+        """Return the number of places n."""
 
     def distances(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """

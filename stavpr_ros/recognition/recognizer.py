@@ -83,7 +83,7 @@ class RecognizerSettings:
 
     @property
     def applied_options(self) -> RobustOptions:
-        """The options that are applied."""
+        """Return the options that are applied."""
         return options_of(self.mode) if self.robust_options is None else self.robust_options
 
 
@@ -111,7 +111,7 @@ class SequenceRecognizer:
 
     @property
     def settings(self) -> RecognizerSettings:
-        """The settings in force."""
+        """Return the settings in force."""
         return self._settings
 
     @property
@@ -275,7 +275,7 @@ class PlaceRecognizer(SequenceRecognizer):
 
     @property
     def places(self) -> int:
-        """Number of places n of the map."""
+        """Return the number of places n of the map."""
         return self._matcher.places
 
     def reset(self) -> None:

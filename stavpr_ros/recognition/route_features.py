@@ -47,7 +47,7 @@ class RouteFeatures:
 
     @property
     def mean(self) -> torch.Tensor:
-        """The mean that is subtracted, (W, d), float32; zeros without centering."""
+        """Return the mean that is subtracted, (W, d), float32; zeros without centering."""
         return self._mean
 
     def original(self) -> LocalFeatures:

@@ -38,7 +38,7 @@ class OpenBag:
 
     @property
     def connections(self) -> list[Connection]:
-        """The recorded connections, one per topic and publisher."""
+        """Return the recorded connections, one per topic and publisher."""
         return list(self.reader.connections)
 
 
