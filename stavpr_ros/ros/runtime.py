@@ -49,7 +49,7 @@ class Runtime:
 
     ``problem`` is the error of the last map or subscription, for the diagnostics; ``loading`` the
     path of the map that is being loaded, '' = none. ``images`` and ``odometry`` are subscriptions
-    while the node is active.
+    while the node is active. ``settings`` are those in force.
     """
 
     def __init__(
