@@ -1,2 +1,3 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
+"""Everything that imports ROS: node, services, messages, diagnostics, replay, launch."""

@@ -310,7 +310,7 @@ class PlaceRecognitionNode(ManagedNode):
             map_info=self._map_info.last or MapInfo(state='none'),
         )
         runtime = self._runtime
-        return health if runtime is None else runtime.add_to(health)
+        return health if runtime is None else runtime.complete(health)
 
     def _publish_map_info(self, state: str = '', path: str = '') -> None:
         """Publish the state of a node that is not configured, or '' = the map in use, if any."""

@@ -49,7 +49,7 @@ class Runtime:
 
     ``problem`` is the error of the last map or subscription, for the diagnostics; ``loading`` the
     path of the map that is being loaded, '' = none. ``images`` and ``odometry`` are subscriptions
-    while the node is active.
+    while the node is active. ``settings`` are those in force.
     """
 
     def __init__(
@@ -223,7 +223,7 @@ class Runtime:
             self._node.get_clock().now().to_msg(),
         )
 
-    def add_to(self, health: Health) -> Health:
+    def complete(self, health: Health) -> Health:
         """Return the health of the node with the queue, the window and the subscriptions."""
         pipeline, images, odometry = self.pipeline, self.images, self.odometry
         needs_poses = pipeline.settings.keyframes.needs_poses  # otherwise poses are optional
