@@ -49,7 +49,7 @@ def imported_modules(path: Path) -> set[str]:
 
 
 def on_a_cycle(arrows: dict[str, set[str]]) -> list[str]:
-    """Return the nodes that are left after repeatedly removing those without an arrow in or out."""
+    """Return the nodes left after repeatedly removing those without an arrow in or out."""
     left = set(arrows)
     while True:
         targets = {target for node in left for target in arrows[node] if target != node}
