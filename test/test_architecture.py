@@ -60,7 +60,7 @@ def imported_modules(path: Path) -> set[str]:
 
 
 def on_a_cycle(arrows: dict[str, set[str]]) -> list[str]:
-    """Return the nodes left when those without an arrow out, or in, are removed repeatedly."""
+    """Return the nodes left after repeatedly removing those without an arrow in or out."""
     left = set(arrows)
     while True:
         targets = {target for node in left for target in arrows[node] if target != node}
@@ -102,7 +102,7 @@ def test_cycles_are_found():
 
 
 def test_modules_import_each_other_in_no_circle():
-    """Also by imports in functions; a name that an __init__ passes on counts as its module's."""
+    """Also by imports within functions; a name that __init__ re-exports counts as its module's."""
     arrows = {
         module: {other for other in imported_modules(path) if other in MODULES and other != module}
         for module, path in MODULES.items()

@@ -73,33 +73,11 @@ def test_measure_two_jobs_runs_them_in_turn_after_warm_up(clock):
     assert found['b'].median_s == 0.03
 
 
-def test_measure_short_job_repeats_it_uncounted_before_each_run(clock):
-    found = timing.measure({'a': clock.job('a', 0.001), 'b': clock.job('b', 0.02)}, 0.001)
-    assert clock.log[4:7] == ['a', 'a', 'b']
-    assert found['a'].runs == found['b'].runs == timing.FEWEST
-
-
 @pytest.mark.parametrize(
     ('round_s', 'rounds'), [(0.2, 7), (0.01, 50), (1e-7, 101), (1.01, 3), (0.0, 101)]
 )
 def test_rounds_for_a_duration_fills_the_time_within_limits(round_s, rounds):
     assert timing.rounds_for(round_s, 0.5) == rounds
-
-
-def test_timed_call_waits_for_the_device_before_and_after(clock):
-    job = timing.timed(clock.job('call', 1.0), clock.job('wait', 0.25))
-    assert job() == 1.25  # work queued before the call does not count
-    assert clock.log == ['wait', 'call', 'wait']
-
-
-def test_best_seconds_returns_the_shortest_run_after_warm_up(clock):
-    seconds = iter([9.0, 3.0, 2.0, 4.0, 5.0, 6.0])
-
-    def call():
-        clock.now += next(seconds)
-
-    assert timing.best_seconds(call, 'cpu', 10.0) == 2.0  # 3 + 2 + 4 + 5 fill 10 s
-    assert next(seconds) == 6.0
 
 
 # ------------------------------------------------ lower bounds and peaks
@@ -150,26 +128,6 @@ def test_reference_slower_than_float32_is_left_out_by_name(monkeypatch):
     assert '1.0 G operations/s, slower than float32 (90.0)' in left_out.reason
 
 
-@pytest.mark.parametrize('faster', ['queries @ map.T', 'map @ queries.T'])
-def test_bare_product_takes_the_faster_orientation(faster, clock, monkeypatch):
-    rows, places = torch.randn(3, 4), torch.randn(2, 5, 4)
-    multiply, made = torch.mm, []
-
-    def mm(left, right, out):
-        form = 'queries @ map.T' if len(left) == 3 else 'map @ queries.T'
-        clock.now += 0.02 if form == faster else 0.03
-        made.append(out)
-        return multiply(left, right, out=out)
-
-    monkeypatch.setattr(torch, 'mm', mm)
-    call, form = stages.bare_product(rows, places, timing.nothing)
-    call()
-    expected = rows @ places.reshape(10, 4).T
-    assert form == faster
-    wanted = expected if faster == 'queries @ map.T' else expected.T
-    np.testing.assert_allclose(made[-1], wanted, rtol=1e-4)
-
-
 # ------------------------------------------------ rows, targets, report
 
 
@@ -191,14 +149,6 @@ def test_run_gives_rows_with_bounds_and_peers(clock, capsys):
         PeerTime('other', pytest.approx(0.2), pytest.approx(0), pytest.approx(2), 'its note'),
     )
     assert 'left out: frame, n = 10, d = 512: too large' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ('seconds', 'text'),
-    [(2.5, '2.5 s'), (0.0123, '12.3 ms'), (0.0005, '500 µs'), (3e-7, '0.3 µs'), (None, '-')],
-)
-def test_seconds_text_has_three_digits_and_a_unit(seconds, text):
-    assert results.seconds_text(seconds) == text
 
 
 @pytest.mark.parametrize(('ratio', 'reached'), [(8.0, True), (7.99, False)])
@@ -277,22 +227,7 @@ def test_sequence_peers_with_other_results_are_rejected():
         stages.sequence_peers(Run('cpu'), window, wrong)
 
 
-def test_sample_is_spread_over_starts_that_see_all_columns():
-    assert baselines.sample(1000, 40, 4) == [0, 320, 640, 960]
-    assert baselines.sample(42, 40, 500) == [0, 1, 2]
-    assert baselines.sample(5, 40, 3) == [0]
-
-
 # ------------------------------------------------ data, memory, comparison, accuracy
-
-
-def test_make_features_draws_unit_norm_from_a_seed(monkeypatch):
-    monkeypatch.setattr(data, 'BLOCK_BYTES', 4 * 16 * 5)  # blocks that do not divide the rows
-    features, again = (data.make_features(9, 16, 7, 'cpu', 3).strips.numpy() for _ in range(2))
-    np.testing.assert_allclose(np.linalg.norm(features, axis=2), 1, rtol=1e-5)
-    np.testing.assert_array_equal(features, again)
-    assert len(np.unique(features.reshape(63, 16), axis=0)) == 63
-    assert not np.array_equal(features, data.make_features(9, 16, 7, 'cpu', 4).strips.numpy())
 
 
 @pytest.mark.long
@@ -389,13 +324,3 @@ def test_command_on_a_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
     assert matching.main(['--device', 'cuda', '--output', str(tmp_path)]) == 2
     assert 'torch sees no CUDA device here' in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_command_skips_sizes_beyond_the_memory_with_a_reason(tmp_path, monkeypatch):
-    run = Run('cpu')
-    options = matching.parse(['--sizes', '50', '--dimensions', '16', '--memory', '1e-6'])
-    options.precisions = ('float32',)
-    for name in ('robust_stages', 'paper_stages'):
-        monkeypatch.setattr(stages, name, lambda *_: None)
-    matching.measure_stages(run, options)
-    assert run.skipped[0].reason == 'needs 0.0 GB, 0.0 GB may be used'

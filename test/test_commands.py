@@ -11,16 +11,18 @@ from types import SimpleNamespace
 
 from conftest import route_images
 import cv2
+from evaluation_commands import write_images
 import numpy as np
 from processes import executable, Process, TIMEOUT
 import pytest
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure, PlaceMatch
-from stavpr_ros.commands import build_map, demo
+from stavpr_ros.commands import build_map, demo, stavpr
 from stavpr_ros.commands.record import loop_closure_record, match_record
 from stavpr_ros.demonstration.loops import read_result
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.records import evaluate_records
 from stavpr_ros.mapping import load_map
+from stavpr_ros.recognition import Status
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 from test_trajectory import write_odometry
@@ -56,13 +58,6 @@ def interrupt(*_, **__):
     raise KeyboardInterrupt
 
 
-def write_images(folder, images):
-    folder.mkdir()
-    for i, image in enumerate(images):
-        cv2.imwrite(str(folder / f'{i}.png'), image[:, :, ::-1])
-    return folder
-
-
 def image_records(count, first=1):
     """Images of the route, one a second from the given second on."""
     images = enumerate(route_images(count), first)
@@ -81,27 +76,25 @@ def poses(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize(
-    'name', ['node', 'build_map', 'replay', 'record', 'demo', 'evaluate', 'experiments']
-)
-def test_executable_help_exits_with_0(name):
-    result = run_process(name, '--help')
-    assert result.returncode == 0
-    assert 'usage:' in result.stdout
-    assert 'exit codes' in result.stdout
+@pytest.mark.parametrize('name', stavpr.COMMANDS)
+def test_command_help_lists_exit_codes(name, run):
+    result = run(stavpr, name, '--help')
+    assert result.code == 0
+    assert 'usage:' in result.out
+    assert 'exit codes' in result.out
 
 
 # --------------------------------------------------------------------------- build_map
 
 
-def test_build_map_with_options_writes_map(traverse, poses, tmp_path):
+def test_build_map_with_options_writes_map(run, traverse, poses, tmp_path):
     output = tmp_path / 'map.stavpr'
     options = ['--every', 2, '--poses', poses, '--projection', 32, '--strips', 5]
-    result = run_process('build_map', '--input', traverse, '--output', output, *options)
-    assert result.returncode == 0, result.stderr
-    assert '12 places, 5 strips of 32 dimensions' in result.stdout
+    result = run(build_map, '--input', traverse, '--output', output, *options)
+    assert result.code == 0, result.err
+    assert '12 places, 5 strips of 32 dimensions' in result.out
     place_map = load_map(output)
-    assert place_map.ids[3] == '6.png'
+    assert place_map.ids[3] == '006.png'
     assert place_map.poses[3].tolist() == [6, 0, 0, 0, 0, 0, 1]
 
 
@@ -114,7 +107,7 @@ def test_build_map_with_keyframe_options_selects_images(run, traverse, poses, tm
     assert result.code == 0, result.err
     assert '6 of 12 images became places, 6 of them with a pose' in result.out
     place_map = load_map(output)
-    assert place_map.ids == tuple(f'{i}.png' for i in range(0, 24, 4))
+    assert place_map.ids == tuple(f'{i:03}.png' for i in range(0, 24, 4))
     assert place_map.poses[:, 0].tolist() == list(range(0, 24, 4))
     assert place_map.thumbnail(0).shape == (48, 64, 3)
     assert '1 of 24 images became places\n' in run(build_map, *paths, '--keyframe-change', 1.9).out
@@ -151,7 +144,6 @@ def test_build_map_with_odometry_sets_poses(run, tmp_path):
         (['--gradient-cell', '9'], 2, 'multiple'),
         (['--poses', '/missing.csv'], 1, '/missing.csv'),
         (['--keyframe-distance', '1'], 2, 'need --odometry or --poses'),
-        (['--keyframe-angle', '1'], 2, 'need --odometry or --poses'),
         (['--keyframe-interval', '1'], 2, 'have no stamps'),
         (['--keyframe-change', '-1'], 2, 'change = -1'),
         (['--odometry', '/odom'], 2, 'is no bag'),
@@ -184,13 +176,13 @@ def test_build_map_interrupted_reports_state(run, traverse, tmp_path, monkeypatc
 
 def test_build_map_with_damaged_image_fails_or_skips(run, tmp_path):
     images = write_images(tmp_path / 'images', route_images(3))
-    (images / '1.png').write_bytes(b'no image')
+    (images / '001.png').write_bytes(b'no image')
     arguments = ['--input', images, '--output', tmp_path / 'map.stavpr']
     result = run(build_map, *arguments)
     assert result.code == 1
-    assert '1.png' in result.err
+    assert '001.png' in result.err
     assert run(build_map, *arguments, '--skip-bad-images').code == 0
-    assert load_map(tmp_path / 'map.stavpr').ids == ('0.png', '2.png')
+    assert load_map(tmp_path / 'map.stavpr').ids == ('000.png', '002.png')
 
 
 # --------------------------------------------------------------------------- ROS arguments, record
@@ -199,11 +191,10 @@ def test_build_map_with_damaged_image_fails_or_skips(run, tmp_path):
 @pytest.mark.parametrize('name', ['node', 'record', 'replay'])
 def test_executable_with_wrong_ros_arguments_fails(name, traverse, tmp_path):
     own = {'node': [], 'record': ['--output', tmp_path / 'x'], 'replay': [traverse]}[name]
-    for wrong in (['--bogus'], ['--params-file', '/missing.yaml']):
-        result = run_process(name, *own, '--ros-args', *wrong)
-        assert result.returncode in (1, 2)
-        assert '--ros-args' in result.stderr
-        assert 'Traceback' not in result.stderr
+    result = run_process(name, *own, '--ros-args', '--params-file', '/missing.yaml')
+    assert result.returncode in (1, 2)
+    assert '--ros-args' in result.stderr
+    assert 'Traceback' not in result.stderr
 
 
 def test_record_of_invalid_topic_fails(tmp_path):
@@ -229,16 +220,11 @@ def test_loop_closure_record_is_plain_json():
     assert loop_closure_record(message)['place_pose'] == [0, 2, 0, 0, 0, 0, 1]
 
 
-@pytest.mark.parametrize(
-    'name',
-    [
-        *('WARMING_UP', 'NO_MATCH', 'MATCH', 'INVALID_IMAGE'),
-        *('NOT_READY', 'DROPPED', 'SKIPPED', 'MAPPED'),
-    ],
-)
-def test_match_record_names_every_status(name):
-    plain = match_record(PlaceMatch(status=getattr(PlaceMatch, name), inliers=12))
-    assert (plain['status'], plain['inliers']) == (name, 12)
+def test_match_record_names_every_status():
+    for name, value in ((status.name, status.value) for status in Status):
+        plain = match_record(PlaceMatch(status=value, inliers=12))
+        assert (plain['status'], plain['inliers']) == (name, 12)
+        assert getattr(PlaceMatch, name) == value
 
 
 # --------------------------------------------------------------------------- demo
@@ -250,17 +236,14 @@ def test_match_record_names_every_status(name):
         (['--map', 'x'], 'go together'),
         (['--truth', 'identity'], '--truth'),
         (['--threshold', '-1'], '--threshold'),
-        (['--tolerance', '-4'], '--tolerance'),
         (['--map', 'x', '--query', 'y', '--truth', 'file.csv'], 'expected identity'),
         (['--loop', '--map', 'x', '--query', 'y'], 'leave --map'),
         (['--loop', 'synthetic', '--truth', 'file.csv'], 'is known'),
         (['--loop', 'x', '--truth', 'identity'], 'takes a file'),
-        (['--loop', '--exclude-places', '0'], '--exclude-places'),
         (['--loop', '--sequence-length', '1'], '--sequence-length'),
         (['--loop', '--mode', 'paper'], '--threshold'),
         (['--loop', '.', '--geometric-check', 'surf'], 'surf'),
         (['--map', 'x', '--query', 'y', '--geometric-check', 'sift'], 'go with --loop'),
-        (['--exclude-places', '50'], 'go with --loop'),
     ],
 )
 def test_demo_with_wrong_options_names_them(run, tmp_path, options, word):

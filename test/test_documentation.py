@@ -9,7 +9,7 @@ import re
 import shlex
 
 from conftest import route_images
-import cv2
+from evaluation_commands import write_images
 import pytest
 from stavpr_ros.commands import stavpr
 from stavpr_ros.parameters import PARAMETERS
@@ -20,18 +20,12 @@ README_LINES = 180
 NAMES = {row.name for row in PARAMETERS}
 
 
-def write_images(folder: Path, count: int, seed: int) -> None:
-    folder.mkdir()
-    for i, image in enumerate(route_images(count, seed)):
-        cv2.imwrite(str(folder / f'{i:03d}.png'), image)
-
-
 @pytest.fixture(scope='module')
 def workspace(tmp_path_factory) -> Path:
     """Write a folder with the images and ground truth that the examples name."""
     folder = tmp_path_factory.mktemp('workspace')
     for name, seed in (('monday', 0), ('tuesday', 0), ('another_town', 7)):
-        write_images(folder / name, 40, seed)
+        write_images(folder / name, route_images(40, seed))
     for name, copy in (('summer', 'monday'), ('winter', 'tuesday'), ('loop', 'monday')):
         (folder / name).symlink_to(folder / copy)
     (folder / 'pairs.csv').write_text(''.join(f'{i},{i}\n' for i in range(40)))

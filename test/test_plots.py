@@ -169,10 +169,3 @@ def test_match_image_puts_query_and_place_side_by_side(accepted, color):
     assert tuple(sheet[-1, 0]) == color
     assert sheet[48:].std() > 5  # the text
     assert np.all(query == 50)
-
-
-def test_match_image_of_no_rgb_image_raises():
-    with pytest.raises(InputError, match=r'query has shape \(4, 4\)'):
-        match_image(np.zeros((4, 4), np.uint8), None, '', True)
-    with pytest.raises(InputError, match='place has shape'):
-        match_image(image(1), np.zeros((4, 4, 3), np.float32), '', True)

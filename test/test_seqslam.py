@@ -57,19 +57,6 @@ def test_lines_at_three_speeds_by_hand():
     assert SeqSlamSettings().lines[:, -1].tolist() == [15, 17, 19, 21, 23]
 
 
-def test_match_differences_ends_come_from_the_outer_windows():
-    """Seven queries, windows of 4: midpoint 1, so queries 0, 5 and 6 are in the middle of none."""
-    settings = SeqSlamSettings(length=4, slowest=1, fastest=1)
-    D = np.ones((7, 20))
-    D[np.arange(7), np.arange(7) + 9] = 0
-    D[4:, :] = 0.9
-    D[[4, 5, 6], [13, 14, 15]] = 0.2
-    places, scores = match_differences(D, settings)
-    assert places.tolist() == list(range(9, 16))
-    assert scores[0] == scores[1]
-    assert scores[4] == scores[5] == scores[6]
-
-
 def naive(D, settings):
     """Compute the paper's method in plain loops."""
     N, n = D.shape

@@ -187,14 +187,6 @@ def test_interrupted_installation_starts_anew(recorder, checkout, step):
     assert recorder.run('setup') == ['venv', 'pip']
 
 
-def test_interrupted_build_continues_and_a_finished_one_runs_nothing(recorder):
-    recorder.fails = 'stavpr_msgs'
-    assert recorder.run('build') == ['venv', 'pip', 'stavpr_msgs']
-    recorder.fails = ''
-    assert recorder.run('build') == ['stavpr_msgs', 'stavpr_ros']
-    assert recorder.run('build') == []
-
-
 # Commands and their environment
 
 
