@@ -35,7 +35,7 @@ GOLDEN_PATH: Cells = [(0, 0), (1, 0), (2, 0), (3, 1), (4, 2), (5, 3), (6, 4), (6
 
 @dataclass
 class Grid:
-    """Accumulated distances S, path costs C and the step into each cell ('d', 'v', 'h'; '' at the start)."""
+    """Accumulated distances S, path costs C, the step into each cell ('d', 'v', 'h'; '' first)."""
 
     S: list[list[Any]]
     C: list[list[Any]]
@@ -178,7 +178,7 @@ def restrict(d: Array, xi: int | None) -> Array:
 
 
 def adaptive_weight(d: Array, sigma: float, dtype: type) -> tuple[Any, int]:
-    """a = sqrt(1 + sigma |I_c - c|) and I_c (0-based); d already restricted, so I_c is an allowed one."""
+    """Return a = sqrt(1 + sigma |I_c - c|) and I_c (0-based) of a restricted d."""
     W = d.shape[0]
     c = math.ceil(W / 2) - 1  # c = ceil(W / 2), 1-based
     nearest = 0
@@ -237,12 +237,12 @@ def image_distances(
 
 
 def frames_searched(length: int, beta: float) -> int:
-    """k = ceil(beta * l - 1e-9), the map frames that one start may reach."""
+    """K = ceil(beta * l - 1e-9), the map frames that one start may reach."""
     return math.ceil(beta * length - 1e-9)
 
 
 def align_sequence(D: Array, start: int, beta: float, dtype: type = np.float64) -> Aligned:
-    """LM-DTW of one start on D (l, n): end free on the last row; the path's map indices are absolute."""
+    """Align D (l, n) from one start, its end free on the last row; map indices are absolute."""
     length = D.shape[0]
     window = D[:, start : start + frames_searched(length, beta)]  # fewer at the end of the map
     grid = accumulate(window, 1, dtype)
@@ -272,7 +272,7 @@ def middle(first: int, last: int) -> int:
 
 
 def best_match(q: Array, m: Array, nms_radius: int) -> Answer | None:
-    """Start of the smallest distance (lowest index on a tie) and the best one outside its nms_radius."""
+    """Return the nearest start (lowest on a tie) and the best one outside its nms_radius."""
     best = _first_minimum(q, range(len(q)))
     if best is None:
         return None
@@ -309,9 +309,10 @@ def aligned_index(path: Cells, query_index: int) -> int:
 
 def best_f1(places: list[tuple[int, Any]], truth: list[list[int]], tolerance: int) -> float:
     """
-    Best F1 over all thresholds; `truth[i]` are the accepted map frames of query frame i, never empty.
+    Return the best F1 over all thresholds.
 
-    Accepted (distance < threshold) and within the tolerance: TP; accepted and outside: FP; rejected: FN.
+    Accepted (distance < threshold) and within the tolerance: TP; accepted and outside: FP;
+    rejected: FN. `truth[i]` are the accepted map frames of query frame i, never empty.
     """
     scores = sorted({float(score) for place, score in places if place >= 0 and np.isfinite(score)})
     best = 0.0

@@ -4,8 +4,8 @@
 The CUDA kernels, bit for bit against the oracle.
 
 They run on a CUDA device where there is one, and in numba's simulator everywhere: numba reads
-NUMBA_ENABLE_CUDASIM when it is imported, so the simulator has a process of its own, which runs this file and
-test_cuda_matcher.py once more.
+NUMBA_ENABLE_CUDASIM when it is imported, so the simulator has a process of its own, which runs
+this file and test_cuda_matcher.py once more.
 """
 
 import json
@@ -32,33 +32,22 @@ FILES = ('test_cuda_kernels.py', 'test_cuda_matcher.py')
 
 @pytest.fixture(scope='module')
 def runtime():
-    """What kernels run on here; skips where there is nothing."""
+    """Return the device or the simulator; skip where there is none."""
     from stavpr_ros.alignment.cuda import compilation
 
     try:
         return compilation.runtime()
     except UnavailableError as error:
-        pytest.skip(
-            f'{error}; the same test runs in the simulator (test_everything_in_the_simulator)'
-        )
+        pytest.skip(f'{error}; test_kernels_in_simulator_pass runs the same test')
 
 
 @pytest.mark.skipif(SIMULATOR, reason='this is the simulator')
-def test_everything_in_the_simulator():
+def test_kernels_in_simulator_pass():
     root = Path(__file__).resolve().parents[1]
     environment = os.environ | {'NUMBA_ENABLE_CUDASIM': '1'}
     files = [str(Path(__file__).with_name(name)) for name in FILES]
-    command = [
-        sys.executable,
-        '-m',
-        'pytest',
-        '-q',
-        '-rs',
-        '-p',
-        'no:cacheprovider',
-        '-c',
-        root / 'pytest.ini',
-    ]
+    command = [sys.executable, '-m', 'pytest', '-q', '-rs', '-p', 'no:cacheprovider']
+    command += ['-c', str(root / 'pytest.ini')]
     done = subprocess.run(
         [*command, *files], env=environment, capture_output=True, text=True, check=False
     )
@@ -66,7 +55,7 @@ def test_everything_in_the_simulator():
     assert ' passed' in done.stdout
 
 
-def test_without_a_device_there_is_an_error_that_says_so():
+def test_runtime_without_device_fails():
     if SIMULATOR or torch.cuda.is_available():
         pytest.skip('there is something to run kernels on')
     from stavpr_ros.alignment.cuda import compilation
@@ -75,7 +64,7 @@ def test_without_a_device_there_is_an_error_that_says_so():
         compilation.runtime()
 
 
-def test_a_missing_numba_cuda_is_named(monkeypatch):
+def test_device_without_numba_cuda_fails(monkeypatch):
     from stavpr_ros.alignment.cuda import compilation
 
     monkeypatch.setattr(torch.cuda, 'is_available', lambda: True)
@@ -85,7 +74,7 @@ def test_a_missing_numba_cuda_is_named(monkeypatch):
 
 
 @pytest.mark.skipif(SIMULATOR, reason='the simulator compiles nothing')
-def test_the_compiler_keeps_everything_in_registers():
+def test_compiled_kernels_spill_no_registers():
     from stavpr_ros.alignment.cuda import lm_dtw
 
     program = Path(__file__).resolve().parents[1] / 'benchmarks' / 'cuda_registers.py'
@@ -105,7 +94,7 @@ def test_the_compiler_keeps_everything_in_registers():
         assert (report['stack_bytes'] > 0) == long, name
 
 
-# ------------------------------------------------ the distance of two images
+# ------------------------------------------------ image distances
 
 
 def image_distances(runtime, products, strategy, sigma=1.0, xi=None, block=4):
@@ -151,35 +140,22 @@ def random_products(seed, queries, W, n, levels=None):
 
 
 @pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'sliding_window'])
-@pytest.mark.parametrize(
-    ('W', 'xi', 'n'), [(7, None, 9), (7, 3, 5), (7, 1, 4), (4, 2, 1), (6, None, 3)]
-)
+@pytest.mark.parametrize(('W', 'xi', 'n'), [(7, None, 6), (7, 3, 5), (4, 2, 1)])
 @pytest.mark.parametrize('levels', [None, 3])  # three levels: ties everywhere
-def test_image_distances_are_the_oracles(runtime, strategy, W, xi, n, levels):
+def test_image_distances_equal_oracle(runtime, strategy, W, xi, n, levels):
     products = random_products(W * 10 + n, 2, W, n, levels)
     got = image_distances(runtime, products, strategy, 1.0, xi)
     np.testing.assert_array_equal(got, expected_images(products, strategy, 1.0, xi))
 
 
-@pytest.mark.parametrize('W', [1, 2, 9])
-@pytest.mark.parametrize('sigma', [0.0, 0.3, 5.0])
-def test_other_numbers_of_strips_and_sigmas(runtime, W, sigma):
+@pytest.mark.parametrize(('W', 'sigma'), [(1, 0.3), (2, 5.0), (6, 0.0), (9, 0.3)])
+def test_image_distances_of_other_strips_and_sigmas_equal_oracle(runtime, W, sigma):
     products = random_products(W, 1, W, 5)
     got = image_distances(runtime, products, 'adaptive', sigma)
     np.testing.assert_array_equal(got, expected_images(products, 'adaptive', sigma))
 
 
-def test_the_published_figure(runtime):
-    products = (1 - oracle.GOLDEN.astype(np.float32))[None, :, :, None]
-    assert image_distances(runtime, products, 'adaptive')[0, 0] == pytest.approx(
-        0.28724851, abs=1e-6
-    )
-    assert image_distances(runtime, products, 'vanilla')[0, 0] == pytest.approx(
-        0.31888889, abs=1e-6
-    )
-
-
-def test_cells_outside_the_band_are_not_read(runtime):
+def test_image_distances_ignore_cells_outside_band(runtime):
     products = random_products(3, 1, 7, 5)
     expected = expected_images(products, 'adaptive', 1.0, 3)
     i, j = np.indices((7, 7))
@@ -187,7 +163,7 @@ def test_cells_outside_the_band_are_not_read(runtime):
     np.testing.assert_array_equal(image_distances(runtime, products, 'adaptive', 1.0, 3), expected)
 
 
-def test_products_of_any_strides(runtime):
+def test_image_distances_of_any_strides_equal_oracle(runtime):
     from stavpr_ros.alignment.cuda import dtw
 
     products = random_products(5, 2, 5, 6)
@@ -230,7 +206,7 @@ def run_sequences(runtime, D, k, apart, block=8, columns=None, first=0, launches
 
 
 def check_sequences(runtime, D, beta, apart=3, **launch):
-    """Hold every start and the choice against the oracle, exactly."""
+    """Compare every start and the selection with the oracle, exactly."""
     l, n = D.shape
     k = oracle.frames_searched(l, beta)
     distances, lengths, found = run_sequences(runtime, D, k, min(apart, n), **launch)
@@ -282,23 +258,23 @@ def random_window(seed, l, n, levels=None, banned=0.0):
     ],
 )
 @pytest.mark.parametrize('columns', [None, 3, 0])  # staged at once, in pieces, not at all
-def test_sequences_are_the_oracles(runtime, l, n, beta, columns):
+def test_sequences_equal_oracle(runtime, l, n, beta, columns):
     check_sequences(runtime, random_window(l * n, l, n), beta, columns=columns)
 
 
 @pytest.mark.parametrize('columns', [None, 0])
-def test_ties_and_bans(runtime, columns):
-    for seed, banned in ((1, 0.0), (2, 0.3), (3, 0.8)):
+def test_sequences_with_ties_and_bans_equal_oracle(runtime, columns):
+    for seed, banned in ((1, 0.0), (2, 0.3)):
         check_sequences(
             runtime, random_window(seed, 4, 21, levels=2, banned=banned), 2.0, columns=columns
         )
 
 
-def test_a_window_of_33_rows(runtime):
+def test_sequences_of_33_rows_equal_oracle(runtime):
     check_sequences(runtime, random_window(33, 33, 6), 1.2, block=4)
 
 
-def test_nothing_is_finite(runtime):
+def test_selection_of_banned_window_is_none(runtime):
     D = np.full((3, 12), np.inf, np.float32)
     distances, lengths, found = run_sequences(runtime, D, 6, 2)
     assert np.isinf(distances).all()
@@ -306,21 +282,21 @@ def test_nothing_is_finite(runtime):
     assert (found.start, found.second_best_start) == (-1, -1)
 
 
-def test_the_lowest_start_wins_across_blocks(runtime):
+def test_selection_of_ties_across_blocks_is_lowest_start(runtime):
     D = np.full((3, 64), 0.5, np.float32)
     found = run_sequences(runtime, D, 6, 4)[2]
-    # every start is as good as every other: a path down the first column has m = 1
+    # all starts are equal: a path down the first column has m = 1
     assert (found.start, found.length) == (0, 1)
     assert found.second_best_start == 5
 
 
-@pytest.mark.parametrize('apart', [0, 1, 7, 8, 20, 39, 1000])
-def test_the_runner_up_lies_outside_the_neighborhood(runtime, apart):
+@pytest.mark.parametrize('apart', [0, 7, 8, 39])
+def test_second_best_is_outside_nms_radius(runtime, apart):
     D = random_window(11, 3, 40, levels=4)
     check_sequences(runtime, D, 2.0, apart=apart, block=4)
 
 
-def test_the_window_may_start_at_any_row_and_be_matched_again(runtime):
+def test_sequences_from_any_row_and_repeated_are_equal(runtime):
     D = random_window(17, 4, 19)
     k = 8
     once = run_sequences(runtime, D, k, 2)
@@ -333,7 +309,7 @@ def test_the_window_may_start_at_any_row_and_be_matched_again(runtime):
     )
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(
     seed=st.integers(0, 2**20),
     l=st.integers(2, 6),
@@ -345,12 +321,14 @@ def test_the_window_may_start_at_any_row_and_be_matched_again(runtime):
     block=st.sampled_from([1, 2, 4, 8]),
     columns=st.sampled_from([None, 0, 1, 2, 5]),
 )
-def test_any_window(runtime, seed, l, n, beta, levels, banned, apart, block, columns):
+def test_sequences_of_any_window_equal_oracle(
+    runtime, seed, l, n, beta, levels, banned, apart, block, columns
+):
     D = random_window(seed, l, n, levels, banned)
     check_sequences(runtime, D, beta, apart=apart, block=block, columns=columns)
 
 
-def test_the_default_window_is_staged_at_once_and_long_ones_not_at_all():
+def test_staged_columns_fit_into_shared_memory():
     from stavpr_ros.alignment.cuda import lm_dtw
 
     assert lm_dtw.staged_columns(20, 40, lm_dtw.BLOCK) == 40
@@ -362,7 +340,7 @@ def test_the_default_window_is_staged_at_once_and_long_ones_not_at_all():
 
 
 @pytest.mark.skipif(SIMULATOR, reason='sizes of a real map take a real device')
-def test_many_places_on_the_device(runtime):
+def test_sequences_of_many_places_on_device_equal_cpu(runtime):
     from stavpr_ros.alignment import match_sequence, SequenceSettings
 
     for l, n, beta in ((20, 70_001, 2.0), (33, 5000, 1.7), (80, 3000, 1.5)):

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The matcher on CUDA beside the one on the CPU; in the simulator as well (see test_cuda_kernels.py)."""
+"""The matcher on CUDA and that of the CPU; also in the simulator (see test_cuda_kernels.py)."""
 
 import os
 
@@ -18,14 +18,14 @@ import torch
 SIMULATOR = os.environ.get('NUMBA_ENABLE_CUDASIM') == '1'
 SHORT = SequenceSettings(length=3, beta=2.0)
 W, D = 4, 24
-# Of products summed up in float32: the order of the sum is the library's. Away from near-ties, that is: where
-# the last bit decides on a path, or on the nearest strip I_c, the distance jumps.
+# Of products summed in float32, in the order of the library. Without near-ties: where the last bit
+# decides on a path, or on the nearest strip I_c, the distance jumps.
 TOLERANCE = 1e-5
 
 
 @pytest.fixture(scope='module')
 def matcher_class():
-    """The class, with small blocks; skips where there is nothing that kernels could run on."""
+    """Return the class, with small blocks; skip where there is no device."""
     from stavpr_ros.alignment.cuda.compilation import runtime
     from stavpr_ros.recognition.cuda_matcher import CudaMatcher
 
@@ -55,7 +55,7 @@ def features(n, seed=0, strips=W, zero=()):
 
 
 def rounded(x, precision):
-    """What is left of the features in half width, in full width."""
+    """Return the features rounded to a precision, in float32."""
     return LocalFeatures(x.strips.to(getattr(torch, precision)).float(), x.weights, x.settings)
 
 
@@ -72,9 +72,8 @@ def expected_row(reference, query, i, settings):
 
 
 @pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'sliding_window', 'none'])
-@pytest.mark.parametrize('xi', [None, 2])
-@pytest.mark.parametrize('precision', ['float32', 'float16'])
-def test_distances_of_every_strategy(matcher_class, strategy, xi, precision):
+@pytest.mark.parametrize(('xi', 'precision'), [(None, 'float32'), (2, 'float16')])
+def test_distances_of_every_strategy_equal_oracle(matcher_class, strategy, xi, precision):
     reference, query = features(7, zero=[(1, 2)]), features(3, seed=1, zero=[(0, 0)])
     settings = SpatialSettings(strategy, 0.7, xi)
     matcher = matcher_class(reference, settings, precision)
@@ -89,7 +88,7 @@ def test_distances_of_every_strategy(matcher_class, strategy, xi, precision):
         np.testing.assert_allclose(row.cpu().numpy(), expected, rtol=0, atol=TOLERANCE)
 
 
-def test_half_width_is_not_full_width(matcher_class):
+def test_float16_distances_differ_from_float32(matcher_class):
     reference, query = features(7), features(1, seed=1)
     rows = [
         matcher_class(reference, SpatialSettings(), precision)
@@ -102,7 +101,7 @@ def test_half_width_is_not_full_width(matcher_class):
 
 
 @pytest.mark.parametrize('precision', ['float32', 'float16'])
-def test_maps_and_batches_in_pieces(matcher_class, monkeypatch, precision):
+def test_distances_in_pieces_are_equal(matcher_class, monkeypatch, precision):
     from stavpr_ros.recognition import cuda_matcher
 
     reference, query = features(11), features(5, seed=1)
@@ -122,19 +121,19 @@ def test_maps_and_batches_in_pieces(matcher_class, monkeypatch, precision):
 
 
 def same(a, b):
-    """Two matches of a window are one."""
+    """Return whether two matches of a window are equal."""
     match, twin, path, twin_path = a.nearest, b.nearest, a.path, b.path
     if match is None or twin is None:
         return match is twin and path.shape == twin_path.shape == (0, 2)
     fields = ('first', 'last', 'distance', 'second_best_index')
     equal = all(getattr(match, name) == getattr(twin, name) for name in fields)
-    runners = np.array_equal(match.second_best_distance, twin.second_best_distance, equal_nan=True)
-    return equal and runners and np.array_equal(path, twin_path) and path.dtype == twin_path.dtype
+    seconds = np.array_equal(match.second_best_distance, twin.second_best_distance, equal_nan=True)
+    return equal and seconds and np.array_equal(path, twin_path) and path.dtype == twin_path.dtype
 
 
 @pytest.mark.parametrize(('n', 'length', 'beta'), [(19, 3, 2.0), (1, 2, 1.5), (4, 3, 3.0)])
 @pytest.mark.parametrize('nms_radius', [0, 3])
-def test_the_window_rolls_like_the_one_of_the_cpu(matcher_class, n, length, beta, nms_radius):
+def test_search_equals_that_of_cpu(matcher_class, n, length, beta, nms_radius):
     sequence = SequenceSettings(length=length, beta=beta)
     search, twin = searches(n, sequence)
     rng = np.random.default_rng(n)
@@ -153,7 +152,7 @@ def test_the_window_rolls_like_the_one_of_the_cpu(matcher_class, n, length, beta
 
 
 def searches(places, sequence=SHORT):
-    """LM-DTW over a window on the device, and over one of the CPU."""
+    """Return LM-DTW over a window on the device, and over one of the CPU."""
     from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
     buffer = SequenceBuffer(sequence.length, places, sequence.k)
@@ -170,7 +169,7 @@ def first_image(x):
     return x.strips[:, 0], x.weights[:, 0]
 
 
-def test_a_traverse_is_recognized_from_normalized_rows(matcher_class):
+def test_search_of_normalized_rows_finds_traverse(matcher_class):
     reference = features(12)
     matcher = matcher_class(reference, SpatialSettings(xi=2))
     search, _ = searches(12)
@@ -182,7 +181,7 @@ def test_a_traverse_is_recognized_from_normalized_rows(matcher_class):
     assert found.path.tolist() == [[0, 5], [1, 6], [2, 7]]
 
 
-def test_rows_that_were_given_out_stay_as_they_were(matcher_class):
+def test_distances_returned_before_stay_unchanged(matcher_class):
     reference = features(6)
     matcher = matcher_class(reference, SpatialSettings())
     first = matcher.distances(*first_image(reference))
@@ -192,7 +191,7 @@ def test_rows_that_were_given_out_stay_as_they_were(matcher_class):
 
 
 @pytest.mark.parametrize('strategy', ['adaptive', 'none'])
-def test_an_empty_map_has_no_match(matcher_class, strategy):
+def test_search_of_empty_map_has_no_match(matcher_class, strategy):
     query = features(1)
     matcher = matcher_class(features(3)[0:0], SpatialSettings(strategy))
     assert matcher.places == 0
@@ -206,7 +205,7 @@ def test_an_empty_map_has_no_match(matcher_class, strategy):
     assert found.path.shape == (0, 2)
 
 
-def test_settings_that_do_not_fit_the_map(matcher_class):
+def test_cuda_matcher_with_invalid_settings_is_rejected(matcher_class):
     with pytest.raises(SettingsError, match='xi = 5'):
         matcher_class(features(3), SpatialSettings(xi=5))
     with pytest.raises(InputError, match='at least 4'):
@@ -215,7 +214,7 @@ def test_settings_that_do_not_fit_the_map(matcher_class):
 
 @pytest.mark.skipif(SIMULATOR, reason='sizes of a real map take a real device')
 @pytest.mark.parametrize('precision', ['float32', 'float16'])
-def test_a_large_map_on_the_device(matcher_class, monkeypatch, precision):
+def test_distances_of_large_map_on_device_equal_cpu(matcher_class, monkeypatch, precision):
     from stavpr_ros.alignment.cuda import dtw, lm_dtw
     from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 

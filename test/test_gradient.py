@@ -90,14 +90,14 @@ def noise_image(seed: int, contrast: int, shape: tuple[int, int]) -> np.ndarray:
 noise = {'seed': st.integers(0, 2**32 - 1), 'contrast': st.sampled_from([0, 1, 3, 60, 255])}
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(settings=gradient_settings(), **noise)
 def test_gradient_kernel_equals_definition(settings, seed, contrast):
     gray = noise_image(seed, contrast, (settings.size, settings.size))
     assert_same_features(kernel_maps(gray, settings), reference_maps(gray, settings))
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(settings=gradient_settings(), **noise)
 def test_gradient_by_torch_equals_definition(settings, seed, contrast):
     """The operators of a GPU, on a CPU."""
@@ -106,7 +106,7 @@ def test_gradient_by_torch_equals_definition(settings, seed, contrast):
     assert_same_features(maps, reference_maps(gray, settings))
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(
     settings=gradient_settings(), height=st.integers(1, 150), width=st.integers(1, 150), **noise
 )
@@ -146,13 +146,6 @@ def test_to_polar_of_every_gradient_is_exact(bins, signed):
         np.testing.assert_array_equal(magnitude[::3], np.hypot(dx, dy).astype(np.float32))
 
 
-def test_gradient_with_odd_cell_drops_half_cells():
-    maps = Gradient(GradientSettings(size=21, cell=7)).feature_maps(
-        [np.zeros((30, 30, 3), np.uint8)]
-    )
-    assert maps.shape == (1, 8, 2, 2)
-
-
 def test_resize_square_area_by_hand():
     """Three pixels to two: the first takes the first and half of the second."""
     gray = np.array([[0, 90, 180], [45, 90, 135], [225, 0, 9]], np.uint8)
@@ -170,7 +163,7 @@ def two_threads():
 
 
 @pytest.mark.usefixtures('two_threads')
-@pytest.mark.parametrize('n', [0, 1, PER_THREAD, 2 * PER_THREAD, 2 * PER_THREAD + 3])
+@pytest.mark.parametrize('n', [0, 1, 2 * PER_THREAD + 3])
 def test_gradient_on_threads_equals_single_images(route, n):
     gradient = Gradient(GradientSettings())
     together = gradient.feature_maps(route[:n])
@@ -180,9 +173,7 @@ def test_gradient_on_threads_equals_single_images(route, n):
 
 
 @pytest.mark.usefixtures('two_threads')
-@pytest.mark.parametrize(
-    ('count', 'threads'), [(PER_THREAD, 1), (2 * PER_THREAD, 2), (9 * PER_THREAD, 2)]
-)
+@pytest.mark.parametrize(('count', 'threads'), [(PER_THREAD, 1), (2 * PER_THREAD, 2)])
 def test_on_threads_with_large_batch_uses_several(count, threads):
     """They meet at every image, which one thread alone could not."""
     meeting, seen = threading.Barrier(threads), set()
@@ -197,10 +188,9 @@ def test_on_threads_with_large_batch_uses_several(count, threads):
 
 
 @pytest.mark.usefixtures('two_threads')
-@pytest.mark.parametrize('bad', range(4))
-def test_gradient_error_in_thread_is_raised(route, bad):
+def test_gradient_error_in_thread_is_raised(route):
     images = [*route[: 2 * PER_THREAD]]
-    images[bad] = np.empty((0, 5, 3), np.uint8)
+    images[3] = np.empty((0, 5, 3), np.uint8)
     with pytest.raises(cv2.error):
         Gradient(GradientSettings()).feature_maps(images)
 

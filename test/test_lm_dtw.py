@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Temporal alignment (LM-DTW): examples by hand, and every start bit for bit against the oracle."""
+"""Temporal alignment (LM-DTW): examples by hand, and every start equal to the oracle's."""
 
 import math
 
@@ -78,6 +78,8 @@ def test_free_end_is_best_column_not_last():
 def test_first_of_equal_ends_and_starts_wins():
     # a map of zeros: every q_x is 0, so m = 1, and every start is equal, so start 0
     matches = match_sequence(np.zeros((3, 8)), SequenceSettings(length=3))
+    path = path_of(align_sequence(np.zeros((3, 8)), 0, SequenceSettings(length=3)))
+    assert path == [(0, 0), (1, 0), (2, 0)]
     assert matches.lengths.tolist() == [1] * 8
     best = best_match(matches, 3)
     assert (best.first, best.last, best.middle) == (0, 0, 0)

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The matcher of the CPU: fused kernels give what the separate functions give; half width is near enough."""
+"""The matcher of the CPU: fused kernels equal separate functions; float16 is near enough."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,16 +20,12 @@ from stavpr_ros.alignment import (
 )
 from stavpr_ros.alignment.velocity import best_velocity_match, match_velocities
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.evaluation.evaluate import recognize_all
-from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
+from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.mapping import build_map, extract_features
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust import ZNormalization
 from stavpr_ros.recognition.sequence_search import LmDtwSearch, SequenceBuffer, VelocitySearch
-from stavpr_ros.sources import open_source
 import torch
 
 # of a number kept in float16, relative; so also of a product of unit-norm features, at most
@@ -37,7 +33,7 @@ ROUNDING = 2.0**-11
 
 
 def random_features(W, n, d, seed=0):
-    """Unit-norm features of n images; those of one strip of the first image are zero."""
+    """Return unit-norm features of n images; one strip of the first image is zero."""
     rng = np.random.default_rng(seed)
     strips = rng.standard_normal((W, n, d))
     strips /= np.linalg.norm(strips, axis=2, keepdims=True)
@@ -58,16 +54,16 @@ def make(features, spatial=None, precision='float32'):
 # ------------------------------------------------ distances
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     W=st.integers(1, 15),
-    n=st.sampled_from([0, 1, 2, 15, 16, 17, 255, 256, 257, 530]),
+    n=st.sampled_from([0, 1, 15, 16, 17, 255, 256, 257]),
     d=st.sampled_from([1, 5, 16, 100]),
     strategy=st.sampled_from(['adaptive', 'vanilla']),
     data=st.data(),
 )
-def test_fused_is_the_same_as_one_after_the_other(W, n, d, strategy, data):
-    """Bit for bit, in every shape: whole tiles of strips and blocks of images, and what is left over."""
+def test_fused_distances_equal_separate_functions(W, n, d, strategy, data):
+    """Bit for bit: whole tiles of strips and blocks of images, and their remainders."""
     xi = data.draw(st.one_of(st.none(), st.integers(1, W)))
     features, queries = random_features(W, n, d), random_features(W, 3, d, seed=1)
     spatial = SpatialSettings(strategy, 1.0, xi)
@@ -82,7 +78,7 @@ def test_fused_is_the_same_as_one_after_the_other(W, n, d, strategy, data):
         np.testing.assert_array_equal(row, separate)
 
 
-def test_distances_against_the_oracle():
+def test_distances_equal_oracle():
     features, query = random_features(7, 33, 40), random_features(7, 1, 40, seed=1)
     row = make(features).distances(query.strips[:, 0], query.weights[:, 0])
     d = oracle.distances(query.strips[:, 0].double().numpy(), features.strips.double().numpy())
@@ -90,8 +86,8 @@ def test_distances_against_the_oracle():
     np.testing.assert_allclose(row, expected, atol=2e-6)
 
 
-@pytest.mark.parametrize('W', [1, 4, 7, 9])
-def test_strategies_without_dtw(W):
+@pytest.mark.parametrize('W', [1, 7])
+def test_strategies_without_dtw_equal_separate_functions(W):
     features, query = random_features(W, 70, 24), random_features(W, 2, 24, seed=1)
     for x in range(2):
         strips, weights = query.strips[:, x], query.weights[:, x]
@@ -106,7 +102,7 @@ def test_strategies_without_dtw(W):
             )
 
 
-def test_features_that_do_not_lie_in_one_piece():
+def test_distances_of_features_not_contiguous_are_equal():
     features, query = random_features(7, 60, 32), random_features(7, 1, 32, seed=1)
     part = make(features[11:40]).distances(query.strips[:, 0], query.weights[:, 0])
     whole = make(features).distances(query.strips[:, 0], query.weights[:, 0])
@@ -117,16 +113,16 @@ def test_features_that_do_not_lie_in_one_piece():
 
 
 def window_and_search(n, velocity=False):
-    """An empty window over n places, and its search without z-normalization."""
+    """Return an empty window over n places, and its search without z-normalization."""
     sequence = SequenceSettings(5)
     buffer = SequenceBuffer(5, n, sequence.k)
     search = VelocitySearch if velocity else LmDtwSearch
     return buffer, search(buffer, ZNormalization(n, False, False))
 
 
-@pytest.mark.parametrize('n', [1, 7, 16, 100])
-def test_search_of_a_rolling_window_equals_the_plain_functions(n):
-    """Whatever the ring's turn: the result of the plain functions on the last l rows."""
+@pytest.mark.parametrize('n', [1, 7, 100])
+def test_lm_dtw_search_equals_plain_functions(n):
+    """At every turn of the ring buffer."""
     buffer, search = window_and_search(n)
     rows = np.random.default_rng(0).random((23, n), np.float32)
     for i, row in enumerate(rows):
@@ -145,8 +141,8 @@ def test_search_of_a_rolling_window_equals_the_plain_functions(n):
                 np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize('n', [1, 16, 1050])
-def test_velocity_search_of_a_rolling_window_equals_the_plain_functions(n):
+@pytest.mark.parametrize('n', [1, 1050])
+def test_velocity_search_equals_plain_functions(n):
     buffer, search = window_and_search(n, velocity=True)
     rows = np.random.default_rng(1).random((13, n), np.float32)
     for i, row in enumerate(rows):
@@ -161,7 +157,7 @@ def test_velocity_search_of_a_rolling_window_equals_the_plain_functions(n):
 
 
 @pytest.mark.parametrize('velocity', [False, True])
-def test_no_places_no_match(velocity):
+def test_search_without_places_has_no_match(velocity):
     buffer, search = window_and_search(0, velocity)
     for _ in range(5):
         buffer.push(torch.empty(0))
@@ -171,48 +167,23 @@ def test_no_places_no_match(velocity):
     assert [len(values) for values in found.sequences()] == [0, 0]
 
 
-# ------------------------------------------------ half width
+# ------------------------------------------------ float16
 
 
-@pytest.mark.parametrize('d', [1, 16, 100, 512])
-def test_half_width_rounds_as_it_says(d):
-    """Strip distances move by 2^-11 at most (Cauchy-Schwarz), far less as a rule; W = 1 shows them bare."""
+@pytest.mark.parametrize('d', [1, 100, 512])
+def test_float16_distances_are_those_of_rounded_features(d):
+    """Strip distances move by 2^-11 at most (Cauchy-Schwarz); with W = 1 they are the result."""
     features, query = random_features(1, 300, d), random_features(1, 2, d, seed=1)
     exact = make(features).distances(query.strips[:, 1], query.weights[:, 1])
     half = make(features, precision='float16').distances(query.strips[:, 1], query.weights[:, 1])
     error = (half - exact).abs()
     assert error.max() <= ROUNDING * 1.001
     assert error.max() > 0 or d == 1
-    if d == 512:
-        assert error.max() < 5e-5
     rounded = LocalFeatures(features.strips.half().float(), features.weights, features.settings)
     widened = make(rounded).distances(query.strips[:, 1], query.weights[:, 1])
     np.testing.assert_array_equal(half, widened)  # the same sums of the rounded numbers
 
 
-def test_half_width_answers_on_real_images(data_folder):
-    """The same place, window for window, on a walk in the paper's configuration; distances within 1e-3."""
-    extractor = FeatureExtractor()
-    place_map = build_map(
-        open_source(data_folder / 'gardens_point' / 'day_left'), extractor, progress=False
-    )
-    query = extract_features(
-        open_source(data_folder / 'gardens_point' / 'day_right'), extractor, progress=False
-    )
-    exact, half = (
-        recognize_all(PlaceRecognizer(place_map, RecognizerSettings(10.0), precision=p), query)[
-            19:
-        ]
-        for p in ('float32', 'float16')
-    )
-    assert [a.sequence.middle for a in half] == [a.sequence.middle for a in exact]
-    moved = [
-        abs(a.sequence.distance - b.sequence.distance) for a, b in zip(half, exact, strict=True)
-    ]
-    print(f'float16: {len(half)} windows, distances moved by {max(moved):.1e} at most')
-    assert max(moved) < 1e-3
-
-
-def test_no_such_precision():
+def test_make_matcher_of_unknown_precision_is_rejected():
     with pytest.raises(SettingsError, match='float8'):
         make_matcher(random_features(7, 4, 8), SpatialSettings(), 'cpu', 'float8')

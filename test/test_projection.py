@@ -42,14 +42,10 @@ def test_apply_equals_matrix_product():
     assert not result[1, 2].any()
 
 
-@pytest.mark.parametrize('n', [0, 2])
-def test_apply_by_default_returns_512_dimensions(n):
-    assert tuple(Projection.gaussian(30).apply(torch.zeros(7, n, 30)).shape) == (7, n, 512)
-
-
 def test_gaussian_entries_are_normal_with_mean_zero():
     matrix = Projection.gaussian(1000, 512).matrix
     spread = matrix.std()
+    assert spread == pytest.approx(512**-0.5, rel=0.01)  # norms are kept on average
     # 512,000 entries: the mean deviates by spread / 715, the share within one sigma by .0007
     assert abs(matrix.mean()) < 5 * spread / 715
     assert np.mean(np.abs(matrix) < spread) == pytest.approx(0.6827, abs=0.004)

@@ -184,7 +184,7 @@ def test_bag_with_write_ahead_log_is_read_and_unchanged(tmp_path):
 
 
 @pytest.mark.parametrize('kind', ['sqlite3', 'mcap', 'ros1'])
-@pytest.mark.parametrize('keep', [0.0, 0.02, 0.3, 0.6, 0.9, 0.99])
+@pytest.mark.parametrize('keep', [0.0, 0.3, 0.99])
 def test_bag_cut_off_fails(tmp_path, kind, keep):
     if kind == 'ros1':
         file = write_mixed(tmp_path / 'mixed.bag', ros1=True)
@@ -206,7 +206,7 @@ def test_bag_with_damaged_bytes_fails_or_reads(tmp_path, kind):
         file = next(file for file in (tmp_path / 'bag').iterdir() if file.suffix != '.yaml')
     data, rng = file.read_bytes(), np.random.default_rng(0)
     outcomes = set()
-    for _ in range(60):
+    for _ in range(30):
         damaged = np.frombuffer(data, np.uint8).copy()
         at = rng.integers(0, len(damaged), 20)
         damaged[at] = rng.integers(0, 256, 20)
@@ -225,9 +225,7 @@ def test_bag_of_foreign_content_fails(tmp_path, name):
         open_source(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    'text', ['', 'a: [', 'rosbag2_bagfile_information: {version: 99}', '[1, 2]']
-)
+@pytest.mark.parametrize('text', ['', 'a: [', 'rosbag2_bagfile_information: {version: 99}'])
 def test_bag_with_foreign_metadata_fails(tmp_path, text):
     write_bag(tmp_path / 'bag', '/image', records())
     (tmp_path / 'bag' / 'metadata.yaml').write_text(text)

@@ -3,8 +3,6 @@
 """Raw image messages to RGB: hand-made pixels of every encoding, lying headers, garbage."""
 
 import array
-import copy
-import pickle
 from types import SimpleNamespace
 
 from hypothesis import example, given
@@ -26,9 +24,7 @@ def test_encodings_are_all_tested():
 
 @pytest.mark.parametrize('encoding', sorted(CHANNELS))
 @pytest.mark.parametrize('big', [False, True])
-@pytest.mark.parametrize(
-    ('height', 'width', 'padding'), [(1, 1, 0), (5, 7, 0), (4, 6, 3), (1, 9, 1), (8, 1, 5)]
-)
+@pytest.mark.parametrize(('height', 'width', 'padding'), [(1, 1, 0), (4, 6, 3), (8, 1, 5)])
 def test_decode_image_of_every_encoding_is_exact(encoding, big, height, width, padding):
     step, data, expected = message(encoding, height, width, big, padding)
     image = decode_image(height, width, encoding, big, step, data)
@@ -54,7 +50,7 @@ def test_decode_image_of_any_buffer_is_exact(kind):
     np.testing.assert_array_equal(decode_image(4, 5, 'rgb8', False, step, kind(data)), expected)
 
 
-@pytest.mark.parametrize('encoding', sorted(ENCODINGS))
+@pytest.mark.parametrize('encoding', ['rgb8', 'mono8', 'bayer_rggb8', 'yuyv', 'nv24'])
 def test_decode_image_shares_no_memory(encoding):
     data = np.random.default_rng(0).integers(0, 256, 600, np.uint8)
     image = decode_image(4, 6, encoding, False, 48, data[:])
@@ -138,8 +134,7 @@ def test_decode_image_with_wrong_header_is_rejected(change, kind, text):
 
 @pytest.mark.parametrize(
     'encoding',
-    [f'{kind}C{n}' for kind in ('8S', '16S', '32S', '32F', '64F') for n in (1, 2, 3, 4)]
-    + ['32FC', '32FC12'],
+    [f'{kind}C{n}' for kind in ('8S', '16S', '32S', '32F', '64F') for n in (1, 4)],
 )
 def test_decode_image_of_measurements_is_rejected(encoding):
     with pytest.raises(ImageError, match=f'{encoding!r} holds depth or measurements') as caught:
@@ -179,13 +174,6 @@ def test_bag_errors_keep_their_kind(tmp_path):
     (frame,) = open_source(tmp_path / 'bag', on_error=errors.append)
     np.testing.assert_array_equal(frame.image, np.full((2, 2, 3), 130))
     assert [error.kind for error in errors] == ['step', 'damaged']
-
-
-def test_image_error_keeps_kind_when_copied():
-    assert ImageError('text').kind == 'image'
-    error = ImageError('text', kind='step')
-    for same in (error, copy.copy(error), pickle.loads(pickle.dumps(error))):
-        assert (str(same), same.kind) == ('text', 'step')
 
 
 def check(image, height, width, data):

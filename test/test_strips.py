@@ -44,17 +44,7 @@ def test_cut_strips_drops_surplus_columns_by_hand():
     assert cut_strips(row, 7)[:, 0].tolist() == [[3], [4], [5], [6], [7], [8], [9]]
 
 
-@pytest.mark.parametrize(
-    ('shape', 'W', 'd'),
-    [((2, 1488, 7, 7), 7, 10416), ((2, 512, 14, 14), 7, 14336)],  # the paper's two backbones
-)
-def test_cut_strips_of_paper_networks_has_expected_shape(shape, W, d):
-    strips = cut_strips(torch.zeros(shape), W)
-    assert tuple(strips.shape) == (W, 2, d)
-    assert strips.dtype == torch.float32
-
-
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     n=st.integers(0, 3),
     channels=st.integers(1, 4),
@@ -106,17 +96,10 @@ def test_normalize_by_hand():
     assert directions.dtype == weights.dtype == np.float32
 
 
-def test_normalize_keeps_its_input():
-    strips = random_strips(0, 3, 4, 5, 0.2)
-    before = strips.copy()
-    unit(strips)
-    np.testing.assert_array_equal(strips, before)
-
-
 # ------------------------------------------------ distances
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     W=st.integers(1, 9),
@@ -159,12 +142,7 @@ def test_strip_distances_of_zero_strips_are_one():
     assert (d[:, [0, 1, 3]] < 1).all()
 
 
-def test_strip_distances_reach_two():
-    query = torch.tensor([[0.6, 0.8]])
-    assert strip_distances(query, -query[:, None]).item() == pytest.approx(2)
-
-
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     W=st.integers(1, 9),

@@ -192,7 +192,7 @@ def test_trajectory_is_read_while_another_thread_adds():
         for i in range(1, 5_000):
             trajectory.add(i, turned(0, x=i))
 
-    def ask():
+    def read():
         try:
             while adding.is_alive():
                 stamp = 1 + len(trajectory)
@@ -202,11 +202,11 @@ def test_trajectory_is_read_while_another_thread_adds():
             failures.append(error)
 
     adding = Thread(target=add)
-    asking = Thread(target=ask)
+    reading = Thread(target=read)
     adding.start()
-    asking.start()
+    reading.start()
     adding.join()
-    asking.join()
+    reading.join()
     assert not failures
     assert trajectory.at(4_999)[0] == 4_999
 

@@ -5,10 +5,10 @@ Maps of format version 1, as robots have them: they load and recognize, and thei
 
 The files in ``data/version1`` were written by commit eb40c94, before most names changed, with its
 ``build_map`` on the eight images ``route_images(8)`` of conftest.py, and with an extractor of the
-kind, settings, strips and projection of the table ``MAPS`` below. ``gradient_projected`` has stamps,
-identifiers, poses (x = i, that of place 3 unknown) and thumbnails 48 pixels wide. ``tiny.onnx`` and
-``tiny.pt`` are one convolution and a ReLU; the weights of the paper's networks are the random ones
-of conftest.py, whose files are equal to the bit on every machine.
+kind, settings, strips and projection of the table ``MAPS`` below. ``gradient_projected`` has
+stamps, identifiers, poses (x = i, that of place 3 unknown) and thumbnails 48 pixels wide.
+``tiny.onnx`` and ``tiny.pt`` are one convolution and a ReLU; the weights of the paper's networks
+are the random ones of conftest.py, whose files are equal to the bit on every machine.
 """
 
 import json

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Vertical alignment, for cameras that rise and sink: cells of strips first, then strips."""
+"""Vertical alignment, for cameras at changing heights: cells of strips first, then strips."""
 
 import numpy as np
 import oracle
@@ -30,7 +30,7 @@ def random_features(n, H=4, channels=3, columns=2, W=5, seed=0):
     )
 
 
-def test_cells_are_those_of_the_feature_map():
+def test_cut_cells_are_those_of_feature_map():
     features = random_features(3)
     cells = cut_cells(features.strips, (4, 2))
     assert cells.shape == (20, 3, 6)
@@ -43,12 +43,12 @@ def test_cells_are_those_of_the_feature_map():
                 np.testing.assert_allclose(cells[strip * 4 + row, image], expected, atol=1e-6)
 
 
-@pytest.mark.parametrize('n', [1, 15, 64, 65, 130])
+@pytest.mark.parametrize('n', [1, 15, 65])
 @pytest.mark.parametrize(
     ('strategy', 'xi'), [('adaptive', None), ('adaptive', 2), ('vanilla', None)]
 )
-def test_against_the_oracle(n, strategy, xi):
-    """Cell by cell as the method says: the inner alignment has its own central cell and no band."""
+def test_vertical_distances_equal_oracle(n, strategy, xi):
+    """The inner alignment has its own central cell and no band."""
     reference, query = random_features(n), random_features(2, seed=1)
     spatial = SpatialSettings(strategy, 1.0, xi, vertical=True)
     matcher = CpuMatcher(reference, spatial)
@@ -68,7 +68,7 @@ def test_against_the_oracle(n, strategy, xi):
     )
 
 
-def test_a_map_remembers_its_cells(route, tmp_path):
+def test_map_file_keeps_cells(route, tmp_path):
     place_map = build_map(
         [Frame(image, i, '') for i, image in enumerate(route[:8])],
         FeatureExtractor(),
@@ -86,7 +86,7 @@ def test_a_map_remembers_its_cells(route, tmp_path):
     np.testing.assert_allclose(np.diag(distances), 0, atol=1e-5)
 
 
-def test_what_is_refused(small_map):
+def test_vertical_alignment_of_other_settings_is_rejected(small_map):
     spatial = SpatialSettings(vertical=True)
     with pytest.raises(InputError, match='without projection'):
         PlaceRecognizer(small_map, RecognizerSettings(1.0, spatial))
@@ -96,9 +96,9 @@ def test_what_is_refused(small_map):
         make_matcher(random_features(3), spatial, 'cuda', 'float32')
 
 
-def test_a_drone_that_flies_higher(data_folder):
-    """Nearest images of one drive, seen from higher up: a third of every query image cut off."""
-    frames = list(open_source(data_folder / 'gardens_point' / 'day_left'))[::2]
+def test_vertical_alignment_finds_places_from_other_height(data_folder):
+    """A third of every query image is cut off, at the top or at the bottom."""
+    frames = list(open_source(data_folder / 'gardens_point' / 'day_left'))[::4]
     extractor = FeatureExtractor()
     place_map = build_map(frames, extractor, progress=False)
     higher = extractor.extract(
@@ -116,7 +116,5 @@ def test_a_drone_that_flies_higher(data_folder):
         right[vertical] = np.mean(
             [np.abs(places - np.arange(len(frames))) <= 1 for places in found]
         )
-    print(
-        f'shifted up and down: right {right[False]:.3f} without, {right[True]:.3f} with vertical alignment'
-    )
+    print(f'right places: {right[False]:.3f} without, {right[True]:.3f} with vertical alignment')
     assert right[True] > right[False] + 0.05

@@ -108,13 +108,6 @@ def test_cache_folder_follows_xdg(monkeypatch, tmp_path):
     assert cache_folder() == tmp_path / '.cache' / 'stavpr_ros'
 
 
-def test_published_files_have_official_names():
-    from stavpr_ros.features.paper_networks import DenseNet161Places365, VGG16Pool4
-
-    assert DenseNet161Places365.published.name == 'densenet161_places365.pth.tar'
-    assert VGG16Pool4.published.name == f'vgg16-{VGG16Pool4.published.sha256}.pth'
-
-
 def test_network_by_default_downloads_nothing(server, cache):
     with pytest.raises(
         UnavailableError, match=rf"{cache}/tiny\.pth.*'download'.*{server.address}"
@@ -163,16 +156,6 @@ def test_download_without_network_fails_with_advice(cache, monkeypatch):
     monkeypatch.setenv('no_proxy', '*')
     with pytest.raises(UnavailableError, match=rf'{address} cannot be downloaded.*give its path'):
         download(address, cache / 'tiny.pth')
-    assert list(cache.iterdir()) == []
-
-
-def test_download_interrupted_leaves_nothing(server, cache, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr('stavpr_ros.features.weights._fetch', interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        download(server.address, cache / 'tiny.pth')
     assert list(cache.iterdir()) == []
 
 
@@ -336,7 +319,7 @@ def test_read_checkpoint_with_damage_fails_or_reads(tmp_path, content):
     """Damage anywhere is an error of ours, or harmless; never one of torch's or Python's."""
     rng = np.random.default_rng(0)
     for file in (content, OldPickle().file({'a.weight': WEIGHT})):
-        for _ in range(150):
+        for _ in range(60):
             damaged = bytearray(file)
             damaged[rng.integers(len(file))] ^= 1 << rng.integers(8)
             try:
