@@ -183,9 +183,7 @@ def test_node_with_another_name_and_namespace_uses_them_everywhere(robot, start,
         return bool(matches)
 
     robot.until(answered, 'a match')
-    robot.until_logged(
-        "parameter 'sequence_lenght' is not one of this node: was sequence_length meant?"
-    )
+    robot.until_logged("parameter 'sequence_lenght' is unknown: did you mean sequence_length?")
 
     def topics():
         statuses = [status for array in robot.arrays for status in array.status]

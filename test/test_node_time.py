@@ -84,17 +84,6 @@ def test_gaps_are_counted_and_keep_the_window(robot, start, route):
     assert int(robot.counts('input')['gaps']) == before + 3
 
 
-def test_images_without_stamps_are_matched(robot, start, route):
-    start()
-    before = robot.counts('input')
-    matches = [robot.ask(image_message(image, 0)) for image in route[20:26]]
-    assert [match.status for match in matches] == 4 * [WARMING_UP] + 2 * [MATCH]
-    assert matches[-1].newest_index == 25
-    assert matches[-1].window_first == matches[-1].window_last == Time()
-    after = robot.counts('input')
-    assert (after['gaps'], after['jumps_back']) == (before['gaps'], before['jumps_back'])
-
-
 def test_change_of_use_sim_time_keeps_the_window(robot, start, set_clock, route):
     start()
     robot.drive(route[:5])
