@@ -32,10 +32,12 @@ def set_clock(robot):
 
 def test_max_rate_skips_images_by_their_stamps(robot, start, route):
     start(max_rate=5.0)
+    before = robot.counts('processing')  # probes may exceed the rate
     statuses = robot.statuses(route, SECOND // 30)
     assert [i for i, status in enumerate(statuses) if status != SKIPPED] == list(range(0, 60, 6))
     assert 'exceeds max_rate = 5 Hz' in robot.answers[-1].reason
-    assert robot.counts('processing')['dropped_max_rate'] == '50'
+    dropped = int(robot.counts('processing')['dropped_max_rate'])
+    assert dropped - int(before.get('dropped_max_rate', 0)) == 50
     robot.show(route[0])
     assert robot.show(route[1], -SECOND // 30).status == SKIPPED  # was overtaken on its way
     assert robot.show(route[2], SECOND // 10).status == SKIPPED

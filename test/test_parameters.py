@@ -126,7 +126,7 @@ def test_a_value_reaches_its_setting(name, value, attribute, expected):
     ],
 )
 def test_invalid_values_are_rejected_by_name(values, words, monkeypatch):
-    monkeypatch.setattr('stavpr_ros.pipeline.settings.choose_backend', lambda wish: wish)
+    monkeypatch.setattr('stavpr_ros.pipeline.settings.choose_backend', lambda backend: backend)
     with pytest.raises(SettingsError, match=words):
         node_settings(DEFAULTS | values)
 
@@ -146,7 +146,7 @@ def test_backend_summary_names_the_device_of_each_stage(
 ):
     module = 'stavpr_ros.pipeline.settings'
     monkeypatch.setattr(
-        f'{module}.choose_backend', lambda wish: available if wish == 'auto' else wish
+        f'{module}.choose_backend', lambda name: available if name == 'auto' else name
     )
     monkeypatch.setattr(
         f'{module}.why_no_cuda', lambda: '' if available == 'cuda' else 'no device'

@@ -1,5 +1,5 @@
 # Copyright 2026 The stavpr_ros authors
-# SPD            broken = pipeline.process(message(image), i)-License-Identifier: Apache-2.0
+# SPDX-License-Identifier: Apache-2.0
 """The pipeline in operation: live settings, keyframes, invalid images, resets, saving."""
 
 from dataclasses import replace
