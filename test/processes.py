@@ -171,8 +171,9 @@ class Bench:
         **fields: object,
     ) -> Iterator[Client]:
         """
-        Send a request to a service of the node and wait for an effect; the client lives in the
-        block.
+        Send a request to a service of the node and wait for an effect.
+
+        The client lives in the block.
 
         :param futures: receives the future of the response.
         """

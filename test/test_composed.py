@@ -6,11 +6,14 @@ import threading
 
 import cv2
 from image_messages import image_message
-from processes import DOMAIN
+from processes import DOMAIN, RELIABLE, TAKEN_RELIABLY
 import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from robot import PARAMETERS, parameters_of
+from sensor_msgs.msg import Image
+from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.mapping import load_map
 from stavpr_ros.ros.node import PlaceRecognitionNode
 from stavpr_ros.threads import limit_threads
@@ -33,8 +36,7 @@ def make(context):
     made = []
 
     def make(**parameters):
-        values = {'autostart': False, 'threads': 1, 'sequence_length': 5, 'nms_radius': 5}
-        overrides = [Parameter(name, value=value) for name, value in (values | parameters).items()]
+        overrides = parameters_of(PARAMETERS | {'autostart': False} | parameters)
         made.append(PlaceRecognitionNode(context=context, parameter_overrides=overrides))
         return made[-1]
 
@@ -50,7 +52,7 @@ def set_parameter(node, name, value):
 def test_shutdown_of_ros_before_the_node_saves_the_map(make, context, route, tmp_path):
     """As with plain `rclpy.spin` and an interrupt; no thread is left."""
     path = tmp_path / 'route.stavpr'
-    node = make(operation='mapping', save_path=str(path), queue_size=100, keyframe_change=0.0)
+    node = make(operation='mapping', save_path=str(path), queue_size=100)
     assert node.trigger_configure() == node.trigger_activate() == SUCCESS
     for i, image in enumerate(route[:20]):
         node.runtime.images.on_image(image_message(image, i + 1))
@@ -60,17 +62,6 @@ def test_shutdown_of_ros_before_the_node_saves_the_map(make, context, route, tmp
     node.destroy_node()
     assert 0 < len(load_map(path)) <= 20
     assert not [thread for thread in threading.enumerate() if thread.name == 'recognition']
-
-
-def test_destroyed_node_leaves_no_services(make, bench):
-    node = make()
-
-    def found():
-        return '/stavpr/get_state' in dict(bench.node.get_service_names_and_types())
-
-    bench.until(found, 'the node')
-    node.destroy_node()
-    bench.until(lambda: not found(), 'the end of the node')
 
 
 def test_parameters_that_are_rejected_change_nothing(make, map_file):
@@ -180,3 +171,33 @@ def test_limit_of_threads_can_be_removed(make):
         counts = node.runtime.worker.run(lambda: (torch.get_num_threads(), cv2.getNumThreads()))
         assert counts == expected
         assert node.trigger_cleanup() == SUCCESS
+
+
+def test_node_with_another_name_and_namespace_uses_them_everywhere(robot, start, route):
+    """In topics, services and diagnostics; a misspelled parameter is logged."""
+    names = ('-r', '__ns:=/robot', '-r', '__node:=places', '-r', 'image:=front/camera')
+    matches = robot.listen(PlaceMatch, '/robot/places/match')
+    publisher = robot.node.create_publisher(Image, '/robot/front/camera', RELIABLE)
+    overrides = TAKEN_RELIABLY['qos_overrides./image.subscription.reliability']
+    reliably = {'qos_overrides./robot/front/camera.subscription.reliability': overrides}
+    start(*names, wait=False, sequence_lenght=5, **reliably)
+    robot.until(lambda: publisher.get_subscription_count() > 0, 'the subscription')
+
+    def answered():
+        publisher.publish(image_message(route[0], 1 + len(matches)))
+        return bool(matches)
+
+    robot.until(answered, 'a match')
+    robot.until_logged("parameter 'sequence_lenght' is unknown: did you mean sequence_length?")
+
+    def topics():
+        statuses = [status for array in robot.arrays for status in array.status]
+        inputs = [status for status in statuses if status.name == 'robot/places: input']
+        return {value.value for status in inputs for value in status.values}
+
+    robot.until(lambda: '/robot/front/camera' in topics(), 'the topic in the diagnostics')
+    services = dict(robot.node.get_service_names_and_types())
+    assert {f'/robot/places/{name}' for name in ('load_map', 'reset', 'change_state')} <= set(
+        services
+    )
+    robot.node.destroy_publisher(publisher)

@@ -31,7 +31,11 @@ def bags(data_folder, tmp_path_factory):
 
 @pytest.mark.parametrize(
     ('kind', 'mode', 'known_f1'),
-    [('gradient', 'paper', 0.75), ('onnx', 'paper', 0.92), ('gradient', 'robust', 0.99)],
+    [
+        pytest.param('gradient', 'paper', 0.75, marks=pytest.mark.long),
+        pytest.param('onnx', 'paper', 0.92, marks=pytest.mark.long),
+        ('gradient', 'robust', 0.99),
+    ],
 )
 def test_node_on_gardens_point_equals_library(
     bags, request, tmp_path, kind, mode, known_f1, record_property

@@ -180,12 +180,6 @@ def test_empty_arguments_are_left_to_the_parameter_file(load, name):
     assert topics == expected
 
 
-def test_mapping_logs_how_to_save(load):
-    logs = [words(e.msg) for e in load('mapping').entities if type(e).__name__ == 'LogInfo']
-    assert len(logs) == 1
-    assert '${namespace}/stavpr/save_map stavpr_msgs/srv/SaveMap' in logs[0]
-
-
 def test_replay_gets_its_options(load):
     launch = load('replay')
     _, replay = launch.start(bag='drive')

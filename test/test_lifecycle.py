@@ -26,7 +26,7 @@ STATES = ('unconfigured', 'inactive', 'active')
 
 @pytest.fixture
 def node(start):
-    """The node, unconfigured, without a map."""
+    """Start a node that is not configured and has no map."""
     return start(wait=False, autostart=False, map_path='', mode='paper', threshold=0.2, xi=0)
 
 

@@ -6,6 +6,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from image_messages import image_message
 import numpy as np
 import pytest
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from robot import LENGTH, SECOND
 from sensor_msgs.msg import Image
@@ -84,7 +86,9 @@ def test_node_publishes_the_matches_of_the_library(robot, start, small_map, rout
 def test_node_after_a_burst_has_one_match_for_each_image(robot, start, route):
     """Every image is processed or dropped, oldest first, and the node goes on."""
     start(**PAPER, queue_size=2)
+    key = 'dropped_queue_full'
     before, count = len(robot.answers), 40
+    counted = int(robot.counts('processing').get(key, 0))
     big = [np.kron(image, np.ones((5, 5, 1), np.uint8)) for image in route[:count]]
     messages = [image_message(image, 100 + i) for i, image in enumerate(big)]
     for message in messages:
@@ -95,7 +99,7 @@ def test_node_after_a_burst_has_one_match_for_each_image(robot, start, route):
     dropped = [match for match in matches if match.status == PlaceMatch.DROPPED]
     assert {match.reason for match in dropped} == {'newer images arrived before it was processed'}
     assert matches[-1].status != PlaceMatch.DROPPED  # the newest
-    assert robot.counts('processing')['dropped_queue_full'] == str(len(dropped))
+    assert int(robot.counts('processing').get(key, 0)) - counted == len(dropped)
     match = robot.drive(route[40:46])[-1]
     assert (match.status, match.newest_index) == (PlaceMatch.MATCH, 45)
 
@@ -130,6 +134,33 @@ def test_node_after_a_failed_start_starts_with_a_changed_parameter(
     robot.wait_for_node()
     match = robot.drive(route[:LENGTH])[-1]
     assert (match.status, match.newest_index) == (PlaceMatch.MATCH, LENGTH - 1)
+
+
+def test_node_with_changing_parameters_publishes_one_match_per_image(robot, start, route):
+    start(queue_size=1000)
+    before, count, futures = len(robot.answers), 60, []
+    changes = [
+        ('threshold', (0.1, 0.3)),
+        ('max_rate', (10.0, 0.0)),
+        ('verbosity', ('warn', 'info')),
+    ]
+    first = []
+    with robot.request(
+        first, SetParameters, 'set_parameters', lambda: any(f.done() for f in first)
+    ) as client:
+        for i in range(count):
+            robot.publisher.publish(image_message(route[i], SECOND + i * SECOND // 30))
+            name, values = changes[i % 3]
+            value = Parameter(name, value=values[i // 3 % 2]).to_parameter_msg()
+            futures.append(client.call_async(SetParameters.Request(parameters=[value])))
+            robot.until(lambda: all(future.done() for future in futures[:-3]), 'earlier changes')
+        robot.until(lambda: all(future.done() for future in futures), 'all changes')
+    robot.until(lambda: len(robot.answers) == before + count, 'a match for each image')
+    assert all(result.successful for future in futures for result in future.result().results)
+    stamps = [nanoseconds(match.header.stamp) for match in robot.answers[before:]]
+    assert sorted(stamps) == [SECOND + i * SECOND // 30 for i in range(count)]
+    statuses = {match.status for match in robot.answers[before:]}
+    assert {PlaceMatch.WARMING_UP, PlaceMatch.SKIPPED} <= statuses
 
 
 def test_node_publishes_candidates_for_every_window(robot, start, route):
@@ -174,6 +205,4 @@ def test_node_with_an_incompatible_subscriber_logs_it(robot, start):
     start()
     requested = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     robot.listen(PlaceMatch, '/stavpr/match', requested)
-    robot.until_logged(
-        'a subscriber of ~/match receives nothing: it requests another durability'
-    )
+    robot.until_logged('a subscriber of ~/match receives nothing: it requests another durability')

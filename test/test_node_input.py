@@ -10,7 +10,7 @@ from image_messages import compressed_message, image_message
 from nav_msgs.msg import Odometry
 import pytest
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile, ReliabilityPolicy
-from robot import LENGTH, SECOND
+from robot import SECOND
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_msgs.msg import PlaceMatch
 from std_msgs.msg import Header

@@ -32,10 +32,12 @@ def set_clock(robot):
 
 def test_max_rate_skips_images_by_their_stamps(robot, start, route):
     start(max_rate=5.0)
+    before = robot.counts('processing')  # probes may exceed the rate
     statuses = robot.statuses(route, SECOND // 30)
     assert [i for i, status in enumerate(statuses) if status != SKIPPED] == list(range(0, 60, 6))
     assert 'exceeds max_rate = 5 Hz' in robot.answers[-1].reason
-    assert robot.counts('processing')['dropped_max_rate'] == '50'
+    dropped = int(robot.counts('processing')['dropped_max_rate'])
+    assert dropped - int(before.get('dropped_max_rate', 0)) == 50
     robot.show(route[0])
     assert robot.show(route[1], -SECOND // 30).status == SKIPPED  # was overtaken on its way
     assert robot.show(route[2], SECOND // 10).status == SKIPPED
@@ -82,17 +84,6 @@ def test_gaps_are_counted_and_keep_the_window(robot, start, route):
     assert robot.statuses(route[7:9]) == 2 * [MATCH]
     robot.show(route[9], SECOND // 2)
     assert int(robot.counts('input')['gaps']) == before + 3
-
-
-def test_images_without_stamps_are_matched(robot, start, route):
-    start()
-    before = robot.counts('input')
-    matches = [robot.ask(image_message(image, 0)) for image in route[20:26]]
-    assert [match.status for match in matches] == 4 * [WARMING_UP] + 2 * [MATCH]
-    assert matches[-1].newest_index == 25
-    assert matches[-1].window_first == matches[-1].window_last == Time()
-    after = robot.counts('input')
-    assert (after['gaps'], after['jumps_back']) == (before['gaps'], before['jumps_back'])
 
 
 def test_change_of_use_sim_time_keeps_the_window(robot, start, set_clock, route):

@@ -120,7 +120,7 @@ def test_a_value_reaches_its_setting(name, value, attribute, expected):
     ],
 )
 def test_invalid_values_are_rejected_by_name(values, words, monkeypatch):
-    monkeypatch.setattr('stavpr_ros.pipeline.settings.choose_backend', lambda requested: requested)
+    monkeypatch.setattr('stavpr_ros.pipeline.settings.choose_backend', lambda backend: backend)
     with pytest.raises(SettingsError, match=words):
         node_settings(DEFAULTS | values)
 
@@ -140,8 +140,7 @@ def test_backend_summary_names_the_device_of_each_stage(
 ):
     module = 'stavpr_ros.pipeline.settings'
     monkeypatch.setattr(
-        f'{module}.choose_backend',
-        lambda requested: available if requested == 'auto' else requested,
+        f'{module}.choose_backend', lambda name: available if name == 'auto' else name
     )
     monkeypatch.setattr(
         f'{module}.why_no_cuda', lambda: '' if available == 'cuda' else 'no device'

@@ -8,10 +8,10 @@ A test of upstream that fails means that its workaround can go.
 
 from concurrent.futures import Future, ThreadPoolExecutor
 import threading
-import time
+from unittest.mock import Mock
 import warnings
 
-from processes import DOMAIN, TIMEOUT
+from processes import DOMAIN
 import pytest
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -48,13 +48,6 @@ def spin_until(executor, done):
         if done():
             return
     raise AssertionError(f'not done after {SPINS} spins')
-
-
-def wait_until(done):
-    end = time.monotonic() + TIMEOUT
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 # the executor
@@ -274,13 +267,17 @@ def test_managed_node_at_an_invalid_transition_stays_in_its_state(context):
     node.destroy_node()
 
 
-def services(node):
-    return dict(node.get_service_names_and_types())
+def test_destroyed_lifecycle_node_of_upstream_keeps_its_state_machine(context):
+    """And with it the services of the life cycle, which other nodes then still discover."""
+    node = LifecycleNode('upstream', context=context)
+    node.destroy_node()
+    assert node._state_machine.current_state[1] == 'unconfigured'
 
 
-def test_services_of_a_destroyed_lifecycle_node_of_upstream_stay(context, node):
-    managed = LifecycleNode('managed', context=context)
-    assert '/managed/get_state' in services(node)
-    managed.destroy_node()
-    wait_until(lambda: '/managed/get_parameters' not in services(node))
-    assert '/managed/get_state' in services(node)
+def test_destroyed_managed_node_destroys_its_state_machine(context, monkeypatch):
+    """A spy shows it: a destroyed state machine cannot be read."""
+    node = ManagedNode('managed', context=context)
+    spy = Mock(wraps=node._state_machine)
+    monkeypatch.setattr(node, '_state_machine', spy)
+    node.destroy_node()
+    spy.destroy_when_not_in_use.assert_called_once_with()

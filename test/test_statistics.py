@@ -54,23 +54,14 @@ def test_counts_without_events_are_zero(clock, statistics):
     assert math.isnan(counts.distance)
 
 
-@pytest.mark.parametrize('hertz', [2, 5, 30, 200])
-@pytest.mark.parametrize('seconds', [1, 3, 9.3, 10, 11.7, 40])
+@pytest.mark.parametrize('hertz', [2, 30])
+@pytest.mark.parametrize('seconds', [1, 9.3, 10, 11.7])
 def test_rate_of_a_steady_stream_is_correct_from_the_start(clock, statistics, hertz, seconds):
     clock.now += 100
     stream(clock, seconds, hertz, statistics.received)
     counts = statistics.counts()
     assert counts.rate_in == pytest.approx(hertz, abs=0.112 if seconds > 9 else 1e-6)
     assert (counts.received, counts.rate_out) == (round(hertz * seconds), 0)
-
-
-@pytest.mark.parametrize('pause', [10.1, 25, 3600])
-def test_rate_after_a_pause_is_correct_at_once(clock, statistics, pause):
-    stream(clock, 30, 30, statistics.received)
-    clock.now += pause
-    assert statistics.counts().rate_in == 0
-    stream(clock, 2, 30, statistics.received)
-    assert statistics.counts().rate_in == pytest.approx(30)
 
 
 def test_rate_after_the_last_image_falls_to_zero_within_the_window(clock, statistics):
@@ -93,18 +84,6 @@ def test_rate_of_a_burst_is_finite(clock, statistics):
     assert statistics.counts().rate_in == pytest.approx(3 / SHORTEST_SPAN)
 
 
-def test_rates_of_input_and_output_are_independent(clock, statistics):
-    for i in range(600):
-        clock.now += 1 / 30
-        statistics.received()
-        if i % 3 == 0:
-            answer(statistics)
-    counts = statistics.counts()
-    assert counts.rate_in == pytest.approx(30, abs=0.2)
-    assert counts.rate_out == pytest.approx(10, abs=0.2)
-    assert (counts.received, counts.answered) == (600, 200)
-
-
 def test_drops_are_counted_by_cause_ever_and_recently(clock, statistics):
     statistics.dropped('queue full')
     statistics.dropped('lost in transport', 7)
@@ -117,14 +96,6 @@ def test_drops_are_counted_by_cause_ever_and_recently(clock, statistics):
     assert counts.recent_drops == {'queue full': 2, 'max_rate': 1}
     clock.now += 5.1
     assert statistics.counts().recent_drops == {'max_rate': 1}
-
-
-def test_recent_counts_end_with_the_window(clock, statistics):
-    statistics.dropped('x')
-    clock.now += RECENT - 0.01
-    assert statistics.counts().recent_drops == {'x': 1}
-    clock.now += 0.02
-    assert statistics.counts().recent_drops == {}
 
 
 def test_statuses_are_counted_in_lower_case_with_the_last_result(clock, statistics):
@@ -179,16 +150,6 @@ def test_reset_sets_all_counts_to_zero(clock, statistics):
     assert statistics.counts() != fresh
     statistics.reset()
     assert str(statistics.counts()) == str(fresh)  # as text, in which NaN equals NaN
-
-
-def test_counts_after_later_events_are_unchanged(statistics):
-    statistics.dropped('queue full')
-    answer(statistics, matching=0.001)
-    before = statistics.counts()
-    text = str(before)
-    statistics.dropped('queue full')
-    answer(statistics, matching=0.5)
-    assert str(before) == text
 
 
 @pytest.fixture
