@@ -158,7 +158,13 @@ class Bench:
     def call(self, kind: type, name: str, **fields: object) -> Any:
         """Call a service of the node, such as ``reset``, and return its response."""
         futures: list[Any] = []
-        with self.request(futures, kind, name, lambda: futures[0].done(), **fields):
+        with self.request(
+            futures,
+            kind,
+            name,
+            lambda: futures[0].done(),
+            **fields,  # noqa: PLW0108
+        ):
             return futures[0].result()
 
     @contextmanager

@@ -199,7 +199,7 @@ def test_extractor_with_moved_weights_has_same_settings(vgg_file, tmp_path):
 
 
 def test_load_parameters_of_other_network_is_rejected(densenet_parameters):
-    """ImageNet's DenseNet161 has the same features' shapes, but they are other features."""
+    """DenseNet161 for ImageNet has the same features' shapes, but they are other features."""
 
     def load(**changes):
         with torch.device('meta'):

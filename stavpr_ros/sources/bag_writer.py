@@ -47,7 +47,11 @@ def write_bag(
     typestore = get_typestore(Stores.ROS2_JAZZY)
     count = 0
     try:
-        with Writer(path, version=VERSION, storage_plugin=plugin) as writer:  # type: ignore[arg-type]
+        with Writer(
+            path,
+            version=VERSION,  # type: ignore[arg-type]
+            storage_plugin=plugin,
+        ) as writer:
             connection = writer.add_connection(topic, RAW, typestore=typestore)
             for record in records:
                 _write(writer, connection, typestore, record)

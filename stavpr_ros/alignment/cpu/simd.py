@@ -143,7 +143,8 @@ def _register(function: Any, instruction: Any) -> None:
     @overload(function)
     def implementation(left, right):
         if isinstance(left, Vector):
-            return lambda left, right: instruction(left, right)  # noqa: PLW0108 numba asks for a function
+            # numba requires a function, not the instruction itself
+            return lambda left, right: instruction(left, right)  # noqa: PLW0108
         return None
 
 
