@@ -158,13 +158,11 @@ class Bench:
     def call(self, kind: type, name: str, **fields: object) -> Any:
         """Call a service of the node, such as ``reset``, and return its response."""
         futures: list[Any] = []
-        with self.request(
-            futures,
-            kind,
-            name,
-            lambda: futures[0].done(),
-            **fields,  # noqa: PLW0108
-        ):
+
+        def done() -> bool:
+            return bool(futures[0].done())
+
+        with self.request(futures, kind, name, done, **fields):
             return futures[0].result()
 
     @contextmanager

@@ -129,6 +129,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         self._in_transition = threading.Lock()
         self.ending = threading.Event()  # set when the process ends: waits are given up
         self.left_behind = False  # work was still running when the node was destroyed
+        self._destroyed = False
         service = self._service_change_state
         self._upstream_change_state = service.callback
         service.callback = self._change_or_reject
@@ -137,8 +138,9 @@ class ManagedNode(LifecycleNodeMixin, Node):
 
     @property
     def state(self) -> str:
-        """Return the label of the life-cycle state."""
-        return str(self._state_machine.current_state[1])
+        """Return the label of the life-cycle state; a destroyed node is finalized."""
+        # the state machine of a destroyed node must not be read: the process would crash
+        return 'finalized' if self._destroyed else str(self._state_machine.current_state[1])
 
     @property
     def parameter_overrides(self) -> list[str]:
@@ -167,6 +169,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         No upstream issue was found: rclpy leaves these services to the garbage collector, and
         until then other nodes discover them and send requests that nobody answers.
         """
+        self._destroyed = True
         if not self.left_behind:  # otherwise a transition may still be running
             self._state_machine.destroy_when_not_in_use()
         super().destroy_node()
