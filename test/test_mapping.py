@@ -317,6 +317,14 @@ def rewritten(saved, change, members=None):
             archive.writestr(name, value)
 
 
+def test_load_map_with_other_content_than_hashed_fails(saved):
+    buffer = io.BytesIO()
+    np.save(buffer, load_map(saved).stamps + 1)
+    rewritten(saved, lambda manifest: None, {'stamps.npy': buffer.getvalue()})
+    with pytest.raises(MapFileError, match='stamps'):
+        load_map(saved)
+
+
 def test_load_map_of_newer_version_fails(saved):
     rewritten(saved, lambda manifest: manifest.update(version=99))
     with pytest.raises(MapFileError, match='version 99'):
