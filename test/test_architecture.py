@@ -9,6 +9,7 @@ import sys
 
 from pipelines import message, process, recorded, SECOND
 import pytest
+import stavpr_ros
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'stavpr_ros'
 ROS = {'rclpy', 'ament_index_python', 'stavpr_msgs', 'rcl_interfaces', 'builtin_interfaces'}
@@ -122,11 +123,12 @@ def test_no_two_classes_share_a_name():
 def files_called(function) -> set[str]:
     """Return the package's files that a call runs through, imports at first use left out."""
     found = set()
+    installed = Path(stavpr_ros.__file__).parent
 
     def note(frame, event, _):
         path = Path(frame.f_code.co_filename)
-        if event == 'call' and path.is_relative_to(PACKAGE):
-            found.add(path.relative_to(PACKAGE).as_posix())
+        if event == 'call' and path.is_relative_to(installed):
+            found.add(path.relative_to(installed).as_posix())
 
     sys.setprofile(note)
     try:
