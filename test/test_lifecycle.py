@@ -178,7 +178,6 @@ def test_node_after_a_failed_configuration_can_be_configured(
     assert not robot.transition('configure')
     assert robot.state() == 'unconfigured'
     robot.until_logged(words)
-    assert node.configured is None
     assert (
         'cannot configure' in robot.until_diagnosed('map', DiagnosticStatus.ERROR, words).message
     )
