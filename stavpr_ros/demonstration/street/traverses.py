@@ -216,6 +216,7 @@ class Traverse(Sequence[WorldFrame]):
     def __getitem__(self, index: int) -> WorldFrame: ...
     @overload
     def __getitem__(self, index: slice) -> list[WorldFrame]: ...
+
     def __getitem__(self, index: int | slice) -> WorldFrame | list[WorldFrame]:
         """Render one image, or a list of them."""
         if isinstance(index, slice):
