@@ -179,8 +179,8 @@ def maps(tmp_path_factory):
     ('owner', 'mode', 'precision'),
     [
         ('recognizer', 'robust', 'float32'),
-        ('recognizer', 'robust', 'float16'),
-        ('recognizer', 'paper', 'float32'),
+        pytest.param('recognizer', 'robust', 'float16', marks=pytest.mark.long),
+        pytest.param('recognizer', 'paper', 'float32', marks=pytest.mark.long),
         ('closer', 'robust', 'float32'),
     ],
 )

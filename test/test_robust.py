@@ -349,6 +349,7 @@ def test_expected_second_best_of_few_sequences_is_usual(other, sequences, expect
     assert expected_second_best(other, sequences) == expected
 
 
+@pytest.mark.long
 def test_loop_closer_at_start_of_route_closes_no_loops():
     """A street passed once: no match can be right."""
     extractor = FeatureExtractor()

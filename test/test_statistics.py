@@ -164,7 +164,7 @@ def frequent_switches():
 @pytest.mark.usefixtures('frequent_switches')
 def test_counts_from_many_threads_are_complete():
     statistics = Statistics()
-    threads, each, errors = 8, 1000, []
+    threads, each, errors = 8, 300, []
     begin = threading.Barrier(threads + 1)
 
     def count(number):
