@@ -8,21 +8,17 @@ from stavpr_ros.demonstration.street.traverses import (
     GOOD_LIGHT,
     nearest_places,
     RAINY_DUSK,
-    Route,
     second_traverse,
     Traverse,
     World,
-    WorldFrame,
 )
 
 __all__ = [
     'GOOD_LIGHT',
     'RAINY_DUSK',
     'Conditions',
-    'Route',
     'Traverse',
     'World',
-    'WorldFrame',
     'first_traverse',
     'nearest_places',
     'second_traverse',

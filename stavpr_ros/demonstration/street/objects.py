@@ -29,7 +29,7 @@ from stavpr_ros.demonstration.street.street import (
 )
 from stavpr_ros.demonstration.street.surfaces import hash01, noise
 
-_LAMPS, _WET, _FOLIAGE, _SUN, _AMBIENT = 5, 7, 8, 0, 4  # of the array of light; see rendering.py
+_LAMPS, _FOLIAGE, _SUN, _AMBIENT = 5, 8, 0, 4  # of the array of light; see rendering.py
 NEAREST = 0.9  # meters; nearer parts of a thing are not drawn
 
 
@@ -164,20 +164,8 @@ def _draw_car(color, depth, thing, bend, camera, light, fine):
     if van:
         _draw_box(color, depth, u, half, z, z + length, 0.3, 2.25, 2, seed, lens, light)
     else:
-        _draw_box(
-            color,
-            depth,
-            u,
-            half - 0.14,
-            z + 0.35,
-            z + length * 0.72,
-            0.85,
-            1.44,
-            1,
-            seed,
-            lens,
-            light,
-        )
+        near, far = z + 0.35, z + length * 0.72
+        _draw_box(color, depth, u, half - 0.14, near, far, 0.85, 1.44, 1, seed, lens, light)
         _draw_box(color, depth, u, half, z, z + length, 0.24, 0.9, 0, seed, lens, light)
 
 

@@ -12,7 +12,6 @@ per wall.
 # mypy: disable-error-code="no-untyped-def"
 # ruff: noqa: PLR0912  (one branch for each thing that a ray meets reads best)
 
-from dataclasses import dataclass
 from math import atan, cos, exp, hypot, pi, sin
 
 from numba import njit
@@ -20,7 +19,6 @@ import numpy as np
 from stavpr_ros.demonstration.street.objects import draw_things
 from stavpr_ros.demonstration.street.street import (
     CELL,
-    LEFT_NEAR,
     LOT_HEIGHT,
     LOT_KIND,
     LOT_SETBACK,
@@ -49,47 +47,23 @@ WALL_DEPTH, WALL_TOP, WALL_LOT, WALL_ALONG, WALL_FRONT, WALL_ROW = range(6)
  FOG, EXPOSURE, WARMTH, RAIN, NOISE) = range(16)  # fmt: skip
 
 
-@dataclass(frozen=True)
-class View:
-    """
-    Where the camera is.
-
-    :param along: meters along the street.
-    :param across: meters to the right of the center line.
-    :param pitch: radians that it looks up.
-    :param yaw: radians that it looks to the right of the street's direction.
-    """
-
-    along: float
-    across: float
-    pitch: float = 0.0
-    yaw: float = 0.0
-
-
-def light_vector(
-    sun: float, azimuth: float, elevation: float, ambient: float, lamps: float, cover: float,
-    wet: float, foliage: float, sky_seed: int, fog: float, exposure: float, warmth: float,
-    rain: float, grain: float,
-) -> np.ndarray:  # fmt: skip
-    """Pack the conditions for the kernels; angles in radians, from where the street began."""
-    return np.array([sun, 0.0, 0.0, sin(elevation), ambient, lamps, cover, wet, foliage, azimuth,
-                     sky_seed, fog, exposure, warmth, rain, grain])  # fmt: skip
-
-
 def render(
-    street: Street, heading: float, view: View, light: np.ndarray, traffic: np.ndarray,
-    grain_seed: int, width: int, height: int,
+    street: Street, along: float, across: float, pitch: float, yaw: float, light: np.ndarray,
+    traffic: np.ndarray, grain_seed: int, width: int, height: int,
 ) -> np.ndarray:  # fmt: skip
     """
     Render one image.
 
-    :param heading: direction of the street at the camera, radians from where it began.
-    :param light: from :func:`light_vector`.
+    :param along, across: where the camera is, meters along the street and to the right of its
+        center line.
+    :param pitch, yaw: radians that it looks up, and to the right of the street's direction.
+    :param light: the conditions; the direction of the sun is filled in here.
     :param traffic: cars, rows as in the table of things of a :class:`Street`.
     :param grain_seed: seed of sensor noise and rain drops.
     :returns: RGB, shape (height, width, 3), uint8.
     """
-    first = int(view.along / CELL)
+    first = int(along / CELL)
+    heading = float(street.headings[first])
     steps = min(int(VIEW / CELL) - 2, len(street.curvature) - first - 2)
     turned = np.cumsum(street.curvature[first : first + steps]) * CELL
     bend = np.cumsum(turned) * CELL
@@ -98,12 +72,12 @@ def render(
     level = np.sqrt(1 - light[SUN_UP] ** 2)
     light[SUN_RIGHT], light[SUN_AHEAD] = sin(towards) * level, cos(towards) * level
     things = np.concatenate([street.things, traffic])
-    ahead = things[:, THING_ALONG] - view.along
+    ahead = things[:, THING_ALONG] - along
     seen = np.flatnonzero((ahead > -3) & (ahead < 150))
     things = things[seen[np.argsort(-ahead[seen], kind='stable')]]
     focal = FOCAL * width
-    horizon = HORIZON * height + view.pitch * focal
-    camera = np.array([view.along, view.across, EYE, focal, horizon, view.yaw, heading])
+    horizon = HORIZON * height + pitch * focal
+    camera = np.array([along, across, EYE, focal, horizon, yaw, heading])
     # Columns lie together in memory, because the scene is drawn column by column.
     color = np.empty((width, height * SAMPLES, 3), np.float32).transpose(1, 0, 2)
     depth = np.empty((width, height * SAMPLES), np.float32).T
@@ -128,7 +102,7 @@ def _find_walls(lots, lot_of, bend, along, across, slope, eye, walls):
         u1 = across + slope * z1 - bend[step]
         side = 1 if u1 > 0 else 0
         for row in range(side, 4, 2):
-            lot = lot_of[LEFT_NEAR + row, first + step]
+            lot = lot_of[row, first + step]
             last = last_near if row < 2 else last_far
             inside = -1
             setback = lots[lot, LOT_SETBACK]
@@ -142,20 +116,9 @@ def _find_walls(lots, lot_of, bend, along, across, slope, eye, walls):
                     top = roof_height(lots, lot, place) if front else lots[lot, LOT_HEIGHT]
                     if (top - eye) / z > highest:
                         highest = (top - eye) / z
-                        (
-                            walls[count, WALL_DEPTH],
-                            walls[count, WALL_TOP],
-                            walls[count, WALL_LOT],
-                        ) = z, top, lot
-                        (
-                            walls[count, WALL_ALONG],
-                            walls[count, WALL_FRONT],
-                            walls[count, WALL_ROW],
-                        ) = (
-                            place,
-                            front,
-                            row,
-                        )
+                        walls[count, WALL_DEPTH], walls[count, WALL_TOP] = z, top
+                        walls[count, WALL_LOT], walls[count, WALL_ALONG] = lot, place
+                        walls[count, WALL_FRONT], walls[count, WALL_ROW] = front, row
                         count += 1
             if row < 2:
                 last_near = inside
@@ -243,28 +206,19 @@ def _draw_scene(color, depth, lots, lot_of, bend, seed, camera, light):
                 u = across + slope * z - bend[min(int(z / CELL), bends)]
                 r, g, b = _lit_ground(lots, lot_of, seed, along + z, u, z, light)
                 if light[WET] > 0:
-                    shine = (
-                        light[WET]
-                        * min(0.62, 0.1 + z / 60.0)
-                        * (0.35 + 0.9 * noise((along + z) * 0.5, u * 0.9, 77))
-                    )
-                    ripple = 0.5 * (hash01(x, y, 31) - 0.5)
-                    if (
-                        count > 0
-                        and ripple - eye - rise * walls[0, WALL_DEPTH] < walls[0, WALL_TOP]
-                    ):
-                        mirrored = max(0.0, ripple - eye - rise * walls[0, WALL_DEPTH])
-                        mr, mg, mb = _lit_wall(
-                            lots, lot_of, walls, 0, mirrored, along + walls[0, WALL_DEPTH], light
-                        )
+                    puddle = 0.35 + 0.9 * noise((along + z) * 0.5, u * 0.9, 77)
+                    shine = light[WET] * min(0.62, 0.1 + z / 60.0) * puddle
+                    far = walls[0, WALL_DEPTH]
+                    mirrored = 0.5 * (hash01(x, y, 31) - 0.5) - eye - rise * far
+                    if count > 0 and mirrored < walls[0, WALL_TOP]:
+                        height = max(0.0, mirrored)
+                        mr, mg, mb = _lit_wall(lots, lot_of, walls, 0, height, along + far, light)
                     else:
                         mr = mg = mb = 0.75 * light[AMBIENT]
                     r, g, b = r + (mr - r) * shine, g + (mg - g) * shine, b + (mb - b) * shine
             else:
                 z = FAR
-                if (
-                    y & 1 and depth[y - 1, x] == FAR
-                ):  # clouds are soft: one ray per pixel is enough
+                if y & 1 and depth[y - 1, x] == FAR:  # clouds are soft: one ray a pixel is enough
                     depth[y, x] = z
                     for channel in range(3):
                         color[y, x, channel] = color[y - 1, x, channel]
@@ -296,19 +250,11 @@ def _expose(color, depth, light, seed, image):
             dx, dy = x / columns - 0.5, y / rows - 0.5
             power = gain * (1.0 - 0.45 * (dx * dx + dy * dy)) / SAMPLES
             for channel in range(3):
-                value = (
-                    r * (1 + light[WARMTH])
-                    if channel == 0
-                    else g
-                    if channel == 1
-                    else b * (1 - light[WARMTH])
-                )
-                value = (
-                    1.585 * value * power / (value * power + 0.714)
-                )  # highlights roll off as on film
-                spot = (
-                    hash01(x * 3 + channel, y, seed) + hash01(x * 3 + channel, y, seed + 1) - 1.0
-                )
+                value = (r * (1 + light[WARMTH]), g, b * (1 - light[WARMTH]))[channel]
+                # highlights roll off as on film
+                value = 1.585 * value * power / (value * power + 0.714)
+                across = x * 3 + channel
+                spot = hash01(across, y, seed) + hash01(across, y, seed + 1) - 1.0
                 value += light[NOISE] * 2.4 * spot
                 image[y, x, channel] = int(min(255.0, max(0.0, value * 255.0 + 0.5)))
 

@@ -10,15 +10,15 @@ of its center line), in meters.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from random import Random
 
 import numpy as np
-from stavpr_ros.errors import SettingsError
 
 CELL = 0.5  # meters of the route that share one entry of the tables
 VIEW = 260.0  # how far the renderer looks along the route, meters
 ROAD_HALF_WIDTH = 5.6  # two lanes and a row of parked cars on each side
-LEFT_NEAR, RIGHT_NEAR, LEFT_FAR, RIGHT_FAR = range(4)
+LEFT, RIGHT = range(2)  # the near rows; the far rows follow in the same order
 
 # Columns of the table of lots; kernels read them by number.
 (
@@ -74,20 +74,19 @@ class Street:
     things: np.ndarray
     seed: int
 
+    @cached_property
+    def headings(self) -> np.ndarray:
+        """Return the direction at the start of each cell, radians from where it began."""
+        return np.concatenate([[0.0], np.cumsum(self.curvature) * CELL])
 
-def make_street(seed: int, length: float, bends: float = 1.0) -> Street:
+
+def make_street(seed: int, length: float) -> Street:
     """
     Make a street from a seed.
 
     :param seed: any integer; equal seeds give equal streets on every machine.
     :param length: meters of the route.
-    :param bends: factor on the curvature; 0 is a straight street.
-    :raises SettingsError: the length is not a positive number of meters.
     """
-    if not 0 < length < 1e5:
-        raise SettingsError(
-            f'length of the street is {length} m; expected more than 0 and less than 100000'
-        )
     cells = int(np.ceil((length + VIEW) / CELL)) + 1
     lots: list[tuple[float, ...]] = []
     lot_of = np.zeros((4, cells), np.int32)
@@ -106,7 +105,7 @@ def make_street(seed: int, length: float, bends: float = 1.0) -> Street:
         length=length,
         lots=table,
         lot_of=lot_of,
-        curvature=_draw_curvature(Random(seed + 7919), cells) * bends,
+        curvature=_draw_curvature(Random(seed + 7919), cells),
         things=_plant(Random(seed + 104729), table, lot_of),
         seed=seed,
     )
@@ -118,7 +117,7 @@ def _between(dice: Random, low: float, high: float) -> float:
 
 def _draw_lot(dice: Random, row: int, start: float) -> tuple[float, ...]:
     """Draw one building, side street or park; its length is a whole number of cells."""
-    near = row in (LEFT_NEAR, RIGHT_NEAR)
+    near = row in (LEFT, RIGHT)
     kind = BUILDING
     if near:
         roll = dice.random()
@@ -138,12 +137,8 @@ def _draw_lot(dice: Random, row: int, start: float) -> tuple[float, ...]:
     if kind == SIDE_STREET:
         length, setback = _between(dice, 7, 11), 1e6
     elif kind == PARK:
-        length, setback, height, gable = (
-            _between(dice, 9, 24),
-            _between(dice, 14.4, 15.8),
-            _between(dice, 0.8, 1.6),
-            0,
-        )
+        length, setback = _between(dice, 9, 24), _between(dice, 14.4, 15.8)
+        height, gable = _between(dice, 0.8, 1.6), 0
     color = PALETTE[int(dice.random() * len(PALETTE))]
     light = _between(dice, 0.82, 1.12)
     return (start, round(length / CELL) * CELL, setback, height, kind,
@@ -167,38 +162,20 @@ def _plant(dice: Random, lots: np.ndarray, lot_of: np.ndarray) -> np.ndarray:
     """Draw the trees, lamps and signs on the pavements and in the parks."""
     things = []
     end = lot_of.shape[1] * CELL
-    for row, side in ((LEFT_NEAR, -1), (RIGHT_NEAR, 1)):
+    for row, side in ((LEFT, -1), (RIGHT, 1)):
         at, avenue = _between(dice, 0, 20), 0.0
         while at < end:
             kind = lots[lot_of[row, int(at / CELL)], LOT_KIND]
             if kind == PARK:
-                things.append(
-                    (
-                        TREE,
-                        at,
-                        side * _between(dice, 16.5, 24),
-                        _between(dice, 0.9, 1.6),
-                        dice.random() * 2**30,
-                    )
-                )
+                across, size = side * _between(dice, 16.5, 24), _between(dice, 0.9, 1.6)
+                things.append((TREE, at, across, size, dice.random() * 2**30))
                 at += _between(dice, 2.5, 6)
                 continue
             avenue = avenue * 0.75 + dice.random() * 0.25  # trees come in groups
             roll = dice.random()
-            if kind == BUILDING:
-                pick = (
-                    TREE
-                    if roll < avenue * 0.9
-                    else LAMP
-                    if roll < 0.65
-                    else SIGN
-                    if roll < 0.78
-                    else -1
-                )
-                if pick >= 0:
-                    size = _between(dice, 0.6, 1.1)
-                    things.append(
-                        (pick, at, side * _between(dice, 6.1, 6.5), size, dice.random() * 2**30)
-                    )
+            if kind == BUILDING and roll < max(avenue * 0.9, 0.78):
+                pick = TREE if roll < avenue * 0.9 else LAMP if roll < 0.65 else SIGN
+                size, across = _between(dice, 0.6, 1.1), side * _between(dice, 6.1, 6.5)
+                things.append((pick, at, across, size, dice.random() * 2**30))
             at += _between(dice, 7, 15)
     return np.array(sorted(things, key=lambda thing: thing[1]), np.float64).reshape(-1, 5)

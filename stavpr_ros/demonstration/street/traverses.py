@@ -8,31 +8,36 @@ with a stop, and leaves the street for a detour that is not on the first. Everyt
 one seed.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from math import radians
-from typing import overload
+from math import radians, sin
 
 import numpy as np
-from stavpr_ros.demonstration.street.rendering import light_vector, render, View
+from stavpr_ros.demonstration.street.rendering import render
 from stavpr_ros.demonstration.street.street import (
     CAR,
     CELL,
-    LEFT_NEAR,
+    LEFT,
     LOT_KIND,
     make_street,
+    RIGHT,
     SIDE_STREET,
     Street,
     VAN,
 )
 from stavpr_ros.demonstration.street.surfaces import hash01, noise
-from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.sources.frame import Frame
 
 RATE = 5.0  # images per second
 LANE = 1.0  # meters from the center line to the middle of a lane
 EPOCH = 1_750_000_000 * 10**9  # stamp of the first traverse's first image, ns
 SECOND_EPOCH = EPOCH + 123 * 86_400 * 10**9  # four months later
+LENGTH = 600.0  # meters of the street
+# of the second traverse: its length, and where it leaves the street and comes back, meters
+DETOUR, DETOUR_FROM, DETOUR_TO = 110.0, 330.0, 380.0
+SIZE = (320, 240)  # width and height of the images
 
 
 @dataclass(frozen=True)
@@ -73,28 +78,6 @@ class Conditions:
     shake: float = 0.12
     traffic: int = 1
 
-    def __post_init__(self) -> None:
-        if not 0 < self.sun_elevation < 90:
-            raise SettingsError(
-                f'sun_elevation is {self.sun_elevation}; expected degrees between 0 and 90'
-            )
-        if abs(self.lane) > 4:
-            raise SettingsError(f'lane is {self.lane} m; expected -4 to 4, the width of the road')
-        for name in (
-            'sun',
-            'ambient',
-            'exposure',
-            'fog',
-            'rain',
-            'noise',
-            'lamps',
-            'autumn',
-            'shake',
-            'clouds',
-        ):
-            if not getattr(self, name) >= 0:
-                raise SettingsError(f'{name} is {getattr(self, name)}; expected 0 or more')
-
 
 GOOD_LIGHT = Conditions()
 RAINY_DUSK = Conditions(
@@ -104,153 +87,88 @@ RAINY_DUSK = Conditions(
 
 
 @dataclass(frozen=True)
-class WorldFrame:
-    """
-    One image of a traverse.
-
-    :param image: RGB, shape (height, width, 3), uint8.
-    :param stamp: nanoseconds.
-    :param position: meters along the first traverse's route; nan off that route.
-    """
-
-    image: np.ndarray
-    stamp: int
-    position: float
-
-
-@dataclass(frozen=True)
 class World:
     """
     A synthetic street, and another one that is the detour of the second traverse.
 
-    :param seed: any integer from 0; equal seeds give equal worlds.
-    :param length: meters of the street.
-    :param detour_length: meters of the detour.
-    :param detour_from: where the detour leaves the street, meters.
-    :param detour_to: where it comes back, meters.
+    :param seed: equal seeds give equal worlds.
+    :raises SettingsError: the seed is negative or too large.
     """
 
     seed: int = 7
-    length: float = 600.0
-    detour_length: float = 110.0
-    detour_from: float = 330.0
-    detour_to: float = 380.0
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.seed, int) and 0 <= self.seed < 2**31):
+        if not 0 <= self.seed < 2**31:
             raise SettingsError(
-                f'seed of the world is {self.seed!r}; expected an integer from 0 to 2**31 - 1'
-            )
-        if not 0 < self.detour_from <= self.detour_to < self.length:
-            raise SettingsError(
-                f'detour from {self.detour_from} m to {self.detour_to} m; expected both inside '
-                'the '
-                f'street of {self.length} m, in this order'
+                f'seed of the world is {self.seed}; expected an integer from 0 to 2**31 - 1'
             )
 
     @cached_property
-    def street(self) -> Street:
-        """Return the street of the first traverse."""
-        return make_street(self.seed, self.length)
-
-    @cached_property
-    def detour(self) -> Street:
-        """Return the street of the detour, entered and left by sharp turns."""
-        return make_street(self.seed + 50_021, self.detour_length)
+    def streets(self) -> tuple[Street, Street]:
+        """Return the street of the first traverse, and the detour between two sharp turns."""
+        return make_street(self.seed, LENGTH), make_street(self.seed + 50_021, DETOUR)
 
 
-@dataclass(frozen=True)
-class Route:
-    """
-    Position of each image of a traverse.
-
-    :param along: meters along the street that the camera is in, shape (images,).
-    :param detour: whether that is the detour, shape (images,), bool.
-    """
-
-    along: np.ndarray
-    detour: np.ndarray
-
-
-class Traverse(Sequence[WorldFrame]):
+class Traverse:
     """
     A traverse of a world: a sequence of images, rendered on access.
 
     :param world: the world.
-    :param route: where the images are taken.
+    :param along: of each image, meters along the street that the camera is in, shape (images,).
+    :param detour: whether that is the detour, shape (images,), bool.
     :param conditions: how it looks.
     :param epoch: stamp of the first image, ns.
     :param size: width and height of the images.
+
+    ``position`` is in meters along the street of the first traverse; NaN in the detour.
     """
 
     def __init__(
-        self, world: World, route: Route, conditions: Conditions, epoch: int = EPOCH,
-        size: tuple[int, int] = (320, 240),
+        self, world: World, along: np.ndarray, detour: np.ndarray, conditions: Conditions,
+        epoch: int = EPOCH, size: tuple[int, int] = SIZE,
     ) -> None:  # fmt: skip
-        if min(size) < 16:
-            raise SettingsError(
-                f'size of the images is {size}; expected a width and a height of 16 or more'
-            )
-        self.route, self.conditions, self.size = route, conditions, size
-        self.position = np.where(route.detour, np.nan, route.along)
-        self.stamps = epoch + np.arange(len(route.along), dtype=np.int64) * round(1e9 / RATE)
-        c = conditions
-        self._streets = (world.street, world.detour)
-        self._headings = [
-            np.concatenate([[0.0], np.cumsum(street.curvature) * CELL]) for street in self._streets
-        ]
+        self._along, self._detour, self._size = along, detour, size
+        self.position = np.where(detour, np.nan, along)
+        self.stamps = epoch + np.arange(len(along), dtype=np.int64) * round(1e9 / RATE)
+        self._conditions = c = conditions
+        self._streets = world.streets
         self._parked = [
             _park_cars(street, c.traffic + turn) for turn, street in enumerate(self._streets)
         ]
-        self._light = light_vector(
-            c.sun, radians(c.sun_azimuth), radians(c.sun_elevation), c.ambient, c.lamps, c.clouds,
-            min(1.0, c.rain * 1.2), c.autumn, 1000 + c.traffic * 77, c.fog, c.exposure,
-            c.warmth, c.rain, c.noise,
-        )  # fmt: skip
+        # in the order of the constants of ``rendering``
+        self._light = np.array([
+            c.sun, 0.0, 0.0, sin(radians(c.sun_elevation)), c.ambient, c.lamps, c.clouds,
+            min(1.0, c.rain * 1.2), c.autumn, radians(c.sun_azimuth), 1000 + c.traffic * 77,
+            c.fog, c.exposure, c.warmth, c.rain, c.noise,
+        ])  # fmt: skip
 
     def __len__(self) -> int:
         """Return the number of images."""
         return len(self.stamps)
 
-    @overload
-    def __getitem__(self, index: int) -> WorldFrame: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[WorldFrame]: ...
-
-    def __getitem__(self, index: int | slice) -> WorldFrame | list[WorldFrame]:
-        """Render one image, or a list of them."""
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        if not -len(self) <= index < len(self):
-            raise IndexError(f'image {index} of a traverse of {len(self)}')
-        k = index % len(self)
-        return WorldFrame(self._render(k), int(self.stamps[k]), float(self.position[k]))
-
-    def __iter__(self) -> Iterator[WorldFrame]:
+    def __iter__(self) -> Iterator[Frame]:
         """Render the images one after the other."""
         return (self[k] for k in range(len(self)))
 
+    def __getitem__(self, k: int) -> Frame:
+        """Render image k."""
+        return Frame(self._render(k), int(self.stamps[k]), '')
+
     def _render(self, k: int) -> np.ndarray:
-        c, along, turn = self.conditions, float(self.route.along[k]), int(self.route.detour[k])
+        c, along, turn = self._conditions, float(self._along[k]), int(self._detour[k])
         # Sway and shake depend on the place: while the vehicle stands, only traffic moves.
         sway = noise(along / 17.0, 0.0, c.traffic) - 0.5
         bump = hash01(int(along * 10), 3, c.traffic) + hash01(int(along * 10), 4, c.traffic) - 1.0
-        view = View(along, c.lane + 0.5 * sway, radians(c.shake) * 2.4 * bump, radians(1.2) * sway)
+        pitch, yaw = radians(c.shake) * 2.4 * bump, radians(1.2) * sway
         traffic = np.concatenate([self._parked[turn], self._driving(k)])
-        heading = float(self._headings[turn][int(along / CELL)])
         return render(
-            self._streets[turn],
-            heading,
-            view,
-            self._light,
-            traffic,
-            k * 7919 + c.traffic,
-            *self.size,
-        )
+            self._streets[turn], along, c.lane + 0.5 * sway, pitch, yaw, self._light, traffic,
+            k * 7919 + c.traffic, *self._size,
+        )  # fmt: skip
 
     def _driving(self, k: int) -> np.ndarray:
         """Place the cars that drive ahead: some in each lane, coming nearer and falling back."""
-        c, along = self.conditions, float(self.route.along[k])
+        c, along = self._conditions, float(self._along[k])
         rows = []
         for car in range(3):
             wave = noise(k / 40.0, car * 9.0, c.traffic + 40)
@@ -262,55 +180,36 @@ class Traverse(Sequence[WorldFrame]):
         return np.array(rows, np.float64).reshape(-1, 5)
 
 
-def first_traverse(
-    world: World, places: int = 300, size: tuple[int, int] = (320, 240)
-) -> Traverse:
+def first_traverse(world: World, places: int = 300, size: tuple[int, int] = SIZE) -> Traverse:
     """Traverse along the street in good light, at one speed: the map."""
-    _check_count('places', places)
-    along = np.linspace(0, world.length, places, endpoint=False)
-    return Traverse(world, Route(along, np.zeros(places, bool)), GOOD_LIGHT, EPOCH, size)
+    along = np.linspace(0, LENGTH, places, endpoint=False)
+    return Traverse(world, along, np.zeros(places, bool), GOOD_LIGHT, EPOCH, size)
 
 
 def second_traverse(
     world: World,
     images: int = 330,
-    size: tuple[int, int] = (320, 240),
+    size: tuple[int, int] = SIZE,
     conditions: Conditions = RAINY_DUSK,
 ) -> Traverse:
     """Traverse along the street again, with a detour, a stop and other conditions: the query."""
-    _check_count('images', images)
-    distance = world.length - (world.detour_to - world.detour_from) + world.detour_length
+    distance = LENGTH - (DETOUR_TO - DETOUR_FROM) + DETOUR
     speed = _vary_speed(world.seed, images)
     driven = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) * distance / speed.sum()
-    back = world.detour_from + world.detour_length
-    detour = (driven >= world.detour_from) & (driven < back)
-    along = np.where(
-        driven < back, driven - world.detour_from * detour, driven - back + world.detour_to
-    )
-    return Traverse(world, Route(along, detour), conditions, SECOND_EPOCH, size)
+    back = DETOUR_FROM + DETOUR
+    detour = (driven >= DETOUR_FROM) & (driven < back)
+    along = np.where(driven < back, driven - DETOUR_FROM * detour, driven - back + DETOUR_TO)
+    return Traverse(world, along, detour, conditions, SECOND_EPOCH, size)
 
 
 def nearest_places(first: Traverse, second: Traverse) -> np.ndarray:
     """
     Return the place of the first traverse that is nearest to each image of the second.
 
-    :returns: shape (images,), int64; -1 where the second is off the first's route.
+    :returns: shape (images,), int64; -1 where the second is in the detour.
     """
-    if len(first) == 0 or np.isnan(first.position).any():
-        missing = int(np.isnan(first.position).sum())
-        raise InputError(
-            f'a first traverse of {len(first)} places, {missing} of them without a position; '
-            'expected at least one place, and a position for all: a traverse without detour'
-        )
-    away = np.abs(second.position[:, None] - first.position[None, :])
-    return np.where(
-        np.isnan(second.position), -1, np.argmin(np.nan_to_num(away, nan=np.inf), axis=1)
-    )
-
-
-def _check_count(name: str, count: int) -> None:
-    if count < 2:
-        raise SettingsError(f'{name} is {count}; expected 2 or more')
+    away = np.abs(second.position[:, None] - first.position)
+    return np.where(np.isnan(second.position), -1, np.argmin(away, axis=1))
 
 
 def _vary_speed(seed: int, images: int) -> np.ndarray:
@@ -326,8 +225,7 @@ def _vary_speed(seed: int, images: int) -> np.ndarray:
 def _park_cars(street: Street, seed: int) -> np.ndarray:
     """Park cars on both sides, groups and gaps, none across a side street."""
     rows = []
-    for side in (-1, 1):
-        row = LEFT_NEAR if side < 0 else LEFT_NEAR + 1
+    for row, side in ((LEFT, -1), (RIGHT, 1)):
         for spot in range(int((street.length + 200) / 5.6)):
             along = spot * 5.6 + hash01(spot, side + 5, seed)
             lots = street.lot_of[row, [int(along / CELL), int((along + 5) / CELL)]]
