@@ -286,8 +286,7 @@ def test_demo_on_bag_and_folder_reports_matches(run, traverse, tmp_path):
     records = [json.loads(line) for line in lines]
     assert [match['status'] for match in records] == ['WARMING_UP'] * 19 + ['MATCH'] * 5
     assert records[-1]['newest_index'] == 23
-    for name in ('demo.png', 'matches.png', 'distance_matrix.png', 'distance_over_time.png'):
-        assert cv2.imread(str(output / name)).std() > 5
+    assert cv2.imread(str(output / 'demo.png')).std() > 5
     assert 'Traceback' not in (output / 'node.log').read_text()
 
 

@@ -2,11 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plots: written, of a sensible size, with the colors of their contents, also for empty input."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
-from stavpr_ros.demonstration.sheet import demo_sheet, distance_matrix, distance_over_time
+from stavpr_ros.demonstration.plots import demo_sheet
 from stavpr_ros.errors import InputError
+from stavpr_ros.evaluation.metrics import ImageMatches
 from stavpr_ros.evaluation.plots import (
     distance_histogram,
     match_overview,
@@ -15,6 +18,7 @@ from stavpr_ros.evaluation.plots import (
     reduced_matrix,
     warping_path,
 )
+from stavpr_ros.evaluation.records import TraverseEvaluation
 from stavpr_ros.pipeline.overlay import match_image, NO_MATCH, RIGHT
 
 QUERIES, PLACES, THRESHOLD = 40, 30, 0.5
@@ -38,12 +42,10 @@ def results():
     matched = truth.copy()
     matched[5], matched[30] = 25, -1
     best = distances.min(axis=1)
-    best[0] = np.nan
-    outcomes = [
-        'unseen' if t < 0 else 'no match' if m < 0 else 'right' if m == t else 'wrong'
-        for m, t in zip(matched, truth, strict=True)
-    ]
-    return distances, matched, truth, best, outcomes
+    best[0] = np.inf
+    matches = ImageMatches(matched, best)
+    result = TraverseEvaluation(matches, matched >= 0, truth, 2, None, np.zeros(0))
+    return distances, result
 
 
 @pytest.fixture
@@ -80,14 +82,6 @@ def test_match_overview_frames_pairs_in_the_color_of_their_outcome(path):
     assert all(colors_of(path, GREEN, RED, AMBER, GRAY))
 
 
-def test_distance_matrix_shows_matches_and_ground_truth(path, results):
-    distances, matched, truth, *_ = results
-    distance_matrix(path, distances, matched, truth, 2)
-    assert all(colors_of(path, BRIGHT_GREEN, BRIGHT_RED, YELLOW))
-    distance_matrix(path, distances, matched, None)
-    assert colors_of(path, (79, 179, 255), BRIGHT_GREEN, YELLOW) == [True, False, False]
-
-
 def test_reduced_matrix_returns_where_its_axes_are(path):
     values = np.random.default_rng(0).random((20, 30)).astype(np.float32) / 9 + 0.5
     truth = np.eye(20, 30, dtype=bool)
@@ -109,14 +103,7 @@ def test_reduced_matrix_returns_where_its_axes_are(path):
     assert red_over_blue[0] > 60 > red_over_blue[1]  # the diagonal is yellow
 
 
-def test_plots_of_arrays_that_do_not_fit_raise(path, results):
-    distances, matched, truth, best, outcomes = results
-    with pytest.raises(InputError, match=r'matched \(39,\)'):
-        distance_matrix(path, distances, matched[1:], truth)
-    with pytest.raises(InputError, match=r'shape \(0, 4\)'):
-        distance_matrix(path, np.zeros((0, 4)), matched[:0], truth[:0])
-    with pytest.raises(InputError, match='39 outcomes'):
-        distance_over_time(path, best, THRESHOLD, outcomes[1:], truth < 0)
+def test_warping_path_of_an_empty_window_raises(path):
     with pytest.raises(InputError, match='not empty'):
         warping_path(path, np.zeros((0, 4)), np.zeros((0, 2)))
 
@@ -148,15 +135,17 @@ def test_distance_histogram_shows_groups_and_threshold(path):
     colors_of(path, spread=1.0)
 
 
-def test_demo_sheet_with_and_without_matches(path, results):
-    distances, matched, truth, best, outcomes = results
-    demo_sheet(
-        path, pairs(), distances, matched, truth, best, THRESHOLD, outcomes, 2, 'Title', 'F1'
-    )
-    assert colors_of(path, BLUE, least=(1000, 1500)) == [True]
-    none = np.full(QUERIES, -1)
-    demo_sheet(path, [], distances, none, none, best * np.nan, 0.1, ['unseen'] * QUERIES)
-    colors_of(path)
+def test_demo_sheet_shows_matches_and_ground_truth_as_far_as_known(path, results):
+    distances, result = results
+    bright = BRIGHT_GREEN, BRIGHT_RED, YELLOW
+    demo_sheet(path, pairs(), distances, result, THRESHOLD, 'Title')
+    assert all(colors_of(path, BLUE, *bright, least=(1000, 1500)))
+    demo_sheet(path, [], distances, replace(result, true_places=None), THRESHOLD, 'Title')
+    assert colors_of(path, (79, 179, 255), *bright) == [True, False, False, False]
+    none = ImageMatches(np.full(QUERIES, -1), np.full(QUERIES, np.inf))
+    nothing = replace(result, matches=none, accepted=np.zeros(QUERIES, bool))
+    demo_sheet(path, [], distances, nothing, THRESHOLD, 'Title')
+    assert colors_of(path, *bright) == [False, False, True]
 
 
 @pytest.mark.parametrize(('accepted', 'color'), [(True, RIGHT), (False, NO_MATCH)])

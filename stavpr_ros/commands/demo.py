@@ -196,8 +196,9 @@ def _localization(arguments: argparse.Namespace, folder: Path) -> None:
     }
     records = run_live(parameters, pair.query.path, len(query), folder, pair.query.topic)
     result = evaluate_records(records, length, threshold, pair.true_places, arguments.tolerance)
-    draw_result(result, query, place_map, threshold, pair.title, folder)
-    _report('4', result.summary(), folder / 'demo.png')
+    plot = folder / 'demo.png'
+    draw_result(result, query, place_map, threshold, pair.title, plot)
+    _report('4', result.summary(), plot)
 
 
 def _loop_traverse(arguments: argparse.Namespace, folder: Path, exclude: int) -> 'LoopTraverse':
