@@ -49,6 +49,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
     """Measure all stages of all sizes."""
+    from extraction import extraction_stages
     from stages import (
         device_retrieval,
         feature_stages,
@@ -58,6 +59,8 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
     )
     import torch
 
+    if run.device == 'cpu':
+        extraction_stages(run, options.seed)
     for n in options.sizes:
         robust_stages(run, n, options.seed)
     for n in options.sizes:

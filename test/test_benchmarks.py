@@ -310,7 +310,9 @@ def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     document = json.loads(path.read_text())
     rows = document['rows']
     robust = {row['stage'] for row in rows if row['mode'] in ('', 'robust')}
-    assert robust == {*report.ROBUST_STAGES, 'distance_matrix', 'frame'}
+    assert robust == {
+        *('decoding', 'extraction'), *report.ROBUST_STAGES, 'distance_matrix', 'frame'
+    }  # fmt: skip
     paper = {row['stage'] for row in rows if row['mode'] == 'paper'}
     assert paper == {'lm_dtw', 'selection', 'path_trace', 'frame'}
     assert document['commit'] == 'abc'
