@@ -9,10 +9,10 @@ import sys
 import time
 
 import rclpy
-from rclpy.exceptions import InvalidTopicNameException
+from stavpr_ros.commands.program import make_parser
 from stavpr_ros.errors import ImageError, SettingsError, StavprError
 from stavpr_ros.ros.process import own_arguments, prepare_transport, ros_node
-from stavpr_ros.ros.replay import NoResultError, NoSubscriberError, Replayer, ReplaySettings
+from stavpr_ros.ros.replay import NoResultError, NoSubscriberError, Replayer
 from stavpr_ros.signals import interrupted, obey_signals
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.folder import FolderSource
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('replay: interrupted', file=sys.stderr)
         return INTERRUPTED
-    except (InvalidTopicNameException, StavprError) as error:
+    except StavprError as error:
         print(f'replay: error: {error}', file=sys.stderr)
         return _exit_code(error)
     except Exception:  # an interrupt within a foreign library comes out as another exception
@@ -66,8 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise
 
 
-def _exit_code(error: Exception) -> int:
-    if isinstance(error, InvalidTopicNameException | SettingsError):
+def _exit_code(error: StavprError) -> int:
+    if isinstance(error, SettingsError):
         return BAD_USAGE
     if isinstance(error, NoSubscriberError):
         return NO_SUBSCRIBER
@@ -90,72 +90,50 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
         records, rate = source.records(options.rate or FOLDER_RATE), 1.0
     else:
         records, rate = source.records(), options.rate or 1.0
-    settings = ReplaySettings(
-        options.publish_to,
-        options.match_topic,
-        rate,
-        options.lossless,
-        options.timeout,
-        options.wait,
-    )
     # no bar without a terminal
     with tqdm(total=len(source), unit='image', desc='replay', disable=None) as bar:
-        report = _replay(records, settings, ros_arguments, notify, bar.update)
+        prepare_transport()
+        with ros_node(lambda: rclpy.create_node('stavpr_replay'), ros_arguments) as node:
+            replayer = Replayer(
+                node, notify, rate, options.lossless, options.timeout, options.wait
+            )
+            try:
+                report = _replay(replayer, records, bar.update)
+            finally:
+                replayer.close()
     print(f'{report}, {len(skipped)} skipped')
     return BAD_INPUT if len(skipped) == len(source) else DONE
 
 
 def _replay(
-    records: Iterator[ImageRecord],
-    settings: ReplaySettings,
-    ros_arguments: list[str],
-    notify: Callable[[str], None],
-    count: Callable[[], object],
+    replayer: Replayer, records: Iterator[ImageRecord], count: Callable[[], object]
 ) -> str:
-    """Replay over ROS; return a summary."""
-    prepare_transport()
-    with ros_node(lambda: rclpy.create_node('stavpr_replay'), ros_arguments) as node:
-        replayer = Replayer(node, settings, notify)
-        try:
-            replayer.wait_for_subscribers()
-            began = time.monotonic()
-            for record in records:
-                replayer.send(record)
-                count()
-            seconds = time.monotonic() - began
-            replayer.finish()
-            return _summary(replayer, seconds)
-        finally:
-            replayer.close()
-
-
-def _summary(replayer: Replayer, seconds: float) -> str:
+    """Publish the records; return a summary."""
+    replayer.wait_for_subscribers()
+    began = time.monotonic()
+    for record in records:
+        replayer.send(record)
+        count()
+    seconds = time.monotonic() - began
+    replayer.finish()
     rate = replayer.published / max(seconds, 1e-9)
     summary = (
         f'{replayer.published} images published on {replayer.publisher.topic_name} '
         f'in {seconds:.1f} s ({rate:.1f} per second)'
     )
-    if replayer.settings.lossless:
+    if replayer.lossless:
         summary += f', {replayer.resent} sent again, {replayer.dropped} dropped'
     return summary
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='replay',
-        description=__doc__.partition(': ')[2],
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser('replay', __doc__.partition(': ')[2], EPILOG)
     parser.add_argument(
         'bag',
         metavar='BAG',
         help='a ROS 2 bag (folder, .db3 or .mcap file), a ROS 1 .bag, or a folder of images',
     )
     parser.add_argument('--topic', help='image topic in the bag; needed if it has several')
-    parser.add_argument(
-        '--publish-to', default='image', metavar='TOPIC', help='topic of the images (%(default)s)'
-    )
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument(
         '--rate',
@@ -165,12 +143,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     pace.add_argument(
         '--lossless', action='store_true', help='send each image after the result of the last one'
-    )
-    parser.add_argument(
-        '--match-topic',
-        default='stavpr/match',
-        metavar='TOPIC',
-        help='topic of the results, one message per image, for --lossless (%(default)s)',
     )
     parser.add_argument(
         '--timeout',

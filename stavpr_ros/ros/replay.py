@@ -4,7 +4,6 @@
 
 import array
 from collections.abc import Callable
-from dataclasses import dataclass
 import math
 import time
 from typing import Any
@@ -23,6 +22,7 @@ from std_msgs.msg import Header
 
 SECOND = 1_000_000_000
 SPIN_SECONDS = 0.1  # until a signal is noticed
+TRIES = 3  # how often one image is sent
 RELIABLE = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -32,29 +32,6 @@ class NoSubscriberError(StavprError):
 
 class NoResultError(StavprError):
     """A published image got neither a result nor an acknowledgment in time."""
-
-
-@dataclass(frozen=True)
-class ReplaySettings:
-    """
-    Settings of a replay.
-
-    :param publish_to: image topic; relative names are remapped and put into the node's namespace.
-    :param match_topic: topic of the results, for ``lossless``.
-    :param rate: factor on the recorded pace, above 0; without effect with ``lossless``.
-    :param lossless: publish the next image after the result of the last one.
-    :param timeout: seconds without a result after which an image is sent again.
-    :param wait: seconds to wait for subscribers; None = no limit.
-    :param tries: how often one image is sent.
-    """
-
-    publish_to: str = 'image'
-    match_topic: str = 'stavpr/match'
-    rate: float = 1.0
-    lossless: bool = False
-    timeout: float = 20.0
-    wait: float | None = None
-    tries: int = 3
 
 
 def image_message(record: ImageRecord) -> Image:
@@ -76,26 +53,37 @@ def image_message(record: ImageRecord) -> Image:
 
 class Replayer:
     """
-    Publishes images on a node, which it spins.
+    Publishes images on the topic ``image`` of a node, which it spins.
 
     :param node: for the publisher and the subscription of the results.
-    :param settings: of the replay.
     :param notify: called with messages for the user: waiting for a subscriber, an image sent
         again.
+    :param rate: factor on the recorded pace, above 0; without effect with ``lossless``.
+    :param lossless: publish the next image after the result of the last one on ``stavpr/match``.
+    :param timeout: seconds without a result after which an image is sent again.
+    :param wait: seconds to wait for subscribers; None = no limit.
     """
 
     def __init__(
-        self, node: Node, settings: ReplaySettings, notify: Callable[[str], None]
+        self,
+        node: Node,
+        notify: Callable[[str], None],
+        rate: float,
+        lossless: bool,
+        timeout: float,
+        wait: float | None,
     ) -> None:
-        self.node, self.settings, self.notify = node, settings, notify
+        self.node, self.notify = node, notify
+        self._rate, self._timeout, self._wait = rate, timeout, wait
+        self.lossless = lossless
         self.published = self.resent = self.dropped = 0
-        self.publisher = node.create_publisher(Image, settings.publish_to, RELIABLE)
-        self._match_topic = node.resolve_topic_name(settings.match_topic)
-        if settings.lossless:
-            node.create_subscription(PlaceMatch, settings.match_topic, self._on_match, RELIABLE)
+        self.publisher = node.create_publisher(Image, 'image', RELIABLE)
+        self._match_topic = node.resolve_topic_name('stavpr/match')
+        if lossless:
+            node.create_subscription(PlaceMatch, 'stavpr/match', self._on_match, RELIABLE)
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._discovery = Discovery(node, self._endpoints, settings.timeout)
+        self._discovery = Discovery(node, self._endpoints, timeout)
         self._outstanding: Header | None = None
         self._start: tuple[float, int] | None = None
 
@@ -115,9 +103,9 @@ class Replayer:
                 notified = missing
             return not missing
 
-        if not self._spin_until(complete, self.settings.wait):
+        if not self._spin_until(complete, self._wait):
             raise NoSubscriberError(
-                f'waited {self.settings.wait:g} s for {self._missing()}: expected a running node; '
+                f'waited {self._wait:g} s for {self._missing()}: expected a running node; '
                 'start it, compare the topics (`ros2 topic list`) and ROS_DOMAIN_ID, or wait '
                 'longer (--wait)'
             )
@@ -130,7 +118,7 @@ class Replayer:
         :raises NoResultError: lossless, and no result after all tries.
         """
         message = image_message(record)
-        if self.settings.lossless:
+        if self.lossless:
             self._send_until_answered(message)
         else:
             self._wait_until_due(record.time_ns)
@@ -143,7 +131,7 @@ class Replayer:
 
         :raises NoResultError: a reliable subscriber has not acknowledged them in time.
         """
-        timeout = self.settings.timeout
+        timeout = self._timeout
         if not self._spin_until(lambda: self.publisher.wait_for_all_acked(Duration()), timeout):
             raise NoResultError(
                 f'the last images on {self.publisher.topic_name} are not acknowledged after '
@@ -171,7 +159,7 @@ class Replayer:
         """Return the endpoint that is not discovered yet; empty = none."""
         if not self.publisher.get_subscription_count():
             return f'a subscriber of {self.publisher.topic_name}'
-        if self.settings.lossless and not self.node.count_publishers(self._match_topic):
+        if self.lossless and not self.node.count_publishers(self._match_topic):
             return f'a publisher of {self._match_topic}'
         return ''
 
@@ -183,7 +171,7 @@ class Replayer:
     def _endpoints(self) -> list[Any]:
         """Return the subscriptions to the images and the publishers of results."""
         found = self.node.get_subscriptions_info_by_topic(self.publisher.topic_name)
-        if self.settings.lossless:
+        if self.lossless:
             found += self.node.get_publishers_info_by_topic(self._match_topic)
         return found
 
@@ -191,7 +179,7 @@ class Replayer:
         if self._start is None:
             self._start = time.monotonic(), time_ns
         began, first_ns = self._start
-        left = began + (time_ns - first_ns) / SECOND / self.settings.rate - time.monotonic()
+        left = began + (time_ns - first_ns) / SECOND / self._rate - time.monotonic()
         if left > 10:
             self.notify(f'the next image is due in {left:.0f} s, as recorded (see --rate)')
         self._spin_until(lambda: False, left)
@@ -204,9 +192,9 @@ class Replayer:
         again to a slow node has two results; with an equal header the second counts for the next
         image.
         """
-        stamp, timeout = message.header.stamp, self.settings.timeout
+        stamp, timeout = message.header.stamp, self._timeout
         name = f'image {self.published + 1} (stamp {stamp.sec}.{stamp.nanosec:09d})'
-        for attempt in range(self.settings.tries):
+        for attempt in range(TRIES):
             if attempt:
                 self.resent += 1
                 self.notify(f'{name}: no result for {timeout:g} s, sent again (try {attempt + 1})')
@@ -215,7 +203,7 @@ class Replayer:
             if self._spin_until(lambda: self._outstanding is None, timeout):
                 return
         raise NoResultError(
-            f'{name} got no result on {self._match_topic} in {self.settings.tries} tries of '
+            f'{name} got no result on {self._match_topic} in {TRIES} tries of '
             f'{timeout:g} s: expected one message per image; check that the node runs and '
             f'subscribes to {self.publisher.topic_name}, or give a slow one a longer --timeout'
         )
