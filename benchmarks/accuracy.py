@@ -29,7 +29,7 @@ from stavpr_ros.evaluation.evaluate import (
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.metrics import counts_at
 from stavpr_ros.evaluation.warp import cropped, KINDS, warp_indices
-from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
@@ -156,7 +156,7 @@ def evaluate_case(
             count = len(query)
             images = np.arange(count) if warp == 'same' else warp_indices(count, warp)
             evaluation = evaluate_on_map(
-                place_map, _selected(query.features, images), truth.select(images), settings
+                place_map, query.features[images], truth.select(images), settings
             )
             threshold = THRESHOLD if mode == 'robust' else None
             yield f'{case.name}/{feature}/{mode}/{warp}', numbers(evaluation, threshold)
@@ -195,11 +195,6 @@ def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict
 
 def _map(source: Any, making: FeatureExtractor) -> PlaceMap:
     return build_map(source, making, thumbnails=False, progress=False)
-
-
-def _selected(features: LocalFeatures, images: np.ndarray) -> LocalFeatures:
-    strips, weights = (x[:, images].contiguous() for x in (features.strips, features.weights))
-    return LocalFeatures(strips, weights, features.settings, features.cells)
 
 
 def measure(folder: Path, quick: bool) -> Iterator[tuple[str, dict[str, Any]]]:

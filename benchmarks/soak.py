@@ -22,23 +22,26 @@ from typing import Any
 import numpy as np
 from results import commit, cpu_model, versions
 
+PLACES, WIDTH, HEIGHT = 2000, 640, 480
+STEP = 41  # pixels from one view to the next
 
-def texture_route(count: int, height: int, width: int, step: int = 41) -> Iterator[np.ndarray]:
+
+def texture_route(count: int) -> Iterator[np.ndarray]:
     """Yield views along one random texture, RGB uint8."""
     rng = np.random.default_rng(0)
-    coarse = rng.integers(0, 256, (height // 16, 4096 // 16, 3), np.uint8)
+    coarse = rng.integers(0, 256, (HEIGHT // 16, 4096 // 16, 3), np.uint8)
     texture = np.kron(coarse, np.ones((16, 16, 1), np.uint8))
-    starts = [(i * step) % (texture.shape[1] - width) for i in range(count)]
-    return (np.ascontiguousarray(texture[:, s : s + width]) for s in starts)
+    starts = [(i * STEP) % (texture.shape[1] - WIDTH) for i in range(count)]
+    return (np.ascontiguousarray(texture[:, s : s + WIDTH]) for s in starts)
 
 
-def make_map(path: Path, places: int, height: int, width: int) -> None:
+def make_map(path: Path) -> None:
     """Save a map of synthetic images."""
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import build_map, save_map
     from stavpr_ros.sources.frame import Frame
 
-    frames = (Frame(image, 0, '') for image in texture_route(places, height, width))
+    frames = (Frame(image, 0, '') for image in texture_route(PLACES))
     save_map(build_map(frames, FeatureExtractor(), thumbnails=False), path)
 
 
@@ -82,13 +85,13 @@ class Latencies:
         }
 
 
-def image_messages(height: int, width: int) -> list[Any]:
+def image_messages() -> list[Any]:
     """Return thirty images as messages."""
     from sensor_msgs.msg import Image
 
     messages = []
-    for image in texture_route(30, height, width):
-        message = Image(height=height, width=width, encoding='rgb8', step=width * 3)
+    for image in texture_route(30):
+        message = Image(height=HEIGHT, width=WIDTH, encoding='rgb8', step=WIDTH * 3)
         message.data = array.array('B', image.tobytes())
         messages.append(message)
     return messages
@@ -103,7 +106,7 @@ def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
     from stavpr_ros.ros.process import Discovery, ros_node, spin_until
 
     matches = Latencies()
-    messages = image_messages(arguments.height, arguments.width)
+    messages = image_messages()
     total = round(arguments.seconds * arguments.rate)
     with ros_node(lambda: rclpy.create_node('soak'), []) as node:
         publisher = node.create_publisher(Image, 'image', qos_profile_sensor_data)
@@ -144,9 +147,6 @@ def main() -> None:
     )
     parser.add_argument('--seconds', type=float, default=300)
     parser.add_argument('--rate', type=float, default=30, help='images per second (%(default)s)')
-    parser.add_argument('--places', type=int, default=2000)
-    parser.add_argument('--width', type=int, default=640)
-    parser.add_argument('--height', type=int, default=480)
     parser.add_argument(
         '--parameter',
         action='append',
@@ -164,7 +164,7 @@ def main() -> None:
     prepare_transport()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'map.stavpr'
-        make_map(path, arguments.places, arguments.height, arguments.width)
+        make_map(path)
         parameters = [f'map_path:={path}', *arguments.parameter]
         options = [word for parameter in parameters for word in ('-p', parameter)]
         command = [executable('node'), '--ros-args', *options]
@@ -174,7 +174,7 @@ def main() -> None:
         finally:
             node.send_signal(signal.SIGINT)
             node.wait()
-    figures |= {'places': arguments.places, 'parameters': arguments.parameter}
+    figures |= {'places': PLACES, 'parameters': arguments.parameter}
     figures |= {'cpu': cpu_model(), 'cores': os.cpu_count(), 'commit': commit(), **versions()}
     text = json.dumps(figures, indent=2)
     print(text)

@@ -197,13 +197,6 @@ def test_executable_with_wrong_ros_arguments_fails(name, traverse, tmp_path):
     assert 'Traceback' not in result.stderr
 
 
-def test_record_of_invalid_topic_fails(tmp_path):
-    result = run_process('record', '--output', tmp_path / 'x', '--topic', 'a b')
-    assert result.returncode == 2
-    assert 'record: Invalid topic name' in result.stderr
-    assert 'Traceback' not in result.stderr
-
-
 def test_loop_closure_record_is_plain_json():
     message = LoopClosure(query_index=9, distance=math.nan, inliers=-1)
     message.header.stamp.sec = 3

@@ -15,7 +15,6 @@ from stavpr_ros.demonstration.street import (
     Traverse,
     World,
 )
-from stavpr_ros.errors import SettingsError
 
 SIZE = (96, 72)
 STILL = replace(GOOD_LIGHT, noise=0.0, shake=0.0)
@@ -112,8 +111,3 @@ def test_nearest_places_by_hand(world):
     second = traverse([0.9, 1.1, 50.0, 6.9, 3.0], [False, False, True, False, False])
     assert nearest_places(first, second).tolist() == [0, 1, -1, 3, 1]  # the lower one on a tie
     assert np.isnan(second.position[2])
-
-
-def test_world_with_negative_seed_is_rejected():
-    with pytest.raises(SettingsError, match='seed of the world is -1'):
-        World(-1)

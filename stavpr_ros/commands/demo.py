@@ -76,7 +76,6 @@ def _parser() -> argparse.ArgumentParser:
         '--geometric-check', choices=('none', 'orb', 'sift'),
         help=f'with --loop: verification of matches by keypoints ({GEOMETRIC_CHECK})',
     )  # fmt: skip
-    add('--street-seed', type=int, default=7, help='seed of the synthetic street (%(default)s)')
     add_feature_options(parser)
     return parser
 
@@ -145,7 +144,7 @@ def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair
 
     if not arguments.map:
         _print('1. Two traverses of a synthetic street')
-        return synthetic_pair(folder, arguments.street_seed)
+        return synthetic_pair(folder)
     _print(f'1. Your traverses: {arguments.map} is the map, {arguments.query} the query')
     identity = arguments.truth == 'identity'
     length = arguments.sequence_length
@@ -208,7 +207,7 @@ def _loop_traverse(arguments: argparse.Namespace, folder: Path, exclude: int) ->
     if arguments.loop == SYNTHETIC:
         _print('1. One traverse twice along a synthetic street, then on the other lane and with '
                'a detour')  # fmt: skip
-        return synthetic_loop(folder, arguments.street_seed, exclude, tolerance)
+        return synthetic_loop(folder, exclude, tolerance)
     _print(f'1. Your traverse: {arguments.loop}')
     return own_loop(arguments.loop, arguments.topic, arguments.truth, exclude, tolerance)
 

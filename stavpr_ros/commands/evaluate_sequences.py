@@ -17,7 +17,7 @@ from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.ground_truth_files import read_poses
 from stavpr_ros.evaluation.paper.datasets import open_dataset
 from stavpr_ros.evaluation.warp import cropped, FrameSource, warp_indices
-from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, load_map, PlaceMap
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import is_bag
@@ -223,16 +223,11 @@ def _poses(path: str | None, place_map: PlaceMap, name: str, degrees: float | No
 
 def _warped(sequences: Sequences, kind: str) -> Sequences:
     """Change the query's speed: its images and their ground truth alike."""
-    query, features = sequences.query, sequences.query.features
+    query = sequences.query
     indices = warp_indices(len(query), kind)
     changed = replace(
         query,
-        features=LocalFeatures(
-            features.strips[:, indices].contiguous(),
-            features.weights[:, indices].contiguous(),
-            features.settings,
-            features.cells,
-        ),
+        features=query.features[indices],
         stamps=query.stamps[indices],
         ids=tuple(query.ids[i] for i in indices),
         poses=None if query.poses is None else query.poses[indices],

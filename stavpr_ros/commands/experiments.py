@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from stavpr_ros.evaluation.paper.datasets import Dataset
     from stavpr_ros.evaluation.paper.experiments import Configuration
 
-COLUMNS = ('f1', 'average_precision', 'recall_at_1', 'recall_at_5', 'recall_at_100_precision')
 EMPTY = '-'
 
 DESCRIPTION = """
@@ -69,9 +68,6 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument(
         '--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)'
-    )
-    parser.add_argument(
-        '--metric', choices=COLUMNS, default='f1', help='number to print (%(default)s)'
     )
     parser.add_argument('--parameter', choices=tuple(SWEEPS), help='of sweep (l)')
     parser.add_argument(
@@ -226,15 +222,14 @@ def _run(arguments: argparse.Namespace) -> None:
             numbers = {
                 key: None if found is None else found.to_json() for key, found in metrics.items()
             }
-            cells = [None if row is None else row[arguments.metric] for row in numbers.values()]
+            cells = [None if row is None else row['f1'] for row in numbers.values()]
             rows.append([name, label, *map(_number, cells)])
             results.append({'dataset': name, 'features': label, 'results': numbers})
-        if arguments.metric == 'f1':
-            for backbone, published in _published(name, columns).items():
-                rows.append(['', f'published, {backbone}', *map(_number, published)])
-                named = dict(zip([column.name for column in columns], published, strict=True))
-                results.append({'dataset': name, 'published': backbone, 'f1': named})
-    print(f'{arguments.experiment}, mode {arguments.mode}: {arguments.metric.replace("_", " ")}')
+        for backbone, published in _published(name, columns).items():
+            rows.append(['', f'published, {backbone}', *map(_number, published)])
+            named = dict(zip([column.name for column in columns], published, strict=True))
+            results.append({'dataset': name, 'published': backbone, 'f1': named})
+    print(f'{arguments.experiment}, mode {arguments.mode}: f1')
     print(_table(rows))
     if arguments.json:
         try:

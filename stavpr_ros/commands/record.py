@@ -11,7 +11,7 @@ import time
 from typing import Any, TextIO, TYPE_CHECKING
 
 from stavpr_ros.commands.program import make_parser, run_program
-from stavpr_ros.errors import SettingsError, SourceError
+from stavpr_ros.errors import SourceError
 
 if TYPE_CHECKING:
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
@@ -23,7 +23,7 @@ STATUSES = (
     *('NOT_READY', 'DROPPED', 'SKIPPED', 'MAPPED'),
 )
 MATCHES, LOOP_CLOSURES = 'matches', 'loop closures'
-TOPICS = {MATCHES: '/stavpr/match', LOOP_CLOSURES: '/stavpr/loop_closure'}
+TOPICS = {MATCHES: 'stavpr/match', LOOP_CLOSURES: 'stavpr/loop_closure'}
 
 EPILOG = """
 The keys are the fields of stavpr_msgs/PlaceMatch, the status by its name, or with --loop-closures
@@ -32,8 +32,8 @@ a list of [query_index, place_index], pairs are [query_index, query_stamp, place
 place_stamp], a pose is [x, y, z, qx, qy, qz, qw], null without odometry. received is the time of
 arrival (ns, system clock).
 
-exit codes: 0 done (--count reached, or stopped by a signal), 1 the file cannot be written,
-2 usage, 130 stopped by a signal before the start
+exit codes: 0 stopped by a signal, 1 the file cannot be written, 2 usage, 130 stopped by a signal
+before the start
 """
 
 
@@ -101,15 +101,12 @@ def _parser() -> argparse.ArgumentParser:
         default=MATCHES,
         help='loop closures (of operation loop_closure) instead of matches',
     )
-    parser.add_argument('--topic', help=f'their topic ({", or ".join(TOPICS.values())})')
-    parser.add_argument('--count', type=int, default=0, help='number of messages (0 = no limit)')
     return parser
 
 
 def _write_messages(arguments: argparse.Namespace, file: TextIO, ros_arguments: list[str]) -> int:
-    """Write messages until a signal or the count; return their number."""
+    """Write messages until a signal; return their number."""
     import rclpy
-    from rclpy.exceptions import InvalidTopicNameException
     from rclpy.qos import QoSProfile
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
     from stavpr_ros.ros.process import Discovery, ros_node, spin_until
@@ -127,26 +124,18 @@ def _write_messages(arguments: argparse.Namespace, file: TextIO, ros_arguments: 
         file.flush()
         written += 1
 
-    def complete() -> bool:
-        return 0 < arguments.count <= written
-
     try:
         with ros_node(lambda: rclpy.create_node('stavpr_record'), ros_arguments) as node:
             subscription = node.create_subscription(
-                message_type,
-                arguments.topic or TOPICS[arguments.kind],
-                write,
-                QoSProfile(depth=1000),
+                message_type, TOPICS[arguments.kind], write, QoSProfile(depth=1000)
             )
             topic = subscription.topic_name
             discovery = Discovery(node, lambda: node.get_publishers_info_by_topic(topic))
             print(f'waiting for a publisher of {topic}', flush=True)
             spin_until(node, lambda: subscription.get_publisher_count() > 0)
-            spin_until(node, lambda: discovery.done() or complete())
+            spin_until(node, discovery.done)
             print(f'recording {topic}', flush=True)  # no message is missed from now on
-            spin_until(node, complete)
-    except InvalidTopicNameException as error:
-        raise SettingsError(str(error)) from error
+            spin_until(node)
     except KeyboardInterrupt:
         pass  # the usual end
     return written

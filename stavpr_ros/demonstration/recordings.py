@@ -90,7 +90,7 @@ class LoopTraverse:
     title: str
 
 
-def synthetic_pair(folder: Path, seed: int) -> TraversePair:
+def synthetic_pair(folder: Path) -> TraversePair:
     """
     Traverse a synthetic street twice and write a bag of each traverse.
 
@@ -99,7 +99,7 @@ def synthetic_pair(folder: Path, seed: int) -> TraversePair:
     bags = folder / 'first_traverse', folder / 'second_traverse'
     for bag in bags:
         remove_earlier_bag(bag)
-    world = World(seed)
+    world = World()
     first, second = first_traverse(world), second_traverse(world)
     for traverse, bag in zip((first, second), bags, strict=True):
         write_bag(bag, TOPIC, _records(traverse, bag.name.replace('_', ' ')))
@@ -108,7 +108,7 @@ def synthetic_pair(folder: Path, seed: int) -> TraversePair:
     return TraversePair(reference, query, nearest_places(first, second), title)
 
 
-def synthetic_loop(folder: Path, seed: int, exclude: int, tolerance: int) -> LoopTraverse:
+def synthetic_loop(folder: Path, exclude: int, tolerance: int) -> LoopTraverse:
     """
     Traverse a synthetic street twice, in the afternoon on the other lane, and write one bag.
 
@@ -118,7 +118,7 @@ def synthetic_loop(folder: Path, seed: int, exclude: int, tolerance: int) -> Loo
     """
     bag = folder / 'loop'
     remove_earlier_bag(bag)
-    world = World(seed)
+    world = World()
     first, second = first_traverse(world), second_traverse(world, conditions=LATER)
     epoch = int(first.stamps[-1] + first.stamps[1] - first.stamps[0])
     both = chain(_records(first, 'first time'), _records(second, 'second time', epoch))

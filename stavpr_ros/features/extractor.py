@@ -82,7 +82,7 @@ class LocalFeatures:
         """Return the number d of dimensions of a strip."""
         return self.strips.shape[2]
 
-    def __getitem__(self, images: slice) -> 'LocalFeatures':
+    def __getitem__(self, images: slice | np.ndarray) -> 'LocalFeatures':
         strips, weights = self.strips[:, images], self.weights[:, images]
         return dataclasses.replace(self, strips=strips, weights=weights)
 

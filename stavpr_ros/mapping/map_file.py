@@ -167,7 +167,7 @@ class StoredFeatures(LocalFeatures):
     def __repr__(self) -> str:
         return f'StoredFeatures({str(self._path)!r}, shape {self._shape}, {self.settings})'
 
-    def __getitem__(self, images: slice) -> LocalFeatures:
+    def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
         return LocalFeatures(
             self.strips[:, images], self.weights[:, images], self.settings, self.cells
         )

@@ -27,7 +27,6 @@ from stavpr_ros.demonstration.street.street import (
     VAN,
 )
 from stavpr_ros.demonstration.street.surfaces import hash01, noise
-from stavpr_ros.errors import SettingsError
 from stavpr_ros.sources.frame import Frame
 
 RATE = 5.0  # images per second
@@ -92,16 +91,9 @@ class World:
     A synthetic street, and another one that is the detour of the second traverse.
 
     :param seed: equal seeds give equal worlds.
-    :raises SettingsError: the seed is negative or too large.
     """
 
     seed: int = 7
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.seed < 2**31:
-            raise SettingsError(
-                f'seed of the world is {self.seed}; expected an integer from 0 to 2**31 - 1'
-            )
 
     @cached_property
     def streets(self) -> tuple[Street, Street]:
