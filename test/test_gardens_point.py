@@ -55,7 +55,7 @@ def test_node_on_gardens_point_equals_library(
     expected = image_matches(offline, 20)
 
     parameters = {'map_path': map_path, 'threshold': threshold, 'mode': mode}
-    records = run_live(parameters, str(bags / 'day_right'), len(query), tmp_path)
+    records, _ = run_live(parameters, str(bags / 'day_right'), len(query), tmp_path)
     truth = np.arange(len(query))
     live = evaluate_records(records, 20, threshold, truth, TOLERANCE).matches
 

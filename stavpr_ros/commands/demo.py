@@ -193,7 +193,7 @@ def _localization(arguments: argparse.Namespace, folder: Path) -> None:
         'sequence_length': length,
         'keyframe_change': 0.0,  # every image is evaluated
     }
-    records = run_live(parameters, pair.query.path, len(query), folder, pair.query.topic)
+    records, _ = run_live(parameters, pair.query.path, len(query), folder, pair.query.topic)
     result = evaluate_records(records, length, threshold, pair.true_places, arguments.tolerance)
     plot = folder / 'demo.png'
     draw_result(result, query, place_map, threshold, pair.title, plot)
@@ -217,7 +217,7 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
     from stavpr_ros.commands.feature_options import make_extractor
     from stavpr_ros.demonstration.loops import draw_loops, read_result
     from stavpr_ros.recognition.robust import LOOP_THRESHOLD
-    from stavpr_ros.ros.live import run_loop_closure
+    from stavpr_ros.ros.live import run_live
 
     exclude = arguments.exclude_places or EXCLUDE_PLACES
     length = arguments.sequence_length
@@ -237,6 +237,7 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
 
     _print('2. The traverse through the node, over ROS, with a replay and recorders')
     parameters = {
+        'operation': 'loop_closure',
         'map_path': features,
         'mode': arguments.mode,
         'threshold': arguments.threshold or LOOP_THRESHOLD,
@@ -244,7 +245,7 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
         'exclude_places': exclude,
         'geometric_check': arguments.geometric_check or GEOMETRIC_CHECK,
     }
-    matches, closures = run_loop_closure(
+    matches, closures = run_live(
         parameters, recording.path, len(place_map), folder, recording.topic
     )
     result = read_result(matches, closures, traverse.ground_truth, exclude)

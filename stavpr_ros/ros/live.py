@@ -4,7 +4,6 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, ExitStack
-from dataclasses import dataclass
 from functools import partial
 import json
 import math
@@ -24,19 +23,7 @@ END_TIMEOUT = 20.0  # seconds for a process to end, or for the last record
 POLL_SECONDS = 0.05
 
 Process = subprocess.Popen[bytes]
-
-
-@dataclass(frozen=True)
-class _Recorder:
-    """A ``record`` process: its name, its options, and the file of its records."""
-
-    name: str
-    file: str
-    options: tuple[str, ...] = ()
-
-
-MATCHES = _Recorder('record', 'matches.jsonl')
-LOOP_CLOSURES = _Recorder('record_loop_closures', 'loop_closures.jsonl', ('--loop-closures',))
+Records = list[dict[str, Any]]
 
 
 def executable(name: str) -> str:
@@ -68,85 +55,60 @@ def run_live(
     images: int,
     folder: Path,
     topic: str | None = None,
-) -> list[dict[str, Any]]:
+) -> tuple[Records, Records]:
     """
-    Replay a query losslessly into a node and return the recorded matches.
+    Replay a query losslessly into a node and return what was recorded.
 
     :param node_parameters: of the node, name to value.
     :param query: the bag or folder of images to replay.
     :param images: number of its images.
-    :param folder: for the logs and ``matches.jsonl``.
+    :param folder: for the logs, ``matches.jsonl``, and in operation loop_closure
+        ``loop_closures.jsonl``.
     :param topic: image topic of the bag; None = its only one.
-    :returns: one record per image, see the command ``record``.
-    :raises StavprError: a process failed; names its log.
-    """
-    return _replay_into_node(node_parameters, query, images, folder, topic, (MATCHES,))
-
-
-def run_loop_closure(
-    node_parameters: dict[str, Any],
-    query: str,
-    images: int,
-    folder: Path,
-    topic: str | None = None,
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """
-    Replay a traverse losslessly into a node in operation loop_closure.
-
-    ``matches.jsonl`` and ``loop_closures.jsonl`` are written into the folder. The parameters are
-    those of :func:`run_live`.
-
     :returns: one match per image, and the loop closures; see the command ``record``.
     :raises StavprError: a process failed; names its log.
     """
-    parameters = node_parameters | {'operation': 'loop_closure'}
-    recorders = (MATCHES, LOOP_CLOSURES)
-    matches = _replay_into_node(parameters, query, images, folder, topic, recorders)
-    return matches, _records(folder / LOOP_CLOSURES.file)
-
-
-def _replay_into_node(
-    node_parameters: dict[str, Any],
-    query: str,
-    images: int,
-    folder: Path,
-    topic: str | None,
-    recorders: tuple[_Recorder, ...],
-) -> list[dict[str, Any]]:
-    """Run all processes; return the matches."""
     environment = private_domain()
     parameters = [f'{name}:={value}' for name, value in node_parameters.items()]
     node = [executable('node'), '--ros-args', *(word for p in parameters for word in ('-p', p))]
     replay = [executable('replay'), query, '--lossless', '--wait', '120']
     replay += [] if topic is None else ['--topic', topic]
+    record = [executable('record'), '--output']
+    matches, closures = folder / 'matches.jsonl', folder / 'loop_closures.jsonl'
+    recorders = {'record': [*record, str(matches)]}
+    if node_parameters.get('operation') == 'loop_closure':
+        recorders['record_loop_closures'] = [*record, str(closures), '--loop-closures']
+    for file in (matches, closures):
+        file.unlink(missing_ok=True)
+
+    def complete() -> bool:
+        """Return whether all images have a match, and accepted ones their loop closure."""
+        found = _records(matches)
+        accepted = sum(match['status'] == 'MATCH' for match in found)
+        enough = len(recorders) == 1 or len(_records(closures)) >= accepted
+        return len(found) >= images and enough
+
     with ExitStack() as stack:
         processes: dict[str, Process] = {}
-
-        def start(name: str, command: list[str]) -> None:
-            log = folder / f'{name}.log'
-            processes[name] = stack.enter_context(_running(command, log, environment))
+        for name, command in {'node': node, **recorders}.items():
+            running = _running(command, folder / f'{name}.log', environment)
+            processes[name] = stack.enter_context(running)
 
         def wait_until(done: Callable[[], bool], seconds: float, event: str) -> None:
             _wait_until(done, processes, folder, seconds, event)
 
-        start('node', node)
-        for recorder in recorders:
-            file = folder / recorder.file
-            file.unlink(missing_ok=True)
-            command = [executable('record'), '--output', str(file), *recorder.options]
-            start(recorder.name, command)
-        for recorder in recorders:
-            log = folder / f'{recorder.name}.log'
+        for name in recorders:
+            log = folder / f'{name}.log'
             wait_until(partial(_is_recording, log), START_TIMEOUT, 'the node')
         with _running(replay, None, environment) as player:
             wait_until(lambda: player.poll() is not None, math.inf, 'the end of the replay')
         if player.returncode != 0:
             raise StavprError(f'the replay ended with {player.returncode}, see {folder}/node.log')
-        wait_until(lambda: _complete(folder, images, recorders), END_TIMEOUT, 'the last record')
-    matches = _records(folder / MATCHES.file)
-    if len(matches) != images:
-        raise StavprError(f'{len(matches)} matches of {images} images, see the logs in {folder}')
-    return matches
+        wait_until(complete, END_TIMEOUT, 'the last record')
+    found = _records(matches)
+    if len(found) != images:
+        raise StavprError(f'{len(found)} matches of {images} images, see the logs in {folder}')
+    return found, _records(closures)
 
 
 @contextmanager
@@ -195,22 +157,10 @@ def _wait_until(
 
 def _is_recording(log: Path) -> bool:
     """Return whether a recorder has logged that it misses no more messages."""
-    return any(line.startswith('recording') for line in _lines(log))
+    return any(line.startswith('recording') for line in log.read_text().splitlines())
 
 
-def _complete(folder: Path, images: int, recorders: tuple[_Recorder, ...]) -> bool:
-    """Return whether every image has its match, and every accepted match its loop closure."""
-    if len(_lines(folder / MATCHES.file)) < images:
-        return False
-    if LOOP_CLOSURES not in recorders:
-        return True
-    accepted = sum(record['status'] == 'MATCH' for record in _records(folder / MATCHES.file))
-    return len(_lines(folder / LOOP_CLOSURES.file)) >= accepted
-
-
-def _lines(path: Path) -> list[str]:
-    return path.read_text().splitlines() if path.exists() else []
-
-
-def _records(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in _lines(path)]
+def _records(path: Path) -> Records:
+    """Return the records in a file; a line that is still being written is left out."""
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    return [json.loads(line) for line in lines if line.endswith('\n')]
