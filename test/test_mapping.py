@@ -74,8 +74,8 @@ def test_save_map_without_extras_loads(route, tmp_path):
     loaded = load_map(tmp_path / 'plain.stavpr')
     assert_same(plain, loaded)
     assert loaded.thumbnail(0) is None
-    assert not loaded.has_stamps
-    assert not loaded.has_ids
+    assert not loaded.stamps.any()
+    assert not any(loaded.ids)
 
 
 def test_recognizer_with_other_features_rejects_them(small_map, route):

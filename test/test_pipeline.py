@@ -26,7 +26,7 @@ import pytest
 from stavpr_ros.alignment import SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import load_map, place_at, place_thumbnail, save_map
+from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.pipeline import OPERATIONS, Pipeline, read_map
 from stavpr_ros.recognition import PlaceRecognizer, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
@@ -169,12 +169,12 @@ def test_loop_closure_evicts_places_and_indices_stay(route):
                 assert match.newest_index == i - 60
                 closed += 1
         for index in indices:
-            place = place_at(places, index)
+            place = places.place(index)
             assert (place.stamp, place.pose[0]) == ((index + 1) * SECOND, index)
     assert closed == 240 - 60 - LENGTH
     assert firsts == set(range(0, 145, 12))  # an eighth of 100 at a time
     for place in (150, 200, 239):
-        thumbnail = place_thumbnail(pipeline.places, place).astype(float)
+        thumbnail = pipeline.places.thumbnail(place).astype(float)
         errors = [np.abs(thumbnail - images[i]).mean() for i in (place, place - 5)]
         assert errors[0] < 20 < errors[1]
     assert stamps_of(pipeline.places) == list(range(145, 241))

@@ -11,8 +11,7 @@ from stavpr_ros.mapping.keyframes import (
     small_gray,
 )
 from stavpr_ros.mapping.map_file import load_map, open_map, save_map
-from stavpr_ros.mapping.place import Place, place_at, place_thumbnail
-from stavpr_ros.mapping.place_map import encode_thumbnail, PlaceMap
+from stavpr_ros.mapping.place_map import encode_thumbnail, Place, PlaceMap
 from stavpr_ros.mapping.trajectory import distance, rotation, Trajectory
 
 __all__ = [
@@ -29,8 +28,6 @@ __all__ = [
     'image_change',
     'load_map',
     'open_map',
-    'place_at',
-    'place_thumbnail',
     'rotation',
     'save_map',
     'small_gray',

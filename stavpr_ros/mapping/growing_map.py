@@ -8,7 +8,7 @@ import dataclasses
 import numpy as np
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures, Projection
-from stavpr_ros.mapping.place_map import PlaceMap, require_projection
+from stavpr_ros.mapping.place_map import decode_thumbnail, Place, PlaceMap, require_projection
 from stavpr_ros.mapping.trajectory import checked_pose
 import torch
 
@@ -130,20 +130,16 @@ class GrowingMap:
         """Return a small JPEG of each place, an empty one = none: not a copy."""
         return self._thumbnails
 
-    @property
-    def has_stamps(self) -> bool:
-        """Return whether some place has a stamp."""
-        return bool(np.any(self.stamps))
+    def place(self, index: int) -> Place:
+        """Return stamp, identifier and pose of a place; counted as by :meth:`add`."""
+        i = index - self._first
+        pose = self._poses[i]
+        known = pose.copy() if np.isfinite(pose).all() else None
+        return Place(int(self._stamps[i]), self._ids[i], known)
 
-    @property
-    def has_ids(self) -> bool:
-        """Return whether some place has an external identifier."""
-        return any(self._ids)
-
-    @property
-    def has_poses(self) -> bool:
-        """Return whether some place has a pose."""
-        return bool(np.isfinite(self.poses).any())
+    def thumbnail(self, index: int) -> np.ndarray | None:
+        """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None; counted likewise."""
+        return decode_thumbnail(self._thumbnails[index - self._first])
 
     @property
     def memory(self) -> int:

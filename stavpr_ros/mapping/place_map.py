@@ -14,6 +14,21 @@ THUMBNAIL_WIDTH = 192  # pixels
 
 
 @dataclass(frozen=True)
+class Place:
+    """
+    Stamp, identifier and pose of a place.
+
+    :param stamp: ns, 0 = unknown.
+    :param identifier: external identifier, '' = none.
+    :param pose: x y z (meters) and quaternion x y z w, shape (7,), or None.
+    """
+
+    stamp: int = 0
+    identifier: str = ''
+    pose: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
 class PlaceMap:
     """
     Places in the order of the route; place i is column i of everything.
@@ -66,16 +81,6 @@ class PlaceMap:
         return self.features.dimension
 
     @cached_property
-    def has_stamps(self) -> bool:
-        """Any place has a stamp."""
-        return bool(np.any(self.stamps))
-
-    @cached_property
-    def has_ids(self) -> bool:
-        """Any place has an external identifier."""
-        return any(self.ids)
-
-    @cached_property
     def has_poses(self) -> bool:
         """Any place has a pose."""
         return self.poses is not None and not bool(np.isnan(self.poses[:, 0]).all())
@@ -85,6 +90,10 @@ class PlaceMap:
         if self.poses is None or np.isnan(self.poses[place, 0]):
             return None
         return self.poses[place]
+
+    def place(self, index: int) -> Place:
+        """Return stamp, identifier and pose of a place."""
+        return Place(int(self.stamps[index]), self.ids[index], self.pose(index))
 
     def extractor(self, device: str = 'cpu', model: str = '') -> FeatureExtractor:
         """
@@ -97,10 +106,7 @@ class PlaceMap:
 
     def thumbnail(self, place: int) -> np.ndarray | None:
         """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None."""
-        if not self.thumbnails or not self.thumbnails[place]:
-            return None
-        image = cv2.imdecode(np.frombuffer(self.thumbnails[place], np.uint8), cv2.IMREAD_COLOR)
-        return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        return decode_thumbnail(self.thumbnails[place]) if self.thumbnails else None
 
 
 def require_projection(projection: Projection | None, settings: FeatureSettings) -> None:
@@ -143,3 +149,9 @@ def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
     if not done:
         raise InputError(f'no JPEG could be made of an image of shape {image.shape}')
     return encoded.tobytes()
+
+
+def decode_thumbnail(content: bytes) -> np.ndarray | None:
+    """Return the image of a thumbnail, RGB (h, w, 3) uint8; None of an empty or damaged one."""
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
+    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

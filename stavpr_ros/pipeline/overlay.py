@@ -7,7 +7,7 @@ import math
 import cv2
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping import GrowingMap, place_thumbnail, PlaceMap
+from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.recognition import Match
 
 RIGHT, NO_MATCH = (46, 125, 80), (200, 150, 40)  # RGB
@@ -31,7 +31,7 @@ def draw_match(match: Match, places: PlaceMap | GrowingMap | None) -> np.ndarray
         text += f' (threshold {match.threshold:.3f})'
     if match.inliers >= 0:
         text += f', {match.inliers} inliers'
-    return match_image(match.image, place_thumbnail(places, place), text, match.accepted)
+    return match_image(match.image, places.thumbnail(place), text, match.accepted)
 
 
 def match_image(

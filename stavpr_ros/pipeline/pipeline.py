@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, MapFileError, StavprError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, place_thumbnail, PlaceMap
+from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.pipeline.operations import Mapping, Observation, Operation
@@ -251,7 +251,7 @@ class Pipeline:
         """Verify a match against the thumbnail of its place; reject too few inliers."""
         if self._verifier is None or not match.accepted:
             return match
-        thumbnail = place_thumbnail(places, match.newest_index)
+        thumbnail = places.thumbnail(match.newest_index)
         if thumbnail is None:
             reason = 'geometric check: the map has no thumbnails; build it with thumbnails'
             return replace(match, status=Status.NO_MATCH, reason=reason)

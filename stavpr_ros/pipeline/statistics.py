@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import math
 import threading
 import time
-from typing import Generic, Literal, TypeVar
+from typing import Generic, TypeVar
 
 RECENT = 10
 """Length of the window behind rates, recent counts and times [s]."""
@@ -215,19 +215,6 @@ class Statistics:
         self._counts = replace(self._counts, **changes)  # type: ignore[arg-type]
 
 
-@dataclass(frozen=True)
-class StampEvent:
-    """
-    An irregularity between two stamps.
-
-    :param kind: ``'gap'``: a pause; ``'jump back'``: an earlier stamp, as when a bag starts again.
-    :param seconds: length of the gap or of the jump; above 0.
-    """
-
-    kind: Literal['gap', 'jump back']
-    seconds: float
-
-
 class StampWatch:
     """
     Compares each stamp with the newest one; for one thread, while any may set ``gap``.
@@ -239,28 +226,26 @@ class StampWatch:
         self.gap = gap
         self._newest = 0
 
-    def see(self, stamp: int) -> StampEvent | None:
+    def see(self, stamp: int) -> float:
         """
-        Take the next stamp and return its irregularity, if any.
+        Take the next stamp; return the seconds of a gap, minus those of a jump back, 0 = neither.
 
-        A reordered image does not move the newest stamp back: otherwise the image after it would
-        seem to come after a gap.
+        A jump back is an earlier stamp, as when a bag starts again. A reordered image does not
+        move the newest stamp back: otherwise the image after it would seem to come after a gap.
 
         :param stamp: nanoseconds; 0 = unknown, ignored.
         """
         if stamp == 0:
-            return None
+            return 0.0
         newest, self._newest = self._newest, stamp
         if newest == 0:
-            return None
+            return 0.0
         ahead = (stamp - newest) / NANOSECONDS
         if ahead <= -REORDERING_SECONDS:
-            return StampEvent('jump back', -ahead)
+            return ahead
         if ahead < 0:
             self._newest = newest
-        elif 0 < self.gap < ahead:
-            return StampEvent('gap', ahead)
-        return None
+        return ahead if 0 < self.gap < ahead else 0.0
 
 
 def _sum(counted: Iterable[tuple[str, int]]) -> dict[str, int]:

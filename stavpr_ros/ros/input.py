@@ -139,13 +139,13 @@ class ImageInput:
 
     def _check_stamp(self, stamp: int) -> None:
         """Count gaps of the stamps; restart after a jump back."""
-        event = self.stamps.see(stamp)
-        if event is not None and event.kind == 'gap':
-            self._statistics.gap(event.seconds)
-        elif event is not None:
-            self._statistics.jump_back(event.seconds)
+        ahead = self.stamps.see(stamp)
+        if ahead > 0:
+            self._statistics.gap(ahead)
+        elif ahead < 0:
+            self._statistics.jump_back(-ahead)
             self._last = None
-            self._restart(f'the stamps of the images jumped back by {event.seconds:.3f} s')
+            self._restart(f'the stamps of the images jumped back by {-ahead:.3f} s')
 
     def _exceeds_rate(self, stamp: int, arrival: float) -> str:
         """Return why an image exceeds ``max_rate``, by stamps, or by arrival without them."""

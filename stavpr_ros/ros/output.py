@@ -27,7 +27,7 @@ from stavpr_msgs.msg import (
     PlaceMatch,
 )
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, place_at, PlaceMap
+from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.map_file import VERSION
 from stavpr_ros.pipeline.overlay import draw_match
 from stavpr_ros.recognition import Match, Status
@@ -99,7 +99,7 @@ def match_message(
         message.second_best_index = sequence.second_best_index
         message.second_best_distance = sequence.second_best_distance
     if match.accepted and places is not None:
-        place, newest = place_at(places, match.place_index), place_at(places, match.newest_index)
+        place, newest = places.place(match.place_index), places.place(match.newest_index)
         message.place_stamp, message.place_id = time_message(place.stamp), place.identifier
         message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
     return message
@@ -113,7 +113,7 @@ def candidates_message(
         return None
     message = PlaceCandidates(header=header, threshold=match.threshold)
     for candidate in match.candidates:
-        place = place_at(places, candidate.place)
+        place = places.place(candidate.place)
         message.candidates.append(
             PlaceCandidate(
                 place_index=candidate.place,
@@ -135,14 +135,14 @@ def loop_closure_message(
     pairs = [
         AlignedPlaces(
             query_index=first + q,
-            query_stamp=time_message(place_at(route, first + q).stamp),
+            query_stamp=time_message(route.place(first + q).stamp),
             place_index=m,
-            place_stamp=time_message(place_at(route, m).stamp),
+            place_stamp=time_message(route.place(m).stamp),
         )
         for q, m in match.path.tolist()
     ]
     middle = first + (len(match.window_stamps) - 1) // 2
-    query, place = place_at(route, middle), place_at(route, match.place_index)
+    query, place = route.place(middle), route.place(match.place_index)
     message = LoopClosure(
         header=header,
         query_index=middle,
@@ -177,14 +177,12 @@ def matched_pose_message(
     if not match.accepted or places is None:
         return None
     newest = match.newest_index
-    pose = place_at(places, newest).pose
+    pose = places.place(newest).pose
     if pose is None:
         return None
     first = places.first if isinstance(places, GrowingMap) else 0
     around = range(max(first, newest - 2), min(first + len(places), newest + 3))
-    near = np.array(
-        [near for near in (place_at(places, i).pose for i in around) if near is not None]
-    )
+    near = np.array([near for near in (places.place(i).pose for i in around) if near is not None])
     turns = Rotation.from_quat(near[:, 3:]) * Rotation.from_quat(pose[3:]).inv()
     variances = np.append(np.var(near[:, :3], axis=0), np.var(turns.as_rotvec(), axis=0))
     message = PoseWithCovarianceStamped()
@@ -231,8 +229,8 @@ def map_info_message(
         message.places = len(places)
         if len(places):
             message.dimension = places.dimension
-        message.has_stamps, message.has_ids = places.has_stamps, places.has_ids
-        message.has_poses = places.has_poses
+        message.has_stamps, message.has_ids = bool(np.any(places.stamps)), any(places.ids)
+        message.has_poses = places.poses is not None and bool(np.isfinite(places.poses).any())
         message.has_thumbnails = any(places.thumbnails)
     return message
 
