@@ -68,11 +68,7 @@ class Memory:
 
 @dataclass(frozen=True)
 class SyntheticSettings:
-    """
-    Settings of the synthetic features.
-
-    :param d: dimensions of a strip.
-    """
+    """Settings of the synthetic features."""
 
     d: int
 

@@ -62,7 +62,6 @@ class Run:
 
         :param size: places n, dimensions d (0 for a stage that reads no features).
         :param works: for its lower bound.
-        :param extra: further values of the row.
         """
         n, d = size
         self._bar.set_description(f'{stage} {mode} n={n:,} d={d} {precision}')

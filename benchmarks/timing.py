@@ -21,7 +21,6 @@ class Timing:
     """
     Summary of the runs of one job.
 
-    :param median_s: median, seconds.
     :param spread_s: interquartile range, seconds.
     :param runs: number of runs, warm-up excluded.
     """
@@ -78,7 +77,6 @@ def measure(jobs: Mapping[str, Job], seconds: float = 0.5) -> dict[str, Timing]:
     job under 10 ms runs once more, uncounted, directly before each counted run: the caches and the
     sleeping threads that another job left behind are not a property of this one.
 
-    :param jobs: by name.
     :param seconds: total time of the counted rounds; 7 to 101 rounds, 3 where a round exceeds 1 s.
     """
     round_s = 0.0

@@ -44,7 +44,6 @@ def draw_result(
     Draw the page of a result.
 
     :param query: a map of the query, with thumbnails.
-    :param path: of the PNG file.
     """
     recognizer = PlaceRecognizer(place_map, RecognizerSettings(threshold=1.0))
     outcomes = outcomes_of(result)
@@ -110,7 +109,6 @@ def demo_sheet(
 
     :param pairs: six fill two rows of three.
     :param distances: every query to every place, shape (N, n).
-    :param threshold: matches are accepted below it.
     """
     above, below = 0.5 + 1.52 * max(1, -(-len(pairs) // 3)), 4.2
     with page(path, 11, 0.75 + above + below) as figure:

@@ -108,11 +108,7 @@ class PublishedNetwork:
 
 
 class VGG16(nn.Module):
-    """
-    All parameters of the network, under their names in torchvision's file.
-
-    :param classes: outputs of the last layer.
-    """
+    """All parameters of the network, under their names in torchvision's file."""
 
     def __init__(self, classes: int = 1000) -> None:
         super().__init__()
@@ -194,11 +190,7 @@ class Transition(nn.Module):
 
 
 class DenseNet161(nn.Module):
-    """
-    All parameters of the network, under their names in the published files.
-
-    :param classes: outputs of the last layer.
-    """
+    """All parameters of the network, under their names in the published files."""
 
     def __init__(self, classes: int = 365) -> None:
         super().__init__()

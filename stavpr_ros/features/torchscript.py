@@ -88,7 +88,6 @@ def up_to_module(
     Return a function from images to the output of an inner module; nothing after it is computed.
 
     :param layer: path of the module, such as ``features.23``; of several calls, the last counts.
-    :param name: of the file, for errors.
     :raises SettingsError: no such module, or it is called in a branch or loop, or not at all.
     """
     modules = [path for path, _ in network.named_modules() if path]

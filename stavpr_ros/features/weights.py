@@ -31,7 +31,6 @@ class PublishedFile:
     """
     A file of weights on the server of its authors.
 
-    :param address: its URL.
     :param sha256: the first digits of its hash as published by the authors, '' if unpublished.
     """
 
@@ -190,7 +189,6 @@ def read_checkpoint(file: BinaryIO, name: str) -> dict[str, torch.Tensor]:
     than tensors, numbers and containers is rejected. A prefix ``module.`` (of DataParallel) is
     removed.
 
-    :param name: of the file, for errors.
     :raises UnavailableError: it is damaged, no checkpoint, or requires code to be executed.
     """
     try:
@@ -230,7 +228,6 @@ def load_parameters(network: nn.Module, parameters: Mapping[str, torch.Tensor], 
     Load all parameters of a network, which must be there and fit, and no others; cpu, float32.
 
     :param network: may be on the device ``meta``, without memory of its own.
-    :param name: of the file, for errors.
     :raises UnavailableError: a parameter is missing, unknown, of another shape, or not finite.
     """
     state = network.state_dict()

@@ -22,7 +22,6 @@ class GrowingMap:
     Adding is cheap: memory doubles when it is full, up to ``limit`` places. The oldest places may
     be evicted; place i of the map is place ``first`` + i of all added ones. Not thread-safe.
 
-    :param settings: of the features.
     :param projection: the random projection of the features, if they have one.
     :param limit: most places kept, at least 1.
     :param cells: see :class:`LocalFeatures`; taken from the first place if not given.
@@ -161,7 +160,6 @@ class GrowingMap:
 
         :param features: those of one image, strips (W, 1, d).
         :param stamp: time of its image, ns; 0 = unknown.
-        :param identifier: external identifier.
         :param pose: x y z (meters) and quaternion x y z w, shape (7,); None = unknown.
         :param thumbnail: a small JPEG, see :func:`encode_thumbnail`.
         :returns: number of the place, counting all added places.

@@ -148,10 +148,6 @@ class StoredFeatures(LocalFeatures):
 
     Every access to ``strips`` and ``weights`` reads and checks them; ``features[:]`` reads both.
     The file stays open, so that it may be replaced or deleted. Thread-safe.
-
-    :param features: the features in the file.
-    :param file: the map file.
-    :param path: its name, for error messages.
     """
 
     def __init__(self, features: LocalFeatures, file: IO[bytes], path: Path) -> None:

@@ -36,7 +36,6 @@ class Pipeline:
     """
     Processes image messages. All calls but those of properties must come from one thread.
 
-    :param settings: see :class:`PipelineSettings`.
     :param operation: one of ``OPERATIONS``.
     :raises StavprError: invalid settings, or a missing model.
     """

@@ -39,7 +39,6 @@ def save_recorded_map(
     A file of another map is not overwritten, a numbered name beside it is used.
 
     :param path: '' = nowhere; the loss is logged.
-    :param log: the logger of the node.
     """
     try:
         unsaved = on_worker(lambda: pipeline.unsaved)  # includes the image being processed

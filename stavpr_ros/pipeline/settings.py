@@ -30,7 +30,6 @@ class PipelineSettings:
 
     :param threshold: a window is matched when its distance is below it; None = the default of the
         mode, mode paper has none.
-    :param backend: ``auto``, ``cpu`` or ``cuda``.
     :param features: kind of the features of a route that starts without a map.
     :param feature_settings: settings of that kind as a JSON object, '' = its defaults.
     :param candidates: nearest places that every match lists.
@@ -163,7 +162,6 @@ class NodeSettings:
     """
     Settings of the node, parameters of these names.
 
-    :param pipeline: settings of the pipeline.
     :raises SettingsError: the operation and the settings of the pipeline exclude each other.
     """
 
@@ -195,7 +193,6 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
     """
     Build the settings from the values of all parameters.
 
-    :param values: name to value.
     :raises SettingsError: a value out of range, or values that exclude each other.
     :raises UnavailableError: the backend is not available.
     """

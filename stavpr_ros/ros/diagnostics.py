@@ -34,7 +34,6 @@ class DiagnosticsPublisher:
     """
     Publishes on ``/diagnostics`` from a thread with a steady clock: a paused bag does not stop it.
 
-    :param node: the publisher's node.
     :param period: seconds.
     :param health: returns the state of the node; called from the thread.
     """
@@ -68,7 +67,6 @@ def diagnostic_array(health: Health, node: str, stamp: Time) -> DiagnosticArray:
     Return the four statuses of a node: input, map, recognition, processing.
 
     :param node: its full name, the first part of the statuses' names without the leading slash.
-    :param stamp: of the array.
     """
     # a node that is not active is so on purpose: a permanent warning on standby would be ignored
     idle = [] if health.state == 'active' else [(OK, inactive_text(health.state, node))]

@@ -33,9 +33,6 @@ class Health:
 
     :param state: label of the life-cycle state.
     :param problem: cause of the last failed transition or load; empty = none failed.
-    :param settings: in force.
-    :param counts: of its images.
-    :param map_info: the map in use.
     :param loading: path of the map that is being loaded by a service; empty = none.
     :param input: topic and publishers of the images; empty while the node is not active.
     :param odometry: fresh, stale or never; empty = no parameter needs it.

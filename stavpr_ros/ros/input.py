@@ -53,7 +53,6 @@ class ImageInput:
     """
     The subscription to images.
 
-    :param node: its node.
     :param settings: transport, maximum rate, and the longest gap of stamps.
     :param statistics: counts images, gaps, jumps and losses.
     :param enqueue: called with a message and its time of arrival, seconds.
@@ -169,8 +168,6 @@ class Worker:
     Calls, such as a change of the map, run on the same thread before the next item: objects that
     the thread owns need no lock.
 
-    :param process: called with each item.
-    :param capacity: maximum number of waiting items.
     :param ending: set when callers must not wait any longer.
     """
 

@@ -66,7 +66,6 @@ def match_message(
     """
     Return the message of a match.
 
-    :param header: of the image.
     :param places: the map that the indices of the match refer to.
     """
     message = PlaceMatch(
@@ -208,11 +207,7 @@ def map_info_message(
     extractor: FeatureExtractor | None,
     stamp: Time,
 ) -> MapInfo:
-    """
-    Return the description of the map in use.
-
-    :param state: see the message.
-    """
+    """Return the description of the map in use."""
     message = MapInfo(
         header=Header(stamp=stamp),
         operation=operation,
@@ -239,7 +234,6 @@ class Output:
     """
     The publishers of matches.
 
-    :param node: their node.
     :param burst: matches that may be published at once.
     """
 
@@ -280,7 +274,6 @@ class Output:
         Publish the results for one image, ``~/match`` last; return that message.
 
         :param places: the map that the indices of the match refer to.
-        :param frame: of the poses.
         """
         message = match_message(header, match, places)
         try:

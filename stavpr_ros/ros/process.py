@@ -92,7 +92,6 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
     rclpy's own signal handlers are not installed: they shut the context down at once (see
     ros2/rclpy#1287), while the worker may be publishing and before the node has saved its map.
 
-    :param make: makes the node.
     :param arguments: without the program's name; the process's own if None.
     :raises SettingsError: the arguments after ``--ros-args`` are invalid.
     """

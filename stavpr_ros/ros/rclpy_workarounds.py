@@ -119,8 +119,6 @@ class ManagedNode(LifecycleNodeMixin, Node):
 
     Its services are reentrant, so that the state can be read during a transition; hence the lock
     against two transitions at once. ``LifecycleNode`` has no option for their callback group.
-
-    :param name: of the node.
     """
 
     def __init__(self, name: str, **options: Any) -> None:

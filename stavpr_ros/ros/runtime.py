@@ -41,9 +41,6 @@ class Runtime:
     """
     Everything between the configuration of the node and its cleanup.
 
-    :param node: the node.
-    :param settings: of the node.
-    :param statistics: counts images.
     :param on_map_change: called when the map, or its loading state, has changed.
     :raises StavprError: invalid settings, or an invalid map or model.
 

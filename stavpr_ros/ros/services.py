@@ -22,10 +22,7 @@ class Services:
 
     They share a callback group of their own: a long request delays neither images nor diagnostics.
 
-    :param node: their node.
     :param runtime: returns the runtime; raises StavprError while the node is not configured.
-    :param load_map: loads a map and uses it.
-    :param set_operation: changes the operation.
     """
 
     def __init__(

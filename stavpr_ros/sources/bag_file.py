@@ -28,7 +28,6 @@ class OpenBag:
     """
     A bag that is open for reading.
 
-    :param reader: of rosbags.
     :param deserialize: (bytes, message type) to message. Only types of ``sensor_msgs`` and
         ``nav_msgs`` are read, equal in every distribution: no definition in the bag is needed.
     """

@@ -30,7 +30,6 @@ def write_bag(
     Write a bag with one topic of raw images; on an error the folder is removed.
 
     :param path: the bag's folder, which must not exist yet.
-    :param topic: topic of the images.
     :param records: the images, in the order of their times of recording.
     :param storage: ``sqlite3`` or ``mcap``.
     :returns: number of images written.

@@ -34,7 +34,6 @@ class FolderSource:
 
     Iterating yields :class:`Frame` with the file's name as identifier and an unknown stamp.
 
-    :param path: the folder.
     :param on_error: called with the :class:`ImageError` of a file that cannot be read, which is
         then skipped; without it the error is raised.
     :raises SourceError: there is no such folder, or no image in it.

@@ -30,9 +30,6 @@ class ImageRecord:
 
     :param time_ns: when it was recorded, nanoseconds: the pace of a replay.
     :param stamp_ns: header stamp, nanoseconds; may be 0 or repeat.
-    :param frame_id: header frame.
-    :param height: rows.
-    :param width: pixels per row.
     :param encoding: as in ``sensor_msgs/image_encodings``.
     :param is_bigendian: byte order of 16 bit values.
     :param step: bytes from one row to the next.
@@ -63,7 +60,6 @@ class ImageRecord:
         :param image: RGB, uint8, shape (height, width, 3).
         :param time_ns: when it was recorded, nanoseconds.
         :param stamp_ns: header stamp, nanoseconds; the time of recording if not given.
-        :param frame_id: header frame.
         """
         height, width = image.shape[:2]
         stamp = time_ns if stamp_ns is None else stamp_ns

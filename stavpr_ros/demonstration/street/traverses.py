@@ -105,10 +105,8 @@ class Traverse:
     """
     A traverse of a world: a sequence of images, rendered on access.
 
-    :param world: the world.
     :param along: of each image, meters along the street that the camera is in, shape (images,).
     :param detour: whether that is the detour, shape (images,), bool.
-    :param conditions: how it looks.
     :param epoch: stamp of the first image, ns.
     :param size: width and height of the images.
 
