@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.sources import open_source
-from stavpr_ros.sources.bag import BagSource, COMPRESSED, image_topics, RAW
+from stavpr_ros.sources.bag import BagSource, COMPRESSED, RAW
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 
@@ -68,7 +68,6 @@ def write_mixed(path, ros1=False, bad=()):
 def test_write_bag_then_open_source_is_identical(tmp_path, storage):
     path = tmp_path / 'bag'
     assert write_bag(path, '/camera/image', records(), storage) == 5
-    assert image_topics(path) == {'/camera/image': (RAW, 5)}
     file = next(file for file in path.iterdir() if file.suffix in {'.db3', '.mcap'})
     for place in (path, file):
         source = open_source(place)
@@ -94,7 +93,6 @@ def test_bag_without_header_stamps_uses_recording_time(tmp_path):
 @pytest.mark.parametrize('ros1', [False, True])
 def test_bag_raw_and_compressed_images_are_equal(tmp_path, ros1):
     path = write_mixed(tmp_path / 'mixed.bag', ros1)
-    assert image_topics(path) == {'/raw': (RAW, 5), '/silent': (RAW, 0), '/small': (COMPRESSED, 5)}
     for topic in ('/raw', '/small'):
         source = open_source(path, topic)
         for i, (original, frame, record) in enumerate(
@@ -251,7 +249,6 @@ def test_write_bag_never_overwrites_nor_leaves_parts(tmp_path):
 def test_bag_of_2019_is_read(data_folder):
     path = data_folder / 'bags' / 'klintan_rosbag2js_sample.db3'
     before = sorted(path.parent.iterdir())
-    assert image_topics(path) == {'/image': (RAW, 1), '/image/compressed': (COMPRESSED, 1)}
     for topic in ('/image', '/image/compressed'):
         (record,), (frame,) = open_source(path, topic).records(), open_source(path, topic)
         assert frame.image.shape == (480, 640, 3)
@@ -261,9 +258,8 @@ def test_bag_of_2019_is_read(data_folder):
 
 def test_bag_of_ros1_is_read(data_folder):
     path = data_folder / 'bags' / 'kapture_t265_trimmed_locoffice.bag'
-    topics = image_topics(path)
-    assert {count for _, count in topics.values()} == {3}
-    for topic in topics:
+    for camera in (1, 2):
+        topic = f'/camera/fisheye{camera}/image_raw'
         frames = list(open_source(path, topic))
         assert [frame.image.shape for frame in frames] == [(800, 848, 3)] * 3
         assert [round(gap / 1e6) for gap in np.diff([frame.stamp for frame in frames])] == [33, 33]

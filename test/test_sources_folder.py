@@ -66,7 +66,7 @@ def test_open_source_of_no_source_fails(tmp_path):
         open_source(tmp_path)
     with pytest.raises(SourceError, match='does not exist'):
         open_source(tmp_path / 'missing')
-    with pytest.raises(SourceError, match='is not a folder'):
+    with pytest.raises(SourceError, match='No such file or directory; check its name'):
         FolderSource(tmp_path / 'missing')
     fill(tmp_path, ['1.png'])
     with pytest.raises(SourceError, match='is no folder and no bag'):
@@ -87,9 +87,6 @@ def test_folder_without_permission_fails(tmp_path, monkeypatch, method):
         patch.setattr(Path, method, refuse)
         with pytest.raises(SourceError, match='Permission denied; check its name and permissions'):
             open_source(tmp_path)
-        if method != 'exists':
-            with pytest.raises(SourceError, match='Permission denied; check permissions'):
-                FolderSource(tmp_path)
 
 
 def test_folder_with_names_not_utf8_is_read(tmp_path):

@@ -179,13 +179,6 @@ def recognizer_settings(arguments: argparse.Namespace) -> 'RecognizerSettings':
     )
 
 
-def _default_threshold(mode: str) -> float | None:
-    """Return the default threshold of a mode; the paper publishes none."""
-    from stavpr_ros.recognition.robust import THRESHOLD
-
-    return THRESHOLD if mode == 'robust' else None
-
-
 def _evaluate(
     arguments: argparse.Namespace, sequences: 'Sequences', settings: 'RecognizerSettings'
 ) -> 'Evaluation':
@@ -233,6 +226,7 @@ def _report(arguments: argparse.Namespace) -> 'Report':
     from stavpr_ros.commands.evaluate_sequences import load_sequences
     from stavpr_ros.evaluation.metrics import import_sklearn
     from stavpr_ros.evaluation.report import Report
+    from stavpr_ros.recognition.robust import THRESHOLD
 
     began = time.perf_counter()
     import_sklearn()  # an error before the work, not after it
@@ -256,7 +250,7 @@ def _report(arguments: argparse.Namespace) -> 'Report':
         title=sequences.title,
         settings=_settings_json(arguments, sequences),
         times=times,
-        default_threshold=_default_threshold(arguments.mode),
+        default_threshold=THRESHOLD if arguments.mode == 'robust' else None,
         window=arguments.window,
     )
 

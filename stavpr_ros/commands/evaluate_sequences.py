@@ -20,7 +20,7 @@ from stavpr_ros.evaluation.warp import cropped, FrameSource, warp_indices
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, load_map, PlaceMap
 from stavpr_ros.sources import open_source
-from stavpr_ros.sources.bag import is_bag
+from stavpr_ros.sources.bag_file import is_bag
 from stavpr_ros.sources.folder import text_of
 
 IDENTITY_TOLERANCE = 3  # places; a file of accepted pairs includes its tolerance

@@ -5,7 +5,6 @@
 import argparse
 import json
 from pathlib import Path
-import shlex
 import sys
 from typing import Any, TYPE_CHECKING
 
@@ -41,8 +40,6 @@ examples:
   experiments paper --data folder_of_all --datasets nordland synth_nordland gardens_point
   experiments strategies --datasets gardens_point=data/gp --features onnx --onnx-model m.onnx \\
       --onnx-layer x
-  experiments ablation --data all --backbone 'small=--features gradient --gradient-cell 32' \\
-      --backbone 'net=--features onnx --onnx-model m.onnx --onnx-layer x'
   experiments sweep --parameter sigma --values 0 0.5 1 2 --data all
 
 exit codes: 0 done, 1 failed (the reason is printed), 2 usage, 130 interrupted
@@ -62,10 +59,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar='NAME[=FOLDER]',
         help='data sets to run (those of the paper in --data)',
     )
-    parser.add_argument(
-        '--backbone', action='append', metavar='LABEL=OPTIONS',
-        help='options of the features, in quotes; may be repeated (the options below)',
-    )  # fmt: skip
     parser.add_argument(
         '--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)'
     )
@@ -113,34 +106,7 @@ def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset]':
     return found
 
 
-def _backbones(arguments: argparse.Namespace) -> dict[str, argparse.Namespace]:
-    """Return the options of each row's features, by label."""
-    from stavpr_ros.commands.feature_options import add_feature_options
-
-    if not arguments.backbone:
-        arguments.features = arguments.features or 'gradient'
-        return {arguments.features: _checked(arguments)}
-    parser = argparse.ArgumentParser(prog='experiments --backbone', add_help=False)
-    add_feature_options(parser)
-    untouched = vars(parser.parse_args([], argparse.Namespace(features=None)))
-    if any(getattr(arguments, name) != value for name, value in untouched.items()):
-        raise SettingsError(
-            'options of features beside --backbone: write them into each --backbone'
-        )
-    found = {}
-    for entry in arguments.backbone:
-        label, separator, options = entry.partition('=')
-        if not separator:
-            raise SettingsError(f'--backbone {entry!r}: expected LABEL=OPTIONS')
-        try:
-            words = shlex.split(options)
-        except ValueError as error:
-            raise SettingsError(f'--backbone {entry!r}: {error}') from error
-        found[label] = _checked(parser.parse_args(words))
-    return found
-
-
-def _checked(options: argparse.Namespace) -> argparse.Namespace:
+def _check_features(options: argparse.Namespace) -> None:
     """Reject options of features that the experiment sets itself."""
     from stavpr_ros.evaluation.paper.experiments import W
 
@@ -148,14 +114,12 @@ def _checked(options: argparse.Namespace) -> argparse.Namespace:
         raise SettingsError(
             '--strips, --projection, --seed: the experiment sets them; leave them out'
         )
-    return options
 
 
 def _run_row(
     dataset: 'Dataset',
     options: argparse.Namespace,
     columns: 'tuple[Configuration, ...]',
-    mode: str,
     name: str,
 ) -> 'dict[str, Metrics | None]':
     """Run all columns of a row; None where the data set is too short for one."""
@@ -166,7 +130,7 @@ def _run_row(
 
     features = make_extractor(options).settings
     device = choose_device(options.device)
-    experiment = DatasetExperiment(dataset, features.kind, features.backbone, mode, device)
+    experiment = DatasetExperiment(dataset, features.kind, features.backbone, options.mode, device)
     found: dict[str, Metrics | None] = {}
     for column in tqdm(columns, desc=name, unit='column', disable=None):
         too_short = len(dataset.query) < column.sequence.length
@@ -213,18 +177,18 @@ def _run(arguments: argparse.Namespace) -> None:
     import_sklearn()
     if arguments.json:
         require_room(arguments.json)
-    columns, backbones, datasets = _columns(arguments), _backbones(arguments), _datasets(arguments)
+    _check_features(arguments)
+    columns, datasets = _columns(arguments), _datasets(arguments)
     rows = [['data set', 'features', *(column.title for column in columns)]]
     results: list[dict[str, Any]] = []
     for name, dataset in datasets.items():
-        for label, options in backbones.items():
-            metrics = _run_row(dataset, options, columns, arguments.mode, f'{name}, {label}')
-            numbers = {
-                key: None if found is None else found.to_json() for key, found in metrics.items()
-            }
-            cells = [None if row is None else row['f1'] for row in numbers.values()]
-            rows.append([name, label, *map(_number, cells)])
-            results.append({'dataset': name, 'features': label, 'results': numbers})
+        metrics = _run_row(dataset, arguments, columns, f'{name}, {arguments.features}')
+        numbers = {
+            key: None if found is None else found.to_json() for key, found in metrics.items()
+        }
+        cells = [None if row is None else row['f1'] for row in numbers.values()]
+        rows.append([name, arguments.features, *map(_number, cells)])
+        results.append({'dataset': name, 'features': arguments.features, 'results': numbers})
         for backbone, published in _published(name, columns).items():
             rows.append(['', f'published, {backbone}', *map(_number, published)])
             named = dict(zip([column.name for column in columns], published, strict=True))
@@ -242,9 +206,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
-    # None = not given
-    given = argparse.Namespace(features=None)
-    return run_program('experiments', lambda: _run(_parser().parse_args(args, given)))
+    return run_program('experiments', lambda: _run(_parser().parse_args(args)))
 
 
 if __name__ == '__main__':

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``stavpr COMMAND``: all executables of the package behind one name on the PATH."""
 
-from dataclasses import dataclass
 import importlib
 import importlib.util
 import sys
@@ -12,52 +11,27 @@ import stavpr_ros
 ROS_MODULES = ('rclpy', 'ament_index_python', 'stavpr_msgs')
 
 
-@dataclass(frozen=True)
-class Command:
-    """
-    A subcommand.
-
-    :param summary: one line for the help text.
-    :param needs_ros: whether it needs a sourced ROS 2 environment.
-    """
-
-    summary: str
-    needs_ros: bool = False
-
-
 COMMANDS = {
-    'build_map': Command('build a reference map from a folder of images or a bag'),
-    'evaluate': Command('evaluate the recognition of one traverse on the map of another'),
-    'experiments': Command("reproduce the paper's tables on local data sets"),
-    'node': Command('run the place-recognition node', needs_ros=True),
-    'replay': Command('publish a bag or a folder of images to the node', needs_ros=True),
-    'record': Command('write matches or loop closures to a JSON Lines file', needs_ros=True),
-    'demo': Command('build, run and evaluate everything on a synthetic street', needs_ros=True),
+    'build_map': 'build a reference map from a folder of images or a bag',
+    'evaluate': 'evaluate the recognition of one traverse on the map of another',
+    'experiments': "reproduce the paper's tables on local data sets",
+    'node': 'run the place-recognition node (ROS 2)',
+    'replay': 'publish a bag or a folder of images to the node (ROS 2)',
+    'record': 'write matches or loop closures to a JSON Lines file (ROS 2)',
+    'demo': 'build, run and evaluate everything on a synthetic street (ROS 2)',
 }
+NEED_ROS = ('node', 'replay', 'record', 'demo')
 
 
 def usage() -> str:
     """Return the help text."""
-    rows = [
-        f'  {name:<12}{command.summary}{" (ROS 2)" if command.needs_ros else ""}'
-        for name, command in COMMANDS.items()
-    ]
-    return '\n'.join(
-        [
-            'usage: stavpr COMMAND [OPTION ...]',
-            '       stavpr COMMAND --help | --help | --version',
-            '',
-            'commands:',
-            *rows,
-            '',
-            'In a sourced ROS 2 workspace, `ros2 run stavpr_ros COMMAND` runs the same commands.',
-        ]
+    rows = ''.join(f'  {name:<12}{summary}\n' for name, summary in COMMANDS.items())
+    return (
+        'usage: stavpr COMMAND [OPTION ...]\n'
+        '       stavpr COMMAND --help | --help | --version\n\n'
+        f'commands:\n{rows}\n'
+        'In a sourced ROS 2 workspace, `ros2 run stavpr_ros COMMAND` runs the same commands.'
     )
-
-
-def missing_ros_modules() -> list[str]:
-    """Return the ROS modules that a ROS command needs and that are not installed or sourced."""
-    return [name for name in ROS_MODULES if importlib.util.find_spec(name) is None]
 
 
 def forget_requirements() -> None:
@@ -91,8 +65,8 @@ def main(args: list[str] | None = None) -> int:
             f'stavpr: unknown command {name!r}; choose from {", ".join(COMMANDS)}', file=sys.stderr
         )
         return 2
-    missing = missing_ros_modules() if COMMANDS[name].needs_ros else []
-    if missing:
+    missing = [module for module in ROS_MODULES if importlib.util.find_spec(module) is None]
+    if missing and name in NEED_ROS:
         print(
             f'stavpr {name}: needs ROS 2, but Python finds no {", ".join(missing)}: source '
             '/opt/ros/jazzy/setup.bash and the install/setup.bash of the workspace that colcon '

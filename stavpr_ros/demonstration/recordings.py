@@ -22,8 +22,8 @@ from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, PlaceMap, save_map
 from stavpr_ros.sources import open_source
-from stavpr_ros.sources.bag import BagSource, is_bag
-from stavpr_ros.sources.bag_file import METADATA
+from stavpr_ros.sources.bag import BagSource
+from stavpr_ros.sources.bag_file import is_bag, METADATA
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord

@@ -8,10 +8,10 @@ from threading import Lock
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.errors import InputError
 
 SECOND = 1_000_000_000
-MAX_GAP = 5.0  # seconds without odometry across which interpolation would be a guess
+MAX_GAP = 5 * SECOND  # without odometry, across which interpolation would be a guess
 
 
 def checked_pose(pose: np.ndarray) -> np.ndarray:
@@ -68,20 +68,10 @@ class Trajectory:
     :param timeout: seconds after the newest pose for which it is still returned, and by which
         poses may arrive out of order; an earlier stamp means that the clock jumped back.
     :param capacity: most poses kept; beyond it, the oldest eighth is evicted at once.
-    :param max_gap: seconds between two poses up to which poses between them are interpolated.
-    :raises SettingsError: a negative timeout or gap, or a capacity below 1.
     """
 
-    def __init__(
-        self, timeout: float = 0.5, capacity: int = 10_000, max_gap: float = MAX_GAP
-    ) -> None:
-        if not timeout >= 0 or not isfinite(timeout):
-            raise SettingsError(f'timeout = {timeout} must be 0 seconds or more')
-        if not max_gap >= 0:
-            raise SettingsError(f'max_gap = {max_gap} must be 0 seconds or more')
-        if capacity < 1:
-            raise SettingsError(f'capacity = {capacity} must be at least 1 pose')
-        self._timeout, self._max_gap = round(timeout * SECOND), max_gap * SECOND
+    def __init__(self, timeout: float = 0.5, capacity: int = 10_000) -> None:
+        self._timeout = round(timeout * SECOND)
         self._capacity = capacity
         self._stamps: list[int] = []
         self._poses: list[np.ndarray] = []
@@ -152,7 +142,7 @@ class Trajectory:
             start, end, first, last = stamps[a], stamps[b], poses[a], poses[b]
         if stamp == end:
             return last.copy()
-        if stamp < start or a == b or end - start > self._max_gap:
+        if stamp < start or a == b or end - start > MAX_GAP:
             return None
         return interpolate(first, last, (stamp - start) / (end - start))
 

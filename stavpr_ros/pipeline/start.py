@@ -64,9 +64,12 @@ def start_operation(
     extractor = extractor or settings.extractor()
     if name == 'mapping':
         extractor.extract([BLANK])
-        return Mapping(
-            extractor, _growing(settings, place_map, extractor), settings.thumbnail_width
+        growing = (
+            GrowingMap(extractor.settings, extractor.projection, settings.max_places)
+            if place_map is None
+            else GrowingMap.from_map(place_map, settings.max_places)
         )
+        return Mapping(extractor, growing, settings.thumbnail_width)
     closer = _loop_closer(settings, settings.exclude_places, extractor)
     # a closer that excludes next to nothing needs few images to warm up
     _warm_up(_loop_closer(settings, 1, extractor), extractor, settings.sequence.length + 8)
@@ -77,14 +80,6 @@ def start_operation(
         held_features=closer.features,
     )
     return LoopClosing(extractor, route, closer, settings.thumbnail_width)
-
-
-def _growing(
-    settings: PipelineSettings, place_map: PlaceMap | None, extractor: FeatureExtractor
-) -> GrowingMap:
-    if place_map is not None:
-        return GrowingMap.from_map(place_map, settings.max_places)
-    return GrowingMap(extractor.settings, extractor.projection, settings.max_places)
 
 
 def _loop_closer(

@@ -39,7 +39,8 @@ def open_source(
     if not there:
         raise SourceError(f'{path} does not exist: expected a folder of images or a bag')
     # imported on use: rosbags and OpenCV load slowly
-    from stavpr_ros.sources.bag import BagSource, is_bag
+    from stavpr_ros.sources.bag import BagSource
+    from stavpr_ros.sources.bag_file import is_bag
     from stavpr_ros.sources.folder import FolderSource
 
     if is_bag(path):

@@ -8,11 +8,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 from stavpr_ros.errors import ImageError, SourceError
-from stavpr_ros.sources.bag_file import is_bag, message_type, open_bag, OpenBag, reading
+from stavpr_ros.sources.bag_file import message_type, open_bag, OpenBag, reading
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.frame import Frame, ImageRecord
-
-__all__ = ['BagSource', 'ImageRecord', 'image_topics', 'is_bag']
 
 RAW = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
@@ -20,20 +18,6 @@ ODOMETRY = 'nav_msgs/msg/Odometry'
 SECOND = 1_000_000_000
 LATE = SECOND // 2  # messages may be out of order by so much; more is a clock that jumped back
 Item = TypeVar('Item')
-
-
-def image_topics(path: str | Path) -> dict[str, tuple[str, int]]:
-    """
-    List the image topics of a bag.
-
-    :param path: as for :class:`BagSource`.
-    :returns: topic to (message type, number of messages), sorted by topic.
-    :raises SourceError: the bag cannot be read.
-    """
-    with open_bag(Path(path)) as bag:
-        return {
-            topic: found for topic, found in _topics(bag).items() if found[0] in {RAW, COMPRESSED}
-        }
 
 
 class BagSource:
@@ -59,8 +43,6 @@ class BagSource:
     ) -> None:
         self.path = Path(path)
         self.on_error = on_error
-        if not self.path.exists():
-            raise SourceError(f'{self.path} does not exist: expected a bag')
         with open_bag(self.path) as bag:
             topics = _topics(bag)
         self.topic = _choose(self.path, topics, topic)
@@ -196,16 +178,13 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
     :raises SourceError: the bag cannot be read, the topic is missing, or time jumps back in it.
     """
     path = Path(path)
-    if not path.exists():
-        raise SourceError(f'{path} does not exist: expected a bag')
     stamps, poses = [], []
     with open_bag(path) as bag:
         wanted = _connections(bag, path, topic)
         with reading(path):
             for connection, time_ns, raw in bag.reader.messages(wanted):
                 message = bag.deserialize(raw, message_type(connection))
-                stamp = message.header.stamp
-                stamps.append(stamp.sec * SECOND + stamp.nanosec or time_ns)
+                stamps.append(_stamp(message) or time_ns)
                 poses.append(_pose(message.pose.pose))
     if not stamps:
         raise SourceError(f'odometry {topic!r} of {path} has no messages: expected at least one')

@@ -45,12 +45,10 @@ class FolderSource:
         self.path = Path(path)
         self.on_error = on_error
         try:
-            if not self.path.is_dir():
-                raise SourceError(f'{self.path} is not a folder: expected a folder of images')
             files = [file for file in self.path.iterdir() if _is_image(file)]
         except OSError as error:
             raise SourceError(
-                f'{self.path} cannot be listed: {error.strerror}; check permissions'
+                f'{self.path} cannot be listed: {error.strerror}; check its name and permissions'
             ) from error
         if not files:
             expected = ' '.join(sorted(SUFFIXES))
