@@ -56,11 +56,6 @@ class LoopResult:
     exclude: int
     skipped: int
 
-    @property
-    def correct(self) -> np.ndarray | None:
-        """Which closures are correct, shape (C,), bool; None = unknown."""
-        return self.are_correct(self.closures)
-
     def are_correct(self, pairs: np.ndarray) -> np.ndarray | None:
         """Return which pairs of images (M, 2) are correct, shape (M,), bool; None = unknown."""
         if self.ground_truth is None:
@@ -71,9 +66,10 @@ class LoopResult:
         """Return the result in words, a line each."""
         C = len(self.closures)
         line = f'{C} loop closures in {self.N} images ({self.skipped} too similar to the last)'
-        if self.ground_truth is None or self.correct is None:
+        right = self.are_correct(self.closures)
+        if self.ground_truth is None or right is None:
             return line
-        correct = np.count_nonzero(self.correct)
+        correct = np.count_nonzero(right)
         precision = f', precision {correct / C:.3f}' if C else ''
         seen = self.ground_truth.has_match
         aligned = self.pairs[self.are_correct(self.pairs)]
@@ -131,22 +127,17 @@ def choose_closures(count: int, correct: np.ndarray | None, shown: int = SHOWN) 
     return sorted(chosen)
 
 
-def _outcomes(result: LoopResult) -> list[Outcome]:
-    if result.correct is None:
-        return ['match'] * len(result.closures)
-    return ['right' if correct else 'wrong' for correct in result.correct]
-
-
 def _pairs(result: LoopResult, place_map: PlaceMap) -> list[MatchPair]:
-    outcomes = _outcomes(result)
+    correct = result.are_correct(result.closures)
     pairs: list[MatchPair] = []
-    for i in choose_closures(len(result.closures), result.correct):
+    for i in choose_closures(len(result.closures), correct):
+        outcome: Outcome = 'match' if correct is None else 'right' if correct[i] else 'wrong'
         query, place = map(int, result.closures[i])
         image = place_map.thumbnail(query)
         if image is None:
             raise InputError('the map of the traverse has no thumbnails')
         caption = f'image {query}: image {place}, distance {result.distances[i]:.2f}'
-        pairs.append(MatchPair(image, place_map.thumbnail(place), caption, outcomes[i]))
+        pairs.append(MatchPair(image, place_map.thumbnail(place), caption, outcome))
     return pairs
 
 
