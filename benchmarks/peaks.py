@@ -82,21 +82,19 @@ def slower_than_float32(device: str, dtype: str) -> str:
     )
 
 
-def measure_peaks(
-    device: str, seconds: float = 1.0, side: int = SIDE, megabytes: int = 0
-) -> Peaks:
+def measure_peaks(device: str, seconds: float) -> Peaks:
     """
     Measure all peaks of a device; the best run counts: a bound must lie below every measurement.
 
     :param seconds: duration of each measurement.
     """
-    megabytes = megabytes or READ_MB[device]
+    megabytes = READ_MB[device]
     rates = dict.fromkeys(ITEM_BYTES, 0.0)
     for dtype in ITEM_BYTES:
         if not slower_than_float32(device, dtype):
             # not every library is at its best with the larger matrix
             rates[dtype] = max(
-                matrix_rate(device, dtype, size, seconds) for size in (side, side // 2)
+                matrix_rate(device, dtype, size, seconds) for size in (SIDE, SIDE // 2)
             )
     if device == 'cuda':
         return Peaks(device_read_bandwidth(megabytes, seconds), rates).widened()

@@ -81,12 +81,10 @@ def memory_section(measured: Sequence[Memory]) -> list[str]:
     return ['## Memory', '', *table(head, lines)]
 
 
-def target_section(
-    rows: Sequence[Row], device: str, targets: Sequence[Target] = TARGETS
-) -> list[str]:
+def target_section(rows: Sequence[Row], device: str) -> list[str]:
     """Return the table of a device's targets."""
     lines = []
-    for target in (target for target in targets if target.device == device):
+    for target in (target for target in TARGETS if target.device == device):
         found = target.found(rows)
         outcome = OUTCOME[None if found is None else target.reached(found)]
         wanted = f'{target.relation} {target.wanted:g}'

@@ -111,7 +111,7 @@ def read_result(
     )
 
 
-def choose_closures(count: int, correct: np.ndarray | None, shown: int = SHOWN) -> list[int]:
+def choose_closures(count: int, correct: np.ndarray | None) -> list[int]:
     """
     Choose closures to show: up to a quarter wrong ones, the others evenly over the traverse.
 
@@ -120,8 +120,8 @@ def choose_closures(count: int, correct: np.ndarray | None, shown: int = SHOWN) 
     good = np.arange(count) if correct is None else np.flatnonzero(correct)
     bad = np.setdiff1d(np.arange(count), good)
     chosen: set[int] = set()
-    for indices, most in ((bad, shown if not len(good) else shown // 4), (good, shown)):
-        room = min(most, shown - len(chosen), len(indices))
+    for indices, most in ((bad, SHOWN if not len(good) else SHOWN // 4), (good, SHOWN)):
+        room = min(most, SHOWN - len(chosen), len(indices))
         if room:
             chosen |= set(indices[np.linspace(0, len(indices) - 1, room).astype(int)].tolist())
     return sorted(chosen)

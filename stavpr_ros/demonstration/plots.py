@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import SubFigure
 
+SHOWN = 6  # pairs of images: two rows of three
+
 
 def draw_result(
     result: TraverseEvaluation,
@@ -64,7 +66,7 @@ def outcomes_of(result: TraverseEvaluation) -> list[Outcome]:
     return outcomes
 
 
-def choose_images(outcomes: list[Outcome], count: int = 6) -> list[int]:
+def choose_images(outcomes: list[Outcome]) -> list[int]:
     """Choose one image of each outcome, and others of the most frequent, far from each other."""
     chosen: list[int] = []
     for outcome in dict.fromkeys(outcomes):
@@ -72,11 +74,11 @@ def choose_images(outcomes: list[Outcome], count: int = 6) -> list[int]:
         chosen.append(same[len(same) // 2])
     common = max(set(outcomes), key=outcomes.count)
     candidates = np.array([i for i, other in enumerate(outcomes) if other == common])
-    while len(chosen) < min(count, len(outcomes)) and len(candidates):
+    while len(chosen) < min(SHOWN, len(outcomes)) and len(candidates):
         others = np.array([0, len(outcomes), *chosen])
         gaps = np.abs(candidates[:, None] - others).min(axis=1)
         chosen.append(int(candidates[gaps.argmax()]))
-    return sorted(set(chosen))[:count]
+    return sorted(set(chosen))[:SHOWN]
 
 
 def _pair(
@@ -107,7 +109,6 @@ def demo_sheet(
     """
     Draw one page: pairs above, the matrix and the distance over time below.
 
-    :param pairs: six fill two rows of three.
     :param distances: every query to every place, shape (N, n).
     """
     above, below = 0.5 + 1.52 * max(1, -(-len(pairs) // 3)), 4.2

@@ -110,7 +110,7 @@ class PublishedNetwork:
 class VGG16(nn.Module):
     """All parameters of the network, under their names in torchvision's file."""
 
-    def __init__(self, classes: int = 1000) -> None:
+    def __init__(self) -> None:
         super().__init__()
         layers: list[nn.Module] = []
         channels = 3
@@ -127,7 +127,7 @@ class VGG16(nn.Module):
             nn.Linear(4096, 4096),
             nn.ReLU(),
             nn.Dropout(),
-            nn.Linear(4096, classes),
+            nn.Linear(4096, 1000),
         )
 
 
@@ -192,7 +192,7 @@ class Transition(nn.Module):
 class DenseNet161(nn.Module):
     """All parameters of the network, under their names in the published files."""
 
-    def __init__(self, classes: int = 365) -> None:
+    def __init__(self) -> None:
         super().__init__()
         features: dict[str, nn.Module] = {
             'conv0': nn.Conv2d(3, FIRST, 7, stride=2, padding=3, bias=False),
@@ -207,7 +207,7 @@ class DenseNet161(nn.Module):
                 channels //= 2
         features['norm5'] = nn.BatchNorm2d(channels)
         self.features = nn.ModuleDict(features)
-        self.classifier = nn.Linear(channels, classes)
+        self.classifier = nn.Linear(channels, 365)
 
 
 class UpToDenseLayer10(nn.Module):

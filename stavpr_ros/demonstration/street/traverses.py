@@ -36,6 +36,7 @@ SECOND_EPOCH = EPOCH + 123 * 86_400 * 10**9  # four months later
 LENGTH = 600.0  # meters of the street
 # of the second traverse: its length, and where it leaves the street and comes back, meters
 DETOUR, DETOUR_FROM, DETOUR_TO = 110.0, 330.0, 380.0
+PLACES = 300  # images of the first traverse
 SIZE = (320, 240)  # width and height of the images
 
 
@@ -170,10 +171,10 @@ class Traverse:
         return np.array(rows, np.float64).reshape(-1, 5)
 
 
-def first_traverse(world: World, places: int = 300, size: tuple[int, int] = SIZE) -> Traverse:
+def first_traverse(world: World) -> Traverse:
     """Traverse along the street in good light, at one speed: the map."""
-    along = np.linspace(0, LENGTH, places, endpoint=False)
-    return Traverse(world, along, np.zeros(places, bool), GOOD_LIGHT, EPOCH, size)
+    along = np.linspace(0, LENGTH, PLACES, endpoint=False)
+    return Traverse(world, along, np.zeros(PLACES, bool), GOOD_LIGHT)
 
 
 def second_traverse(
