@@ -169,7 +169,7 @@ def test_replay_lossless_without_a_match_after_all_tries_fails(tmp_path, subscri
     code, _, errors = replay(bag, '--lossless', '--timeout', '1')
     assert code == 4
     name = 'image 2 (stamp 1000000000.020000000)'
-    assert f'error: {name} got no result on /stavpr/match in 3 tries' in errors
+    assert f'replay: {name} got no result on /stavpr/match in 3 tries' in errors
     assert subscriber.milliseconds()[-3:] == [20] * 3
 
 

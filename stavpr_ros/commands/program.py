@@ -3,11 +3,12 @@
 """The frame of the commands: parser, signals, exit codes."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import sys
+from types import MappingProxyType
 
 from stavpr_ros.errors import SettingsError, StavprError
-from stavpr_ros.signals import obey_signals
+from stavpr_ros.signals import interrupted, obey_signals
 from stavpr_ros.threads import wait_passively
 
 DONE, FAILED, BAD_USAGE, INTERRUPTED = 0, 1, 2, 130
@@ -24,22 +25,30 @@ def make_parser(name: str, description: str, epilog: str) -> argparse.ArgumentPa
 
 
 def run_program(
-    name: str, work: Callable[[], None], interruption: Callable[[], str] = lambda: 'interrupted'
+    name: str,
+    work: Callable[[], int | None],
+    interruption: Callable[[], str] = lambda: 'interrupted',
+    codes: Mapping[type[StavprError], int] = MappingProxyType({}),
 ) -> int:
     """
     Run the work of a command and print the reason if it fails or is interrupted.
 
+    :param work: returns the exit code, None = 0.
     :param interruption: returns the text that is printed after an interrupt.
+    :param codes: exit codes of types of errors, besides 2 for invalid settings.
     :returns: the exit code: 0 done, 1 failed, 2 invalid settings, 130 interrupted.
     """
     obey_signals()
     wait_passively()
     try:
-        work()
+        return work() or DONE
     except StavprError as error:
         print(f'{name}: {error}', file=sys.stderr)
-        return BAD_USAGE if isinstance(error, SettingsError) else FAILED
-    except KeyboardInterrupt:
+        known: dict[type[StavprError], int] = {SettingsError: BAD_USAGE, **codes}
+        return next((code for kind, code in known.items() if isinstance(error, kind)), FAILED)
+    except BaseException as error:
+        # an interrupt within a foreign library comes out as another exception
+        if not (isinstance(error, KeyboardInterrupt) or interrupted()):
+            raise
         print(f'{name}: {interruption()}', file=sys.stderr)
         return INTERRUPTED
-    return DONE

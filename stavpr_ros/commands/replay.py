@@ -9,17 +9,16 @@ import sys
 import time
 
 import rclpy
-from stavpr_ros.commands.program import make_parser
-from stavpr_ros.errors import ImageError, SettingsError, StavprError
+from stavpr_ros.commands.program import DONE, FAILED, make_parser, run_program
+from stavpr_ros.errors import ImageError, StavprError
 from stavpr_ros.ros.process import own_arguments, prepare_transport, ros_node
 from stavpr_ros.ros.replay import NoResultError, NoSubscriberError, Replayer
-from stavpr_ros.signals import interrupted, obey_signals
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord
 from tqdm import tqdm
 
-DONE, BAD_INPUT, BAD_USAGE, NO_SUBSCRIBER, NO_RESULT, INTERRUPTED = 0, 1, 2, 3, 4, 130
+NO_SUBSCRIBER, NO_RESULT = 3, 4  # exit codes, besides those of every command
 FOLDER_RATE = 10.0
 
 EPILOG = """\
@@ -51,27 +50,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :returns: exit code, see ``--help``.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
-    obey_signals()
-    try:
-        return _run(_parser().parse_args(own_arguments(given)), given)
-    except KeyboardInterrupt:
-        print('replay: interrupted', file=sys.stderr)
-        return INTERRUPTED
-    except StavprError as error:
-        print(f'replay: error: {error}', file=sys.stderr)
-        return _exit_code(error)
-    except Exception:  # an interrupt within a foreign library comes out as another exception
-        if interrupted():
-            return INTERRUPTED
-        raise
-
-
-def _exit_code(error: StavprError) -> int:
-    if isinstance(error, SettingsError):
-        return BAD_USAGE
-    if isinstance(error, NoSubscriberError):
-        return NO_SUBSCRIBER
-    return NO_RESULT if isinstance(error, NoResultError) else BAD_INPUT
+    codes: dict[type[StavprError], int] = {
+        NoSubscriberError: NO_SUBSCRIBER,
+        NoResultError: NO_RESULT,
+    }
+    return run_program(
+        'replay', lambda: _run(_parser().parse_args(own_arguments(given)), given), codes=codes
+    )
 
 
 def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
@@ -102,7 +87,7 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
             finally:
                 replayer.close()
     print(f'{report}, {len(skipped)} skipped')
-    return BAD_INPUT if len(skipped) == len(source) else DONE
+    return FAILED if len(skipped) == len(source) else DONE
 
 
 def _replay(
