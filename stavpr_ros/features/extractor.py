@@ -139,14 +139,14 @@ class FeatureExtractor:
         if backbone is None:
             backbone = settings_class(kind)()
         self._backbone: Backbone = backbone_class(kind)(backbone, device)
-        self._projection: Projection | None = None
+        self.projection: Projection | None = None
         plain = FeatureSettings(kind, self._backbone.settings, strips)
         self.settings = plain
         if isinstance(projection, int):
             dimension = self.extract([np.zeros((64, 64, 3), np.uint8)]).strips.shape[2]
             projection = Projection.gaussian(dimension, projection, seed)
         if projection is not None:
-            self._projection = projection
+            self.projection = projection
             self.settings = dataclasses.replace(plain, projection=projection.identity)
 
     @classmethod
@@ -175,11 +175,6 @@ class FeatureExtractor:
             )
         return extractor
 
-    @property
-    def projection(self) -> Projection | None:
-        """Return the random projection of the features, if any."""
-        return self._projection
-
     def extract(self, images: Sequence[np.ndarray]) -> LocalFeatures:
         """
         Extract the local features of images.
@@ -197,8 +192,8 @@ class FeatureExtractor:
                 'range',
                 kind='features',
             )
-        if self._projection is not None:
-            strips, cells = self._projection.apply(strips), None
+        if self.projection is not None:
+            strips, cells = self.projection.apply(strips), None
         return LocalFeatures(*normalize(strips), self.settings, cells)
 
 

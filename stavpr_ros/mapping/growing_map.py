@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map that grows by one place at a time."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import dataclasses
 
 import numpy as np
@@ -45,13 +45,13 @@ class GrowingMap:
         self.settings, self.projection, self.limit = settings, projection, limit
         self._cells, self._held_features = cells, held_features
         self.dimension = 0  # d of a strip, once there is a place
-        self._first = self._count = 0
+        self.first = self._count = 0
         self._strips = np.empty((settings.strips, 0, 0), np.float32)
         self._weights = np.empty((settings.strips, 0), np.float32)
         self._stamps = np.empty(0, np.int64)
         self._poses = np.empty((0, 7))
-        self._ids: list[str] = []
-        self._thumbnails: list[bytes] = []
+        self.ids: list[str] = []  # '' = none
+        self.thumbnails: list[bytes] = []  # small JPEGs, an empty one = none
 
     @classmethod
     def from_map(cls, place_map: PlaceMap, limit: int) -> 'GrowingMap':
@@ -75,18 +75,13 @@ class GrowingMap:
         )
         growing._stamps[:n] = place_map.stamps
         growing._poses[:n] = np.nan if place_map.poses is None else place_map.poses
-        growing._ids = list(place_map.ids)
-        growing._thumbnails = list(place_map.thumbnails) or [b''] * n
+        growing.ids = list(place_map.ids)
+        growing.thumbnails = list(place_map.thumbnails) or [b''] * n
         growing._count = n
         return growing
 
     def __len__(self) -> int:
         return self._count
-
-    @property
-    def first(self) -> int:
-        """Return the number of places evicted so far: the number of the oldest kept place."""
-        return self._first
 
     @property
     def full(self) -> bool:
@@ -119,32 +114,22 @@ class GrowingMap:
         """Pose of each place, a row of NaN = unknown: a view, shape (n, 7), float64."""
         return self._poses[: self._count]
 
-    @property
-    def ids(self) -> Sequence[str]:
-        """External identifiers, '' = none: not a copy."""
-        return self._ids
-
-    @property
-    def thumbnails(self) -> Sequence[bytes]:
-        """Return a small JPEG of each place, an empty one = none: not a copy."""
-        return self._thumbnails
-
     def place(self, index: int) -> Place:
         """Return stamp, identifier and pose of a place; counted as by :meth:`add`."""
-        i = index - self._first
+        i = index - self.first
         pose = self._poses[i]
         known = pose.copy() if np.isfinite(pose).all() else None
-        return Place(int(self._stamps[i]), self._ids[i], known)
+        return Place(int(self._stamps[i]), self.ids[i], known)
 
     def thumbnail(self, index: int) -> np.ndarray | None:
         """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None; counted likewise."""
-        return decode_thumbnail(self._thumbnails[index - self._first])
+        return decode_thumbnail(self.thumbnails[index - self.first])
 
     @property
     def memory(self) -> int:
         """Bytes held, the room for places to come included."""
         arrays = (self._strips, self._weights, self._stamps, self._poses)
-        texts = sum(map(len, self._thumbnails)) + sum(map(len, self._ids))
+        texts = sum(map(len, self.thumbnails)) + sum(map(len, self.ids))
         return sum(array.nbytes for array in arrays) + texts
 
     def add(
@@ -175,12 +160,12 @@ class GrowingMap:
         if self._held_features is None:
             self._strips[:, n], self._weights[:, n] = strips, weights
         self._stamps[n], self._poses[n] = stamp, row
-        if not n and not self._first and self._cells is None:
+        if not n and not self.first and self._cells is None:
             self._cells = features.cells
-        self._ids.append(identifier)
-        self._thumbnails.append(thumbnail)
+        self.ids.append(identifier)
+        self.thumbnails.append(thumbnail)
         self._count += 1
-        return self._first + n
+        return self.first + n
 
     def forget(self, count: int) -> None:
         """
@@ -194,8 +179,8 @@ class GrowingMap:
         features = (*self._strips, *self._weights) if self._held_features is None else ()
         for array in (*features, self._stamps, self._poses):
             array[: n - count] = array[count:n]
-        del self._ids[:count], self._thumbnails[:count]
-        self._first, self._count = self._first + count, n - count
+        del self.ids[:count], self.thumbnails[:count]
+        self.first, self._count = self.first + count, n - count
 
     def snapshot(self) -> PlaceMap:
         """Return the map as it is now, in memory of its own."""
@@ -207,9 +192,9 @@ class GrowingMap:
             features=features,
             projection=self.projection,
             stamps=self.stamps.copy(),
-            ids=tuple(self._ids),
+            ids=tuple(self.ids),
             poses=None if np.isnan(self.poses).all() else self.poses.copy(),
-            thumbnails=tuple(self._thumbnails) if any(self._thumbnails) else (),
+            thumbnails=tuple(self.thumbnails) if any(self.thumbnails) else (),
         )
 
     def _checked(self, features: LocalFeatures) -> tuple[np.ndarray, np.ndarray]:

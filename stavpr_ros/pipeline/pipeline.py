@@ -38,16 +38,18 @@ class Pipeline:
 
     :param operation: one of ``OPERATIONS``.
     :raises StavprError: invalid settings, or a missing model.
+
+    ``settings`` and ``threshold`` (None = not set) are those in force; :meth:`change` sets them.
     """
 
     def __init__(self, settings: PipelineSettings, operation: str = 'localization') -> None:
-        self._settings = settings
+        self.settings = settings
         # of localization, or of loop closure for its kind of features
         self._map: PlaceMap | None = None
         self._extractor: FeatureExtractor | None = None
         self._operation: Operation | None = None
         self._name = operation
-        self._threshold = settings.applied_threshold(operation)
+        self.threshold = settings.applied_threshold(operation)
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
         self._last: Match | None = None
@@ -58,19 +60,9 @@ class Pipeline:
         self._start(operation, settings, None)
 
     @property
-    def settings(self) -> PipelineSettings:
-        """Return the settings in force."""
-        return self._settings
-
-    @property
     def operation(self) -> str:
         """Return the name of the operation."""
         return self._name
-
-    @property
-    def threshold(self) -> float | None:
-        """Return the threshold in force, None = not set."""
-        return self._threshold
 
     @property
     def places(self) -> PlaceMap | GrowingMap | None:
@@ -134,9 +126,9 @@ class Pipeline:
         :raises InputError: unsaved places would be lost.
         :raises StavprError: an unknown operation, or invalid settings.
         """
-        settings, name = settings or self._settings, operation or self._name
+        settings, name = settings or self.settings, operation or self._name
         settings.require_operation(name)
-        threshold, before = settings.applied_threshold(name), self._threshold
+        threshold, before = settings.applied_threshold(name), self.threshold
         if loaded is not None or name != self._name:
             self._require_no_loss(name, loaded)
             self._start(name, settings, loaded)
@@ -144,7 +136,7 @@ class Pipeline:
             if before is None:
                 self.reset()  # images since then are not in the window
             self._operation.recognizer.set_threshold(threshold)
-        self._settings, self._threshold = settings, threshold
+        self.settings, self.threshold = settings, threshold
         self._keyframes.settings = settings.keyframes
         self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
 
@@ -187,7 +179,7 @@ class Pipeline:
         recognizer = self._operation.recognizer if self._operation else None
         if recognizer is None or self._last is None or self._last.status is Status.WARMING_UP:
             raise InputError(
-                f'{self.window_fill} of {self._settings.sequence.length} images in the window'
+                f'{self.window_fill} of {self.settings.sequence.length} images in the window'
             )
         return replace(self._last, candidates=tuple(recognizer.ranked(count)))
 
@@ -199,12 +191,12 @@ class Pipeline:
         :param pose: of the camera, from odometry, shape (7,), or None.
         :raises InputError: an invalid pose; nothing is changed then.
         """
-        threshold = math.nan if self._threshold is None else self._threshold
+        threshold = math.nan if self.threshold is None else self.threshold
         pose = None if pose is None else checked_pose(pose)
         if self._operation is None or self.missing:
             return Match(Status.NOT_READY, self.missing, threshold, cause='not ready')
         if reason := self._keyframes.too_soon(stamp, pose):
-            blind = pose is None and self._settings.keyframes.needs_poses
+            blind = pose is None and self.settings.keyframes.needs_poses
             cause = 'no odometry' if blind else NOT_A_KEYFRAME
             return Match(Status.SKIPPED, reason, threshold, cause=cause)
         stages: dict[str, float] = {}
@@ -228,7 +220,7 @@ class Pipeline:
             if reason := self._keyframes.too_alike(image):
                 return Match(Status.SKIPPED, reason, image=image, cause=NOT_A_KEYFRAME)
         if self._is_full(operation):
-            reason = f'the map is full: parameter max_places = {self._settings.max_places}'
+            reason = f'the map is full: parameter max_places = {self.settings.max_places}'
             return Match(Status.NOT_READY, reason, image=image, cause='map full')
         with _timed(stages, 'extraction'):
             features = operation.extractor.extract([image])
@@ -241,7 +233,7 @@ class Pipeline:
         with _timed(stages, 'verification'):
             match = self._verified(match, image, operation.places)
         if self.list_candidates and match.sequence is not None:
-            candidates = tuple(operation.recognizer.ranked(self._settings.candidates))
+            candidates = tuple(operation.recognizer.ranked(self.settings.candidates))
             match = replace(match, candidates=candidates)
         self._last = replace(match, image=image)
         return self._last

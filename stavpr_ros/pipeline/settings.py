@@ -10,7 +10,7 @@ from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.devices import choose_backend, why_no_cuda
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.features.registry import KINDS, settings_from_json
+from stavpr_ros.features.registry import settings_class, settings_from_json
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.recognition import RecognizerSettings
@@ -60,10 +60,7 @@ class PipelineSettings:
             raise SettingsError(
                 'threshold = 0 would match nothing: set it above 0, or negative = not set'
             )
-        if self.features not in KINDS:
-            raise SettingsError(
-                f'features {self.features!r} are unknown: take one of {", ".join(KINDS)}'
-            )
+        settings_class(self.features)  # rejects an unknown kind
         if self.feature_settings:
             settings_from_json(self.features, self.feature_settings)
         self.recognition('localization')

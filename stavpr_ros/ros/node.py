@@ -56,9 +56,9 @@ class PlaceRecognitionNode(ManagedNode):
         super().__init__('stavpr', **options)
         for warning in unknown_parameters(self.parameter_overrides):
             self.get_logger().warning(warning)
-        self._settings = node_settings(declare_parameters(self))
+        self.settings = node_settings(declare_parameters(self))
         self._verbosity = 'default'
-        self._apply_verbosity(self._settings.verbosity)
+        self._apply_verbosity(self.settings.verbosity)
         self._runtime: Runtime | None = None
         self.statistics = Statistics()
         self.problem = ''  # why the last transition failed
@@ -73,21 +73,16 @@ class PlaceRecognitionNode(ManagedNode):
             backwards, post_callback=self._on_clock_jump
         )
         self._diagnostics = DiagnosticsPublisher(
-            self, self._settings.diagnostics_period, self._health
+            self, self.settings.diagnostics_period, self._health
         )
         self._start: Timer | None = None
-        if self._settings.autostart:
+        if self.settings.autostart:
             self._start = self.create_timer(
                 0.0,
                 self._on_start,
                 callback_group=MutuallyExclusiveCallbackGroup(),
                 clock=Clock(clock_type=ClockType.STEADY_TIME),
             )
-
-    @property
-    def settings(self) -> NodeSettings:
-        """Return the settings in force."""
-        return self._settings
 
     @property
     def runtime(self) -> Runtime:
@@ -111,11 +106,11 @@ class PlaceRecognitionNode(ManagedNode):
         self._start.cancel()
         if self.state != 'unconfigured':
             return
-        tried = self._settings
+        tried = self.settings
         if self.advance(self.trigger_configure):
             if not self.ending.is_set():
                 self.advance(self.trigger_activate)
-        elif self.state == 'unconfigured' and self._settings != tried:
+        elif self.state == 'unconfigured' and self.settings != tried:
             self._start.reset()  # a parameter was set during the failing transition
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -172,7 +167,7 @@ class PlaceRecognitionNode(ManagedNode):
 
     def _configure(self) -> None:
         # a service may have changed the operation
-        self._settings = settings = self._settings_with({})
+        self.settings = settings = self._settings_with({})
         self.get_logger().info(settings.pipeline.backend_summary(settings.operation))
         require_writable(settings.save_path)
         if settings.map_path:
@@ -240,7 +235,7 @@ class PlaceRecognitionNode(ManagedNode):
         with self._lock:
             runtime, settings = self.runtime, self._settings_with({'operation': operation})
             runtime.change(settings)
-            self._settings = settings
+            self.settings = settings
             self.get_logger().info(settings.pipeline.backend_summary(operation))
             self._publish_map_info()
 
@@ -248,7 +243,7 @@ class PlaceRecognitionNode(ManagedNode):
         """Return the settings after a change of parameters; the operation in force stays."""
         values = {name: self.get_parameter(name).value for name in BY_NAME}
         if self._runtime is not None:
-            values['operation'] = self._settings.operation
+            values['operation'] = self.settings.operation
         return node_settings({**values, **changes})
 
     def _validate_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
@@ -269,7 +264,7 @@ class PlaceRecognitionNode(ManagedNode):
         if self._runtime is not None:
             require_changeable(changes, self.state)
         settings = self._settings_with(changes)
-        if settings.save_path != self._settings.save_path:
+        if settings.save_path != self.settings.save_path:
             require_writable(settings.save_path)
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
@@ -277,11 +272,11 @@ class PlaceRecognitionNode(ManagedNode):
         if not any(parameter.name in BY_NAME for parameter in parameters):
             return
         with self._lock:
-            self._settings = self._settings_with({})
-            self._apply_verbosity(self._settings.verbosity)
+            self.settings = self._settings_with({})
+            self._apply_verbosity(self.settings.verbosity)
             if self._runtime is not None:
                 try:
-                    self._runtime.change(self._settings)
+                    self._runtime.change(self.settings)
                 except StavprError as error:  # the node ends
                     self.get_logger().error(f'parameters not applied: {error}')
                 self._publish_map_info()
@@ -305,7 +300,7 @@ class PlaceRecognitionNode(ManagedNode):
         health = Health(
             state=self.state,
             problem=self.problem,
-            settings=self._settings,
+            settings=self.settings,
             counts=self.statistics.counts(),
             map_info=self._map_info.last or MapInfo(state='none'),
         )
@@ -318,7 +313,7 @@ class PlaceRecognitionNode(ManagedNode):
         def describe() -> MapInfo | None:
             runtime = self._runtime
             if state:
-                return MapInfo(operation=self._settings.operation, state=state, path=path)
+                return MapInfo(operation=self.settings.operation, state=state, path=path)
             return None if runtime is None else runtime.map_info()
 
         self._map_info.publish(describe)
