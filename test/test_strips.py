@@ -61,15 +61,6 @@ def test_cut_strips_equals_oracle(n, channels, height, width, W):
     )
 
 
-def test_cut_strips_of_strided_float64_equals_oracle():
-    maps = np.random.default_rng(0).random((2, 4, 9, 3))
-    strided = torch.from_numpy(maps).permute(0, 3, 1, 2)  # (2, 3, 4, 9)
-    expected = oracle.cut_strips(maps.transpose(0, 3, 1, 2).astype(np.float32), 4)
-    strips = cut_strips(strided, 4)
-    assert strips.dtype == torch.float32
-    np.testing.assert_array_equal(strips.numpy(), expected)
-
-
 @pytest.mark.parametrize(
     ('shape', 'W', 'text'),
     [
@@ -124,22 +115,6 @@ def test_strip_distances_at_vgg_size_are_precise():
     expected = oracle.distances(query[:, 0], reference)
     assert expected[0, 0, 0] == pytest.approx(0, abs=1e-6)
     np.testing.assert_allclose(result.numpy(), expected, rtol=0, atol=TOLERANCE)
-
-
-def test_strip_distances_rows_are_query_strips():
-    query = torch.tensor([[1.0, 0], [0, 1]])
-    reference = torch.tensor([[[1.0, 0]], [[1, 0]]])  # both strips like the query's first
-    assert strip_distances(query, reference)[:, :, 0].tolist() == [[0, 0], [1, 1]]
-
-
-def test_strip_distances_of_zero_strips_are_one():
-    reference = random_strips(1, 4, 3, 6, 0.0)
-    reference[2] = 0
-    d = strip_distances(torch.zeros(4, 6), unit(reference)[0])
-    assert (d == 1).all()
-    d = strip_distances(unit(random_strips(2, 4, 1, 6, 0.0))[0][:, 0], unit(reference)[0])
-    assert (d[:, 2] == 1).all()
-    assert (d[:, [0, 1, 3]] < 1).all()
 
 
 @settings(max_examples=25, deadline=None)
