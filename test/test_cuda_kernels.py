@@ -148,8 +148,8 @@ def random_products(seed, queries, W, n, levels=None):
     [
         (7, None, 5, 1.0, None),
         (7, 3, 5, 0.3, 3),  # three levels: ties everywhere
-        (6, None, 3, 0.0, 3),  # vanilla DTW
-        (4, 2, 1, 5.0, None),
+        (6, None, 1, 0.0, 3),  # vanilla DTW
+        (4, None, 6, 5.0, None),  # an even number of strips
     ],
 )
 def test_image_distances_equal_oracle(runtime, strategy, W, xi, n, sigma, levels):
