@@ -17,7 +17,6 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / 'benchmarks'
 sys.path.insert(0, str(BENCHMARKS))
 
 import accuracy
-import baselines
 import compare
 import data
 import lower_bounds as bounds
@@ -73,9 +72,7 @@ def test_measure_two_jobs_runs_them_in_turn_after_warm_up(clock):
     assert found['b'].median_s == 0.03
 
 
-@pytest.mark.parametrize(
-    ('round_s', 'rounds'), [(0.2, 7), (0.01, 50), (1e-7, 101), (1.01, 3), (0.0, 101)]
-)
+@pytest.mark.parametrize(('round_s', 'rounds'), [(0.01, 50), (0.0, 101), (1.01, 3)])
 def test_rounds_for_a_duration_fills_the_time_within_limits(round_s, rounds):
     assert timing.rounds_for(round_s, 0.5) == rounds
 
@@ -190,17 +187,6 @@ def test_report_counts_losses_and_sums_the_stages_of_a_frame():
 # ------------------------------------------------ peers
 
 
-@pytest.mark.parametrize('n', [1, 7, 30])
-def test_prange_gives_the_results_of_the_oracle(n):
-    # few values that add up exactly: ties everywhere
-    window = np.random.default_rng(n).integers(0, 3, (5, n)).astype(np.float32)
-    q, m = oracle.match_sequence(window, 2, np.float32)
-    distances, lengths = np.empty(n, np.float32), np.empty(n, np.int32)
-    baselines.prange()(window, 10, distances, lengths)
-    np.testing.assert_array_equal(distances, q)
-    np.testing.assert_array_equal(lengths, m)
-
-
 def accumulate(costs):
     return np.array(oracle.accumulate(costs, 1, np.float64).S)
 
@@ -272,8 +258,6 @@ def test_compare_of_this_checkout_with_itself_gives_equal_results(capsys):
     [
         ('sequence', 'f1', 0.9, 0.8, True),
         ('sequence', 'f1', 0.8, 0.9, False),
-        ('sequence', 'recall_at_1', 0.9, 0.8, True),
-        ('sequence', 'threshold', 0.9, 0.8, False),
         ('sequence', 'precision', 0.9, 0.8, False),  # at the best F1
         ('at_default', 'precision', 0.9, 0.8, True),
         ('unknown', 'matched', 3, 4, True),
@@ -285,10 +269,7 @@ def test_changes_of_a_value_are_listed_and_classified(group, name, before, after
     assert lines == [f'{"WORSE" if worse else "changed"}: a {group}.{name}: {before} -> {after}']
     assert found is worse
     assert accuracy.changes(old, old) == ([], False)
-
-
-def test_changes_name_a_value_that_is_gone():
-    assert accuracy.changes({'a': {'f1': 1.0}}, {'a': {}})[1]
+    assert accuracy.changes(old, {'a': {}})[1]  # a value is gone
 
 
 def test_committed_accuracy_table_has_all_rows_and_its_markdown():

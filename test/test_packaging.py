@@ -215,13 +215,11 @@ def test_stavpr_passes_arguments_and_exit_code(monkeypatch):
     assert received == [['--input', 'a b']]
 
 
-@pytest.mark.parametrize('name', ['node', 'replay', 'record', 'demo'])
-def test_stavpr_without_ros_names_the_missing_modules(name, monkeypatch, capsys):
+def test_stavpr_without_ros_names_the_missing_modules(monkeypatch, capsys):
     monkeypatch.setattr(stavpr.importlib.util, 'find_spec', lambda _: None)
-    assert stavpr.main([name]) == 2
-    text = capsys.readouterr().err
-    assert 'rclpy' in text
-    assert 'setup.bash' in text
+    for name in ('node', 'replay', 'record', 'demo'):
+        assert stavpr.main([name]) == 2
+        assert re.search(r'rclpy.*setup\.bash', capsys.readouterr().err, re.DOTALL)
 
 
 def test_stavpr_forgets_the_requirements_of_generated_scripts(monkeypatch):

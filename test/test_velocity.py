@@ -118,6 +118,19 @@ def test_match_velocities_at_block_borders_equals_that_of_a_cut_map(n):
             )
 
 
+def test_path_one_place_faster_at_every_step_crosses_block_border():
+    l, end = 40, kernel.ENDS
+    places = end - 3 * np.arange(l)[::-1]
+    costs = np.full((l, end + 1), 10.0)
+    costs[np.arange(l), places] = 0
+    chosen = VelocitySettings((2.0,), 0.5)
+    matches = match_velocities(costs, chosen)
+    assert matches.distances[end] == 0.5 * (l - 1) / l
+    assert (matches.firsts[end], matches.middles[end]) == (places[0], places[(l - 1) // 2])
+    path = trace_velocity(costs, end, chosen.steps(l)[0], chosen.penalty)
+    assert path[:, 1].tolist() == places.tolist()
+
+
 def test_match_velocities_applies_shift_and_scale():
     rng = np.random.default_rng(0)
     window, shift = rng.random((5, 30)), rng.random(30)

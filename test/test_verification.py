@@ -40,8 +40,9 @@ VIEWS = {
 }
 
 
-@pytest.mark.parametrize('method', METHODS)
-@pytest.mark.parametrize('view', VIEWS)
+@pytest.mark.parametrize(
+    ('method', 'view'), [*(('orb', view) for view in VIEWS), ('sift', 'slanted')]
+)
 def test_inliers_of_flat_scene_from_other_viewpoint_are_many(method, view):
     check = GeometricVerifier(GeometricSettings(method))
     one = texture(0)
@@ -52,7 +53,7 @@ def test_inliers_of_flat_scene_from_other_viewpoint_are_many(method, view):
 @pytest.mark.parametrize('method', METHODS)
 def test_inliers_of_other_scene_are_few(method):
     check = GeometricVerifier(GeometricSettings(method))
-    found = [check.inliers(texture(seed), texture(seed + 100)) for seed in range(4)]
+    found = [check.inliers(texture(seed), texture(seed + 100)) for seed in range(2)]
     assert max(found) < 30
 
 
@@ -108,7 +109,9 @@ def test_inliers_of_any_image_are_a_count(method, shapes, kind, seed):
         one, other = np.tile(one[:8, :8], (6, 6, 1)), np.tile(one[:8, :8], (5, 9, 1))
     if kind == 3:
         other = one.copy()
-    assert GeometricVerifier(GeometricSettings(method, ratio=1.0)).inliers(one, other) >= 0
+    assert (
+        GeometricVerifier(GeometricSettings(method, ratio=1.0, width=64)).inliers(one, other) >= 0
+    )
 
 
 def test_inliers_do_not_depend_on_image_size():
