@@ -93,7 +93,7 @@ def test_default_values_give_default_settings():
         ('geometric_check', 'sift', 'geometric.method', 'sift'),
     ],
 )
-def test_a_value_reaches_its_setting(name, value, attribute, expected):
+def test_node_settings_of_value_contain_it(name, value, attribute, expected):
     setting = node_settings(DEFAULTS | {name: value}).pipeline
     for part in attribute.split('.'):
         setting = getattr(setting, part)

@@ -150,6 +150,8 @@ def test_best_velocity_match_has_second_best_elsewhere():
     assert (nearest.first, nearest.last, nearest.middle) == (20, 23, 21)
     assert (nearest.second_best_index, nearest.second_best_distance) == (3, 0.25)
     assert best_velocity_match(matches, 18).second_best_index != 3  # 21 - 3 is not above 18
+    equal = match_velocities(np.zeros((4, 30)), VelocitySettings())
+    assert best_velocity_match(equal, 18).last == 0  # the lowest end on a tie
     alone = best_velocity_match(matches, 30)
     assert alone.second_best_index == -1
     assert np.isnan(alone.second_best_distance)

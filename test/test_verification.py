@@ -83,6 +83,14 @@ def test_inliers_without_common_geometry_are_few():
     assert GeometricVerifier(settings).inliers(one, other) < 150
 
 
+def test_verifies_one_patch_repeated_in_query_is_false():
+    """Each of its keypoints counts for the one that is nearest to it, not for every copy."""
+    patch = texture(0, (120, 160))
+    place = np.pad(patch, ((0, 360), (0, 480), (0, 0)))
+    assert GeometricVerifier().verifies(place, place)
+    assert not GeometricVerifier().verifies(np.tile(patch, (4, 4, 1)), place)
+
+
 @pytest.mark.parametrize('method', METHODS)
 def test_inliers_of_blank_image_are_zero(method):
     check, scene = GeometricVerifier(GeometricSettings(method)), texture(0)
