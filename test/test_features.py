@@ -89,17 +89,6 @@ def test_onnx_errors_name_file_and_layer(tiny_onnx, tmp_path):
         FeatureExtractor('onnx', onnx_settings(tiny_onnx, sha256='0' * 64))
 
 
-def test_onnx_model_may_move_but_not_change(tiny_onnx, tmp_path):
-    """A moved file gives the same features; another file under its name is rejected."""
-    settings = FeatureExtractor('onnx', onnx_settings(tiny_onnx)).settings
-    moved = tmp_path / 'moved.onnx'
-    moved.write_bytes(tiny_onnx.read_bytes())
-    assert FeatureExtractor.from_settings(settings, None, model=str(moved)).settings == settings
-    moved.write_bytes(tiny_onnx.read_bytes() + b'\x00')
-    with pytest.raises((FeatureMismatchError, UnavailableError)):
-        FeatureExtractor.from_settings(settings, None, model=str(moved))
-
-
 def test_onnx_squeezenet_has_expected_shape(squeezenet_settings):
     """The real network's inner layer: 13 x 13 x 384, cropped to seven strips of one column."""
     extractor = FeatureExtractor('onnx', squeezenet_settings)
