@@ -4,7 +4,12 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
+from stavpr_ros.errors import (
+    FeatureMismatchError,
+    ImageError,
+    SettingsError,
+    UnavailableError,
+)
 from stavpr_ros.features import FeatureExtractor, FeatureSettings
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.features.registry import backbone_class, settings_class
@@ -73,6 +78,12 @@ def test_onnx_inner_layer_by_hand(tiny_onnx):
     assert maps.shape == (2, 1, 8, 8)
     assert (maps[0] == 4 * (1 + 2 + (100 - 20) / 2)).all()
     assert (maps[1] == 4 * (2 + 4 + (200 - 20) / 2)).all()
+
+
+def test_extractor_of_features_not_finite_fails(tiny_onnx):
+    extractor = FeatureExtractor('onnx', onnx_settings(tiny_onnx, scale=1e36), strips=2)
+    with pytest.raises(ImageError, match='not finite'):
+        extractor.extract([np.full((16, 16, 3), 255, np.uint8)])
 
 
 def test_onnx_errors_name_file_and_layer(tiny_onnx, tmp_path):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.features.extractor import cut_strips, normalize, resize_square
+from stavpr_ros.features.extractor import cut_strips, normalize
 from stavpr_ros.features.gradient import (
     _on_threads,
     _to_polar,
@@ -129,14 +129,6 @@ def test_to_polar_of_every_gradient_is_exact(bins, signed):
         assert turns.min() >= 0
         assert turns.max() <= period
         np.testing.assert_array_equal(magnitude[::3], np.hypot(dx, dy).astype(np.float32))
-
-
-def test_resize_square_area_by_hand():
-    """Three pixels to two: the first takes the first and half of the second."""
-    gray = np.array([[0, 90, 180], [45, 90, 135], [225, 0, 9]], np.uint8)
-    expected = [[(4 * 0 + 2 * 90 + 2 * 45 + 90) / 9, (4 * 180 + 2 * 90 + 2 * 135 + 90) / 9]]
-    expected += [[(4 * 225 + 2 * 45 + 2 * 0 + 90) / 9, (4 * 9 + 2 * 135 + 2 * 0 + 90) / 9]]
-    np.testing.assert_array_equal(resize_square(gray, 2, 'area'), np.round(expected))
 
 
 @pytest.fixture

@@ -161,7 +161,7 @@ def test_search_without_places_has_no_match(velocity):
 # ------------------------------------------------ float16
 
 
-@pytest.mark.parametrize('d', [1, 100, 512])
+@pytest.mark.parametrize('d', [1, 512])
 def test_float16_distances_are_those_of_rounded_features(d):
     """Strip distances move by 2^-11 at most (Cauchy-Schwarz); with W = 1 they are the result."""
     features, query = random_features(1, 300, d), random_features(1, 2, d, seed=1)
