@@ -84,13 +84,13 @@ def test_folder_imports_only_those_below_it(folder):
                 assert parts[0] not in ROS, f'{path} imports {module}'
 
 
-def test_folders_are_those_of_the_plan():
+def test_folders_are_those_of_plan():
     folders = {path.name for path in PACKAGE.iterdir() if (path / '__init__.py').exists()}
     assert folders == set(MAY_IMPORT)
 
 
-def test_importing_the_package_is_light():
-    code = 'import sys, stavpr_ros; print(*sys.modules)'
+def test_package_and_parameters_import_lightly():
+    code = 'import sys, stavpr_ros.parameters; print(*sys.modules)'
     loaded = subprocess.run(
         [sys.executable, '-c', code], capture_output=True, text=True, check=True
     ).stdout

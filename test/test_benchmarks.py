@@ -73,21 +73,21 @@ def test_measure_two_jobs_runs_them_in_turn_after_warm_up(clock):
 
 
 @pytest.mark.parametrize(('round_s', 'rounds'), [(0.01, 50), (0.0, 101), (1.01, 3)])
-def test_rounds_for_a_duration_fills_the_time_within_limits(round_s, rounds):
+def test_rounds_for_duration_fills_time_within_limits(round_s, rounds):
     assert timing.rounds_for(round_s, 0.5) == rounds
 
 
 # ------------------------------------------------ lower bounds and peaks
 
 
-def test_bound_of_several_works_adds_the_longer_of_bytes_and_operations():
+def test_bound_of_several_works_adds_longer_of_bytes_and_operations():
     works = [
         bounds.Work(200, 1000), bounds.Work(50, 3000), bounds.Work(0, 4000, 'bfloat16')
     ]  # fmt: skip
     assert bounds.bound_seconds(works, PEAKS) == 2.0 + 3.0 + 1.0
 
 
-def test_operations_of_the_alignments_are_those_of_their_cells():
+def test_operations_of_alignments_are_those_of_their_cells():
     def count(rows, columns, inner):
         cells = [(i, j) for i in range(rows) for j in range(columns) if i + j]
         return sum(inner if i and j else 2 for i, j in cells)
@@ -97,7 +97,7 @@ def test_operations_of_the_alignments_are_those_of_their_cells():
     assert bounds.lm_dtw(sizes) == bounds.Work(4 * 4 * 10, 10 * (count(4, 6, 8) + 2 * 6))
 
 
-def test_peaks_are_raised_by_a_faster_stage():
+def test_peaks_are_raised_by_faster_stage():
     quick = PEAKS.raised(bounds.Work(2**28, 100, 'bfloat16'), 0.01, 'product')
     assert quick.bytes_per_s == 2**28 / 0.01
     assert quick.operations_per_s['bfloat16'] == 10_000.0
@@ -161,7 +161,7 @@ def test_target_at_its_bound_is_reached(ratio, reached):
     assert target.found([replace(row, mode='robust')]) is None
 
 
-def test_report_counts_losses_and_sums_the_stages_of_a_frame():
+def test_report_counts_losses_and_sums_stages_of_frame():
     parts = [Row(s, 'robust', 5, 0, 'float32', 0.001, 0, 7) for s in report.ROBUST_STAGES[2:]]
     parts += [Row('mean_centering', 'robust', 5, 8, 'float32', 0.001, 0.0, 7)]
     parts += [Row('image_distances', '', 5, 8, p, 0.002, 0.0, 7) for p in ('float16', 'float32')]
@@ -191,7 +191,7 @@ def accumulate(costs):
     return np.array(oracle.accumulate(costs, 1, np.float64).S)
 
 
-def test_librosa_peer_scales_a_sample_and_rejects_other_sums(clock):
+def test_librosa_peer_scales_sample_and_rejects_other_sums(clock):
     def dtw(C, backtrack):
         clock.now += 0.5
         return accumulate(C)
@@ -217,7 +217,7 @@ def test_sequence_peers_with_other_results_are_rejected():
 
 
 @pytest.mark.long
-def test_measure_memory_counts_at_least_the_features():
+def test_measure_memory_counts_at_least_features():
     found = memory.measure_memory('localization', 'robust', 'float32', 2_000, 512)
     assert found.feature_bytes == 2_000 * 512 * 7 * 4
     assert 0.9 < found.ratio < 10
@@ -263,7 +263,7 @@ def test_compare_of_this_checkout_with_itself_gives_equal_results(capsys):
         ('unknown', 'matched', 3, 4, True),
     ],
 )
-def test_changes_of_a_value_are_listed_and_classified(group, name, before, after, worse):
+def test_changes_of_value_are_listed_and_classified(group, name, before, after, worse):
     old, new = ({'a': {group: {name: value, 'queries': 5}}} for value in (before, after))
     lines, found = accuracy.changes(old | {'b': {}}, new)
     assert lines == [f'{"WORSE" if worse else "changed"}: a {group}.{name}: {before} -> {after}']
@@ -300,7 +300,7 @@ def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     assert text.index('A frame in mode robust') < text.index('## All stages')
 
 
-def test_command_on_a_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
+def test_command_on_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, 'is_available', lambda: False)
     assert matching.main(['--device', 'cuda', '--output', str(tmp_path)]) == 2
     assert 'torch sees no CUDA device here' in capsys.readouterr().err

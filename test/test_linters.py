@@ -53,11 +53,11 @@ def test_python_files_finds_package_tests_and_executables():
     assert not {name for name in found if name.split('/')[0] in NOT_OURS | {'.venv'}}
 
 
-def test_python_files_have_the_license_header():
+def test_python_files_have_license_header():
     assert [str(path.relative_to(ROOT)) for path in without_header(list(python_files()))] == []
 
 
-def test_without_header_names_the_file(tmp_path):
+def test_without_header_names_file(tmp_path):
     good, bad = tmp_path / 'good.py', tmp_path / 'bad.py'
     good.write_text('#!/usr/bin/env python3\n' + '\n'.join(HEADER))
     bad.write_text('# Copyright 2026\n')

@@ -93,7 +93,7 @@ def test_python_unsupported_is_rejected_by_name(
         assert (word in text) == (status == 1)
 
 
-def test_python_old_parses_the_program():
+def test_python_old_parses_setup_venv():
     source = (ROOT / 'tools' / 'setup_venv.py').read_text(encoding='utf-8')
     ast.parse(source, feature_version=(3, 6))
     assert '__future__' not in source
@@ -238,7 +238,7 @@ def write_fake_wheel(folder: Path) -> None:
         wheel.writestr(f'{info}/RECORD', '')
 
 
-def test_build_offline_with_a_real_environment(checkout, monkeypatch, capsys):
+def test_build_offline_with_real_environment(checkout, monkeypatch, capsys):
     pytest.importorskip('ensurepip', reason='this Python cannot create virtual environments')
     write_fake_wheel(checkout)
     monkeypatch.setenv('PIP_CONFIG_FILE', os.devnull)

@@ -103,7 +103,7 @@ def test_match_velocities_equals_plain_loops(seed, l, n, levels, speeds, penalty
 
 
 @pytest.mark.parametrize('n', [kernel.ENDS, kernel.ENDS + 1, 2 * kernel.ENDS + 17])
-def test_match_velocities_at_block_borders_equals_that_of_a_cut_map(n):
+def test_match_velocities_at_block_borders_equals_cut_map(n):
     rng = np.random.default_rng(n)
     window = rng.standard_normal((20, n)).astype(np.float32)
     shift, scale = (rng.uniform(0.5, 2, n).astype(np.float32) for _ in range(2))

@@ -107,7 +107,7 @@ def test_inliers_of_blank_image_are_zero(method):
     shapes=st.tuples(*[st.integers(1, 90)] * 4), kind=st.integers(0, 3), seed=st.integers(0, 99)
 )
 @hypothesis_settings(max_examples=20)
-def test_inliers_of_any_image_are_a_count(method, shapes, kind, seed):
+def test_inliers_of_any_image_are_not_negative(method, shapes, kind, seed):
     """Any size, noise, stripes and repeated tiles, whose matches are degenerate."""
     rng = np.random.default_rng(seed)
     one, other = (rng.integers(0, 256, (*size, 3), np.uint8) for size in (shapes[:2], shapes[2:]))

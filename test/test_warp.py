@@ -23,7 +23,7 @@ def test_warp_indices_by_hand(n, kind, expected):
     assert warp_indices(n, kind).tolist() == expected
 
 
-def test_warp_indices_at_a_rate_are_floors():
+def test_warp_indices_at_rate_are_floors():
     """floor(r i), also where 0.7 i is a whole number that binary fractions miss."""
     for kind in ('2x', '1.5x', '0.7x', '0.5x'):
         tenths = round(float(kind[:-1]) * 10)

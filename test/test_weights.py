@@ -182,7 +182,7 @@ def test_download_with_other_published_hash_is_rejected(
     assert 'as published' in capsys.readouterr().err
 
 
-def test_download_unlike_the_first_is_rejected(server, cache, content):
+def test_download_unlike_first_is_rejected(server, cache, content):
     """A file that was deleted and downloaded again must equal the first one."""
     tiny(model='download')
     (cache / 'tiny.pth').unlink()
