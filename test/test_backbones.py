@@ -115,25 +115,25 @@ def smooth_images(*sizes: tuple[int, int]) -> list[np.ndarray]:
 
 
 def test_densenet161_equals_second_implementation(densenet_file, densenet_parameters):
-    """At full size, from the published file format to 7 x 7 x 1488, in a batch of two."""
+    """At 96 pixels, from the published file format to 3 x 3 x 1488, in a batch of two."""
     images = smooth_images((120, 160), (300, 200))
-    settings = settings_class('densenet161_places365')(model=str(densenet_file))
+    settings = settings_class('densenet161_places365')(model=str(densenet_file), size=96)
     ours = backbone_class('densenet161_places365')(settings).feature_maps(images)
     doubles = {name: value.double() for name, value in densenet_parameters.items()}
-    assert ours.shape == (2, 1488, 7, 7)
-    assert_same(ours, networks.densenet161_layer10(doubles, standardized(images, 224)))
+    assert ours.shape == (2, 1488, 3, 3)
+    assert_same(ours, networks.densenet161_layer10(doubles, standardized(images, 96)))
 
 
 def test_vgg16_equals_second_implementation(vgg_file, vgg_parameters):
-    """At 96 pixels, where nothing but the size of the maps differs from 224."""
+    """In a batch of three."""
     images = smooth_images((120, 160), (96, 96), (50, 70))
-    settings = settings_class('vgg16')(model=str(vgg_file), size=96)
+    settings = settings_class('vgg16')(model=str(vgg_file), size=64)
     ours = backbone_class('vgg16')(settings).feature_maps(images)
     doubles = {
         name: value.double() for name, value in vgg_parameters.items() if 'features' in name
     }
-    assert ours.shape == (3, 512, 6, 6)
-    assert_same(ours, networks.vgg16_pool4(doubles, standardized(images, 96)))
+    assert ours.shape == (3, 512, 4, 4)
+    assert_same(ours, networks.vgg16_pool4(doubles, standardized(images, 64)))
 
 
 @pytest.fixture(scope='module')
