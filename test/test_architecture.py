@@ -72,7 +72,7 @@ def on_a_cycle(arrows: dict[str, set[str]]) -> list[str]:
 
 
 @pytest.mark.parametrize('folder', list(MAY_IMPORT))
-def test_arrows_run_one_way(folder):
+def test_folder_imports_only_those_below_it(folder):
     files = sorted((PACKAGE / folder).rglob('*.py'))
     assert files
     for path in files:
@@ -84,25 +84,25 @@ def test_arrows_run_one_way(folder):
                 assert parts[0] not in ROS, f'{path} imports {module}'
 
 
-def test_every_folder_is_in_the_plan():
+def test_folders_are_those_of_plan():
     folders = {path.name for path in PACKAGE.iterdir() if (path / '__init__.py').exists()}
     assert folders == set(MAY_IMPORT)
 
 
-def test_importing_the_package_is_light():
-    code = 'import sys, stavpr_ros; print(*sys.modules)'
+def test_package_and_parameters_import_lightly():
+    code = 'import sys, stavpr_ros.parameters; print(*sys.modules)'
     loaded = subprocess.run(
         [sys.executable, '-c', code], capture_output=True, text=True, check=True
     ).stdout
     assert not {'torch', 'numba', 'numpy', 'cv2', 'rclpy', 'rosbags'} & set(loaded.split())
 
 
-def test_cycles_are_found():
+def test_on_a_cycle_by_hand():
     assert on_a_cycle({'a': {'b'}, 'b': {'c'}, 'c': set()}) == []
     assert on_a_cycle({'a': {'b'}, 'b': {'c', 'd'}, 'c': {'b'}, 'd': set()}) == ['b', 'c']
 
 
-def test_modules_import_each_other_in_no_circle():
+def test_modules_import_each_other_without_cycles():
     """Also by imports within functions; a name that __init__ re-exports counts as its module's."""
     arrows = {
         module: {other for other in imported_modules(path) if other in MODULES and other != module}
@@ -111,7 +111,7 @@ def test_modules_import_each_other_in_no_circle():
     assert on_a_cycle(arrows) == []
 
 
-def test_no_two_classes_share_a_name():
+def test_classes_have_unique_names():
     found: dict[str, list[str]] = {}
     for module, path in MODULES.items():
         for node in ast.walk(ast.parse(path.read_text())):
@@ -138,7 +138,7 @@ def files_called(function) -> set[str]:
     return found
 
 
-def test_an_image_passes_through_few_files(route):
+def test_pipeline_of_one_image_calls_few_files(route):
     """In mode robust with gradient features, from the subscription to the published match."""
     pipeline = recorded(route, 'localization', mode='robust')
     process(pipeline, route[:10])  # fills the window; modules are imported at first use

@@ -17,7 +17,6 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / 'benchmarks'
 sys.path.insert(0, str(BENCHMARKS))
 
 import accuracy
-import baselines
 import compare
 import data
 import lower_bounds as bounds
@@ -73,24 +72,22 @@ def test_measure_two_jobs_runs_them_in_turn_after_warm_up(clock):
     assert found['b'].median_s == 0.03
 
 
-@pytest.mark.parametrize(
-    ('round_s', 'rounds'), [(0.2, 7), (0.01, 50), (1e-7, 101), (1.01, 3), (0.0, 101)]
-)
-def test_rounds_for_a_duration_fills_the_time_within_limits(round_s, rounds):
+@pytest.mark.parametrize(('round_s', 'rounds'), [(0.01, 50), (0.0, 101), (1.01, 3)])
+def test_rounds_for_duration_fills_time_within_limits(round_s, rounds):
     assert timing.rounds_for(round_s, 0.5) == rounds
 
 
 # ------------------------------------------------ lower bounds and peaks
 
 
-def test_bound_of_several_works_adds_the_longer_of_bytes_and_operations():
+def test_bound_of_several_works_adds_longer_of_bytes_and_operations():
     works = [
         bounds.Work(200, 1000), bounds.Work(50, 3000), bounds.Work(0, 4000, 'bfloat16')
     ]  # fmt: skip
     assert bounds.bound_seconds(works, PEAKS) == 2.0 + 3.0 + 1.0
 
 
-def test_operations_of_the_alignments_are_those_of_their_cells():
+def test_operations_of_alignments_are_those_of_their_cells():
     def count(rows, columns, inner):
         cells = [(i, j) for i in range(rows) for j in range(columns) if i + j]
         return sum(inner if i and j else 2 for i, j in cells)
@@ -100,7 +97,7 @@ def test_operations_of_the_alignments_are_those_of_their_cells():
     assert bounds.lm_dtw(sizes) == bounds.Work(4 * 4 * 10, 10 * (count(4, 6, 8) + 2 * 6))
 
 
-def test_peaks_are_raised_by_a_faster_stage():
+def test_peaks_are_raised_by_faster_stage():
     quick = PEAKS.raised(bounds.Work(2**28, 100, 'bfloat16'), 0.01, 'product')
     assert quick.bytes_per_s == 2**28 / 0.01
     assert quick.operations_per_s['bfloat16'] == 10_000.0
@@ -164,7 +161,7 @@ def test_target_at_its_bound_is_reached(ratio, reached):
     assert target.found([replace(row, mode='robust')]) is None
 
 
-def test_report_counts_losses_and_sums_the_stages_of_a_frame():
+def test_report_counts_losses_and_sums_stages_of_frame():
     parts = [Row(s, 'robust', 5, 0, 'float32', 0.001, 0, 7) for s in report.ROBUST_STAGES[2:]]
     parts += [Row('mean_centering', 'robust', 5, 8, 'float32', 0.001, 0.0, 7)]
     parts += [Row('image_distances', '', 5, 8, p, 0.002, 0.0, 7) for p in ('float16', 'float32')]
@@ -190,22 +187,11 @@ def test_report_counts_losses_and_sums_the_stages_of_a_frame():
 # ------------------------------------------------ peers
 
 
-@pytest.mark.parametrize('n', [1, 7, 30])
-def test_prange_gives_the_results_of_the_oracle(n):
-    # few values that add up exactly: ties everywhere
-    window = np.random.default_rng(n).integers(0, 3, (5, n)).astype(np.float32)
-    q, m = oracle.match_sequence(window, 2, np.float32)
-    distances, lengths = np.empty(n, np.float32), np.empty(n, np.int32)
-    baselines.prange()(window, 10, distances, lengths)
-    np.testing.assert_array_equal(distances, q)
-    np.testing.assert_array_equal(lengths, m)
-
-
 def accumulate(costs):
     return np.array(oracle.accumulate(costs, 1, np.float64).S)
 
 
-def test_librosa_peer_scales_a_sample_and_rejects_other_sums(clock):
+def test_librosa_peer_scales_sample_and_rejects_other_sums(clock):
     def dtw(C, backtrack):
         clock.now += 0.5
         return accumulate(C)
@@ -231,7 +217,7 @@ def test_sequence_peers_with_other_results_are_rejected():
 
 
 @pytest.mark.long
-def test_measure_memory_counts_at_least_the_features():
+def test_measure_memory_counts_at_least_features():
     found = memory.measure_memory('localization', 'robust', 'float32', 2_000, 512)
     assert found.feature_bytes == 2_000 * 512 * 7 * 4
     assert 0.9 < found.ratio < 10
@@ -272,23 +258,18 @@ def test_compare_of_this_checkout_with_itself_gives_equal_results(capsys):
     [
         ('sequence', 'f1', 0.9, 0.8, True),
         ('sequence', 'f1', 0.8, 0.9, False),
-        ('sequence', 'recall_at_1', 0.9, 0.8, True),
-        ('sequence', 'threshold', 0.9, 0.8, False),
         ('sequence', 'precision', 0.9, 0.8, False),  # at the best F1
         ('at_default', 'precision', 0.9, 0.8, True),
         ('unknown', 'matched', 3, 4, True),
     ],
 )
-def test_changes_of_a_value_are_listed_and_classified(group, name, before, after, worse):
+def test_changes_of_value_are_listed_and_classified(group, name, before, after, worse):
     old, new = ({'a': {group: {name: value, 'queries': 5}}} for value in (before, after))
     lines, found = accuracy.changes(old | {'b': {}}, new)
     assert lines == [f'{"WORSE" if worse else "changed"}: a {group}.{name}: {before} -> {after}']
     assert found is worse
     assert accuracy.changes(old, old) == ([], False)
-
-
-def test_changes_name_a_value_that_is_gone():
-    assert accuracy.changes({'a': {'f1': 1.0}}, {'a': {}})[1]
+    assert accuracy.changes(old, {'a': {}})[1]  # a value is gone
 
 
 def test_committed_accuracy_table_has_all_rows_and_its_markdown():
@@ -321,7 +302,7 @@ def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     assert text.index('A frame in mode robust') < text.index('## All stages')
 
 
-def test_command_on_a_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
+def test_command_on_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, 'is_available', lambda: False)
     assert matching.main(['--device', 'cuda', '--output', str(tmp_path)]) == 2
     assert 'torch sees no CUDA device here' in capsys.readouterr().err

@@ -71,8 +71,16 @@ def expected_row(reference, query, i, settings):
     return oracle.image_distances(1 - products, settings.strategy, settings.sigma, settings.xi)
 
 
-@pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'sliding_window', 'none'])
-@pytest.mark.parametrize(('xi', 'precision'), [(None, 'float32'), (2, 'float16')])
+@pytest.mark.parametrize(
+    ('strategy', 'xi', 'precision'),
+    [
+        ('adaptive', None, 'float32'),
+        ('adaptive', 2, 'float16'),
+        ('vanilla', 2, 'float32'),
+        ('sliding_window', 2, 'float32'),
+        ('none', None, 'float16'),
+    ],
+)
 def test_distances_of_every_strategy_equal_oracle(matcher_class, strategy, xi, precision):
     reference, query = features(7, zero=[(1, 2)]), features(3, seed=1, zero=[(0, 0)])
     settings = SpatialSettings(strategy, 0.7, xi)
@@ -88,21 +96,10 @@ def test_distances_of_every_strategy_equal_oracle(matcher_class, strategy, xi, p
         np.testing.assert_allclose(row.cpu().numpy(), expected, rtol=0, atol=TOLERANCE)
 
 
-def test_float16_distances_differ_from_float32(matcher_class):
-    reference, query = features(7), features(1, seed=1)
-    rows = [
-        matcher_class(reference, SpatialSettings(), precision)
-        .distances(query.strips[:, 0], query.weights[:, 0])
-        .cpu()
-        for precision in ('float32', 'float16')
-    ]
-    assert not torch.equal(*rows)
-    torch.testing.assert_close(*rows, rtol=0, atol=0.2)
-
-
-@pytest.mark.parametrize('precision', ['float32', 'float16'])
-def test_distances_in_pieces_are_equal(matcher_class, monkeypatch, precision):
+def test_distances_in_pieces_are_equal(matcher_class, monkeypatch):
     from stavpr_ros.recognition import cuda_matcher
+
+    precision = 'float16'
 
     reference, query = features(11), features(5, seed=1)
     whole = matcher_class(reference, SpatialSettings(), precision)
@@ -131,8 +128,9 @@ def same(a, b):
     return equal and seconds and np.array_equal(path, twin_path) and path.dtype == twin_path.dtype
 
 
-@pytest.mark.parametrize(('n', 'length', 'beta'), [(19, 3, 2.0), (1, 2, 1.5), (4, 3, 3.0)])
-@pytest.mark.parametrize('nms_radius', [0, 3])
+@pytest.mark.parametrize(
+    ('n', 'length', 'beta', 'nms_radius'), [(11, 3, 2.0, 3), (1, 2, 1.5, 0), (4, 3, 3.0, 0)]
+)
 def test_search_equals_that_of_cpu(matcher_class, n, length, beta, nms_radius):
     sequence = SequenceSettings(length=length, beta=beta)
     search, twin = searches(n, sequence)
@@ -169,18 +167,6 @@ def first_image(x):
     return x.strips[:, 0], x.weights[:, 0]
 
 
-def test_search_of_normalized_rows_finds_traverse(matcher_class):
-    reference = features(12)
-    matcher = matcher_class(reference, SpatialSettings(xi=2))
-    search, _ = searches(12)
-    for place in range(5, 8):
-        row = matcher.distances(reference.strips[:, place], reference.weights[:, place])
-        search.buffer.push((row - row.mean()) / row.std())
-    found = search(2)
-    assert (found.nearest.first, found.nearest.last) == (5, 7)
-    assert found.path.tolist() == [[0, 5], [1, 6], [2, 7]]
-
-
 def test_distances_returned_before_stay_unchanged(matcher_class):
     reference = features(6)
     matcher = matcher_class(reference, SpatialSettings())
@@ -190,10 +176,9 @@ def test_distances_returned_before_stay_unchanged(matcher_class):
     assert torch.equal(first, kept)
 
 
-@pytest.mark.parametrize('strategy', ['adaptive', 'none'])
-def test_search_of_empty_map_has_no_match(matcher_class, strategy):
+def test_search_of_empty_map_has_no_match(matcher_class):
     query = features(1)
-    matcher = matcher_class(features(3)[0:0], SpatialSettings(strategy))
+    matcher = matcher_class(features(3)[0:0], SpatialSettings())
     assert matcher.places == 0
     search, _ = searches(0)
     for _ in range(3):

@@ -121,7 +121,7 @@ def test_readme_is_short():
     assert len((ROOT / 'README.md').read_text().splitlines()) <= README_LINES
 
 
-def test_readme_results_are_those_of_the_accuracy_table():
+def test_readme_results_are_those_of_accuracy_table():
     results = ROOT / 'benchmarks/results/accuracy-eb40c94.json'
     table = json.loads(results.read_text())['results']
 

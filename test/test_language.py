@@ -94,11 +94,11 @@ def findings(text: str) -> list[str]:
         ('first line\nWhat has grown', ['what has grown']),
     ],
 )
-def test_findings_names_the_avoided_words(text, words):
+def test_findings_names_avoided_words(text, words):
     assert [re.match(r'\d+: (.*) \(', line).group(1) for line in findings(text)] == words
 
 
-def test_prose_uses_the_terms_of_the_field():
+def test_prose_uses_terms_of_field():
     found = [
         f'{path.relative_to(ROOT)}:{line}'
         for path in prose_files()

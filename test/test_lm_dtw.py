@@ -6,6 +6,7 @@ import math
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import numba
 import numpy as np
 import oracle
 import pytest
@@ -53,7 +54,13 @@ def random_distances(seed, length, n, dtype, levels, banned):
 
 @pytest.mark.parametrize('dtype', DTYPES)
 def test_match_sequence_by_hand(dtype):
-    """The table of test_oracle.py's test of the same name."""
+    # l = 2, k = 4. Start 0: S row 1 = 4 6 7 12, row 2 by column:
+    #   x=1: vertical 1 + 4 = 5, C = 2, q = 2.5
+    #   x=2: cell 8: diagonal 8 + 4 = 12, vertical 14, horizontal 13: diagonal, C = 2, q = 6
+    #   x=3: cell 0: diagonal 6, vertical 7, horizontal 12: diagonal, C = 3, q = 2
+    #   x=4: cell 9: diagonal 16, vertical 21, horizontal 15: C = 4, q = 3.75 -> m = 3, q = 2
+    # Start 1: 2 3 8 over 8 0 9: x=1: 10 / 2 = 5; x=2: diagonal 2 < vertical 3 -> m = 2, q = 1
+    # Start 2: 1 6 over 0 9: x=1: 1 / 2 = .5 -> m = 1; start 3, one frame: 14 / 2 = 7 -> m = 1
     D = np.array([[4, 2, 1, 5], [1, 8, 0, 9]], dtype)
     sequence = SequenceSettings(length=2, beta=2.0)
     matches = match_sequence(D, sequence)
@@ -64,15 +71,6 @@ def test_match_sequence_by_hand(dtype):
     assert aligned.distance == 2
     assert path_of(aligned) == [(0, 0), (0, 1), (1, 2)]
     assert path_of(align_sequence(D, 3, sequence)) == [(0, 3), (1, 3)]
-
-
-def test_free_end_is_best_column_not_last():
-    # zeros on the diagonal from place 0: q_1 = 1 / 2, q_2 = 1 / 3, q_3 = 0 / 3, then (0 + 1) / 4
-    D = np.ones((3, 6))
-    D[0, 0] = D[1, 1] = D[2, 2] = 0
-    matches = match_sequence(D, SequenceSettings(length=3, beta=2.0))
-    assert (matches.distances[0], matches.lengths[0]) == (0, 3)
-    assert path_of(align_sequence(D, 0, SequenceSettings(length=3))) == [(0, 0), (1, 1), (2, 2)]
 
 
 def test_first_of_equal_ends_and_starts_wins():
@@ -89,74 +87,12 @@ def test_first_of_equal_ends_and_starts_wins():
     assert (matches.distances[0], matches.lengths[0]) == (1, 2)
 
 
-def test_vertical_step_wins_ties():
-    D = np.array([[0.0, 1, 9], [1, 9, 1], [0, 1, -7]])
-    # S = 0  1 10   (2,3): diagonal 1 + 1 = 2, C = 3
-    #     1  9  2   (3,2): diagonal 1 + 1, vertical 1 + 9, horizontal 1 + 1: horizontal, C = 4
-    #     1  2 -5   (3,3): diagonal -7 + 9, vertical -7 + 2, horizontal -7 + 2: vertical, C = 4
-    # q = 1 / 3, 2 / 4, -5 / 4; by the horizontal step the last would be -5 / 5
-    aligned = align_sequence(D, 0, SequenceSettings(length=3))
-    assert aligned.distance == -5 / 4
-    assert path_of(aligned) == [(0, 0), (0, 1), (1, 2), (2, 2)]
-    assert match_sequence(D, SequenceSettings(length=3)).distances[0] == -5 / 4
-    # all three sums are -5 + 1
-    D = np.array([[1.0, 0], [0, -5]])
-    aligned = align_sequence(D, 0, SequenceSettings(length=2))
-    assert path_of(aligned) == [(0, 0), (0, 1), (1, 1)]
-    assert match_sequence(D, SequenceSettings(length=2)).distances[0] == -4 / 3
-
-
-@pytest.mark.parametrize('dtype', DTYPES)
-def test_ties_are_those_of_rounded_sums(dtype):
-    # 4 + 1 and 4 + (1 + ulp) both round to 5: vertical, C = 3
-    D = np.array([[1, np.finfo(dtype).eps], [9, 4]], dtype)
-    matches = match_sequence(D, SequenceSettings(length=2))
-    assert (matches.distances[0], matches.lengths[0]) == (dtype(5) / dtype(3), 2)
-
-
-def test_one_place_may_absorb_whole_query():
-    D = np.ones((20, 30))
-    D[:, 11] = 0
-    best = best_match(match_sequence(D, SequenceSettings()), 3)
-    assert (best.first, best.last, best.distance) == (11, 11, 0)
-
-
-def test_starts_at_end_of_map_have_fewer_places():
-    # l = 4, n = 3 < l: starts 0, 1, 2 have 3, 2, 1 places; start 2: (2 + 2 + 2 + 2) / 4
-    matches = check_every_start(np.array([[9.0, 9, 2]] * 4), 4, 2.0)
-    assert (matches.distances[2], matches.lengths[2]) == (2, 1)
-    # start 1: 9, diagonal to 2, then down: 15 / 4; by way of (1,2) it would be 17 / 5, less, but
-    # the recursion minimizes S, not q
-    assert matches.distances[1] == 15 / 4
-
-
 @pytest.mark.parametrize(
     ('length', 'beta', 'k'), [(20, 2.0, 40), (25, 2.2, 55), (10, 1.11, 12), (7, 1.05, 8)]
 )
 def test_places_searched_round_up_but_not_rounding_errors(length, beta, k):
     # 2.2 * 25 = 55.00000000000001 in floating point: 55, not 56
     assert SequenceSettings(length=length, beta=beta).k == k
-
-
-def test_place_beyond_k_is_out_of_reach():
-    # free along row 1, then only the 56th place is cheap: with k = 55 it is not reached
-    D = np.full((25, 56), 5.0)
-    D[0, :] = 0
-    D[1:, 55] = 0
-    matches = match_sequence(D, SequenceSettings(length=25, beta=2.2))
-    assert matches.distances[0] > 0
-    assert matches.distances[1] == 0
-    wider = match_sequence(D, SequenceSettings(length=25, beta=2.24))  # k = 56
-    assert (wider.distances[0], wider.lengths[0]) == (0, 56)
-
-
-def test_banned_pairs_are_never_used():
-    # start 0 is banned itself; start 1 must pass by the ban at (1, 1): straight down is +inf
-    D = np.array([[INF, 1.0, 1.0], [1.0, INF, 1.0]])
-    matches = match_sequence(D, SequenceSettings(length=2))
-    assert matches.distances.tolist() == [INF, 1, 1]
-    assert matches.lengths[1:].tolist() == [2, 1]
-    assert path_of(align_sequence(D, 1, SequenceSettings(length=2))) == [(0, 1), (1, 2)]
 
 
 # ------------------------------------------------ the best match
@@ -195,20 +131,11 @@ def test_aligned_index_is_floor_of_middle():
 # ------------------------------------------------ the kernel against the oracle, exactly
 
 
-@pytest.mark.parametrize('beta', [1.05, 1.5, 2.0])
-@pytest.mark.parametrize('length', [2, 3, 4, 7, 10, 13])
-def test_match_sequence_of_every_size_equals_oracle(length, beta):
-    """Hypothesis prefers small examples: this sweep has every size and kind of tie."""
-    for n in (1, length - 1, length + 3):
-        for dtype, levels, banned in ((np.float32, 4, 0.1), (np.float64, 2, 0.0)):
-            check_every_start(random_distances(n, length, n, dtype, levels, banned), length, beta)
-
-
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=100)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    length=st.integers(2, 14),
-    n=st.integers(0, 12),
+    length=st.sampled_from([*range(2, 15), 20]),  # integers() would prefer small ones
+    n=st.sampled_from(range(13)),
     beta=st.sampled_from([1.05, 1.1, 1.5, 2.0, 2.35, 3.0]),
     dtype=st.sampled_from(DTYPES),
     levels=st.sampled_from([0, 1, 2, 4, 10]),
@@ -247,10 +174,6 @@ def test_match_sequence_at_block_borders_equals_oracle(n):
     check_every_start(random_distances(n, 2, n, np.float64, 2, 0.0), 2, 1.5)
 
 
-def test_match_sequence_by_default_equals_oracle():
-    check_every_start(random_distances(20, 20, 45, np.float32, 0, 0.0), 20, 2.0)
-
-
 def test_match_sequence_of_any_memory_layout_changes_nothing():
     D = random_distances(5, 4, 80, np.float32, 3, 0.1)
     before, sequence = D.copy(), SequenceSettings(length=4)
@@ -261,10 +184,8 @@ def test_match_sequence_of_any_memory_layout_changes_nothing():
     np.testing.assert_array_equal(D, before)
 
 
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason='one processor only')
 def test_match_sequence_does_not_depend_on_number_of_threads():
-    numba = pytest.importorskip('numba')
-    if numba.config.NUMBA_NUM_THREADS < 2:
-        pytest.skip('one processor only')
     D = random_distances(7, 20, 3000, np.float32, 0, 0.01)
     before = numba.get_num_threads()
     results = []

@@ -5,7 +5,6 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
-import oracle
 import pytest
 from stavpr_ros.alignment import (
     align_sequence,
@@ -76,14 +75,6 @@ def test_fused_distances_equal_separate_functions(W, n, d, strategy, data):
         np.testing.assert_array_equal(matrix[x], separate)
         row = make(features, spatial).distances(queries.strips[:, x], queries.weights[:, x])
         np.testing.assert_array_equal(row, separate)
-
-
-def test_distances_equal_oracle():
-    features, query = random_features(7, 33, 40), random_features(7, 1, 40, seed=1)
-    row = make(features).distances(query.strips[:, 0], query.weights[:, 0])
-    d = oracle.distances(query.strips[:, 0].double().numpy(), features.strips.double().numpy())
-    expected = oracle.image_distances(d)
-    np.testing.assert_allclose(row, expected, atol=2e-6)
 
 
 @pytest.mark.parametrize('W', [1, 7])
@@ -170,7 +161,7 @@ def test_search_without_places_has_no_match(velocity):
 # ------------------------------------------------ float16
 
 
-@pytest.mark.parametrize('d', [1, 100, 512])
+@pytest.mark.parametrize('d', [1, 512])
 def test_float16_distances_are_those_of_rounded_features(d):
     """Strip distances move by 2^-11 at most (Cauchy-Schwarz); with W = 1 they are the result."""
     features, query = random_features(1, 300, d), random_features(1, 2, d, seed=1)

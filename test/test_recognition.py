@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recognizer image by image: equal to the whole matrix at once, never a false place 0."""
 
+from dataclasses import replace
+
 from conftest import route_images
 import numpy as np
 import pytest
@@ -96,19 +98,23 @@ def test_recognizer_on_map_shorter_than_window_matches(small_map, places):
     assert answer.path[:, 1].max() < places
 
 
+@pytest.mark.parametrize('mode', ['paper', 'robust'])
 @pytest.mark.parametrize('value', [np.nan, np.inf])
-def test_update_with_features_not_finite_changes_nothing(small_map, value):
-    one = recognizer(small_map)
-    recognize_all(one, small_map.features[:3])
-    strips = small_map.features.strips[:, :1].clone()
+def test_features_not_finite_are_rejected_and_change_nothing(small_map, value, mode):
+    one, other = (recognizer(small_map, mode=mode) for _ in range(2))
+    features = small_map.features
+    strips = features[:].strips.clone()
     strips[2, 0, 0] = value
-    with pytest.raises(InputError, match=r'not finite|NaN'):
-        one.update(LocalFeatures(strips, small_map.features.weights[:, :1], small_map.settings))
-    assert one.window_fill == 3
-    for i in range(3, 5):
-        answer = one.update(small_map.features[i : i + 1])
-    assert answer.status is Status.MATCH
-    assert answer.newest_index == 4
+    damaged = LocalFeatures(strips, features.weights, features.settings)
+    for each in (one, other):
+        recognize_all(each, features[:3])
+    for call in (one.update, one.distances):
+        with pytest.raises(InputError, match='features of the image are not finite'):
+            call(damaged[:1])
+    for i in range(3, 6):
+        assert repr(one.update(features[i : i + 1])) == repr(other.update(features[i : i + 1]))
+    with pytest.raises(InputError, match='features of the map are not finite'):
+        recognizer(replace(small_map, features=damaged))
 
 
 def test_update_with_two_images_is_rejected(small_map):

@@ -6,6 +6,7 @@ import math
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import numba
 import numpy as np
 import oracle
 import pytest
@@ -120,14 +121,6 @@ def test_adaptive_weight_by_hand():
     assert aligned_pair(d, SpatialSettings(sigma=0.0)).distance == pytest.approx(0.7 / 2)
 
 
-def test_diagonal_step_costs_adaptive_weight():
-    # W = 3, c = 2, row 2 = .1 .5 .9: I = 1, a = sqrt(2)
-    # S22 = min(.707, 9.5, .6): horizontal from S21 = .1, C = 3; S33: diagonal, C = 3 + sqrt(2)
-    aligned = aligned_pair(np.array([[0.0, 9, 9], [0.1, 0.5, 0.9], [9, 9, 0]]), ADAPTIVE)
-    assert path_of(aligned) == [(0, 0), (1, 0), (1, 1), (2, 2)]
-    assert aligned.cost == pytest.approx(3 + math.sqrt(2))
-
-
 @pytest.mark.parametrize(
     ('row', 'places_away'),
     [
@@ -142,19 +135,23 @@ def test_adaptive_weight_of_even_number_of_strips_by_hand(row, places_away):
     assert aligned_pair(d, ADAPTIVE).weight == math.sqrt(1 + places_away)
 
 
-def test_image_distance_is_not_symmetric():
-    d = np.array([[1.0, 3, 3], [0, 1, 3], [3, 3, 1]])
-    # row 2 = 0 1 3: a = sqrt(2): (2,2): diagonal 2.414, vertical 5, horizontal 2, C = 3
-    # (3,3): diagonal 1.414 + 2, C = 3 + 1.414; transposed, row 2 = 3 1 3: a = 1: (2,2) is 2 by
-    # vertical, C = 3; (3,3): diagonal 1 + 2, C = 4
-    assert one(d, ADAPTIVE) == pytest.approx((2 + math.sqrt(2)) / (3 + math.sqrt(2)))
-    assert one(np.ascontiguousarray(d.T), ADAPTIVE) == pytest.approx(3 / 4)
+def cheapest_path(d, a, i=0, j=0):
+    """Return the smallest sum over every monotone path from (i, j) to the end, trying all."""
+    rows, columns = d.shape
+    if (i, j) == (rows - 1, columns - 1):
+        return 0.0
+    costs = []
+    for di, dj, weight in ((1, 1, a), (1, 0, 1.0), (0, 1, 1.0)):
+        if i + di < rows and j + dj < columns:
+            costs.append(weight * d[i + di, j + dj] + cheapest_path(d, a, i + di, j + dj))
+    return min(costs)
 
 
-def test_single_strip_is_its_distance():
-    d = np.array([[[0.25, 0.75]]])
-    for spatial in (ADAPTIVE, VANILLA, SpatialSettings(xi=1)):
-        assert image_distances(d, spatial).tolist() == [0.25, 0.75]
+@pytest.mark.parametrize('seed', range(3))
+def test_accumulated_distance_is_cheapest_of_all_paths(seed):
+    d = np.random.default_rng(seed).random((5, 5))
+    aligned = aligned_pair(d, ADAPTIVE)
+    assert aligned.accumulated == pytest.approx(d[0, 0] + cheapest_path(d, aligned.weight))
 
 
 # ------------------------------------------------ the band
@@ -171,14 +168,6 @@ def test_band_allows_29_of_49_cells():
                 allowed.add((i, j))
     assert allowed == {(i, j) for i in range(7) for j in range(7) if abs(i - j) < 3}
     assert len(allowed) == 29
-
-
-def test_band_of_one_is_mean_of_diagonal():
-    d = np.zeros((7, 7))
-    np.fill_diagonal(d, [1, 2, 3, 4, 5, 6, 7])  # row 4's minimum is outside; a = 1 all the same
-    aligned = aligned_pair(d, SpatialSettings(xi=1))
-    assert (aligned.weight, aligned.cost, aligned.distance) == (1, 7, 4)
-    assert path_of(aligned) == [(i, i) for i in range(7)]
 
 
 def test_adaptive_weight_considers_allowed_cells_only():
@@ -223,20 +212,10 @@ def check(d, strategy, sigma=1.0, xi=None):
     assert (aligned.weight, aligned.distance) == (expected.weight, expected.distance)
 
 
-@pytest.mark.parametrize('dtype', DTYPES)
-@pytest.mark.parametrize('W', range(1, 10))
-def test_image_distances_of_every_size_equal_oracle(W, dtype):
-    """Hypothesis prefers small examples: this sweep has every size and kind of tie."""
-    for strategy in ('adaptive', 'vanilla', 'sliding_window')[: 3 if W >= 4 else 2]:
-        for levels in (0, 2, 6):
-            for xi in {None, 1, (W + 1) // 2, W}:
-                check(random_distances(W, W, 3, dtype, levels), strategy, 1.0, xi)
-
-
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=120)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    W=st.integers(1, 9),
+    W=st.sampled_from(range(1, 10)),  # integers() would prefer small ones
     n=st.sampled_from([0, 1, 2, 5, 9]),
     dtype=st.sampled_from(DTYPES),
     levels=st.sampled_from([0, 1, 2, 4, 10]),
@@ -262,7 +241,6 @@ def test_image_distances_at_block_borders_equal_oracle(n, strategy):
 
 
 def test_image_distances_do_not_depend_on_number_of_threads():
-    numba = pytest.importorskip('numba')
     if numba.config.NUMBA_NUM_THREADS < 2:
         pytest.skip('one processor only')
     d = random_distances(3, 7, 3000, np.float32, 0)

@@ -12,27 +12,27 @@ def events(watch, *milliseconds):
     return [watch.see(START + ms * MS) for ms in milliseconds]
 
 
-def test_watch_of_a_steady_stream_reports_nothing():
+def test_watch_of_steady_stream_reports_nothing():
     assert events(StampWatch(0.5), *range(0, 3000, 33)) == [0] * 91
 
 
-def test_watch_of_a_pause_above_the_limit_reports_a_gap():
+def test_watch_of_pause_above_limit_reports_gap():
     expected = [0, 0, 0.501, 0]
     assert events(StampWatch(0.5), 0, 500, 1001, 1500) == expected
 
 
-def test_watch_of_a_jump_back_reports_it_once():
+def test_watch_of_jump_back_reports_it_once():
     jump = -60.0
     found = events(StampWatch(0.5), 60_000, 60_033, 33, 66, 99)
     assert found == [0, 0, jump, 0, 0]
 
 
-def test_watch_of_reordered_images_reports_jumps_from_a_tenth_of_a_second():
+def test_watch_of_reordered_images_reports_jumps_from_tenth_of_second():
     assert events(StampWatch(0.5), 1000, 900) == [0, -0.1]
     assert events(StampWatch(0.5), 1000, 901) == [0, 0]
 
 
-def test_watch_after_reordered_images_compares_with_the_newest_stamp():
+def test_watch_after_reordered_images_compares_with_newest_stamp():
     # 1 ms more than the limit after the reordered image, but within it after the newest
     assert events(StampWatch(0.5), 1000, 910, 1411) == [0, 0, 0]
     # two small steps back are together a jump
@@ -51,7 +51,7 @@ def test_watch_of_unknown_stamps_ignores_them():
     assert events(watch, 501) == [0.501]  # ... and no new start
 
 
-def test_watch_with_a_changed_limit_applies_it():
+def test_watch_with_changed_limit_applies_it():
     watch = StampWatch(0.5)
     assert events(watch, 0, 400) == [0, 0]
     watch.gap = 0.3

@@ -18,10 +18,8 @@ class Block(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.first, self.second = (
-            nn.Conv2d(3, 4, 3, padding=1),
-            nn.Conv2d(4, 5, 3, stride=2, padding=1),
-        )
+        self.first = nn.Conv2d(3, 4, 3, padding=1)
+        self.second = nn.Conv2d(4, 5, 3, stride=2, padding=1)
         self.relu, self.unused = nn.ReLU(), nn.ReLU()
 
     def forward(self, x, shift):
@@ -171,17 +169,13 @@ def test_torchscript_errors_name_file_and_layer(file, tmp_path):
         settings(file, sha256='12')
 
 
-def test_torchscript_layer_in_branch_is_rejected(tmp_path):
+def test_torchscript_layer_that_cannot_be_cut_off_is_rejected(tmp_path, net):
     torch.jit.save(torch.jit.script(Branch()), tmp_path / 'branch.pt')
     with pytest.raises(SettingsError, match='in a branch or loop'):
         FeatureExtractor('torchscript', settings(tmp_path / 'branch.pt', layer='layer'))
     maps = backbone_class('torchscript')(settings(tmp_path / 'branch.pt')).feature_maps(images(2))
     assert maps.shape == (2, 4, 16, 16)
-
-
-def test_torchscript_frozen_program_has_no_layers(tmp_path, net):
-    frozen = torch.jit.freeze(torch.jit.script(net))
-    torch.jit.save(frozen, tmp_path / 'frozen.pt')
+    torch.jit.save(torch.jit.freeze(torch.jit.script(net)), tmp_path / 'frozen.pt')
     with pytest.raises(SettingsError, match='its layers are none'):
         FeatureExtractor('torchscript', settings(tmp_path / 'frozen.pt', layer='head'))
 

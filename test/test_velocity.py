@@ -103,7 +103,7 @@ def test_match_velocities_equals_plain_loops(seed, l, n, levels, speeds, penalty
 
 
 @pytest.mark.parametrize('n', [kernel.ENDS, kernel.ENDS + 1, 2 * kernel.ENDS + 17])
-def test_match_velocities_at_block_borders_equals_that_of_a_cut_map(n):
+def test_match_velocities_at_block_borders_equals_cut_map(n):
     rng = np.random.default_rng(n)
     window = rng.standard_normal((20, n)).astype(np.float32)
     shift, scale = (rng.uniform(0.5, 2, n).astype(np.float32) for _ in range(2))
@@ -116,6 +116,19 @@ def test_match_velocities_at_block_borders_equals_that_of_a_cut_map(n):
             np.testing.assert_array_equal(
                 getattr(whole, name)[near][ends], getattr(part, name)[ends] + offset
             )
+
+
+def test_path_one_place_faster_at_every_step_crosses_block_border():
+    l, end = 40, kernel.ENDS
+    places = end - 3 * np.arange(l)[::-1]
+    costs = np.full((l, end + 1), 10.0)
+    costs[np.arange(l), places] = 0
+    chosen = VelocitySettings((2.0,), 0.5)
+    matches = match_velocities(costs, chosen)
+    assert matches.distances[end] == 0.5 * (l - 1) / l
+    assert (matches.firsts[end], matches.middles[end]) == (places[0], places[(l - 1) // 2])
+    path = trace_velocity(costs, end, chosen.steps(l)[0], chosen.penalty)
+    assert path[:, 1].tolist() == places.tolist()
 
 
 def test_match_velocities_applies_shift_and_scale():
@@ -137,6 +150,8 @@ def test_best_velocity_match_has_second_best_elsewhere():
     assert (nearest.first, nearest.last, nearest.middle) == (20, 23, 21)
     assert (nearest.second_best_index, nearest.second_best_distance) == (3, 0.25)
     assert best_velocity_match(matches, 18).second_best_index != 3  # 21 - 3 is not above 18
+    equal = match_velocities(np.zeros((4, 30)), VelocitySettings())
+    assert best_velocity_match(equal, 18).last == 0  # the lowest end on a tie
     alone = best_velocity_match(matches, 30)
     assert alone.second_best_index == -1
     assert np.isnan(alone.second_best_distance)

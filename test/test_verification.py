@@ -40,8 +40,9 @@ VIEWS = {
 }
 
 
-@pytest.mark.parametrize('method', METHODS)
-@pytest.mark.parametrize('view', VIEWS)
+@pytest.mark.parametrize(
+    ('method', 'view'), [*(('orb', view) for view in VIEWS), ('sift', 'slanted')]
+)
 def test_inliers_of_flat_scene_from_other_viewpoint_are_many(method, view):
     check = GeometricVerifier(GeometricSettings(method))
     one = texture(0)
@@ -52,7 +53,7 @@ def test_inliers_of_flat_scene_from_other_viewpoint_are_many(method, view):
 @pytest.mark.parametrize('method', METHODS)
 def test_inliers_of_other_scene_are_few(method):
     check = GeometricVerifier(GeometricSettings(method))
-    found = [check.inliers(texture(seed), texture(seed + 100)) for seed in range(4)]
+    found = [check.inliers(texture(seed), texture(seed + 100)) for seed in range(2)]
     assert max(found) < 30
 
 
@@ -82,6 +83,14 @@ def test_inliers_without_common_geometry_are_few():
     assert GeometricVerifier(settings).inliers(one, other) < 150
 
 
+def test_verifies_one_patch_repeated_in_query_is_false():
+    """Each of its keypoints counts for the one that is nearest to it, not for every copy."""
+    patch = texture(0, (120, 160))
+    place = np.pad(patch, ((0, 360), (0, 480), (0, 0)))
+    assert GeometricVerifier().verifies(place, place)
+    assert not GeometricVerifier().verifies(np.tile(patch, (4, 4, 1)), place)
+
+
 @pytest.mark.parametrize('method', METHODS)
 def test_inliers_of_blank_image_are_zero(method):
     check, scene = GeometricVerifier(GeometricSettings(method)), texture(0)
@@ -98,7 +107,7 @@ def test_inliers_of_blank_image_are_zero(method):
     shapes=st.tuples(*[st.integers(1, 90)] * 4), kind=st.integers(0, 3), seed=st.integers(0, 99)
 )
 @hypothesis_settings(max_examples=20)
-def test_inliers_of_any_image_are_a_count(method, shapes, kind, seed):
+def test_inliers_of_any_image_are_not_negative(method, shapes, kind, seed):
     """Any size, noise, stripes and repeated tiles, whose matches are degenerate."""
     rng = np.random.default_rng(seed)
     one, other = (rng.integers(0, 256, (*size, 3), np.uint8) for size in (shapes[:2], shapes[2:]))
@@ -108,7 +117,9 @@ def test_inliers_of_any_image_are_a_count(method, shapes, kind, seed):
         one, other = np.tile(one[:8, :8], (6, 6, 1)), np.tile(one[:8, :8], (5, 9, 1))
     if kind == 3:
         other = one.copy()
-    assert GeometricVerifier(GeometricSettings(method, ratio=1.0)).inliers(one, other) >= 0
+    assert (
+        GeometricVerifier(GeometricSettings(method, ratio=1.0, width=64)).inliers(one, other) >= 0
+    )
 
 
 def test_inliers_do_not_depend_on_image_size():
