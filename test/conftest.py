@@ -58,6 +58,28 @@ def small_map(route):
 
 
 @pytest.fixture(scope='module')
+def one_thread():
+    """Limit the threads: waiting ones spin, 100 ms an image on a busy machine."""
+    from stavpr_ros.threads import limit_threads
+
+    limit_threads(1)
+    yield
+    limit_threads(0)
+
+
+@pytest.fixture
+def context():
+    """Yield an initialized ROS context."""
+    from processes import DOMAIN
+    import rclpy
+
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    yield context
+    rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture(scope='module')
 def robot():
     """Yield a robot with a camera: a ROS node beside the tested one."""
     from robot import Robot

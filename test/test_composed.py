@@ -6,7 +6,7 @@ import threading
 
 import cv2
 from image_messages import image_message
-from processes import DOMAIN, RELIABLE, TAKEN_RELIABLY
+from processes import RELIABLE, TAKEN_RELIABLY
 import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
@@ -20,14 +20,6 @@ from stavpr_ros.threads import limit_threads
 import torch
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
-
-
-@pytest.fixture
-def context():
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    yield context
-    rclpy.try_shutdown(context=context)
 
 
 @pytest.fixture
