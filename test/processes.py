@@ -39,19 +39,23 @@ def executable(name: str) -> str:
     return str(Path(get_package_prefix('stavpr_ros')) / 'lib' / 'stavpr_ros' / name)
 
 
+def environment() -> dict[str, str]:
+    """Return the environment of a process that shares the domain of the tests."""
+    return os.environ | {
+        'ROS_DOMAIN_ID': str(DOMAIN),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+    }
+
+
 class Process:
     """One executable, started as `ros2 run` would, its output in a file."""
 
     def __init__(self, log: Path, name: str, *arguments: str) -> None:
         self.log = log
-        environment = os.environ | {
-            'ROS_DOMAIN_ID': str(DOMAIN),
-            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        }
         with log.open('w') as output:
             self.popen = subprocess.Popen(
                 [executable(name), *arguments],
-                env=environment,
+                env=environment(),
                 stdout=output,
                 stderr=subprocess.STDOUT,
             )
