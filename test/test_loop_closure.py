@@ -34,6 +34,7 @@ from stavpr_ros.recognition.robust import (
 from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
 import torch
 
+pytestmark = pytest.mark.usefixtures('one_thread')
 SHORT = SequenceSettings(length=5, beta=2.0)
 SECOND = 10**9
 

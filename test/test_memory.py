@@ -17,6 +17,7 @@ from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CACHE_LINE
 import torch
 
+pytestmark = pytest.mark.usefixtures('one_thread')
 # Resident bytes beside the features: the heap and the window; a copy of the features takes more.
 ALLOWANCE = 26e6
 
