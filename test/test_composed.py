@@ -110,7 +110,7 @@ def test_odometry_is_subscribed_while_it_is_needed(make, map_file):
     assert node.count_subscribers('/odom') == 1
 
 
-def test_a_parameter_that_is_set_while_the_start_fails_starts_it_again(
+def test_start_that_fails_is_repeated_after_a_parameter_set_meanwhile(
     make, map_file, tmp_path, monkeypatch
 ):
     node = make(autostart=True, map_path=str(tmp_path / 'missing.stavpr'))

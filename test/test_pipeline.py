@@ -180,7 +180,7 @@ def test_loop_closure_evicts_places_and_indices_stay(route):
 
 
 @pytest.mark.parametrize('images', [(6, 0, 6), (6, 6, 6)])
-def test_every_change_of_operation_keeps_the_places(route, images):
+def test_change_of_operation_keeps_the_places(route, images):
     """A recorded route becomes the map, an empty one loses nothing: against a list of stamps."""
     for names in itertools.product(OPERATIONS, repeat=3):
         pipeline = Pipeline(settings_of(), names[0])
