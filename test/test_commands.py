@@ -9,6 +9,7 @@ import subprocess
 import time
 from types import SimpleNamespace
 
+from bags import SECOND, write_odometry
 from conftest import route_images
 import cv2
 from evaluation_commands import write_images
@@ -25,9 +26,7 @@ from stavpr_ros.mapping import load_map
 from stavpr_ros.recognition import Status
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
-from test_trajectory import write_odometry
 
-SECOND = 10**9
 HANGS = 5 * TIMEOUT  # seconds after which an executable counts as stuck
 
 

@@ -5,13 +5,12 @@
 import array
 from types import SimpleNamespace
 
+from bags import SECOND, writing
 from hypothesis import example, given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 from raw_images import BAYER, CHANNELS, message, PAIRS, YUV
-from rosbags.rosbag2 import Writer
-from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import ImageError
 from stavpr_ros.sources import files, open_source
 from stavpr_ros.sources.bag import RAW
@@ -141,15 +140,11 @@ def test_decode_message_of_either_type_is_exact():
 
 
 def test_bag_errors_keep_their_kind(tmp_path):
-    store = get_typestore(Stores.ROS2_JAZZY)
-    with Writer(tmp_path / 'bag', version=9) as writer:
-        topic = writer.add_connection('/image', RAW, typestore=store)
+    with writing(tmp_path / 'bag') as bag:
         for i, (encoding, step) in enumerate([('rgb8', 5), ('nv12', 2)]):
-            stamp = store.types['builtin_interfaces/msg/Time'](sec=i, nanosec=0)
-            header = store.types['std_msgs/msg/Header'](stamp=stamp, frame_id='')
-            sent = store.types[RAW](header, 2, 2, encoding, 0, step, np.full(6, 128, np.uint8))
-            writer.write(topic, i, store.serialize_cdr(sent, RAW))
-        writer.write(topic, 2, b'no message')
+            pixels = np.full(6, 128, np.uint8)
+            bag.write('/image', RAW, i, bag.header(i * SECOND), 2, 2, encoding, 0, step, pixels)
+        bag.write_bytes('/image', RAW, 2, b'no message')
     errors = []
     (frame,) = open_source(tmp_path / 'bag', on_error=errors.append)
     np.testing.assert_array_equal(frame.image, np.full((2, 2, 3), 130))
