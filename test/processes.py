@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The installed executables as processes of their own, and a ROS context beside them."""
 
+import array
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import os
@@ -12,21 +13,23 @@ import time
 from typing import Any
 
 from ament_index_python.packages import get_package_prefix
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from rcl_interfaces.srv import SetParameters
+import numpy as np
 import rclpy
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
+from std_msgs.msg import Header
 
 DOMAIN = 1 + os.getpid() % 100
 TIMEOUT = 60.0  # seconds until an expected event counts as missing
+SECOND = 10**9
 RESEND = 20  # attempts to receive a response until a probe is sent again
 RELIABLE = QoSProfile(depth=1000)
 TAKEN_RELIABLY = {
@@ -88,6 +91,18 @@ def node_process(log: Path, *options: str, **parameters: object) -> Process:
     return Process(log, 'node', '--ros-args', *options, *values)
 
 
+def image_message(image: np.ndarray, stamp: int = 0, encoding: str = 'rgb8') -> Image:
+    """Return an image, rgb8 or bgr8, as a message with padded rows."""
+    height, width, _ = image.shape
+    message = Image(height=height, width=width, encoding=encoding, step=3 * width + 5)
+    rows = np.pad(image[..., ::-1] if encoding == 'bgr8' else image, ((0, 0), (0, 2), (0, 0)))
+    message.data = array.array('B', rows.reshape(height, -1)[:, : message.step].tobytes())
+    message.header = Header(
+        frame_id='camera', stamp=Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
+    )
+    return message
+
+
 class Bench:
     """
     A node in the test's own process: publishes images, receives matches, calls services.
@@ -104,7 +119,6 @@ class Bench:
         self.executor.add_node(self.node)
         self.publisher = self.node.create_publisher(Image, 'image', images)
         self.answers: list[PlaceMatch] = []
-        self.probes = 0  # answered empty images that only tested the connection
         self.node.create_subscription(
             PlaceMatch, '/stavpr/match', self.answers.append, QoSProfile(depth=1000)
         )
@@ -140,7 +154,6 @@ class Bench:
         self.until(
             lambda: self.answers[-1].header.stamp.nanosec == sent, 'the match of the last probe'
         )
-        self.probes = len(self.answers) - before
 
     def publish_anew(self) -> None:
         """Replace the publisher of images."""
@@ -217,11 +230,6 @@ class Bench:
             self.until(responded, 'a response of the node')
         finally:
             self.node.destroy_client(probe)
-
-    def set_parameter(self, name: str, value: object) -> tuple[bool, str]:
-        values = [Parameter(name, value=value).to_parameter_msg()]
-        result = self.call(SetParameters, 'set_parameters', parameters=values).results[0]
-        return result.successful, result.reason
 
     def state(self) -> str:
         """Label of the node's life-cycle state."""

@@ -8,11 +8,11 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from image_messages import image_message
 from nav_msgs.msg import Odometry
 import numpy as np
-from processes import Bench, DOMAIN, RELIABLE, TAKEN_RELIABLY, TIMEOUT
+from processes import Bench, DOMAIN, image_message, RELIABLE, SECOND, TAKEN_RELIABLY, TIMEOUT
 from rcl_interfaces.msg import Log
+from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -22,7 +22,7 @@ from stavpr_ros.ros.node import PlaceRecognitionNode
 from stavpr_ros.ros.rclpy_workarounds import PromptExecutor
 from std_msgs.msg import Header
 
-LENGTH, SECOND = 5, 10**9
+LENGTH = 5
 LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PARAMETERS = {
     'sequence_length': LENGTH,
@@ -103,7 +103,7 @@ class Robot(Bench):
     ) -> PlaceMatch:
         """Publish an image, or a message, stamped later than the last by so many ns."""
         self.stamp += later
-        message = image_message(image, 0) if isinstance(image, np.ndarray) else image
+        message = image_message(image) if isinstance(image, np.ndarray) else image
         message.header = Header(frame_id='camera', stamp=self.time())
         match = self.ask(message, publisher)
         assert match.header == message.header
@@ -174,5 +174,6 @@ class Robot(Bench):
 
     def set(self, **values: object) -> None:
         """Set parameters of the node."""
-        for name, value in values.items():
-            assert self.set_parameter(name, value) == (True, '')
+        messages = [parameter.to_parameter_msg() for parameter in parameters_of(values)]
+        for result in self.call(SetParameters, 'set_parameters', parameters=messages).results:
+            assert result.successful, result.reason

@@ -5,8 +5,7 @@
 import threading
 
 import cv2
-from image_messages import image_message
-from processes import RELIABLE, TAKEN_RELIABLY
+from processes import image_message, RELIABLE, TAKEN_RELIABLY
 import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn

@@ -7,9 +7,9 @@ from pathlib import Path
 import weakref
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from image_messages import image_message
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState
+from processes import image_message
 import pytest
 from robot import LATCHED, LENGTH
 from stavpr_msgs.msg import MapInfo, PlaceMatch

@@ -3,8 +3,8 @@
 """The node over ROS: images in, matches out; parameters that change meanwhile."""
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from image_messages import image_message
 import numpy as np
+from processes import image_message
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -64,7 +64,7 @@ def test_node_publishes_the_matches_of_the_library(robot, start, small_map, rout
     cores = recognize(small_map, images)
     stamps, windows, matches = [], [], []
     for image, core in zip(images, cores, strict=True):
-        bgr = image_message(image, 0, 'bgr8', padding=5)
+        bgr = image_message(image, encoding='bgr8')
         message = robot.show(bgr, SECOND + 7)
         stamps.append(robot.stamp)
         same_match(message, core)
@@ -168,7 +168,7 @@ def test_node_draws_match_images_for_a_subscriber_only(robot, start, route, monk
         return bool(drawn)
 
     robot.until(received, 'an image')
-    invalid = image_message(route[0], 0)
+    invalid = image_message(route[0])
     invalid.encoding = 'none'
     robot.show(invalid)  # there is nothing to draw
     assert all(match.image is not None for match, _ in calls)

@@ -8,8 +8,8 @@ import os
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from image_messages import image_message
 import numpy as np
+from processes import image_message
 import pytest
 from robot import LENGTH, SECOND
 from stavpr_msgs.msg import PlaceMatch

@@ -3,7 +3,7 @@
 """Time: rates, gaps and jumps of stamps, simulated time, bags that loop or pause."""
 
 from builtin_interfaces.msg import Time
-from image_messages import image_message
+from processes import image_message
 import pytest
 from rclpy.qos import QoSProfile
 from robot import SECOND
@@ -51,7 +51,7 @@ def test_max_rate_without_stamps_uses_arrival(robot, start, route):
     matches = [robot.ask(image_message(image, 0)) for image in route[:3]]
     assert [match.status for match in matches] == [WARMING_UP, SKIPPED, SKIPPED]
     robot.set(max_rate=5.0)
-    late = image_message(route[3], 0)
+    late = image_message(route[3])
     robot.until(lambda: robot.ask(late).status == WARMING_UP, 'an image that is late enough')
 
 

@@ -59,6 +59,7 @@ def test_localization_returns_the_matches_of_the_recognizer(
         assert set(match.stages) == {'decoding', 'extraction', 'matching', 'verification'}
     assert statuses(matches).count(Status.MATCH) >= 8
     assert (pipeline.map_state, pipeline.window_fill, pipeline.missing) == ('loaded', LENGTH, '')
+    assert (len(pipeline.places), pipeline.unsaved) == (60, 0)
 
 
 def test_missing_map_or_threshold_is_the_reason(map_file, route):

@@ -7,11 +7,10 @@ import shutil
 import signal
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from image_messages import image_message
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import numpy as np
-from processes import Bench, node_process, RELIABLE, TAKEN_RELIABLY
+from processes import Bench, image_message, node_process, RELIABLE, TAKEN_RELIABLY
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from stavpr_msgs.msg import PlaceMatch
