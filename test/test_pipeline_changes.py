@@ -68,6 +68,7 @@ def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
         Status.WARMING_UP, Status.SKIPPED, Status.SKIPPED, *[Status.WARMING_UP] * 3, Status.MATCH
     ]  # fmt: skip
     assert matches[1].cause == 'not a keyframe'
+    assert {match.threshold for match in matches} == {1.0}
     assert 'differs by 0.0000' in matches[1].reason
     assert matches[-1].window_stamps == tuple(stamp * SECOND for stamp in (1, 4, 5, 6, 7))
     pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(interval=2.0)))

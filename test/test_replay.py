@@ -218,25 +218,6 @@ def test_replay_of_a_folder_with_a_damaged_image_skips_it(tmp_path, subscribe, r
     assert subscriber.milliseconds() == [50, 100, 200]
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'code', 'text'),
-    [
-        (['no/such.bag'], 1, 'no/such.bag does not exist'),
-        ([], 2, 'BAG'),
-        (['.', '--rate', '0'], 2, '0: expected a number above 0'),
-        (['.', '--rate', '2', '--lossless'], 2, 'not allowed with'),
-        (['{bag}', '--publish-to', 'im%age'], 2, 'Invalid topic name'),
-        (['{bag}', '--ros-args', '-r'], 2, 'remap'),
-        (['{bag}', '--topic', '/other'], 1, 'expected one of /camera'),
-    ],
-)
-def test_replay_with_wrong_arguments_fails(tmp_path, arguments, code, text):
-    bag, _ = make_bag(tmp_path / 'bag', count=1)
-    found, _, errors = replay(*(argument.format(bag=bag) for argument in arguments))
-    assert found == code
-    assert text in errors
-
-
 def test_replay_of_real_bags_publishes_their_encodings(data_folder, subscribe):
     subscriber = subscribe()
     bags = data_folder / 'bags'

@@ -58,23 +58,11 @@ def ends_well(process, number):
 
 
 @pytest.mark.parametrize(
-    ('parameters', 'word'),
-    [({'beta': 0.5}, 'beta'), ({'threshold': 'low'}, 'threshold')],
-)
-def test_node_with_invalid_parameters_ends_with_an_error(tmp_path, parameters, word):
-    process = node_process(tmp_path / 'node.log', **parameters)
-    assert process.wait() == 1
-    assert 'cannot start' in process.output()
-    assert word in process.output()
-    assert 'Traceback' not in process.output()
-
-
-@pytest.mark.parametrize(
     ('labels', 'number'),
     [
-        pytest.param(['configure'], signal.SIGTERM, marks=pytest.mark.long),
+        pytest.param(['configure'], signal.SIGINT, marks=pytest.mark.long),
         pytest.param([], signal.SIGINT, marks=pytest.mark.long),
-        (['configure', 'activate', 'shutdown'], signal.SIGINT),
+        (['configure', 'activate', 'shutdown'], signal.SIGTERM),
     ],
 )
 def test_node_after_a_signal_in_any_state_ends(bench, run, map_file, labels, number):
@@ -95,8 +83,7 @@ def test_node_after_a_signal_in_any_state_ends(bench, run, map_file, labels, num
     assert ends_well(process, number)
 
 
-@pytest.mark.parametrize('numbers', [[signal.SIGINT] * 2, [signal.SIGTERM]])
-def test_node_after_signals_during_an_image_ends(bench, run, map_file, route, numbers):
+def test_node_after_two_signals_during_an_image_ends(bench, run, map_file, route):
     """`ros2 launch` sends a second interrupt."""
     process = run(map_path=map_file, queue_size=1000)
     bench.wait_for_node()
@@ -104,9 +91,8 @@ def test_node_after_signals_during_an_image_ends(bench, run, map_file, route, nu
     for i in range(images):
         bench.publisher.publish(image_message(route[i % 60], 7000 + i))
     bench.until(lambda: len(bench.answers) > before + 2, 'some matches')
-    for number in numbers[1:]:
-        process.popen.send_signal(number)
-    assert ends_well(process, numbers[0])
+    process.popen.send_signal(signal.SIGINT)
+    assert ends_well(process, signal.SIGINT)
     assert len(bench.answers) < before + images  # the signal came before the last image
 
 
