@@ -5,7 +5,8 @@
 import threading
 
 import cv2
-from processes import image_message, RELIABLE, TAKEN_RELIABLY
+import numpy as np
+from processes import image_message, RELIABLE, SECOND, TAKEN_RELIABLY, TIMEOUT
 import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
@@ -40,13 +41,71 @@ def set_parameter(node, name, value):
     return node.set_parameters([Parameter(name, value=value)])[0]
 
 
+def activated(node):
+    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+    return node
+
+
+def enqueue(node, images):
+    for i, image in enumerate(images, 1):
+        node.runtime.images.on_image(image_message(image, i * SECOND))
+
+
+def until_processed(node, count):
+    """Wait until so many images have a result or were dropped."""
+    while True:
+        counts = node.statistics.counts()
+        if counts.answered + sum(counts.drops.values()) == count:
+            return counts
+        node.runtime.worker.run(lambda: None)
+
+
+@pytest.mark.parametrize(
+    ('act', 'cause'),
+    [
+        (lambda node: node.runtime.reset(), 'window reset'),
+        (lambda node: node.trigger_deactivate(), 'deactivated'),
+    ],
+    ids=['reset', 'deactivate'],
+)
+def test_waiting_images_are_dropped(make, map_file, route, monkeypatch, act, cause):
+    """Images that came before a reset or the deactivation do not fill the window after it."""
+    node = activated(make(map_path=map_file, queue_size=10))
+    worker, free = node.runtime.worker, threading.Event()
+
+    def run(function):
+        future = worker.call(function)
+        free.set()  # until then, images wait
+        return future.result(TIMEOUT)
+
+    worker.call(free.wait)
+    enqueue(node, route[:3])
+    monkeypatch.setattr(worker, 'run', run)
+    act(node)
+    assert until_processed(node, 3).drops == {cause: 3}
+    assert node.runtime.pipeline.window_fill == 0
+
+
+def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(
+    make, route, monkeypatch
+):
+    node = activated(make(operation='mapping'))
+    with monkeypatch.context() as defect:
+        defect.setattr(node.runtime.pipeline.extractor, 'extract', lambda images: 1 / 0)
+        enqueue(node, route[:1])
+        assert until_processed(node, 1).drops == {'internal error': 1}
+    enqueue(node, route[:2])
+    counts = until_processed(node, 3)
+    assert (counts.received, counts.answered, counts.status, counts.place) == (3, 2, 'mapped', 1)
+    assert list(counts.stages) == ['waiting', 'decoding', 'extraction', 'matching', 'publishing']
+    assert min(stage.max for stage in counts.stages.values()) > 0
+
+
 def test_shutdown_of_ros_before_the_node_saves_the_map(make, context, route, tmp_path):
     """As with plain `rclpy.spin` and an interrupt; no thread is left."""
     path = tmp_path / 'route.stavpr'
-    node = make(operation='mapping', save_path=str(path), queue_size=100)
-    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
-    for i, image in enumerate(route[:20]):
-        node.runtime.images.on_image(image_message(image, i + 1))
+    node = activated(make(operation='mapping', save_path=str(path), queue_size=100))
+    enqueue(node, route[:20])
     while not len(node.runtime.pipeline.places):
         node.runtime.worker.run(lambda: None)
     rclpy.shutdown(context=context)
@@ -92,21 +151,27 @@ def test_operation_of_the_service_lasts_until_the_next_configuration(make, map_f
 def test_failed_odometry_subscription_is_the_problem(make, map_file):
     """Live parameters are applied; the error is logged and in the diagnostics."""
     topic = {'qos_overrides./odom.subscription.reliability': 'certain'}
-    node = make(map_path=map_file, **topic)
-    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+    node = activated(make(map_path=map_file, **topic))
     assert set_parameter(node, 'keyframe_distance', 1.0).successful
     assert 'correct qos_overrides./odom.subscription' in node.runtime.problem
     assert node.runtime.pipeline.settings.keyframes.distance == 1
 
 
 def test_odometry_is_subscribed_while_it_is_needed(make, map_file):
-    node = make(map_path=map_file)
-    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+    node = activated(make(map_path=map_file))
     for distance, count in ((1.0, 1), (2.0, 1), (0.0, 0)):
         assert set_parameter(node, 'keyframe_distance', distance).successful
         assert node.count_subscribers('/odom') == count
     node.set_operation('mapping')
     assert node.count_subscribers('/odom') == 1
+
+
+def test_restart_removes_the_poses_of_the_odometry(make, map_file):
+    node = activated(make(map_path=map_file, keyframe_distance=1.0))
+    trajectory = node.runtime.odometry.trajectory
+    trajectory.add(SECOND, np.array([0, 0, 0, 0, 0, 0, 1.0]))
+    node.runtime.restart('the stamps jumped back')
+    assert len(trajectory) == 0
 
 
 def test_start_that_fails_is_repeated_after_a_parameter_set_meanwhile(

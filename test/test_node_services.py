@@ -177,6 +177,9 @@ def test_relocalize_returns_the_last_match_and_candidates(robot, start, route):
     """As many as requested, or as parameter candidates."""
     start(candidates=3)
     match = robot.drive(route[30 : 30 + LENGTH])[-1]
+    invalid = image_message(route[0])
+    invalid.encoding = 'none'
+    robot.show(invalid)  # is in no window
     for count, expected in ((0, 3), (6, 6)):
         response = robot.does(Relocalize, 'relocalize', count=count)
         assert response.match == match
