@@ -211,11 +211,6 @@ def test_save_path_that_cannot_be_written_is_rejected(make, tmp_path):
     assert node.trigger_configure() == SUCCESS
 
 
-def test_unknown_parameter_is_logged_with_the_most_similar_name(make, capfd):
-    make(treshold=0.5)
-    assert "parameter 'treshold' is unknown: did you mean threshold?" in capfd.readouterr().err
-
-
 def test_limit_of_threads_can_be_removed(make):
     """The limit of OpenCV holds for the process, that of torch for the worker."""
     limit_threads(0)
