@@ -3,15 +3,16 @@
 """The node in a process of another program: its executor, its context, its end."""
 
 import threading
+import time
 
 import cv2
 import numpy as np
-from processes import image_message, RELIABLE, SECOND, TAKEN_RELIABLY, TIMEOUT
+from processes import SECOND, TIMEOUT
 import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from robot import PARAMETERS, parameters_of
+from robot import image_message, PARAMETERS, parameters_of, RELIABLE
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.mapping import load_map
@@ -53,11 +54,13 @@ def enqueue(node, images):
 
 def until_processed(node, count):
     """Wait until so many images have a result or were dropped."""
-    while True:
+    end = time.monotonic() + TIMEOUT
+    while time.monotonic() < end:
         counts = node.statistics.counts()
         if counts.answered + sum(counts.drops.values()) == count:
             return counts
         node.runtime.worker.run(lambda: None)
+    raise AssertionError(counts)
 
 
 @pytest.mark.parametrize(
@@ -229,8 +232,7 @@ def test_node_with_another_name_and_namespace_uses_them_everywhere(robot, start,
     names = ('-r', '__ns:=/robot', '-r', '__node:=places', '-r', 'image:=front/camera')
     matches = robot.listen(PlaceMatch, '/robot/places/match')
     publisher = robot.node.create_publisher(Image, '/robot/front/camera', RELIABLE)
-    overrides = TAKEN_RELIABLY['qos_overrides./image.subscription.reliability']
-    reliably = {'qos_overrides./robot/front/camera.subscription.reliability': overrides}
+    reliably = {'qos_overrides./robot/front/camera.subscription.reliability': 'reliable'}
     start(*names, wait=False, sequence_lenght=5, **reliably)
     robot.until(lambda: publisher.get_subscription_count() > 0, 'the subscription')
 

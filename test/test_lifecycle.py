@@ -8,9 +8,8 @@ import weakref
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState
-from processes import image_message
 import pytest
-from robot import LATCHED, LENGTH
+from robot import image_message, LATCHED, LENGTH
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.features.registry import settings_class

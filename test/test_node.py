@@ -4,12 +4,11 @@
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
-from processes import image_message
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from robot import LENGTH, SECOND
+from robot import image_message, LENGTH, SECOND
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceCandidates, PlaceMatch
 from stavpr_ros.alignment import SequenceSettings

@@ -8,10 +8,9 @@ from builtin_interfaces.msg import Time
 import cv2
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
-from processes import image_message
 import pytest
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile, ReliabilityPolicy
-from robot import SECOND
+from robot import image_message, SECOND
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_msgs.msg import PlaceMatch
 from std_msgs.msg import Header

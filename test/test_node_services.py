@@ -9,9 +9,8 @@ import os
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
-from processes import image_message
 import pytest
-from robot import LENGTH, SECOND
+from robot import image_message, LENGTH, SECOND
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.mapping import load_map, save_map

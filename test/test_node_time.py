@@ -3,10 +3,9 @@
 """Time: rates, gaps and jumps of stamps, simulated time, bags that loop or pause."""
 
 from builtin_interfaces.msg import Time
-from processes import image_message
 import pytest
 from rclpy.qos import QoSProfile
-from robot import SECOND
+from robot import image_message, SECOND
 from rosgraph_msgs.msg import Clock
 from stavpr_msgs.msg import PlaceMatch
 

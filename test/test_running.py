@@ -10,9 +10,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import numpy as np
-from processes import image_message, node_process, TAKEN_RELIABLY
+from processes import node_process
 import pytest
-from robot import PARAMETERS
+from robot import image_message, PARAMETERS
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap
 
@@ -23,7 +23,7 @@ def run(robot, tmp_path):
     started = []
 
     def run(options=(), **parameters):
-        values = PARAMETERS | TAKEN_RELIABLY | parameters
+        values = PARAMETERS | parameters
         started.append(node_process(tmp_path / 'node.log', *options, **values))
         return started[0]
 
