@@ -232,7 +232,7 @@ class Robot:
         A matched publisher does not imply a matched subscriber on the other side, and a
         best-effort one loses earlier images: so empty images are sent until one has a match.
 
-        :param publisher: another one than that of the bench, of messages of a kind.
+        :param publisher: another one than that of the robot, of messages of a kind.
         """
         publisher = publisher or self.publisher
         self.until(lambda: publisher.get_subscription_count() > 0, 'the node')
@@ -248,11 +248,6 @@ class Robot:
         self.until(
             lambda: self.answers[-1].header.stamp.nanosec == sent, 'the match of the last probe'
         )
-
-    def publish_anew(self) -> None:
-        """Replace the publisher of images."""
-        self.node.destroy_publisher(self.publisher)
-        self.publisher = self.node.create_publisher(Image, 'image', RELIABLE)
 
     def wait_for_nobody(self) -> None:
         """Wait until no node subscribes to the images."""

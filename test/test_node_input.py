@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import pytest
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile, ReliabilityPolicy
-from robot import image_message, SECOND
+from robot import image_message, RELIABLE, SECOND
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_msgs.msg import PlaceMatch
 from std_msgs.msg import Header
@@ -127,7 +127,7 @@ def test_incompatible_publishers_are_reported(robot, start, publish, route):
     offers = f'a publisher of /image offers another reliability: {remedy}'
     robot.until_diagnosed('input', ERROR, f'1 publisher refused for QoS: {offers}')
     robot.until_logged(f'images are not received: {offers}')
-    robot.publish_anew()
+    robot.publisher = robot.node.create_publisher(Image, 'image', RELIABLE)
     robot.wait_for_node()
 
     def reported():
