@@ -31,6 +31,7 @@ from stavpr_ros.ros.rclpy_workarounds import PromptExecutor
 from std_msgs.msg import Header
 
 LENGTH = 5
+ATTEMPTS = 1000  # to publish odometry before its image
 RESEND = 20  # attempts to receive a response until a probe is sent again
 RELIABLE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -169,15 +170,17 @@ class Robot:
         Both are published again while the node has no pose of that time yet.
         """
         self.stamp += SECOND
-        odometry, half = Odometry(header=Header(stamp=self.time())), np.radians(degrees) / 2
+        header, half = Header(frame_id='wheels', stamp=self.time()), np.radians(degrees) / 2
+        odometry = Odometry(header=header)
         odometry.pose.pose.position.x = float(x)
         orientation = odometry.pose.pose.orientation
         orientation.z, orientation.w = float(np.sin(half)), float(np.cos(half))
-        while True:
+        for _ in range(ATTEMPTS):
             self.odometry.publish(odometry)
             match = self.show(image, 0)
             if 'no odometry' not in match.reason:
                 return match
+        raise AssertionError('the node received no odometry')
 
     def until_logged(self, words: str) -> None:
         """Wait for a line of the log with these words."""
