@@ -177,6 +177,16 @@ def test_restart_removes_the_poses_of_the_odometry(make, map_file):
     assert len(trajectory) == 0
 
 
+def test_place_has_the_pose_at_the_stamp_of_its_image(make, route):
+    node = activated(make(operation='mapping', keyframe_distance=0.1))
+    for seconds in (1, 2):
+        pose = np.array([10 * seconds, 0, 0, 0, 0, 0, 1.0])
+        node.runtime.odometry.trajectory.add(seconds * SECOND, pose)
+    node.runtime.images.on_image(image_message(route[0], SECOND * 5 // 4))
+    until_processed(node, 1)
+    assert node.runtime.pipeline.places.poses[0][0] == 12.5
+
+
 def test_start_that_fails_is_repeated_after_a_parameter_set_meanwhile(
     make, map_file, tmp_path, monkeypatch
 ):
