@@ -6,12 +6,12 @@ from collections import OrderedDict
 import os
 from pathlib import Path
 
-from checkpoints import OldPickle, places365_file, random_parameters
 from hypothesis import settings
-import networks
 import numpy as np
 import pytest
+from stavpr_ros.threads import wait_passively
 
+wait_passively()  # torch and numba are not imported yet
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 # No deadline: a shared machine may be slow. Examples are random everywhere but in CI, where a
 # failure must be reproducible.
@@ -55,6 +55,28 @@ def small_map(route):
     poses = np.zeros((len(route), 7))
     poses[:, 0], poses[:, 6] = np.arange(len(route)), 1
     return build_map(frames, FeatureExtractor(projection=64), poses, progress=False)
+
+
+@pytest.fixture(scope='module')
+def one_thread():
+    """Limit the threads: waiting ones spin, 100 ms an image on a busy machine."""
+    from stavpr_ros.threads import limit_threads
+
+    limit_threads(1)
+    yield
+    limit_threads(0)
+
+
+@pytest.fixture
+def context():
+    """Yield an initialized ROS context."""
+    from processes import DOMAIN
+    import rclpy
+
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    yield context
+    rclpy.try_shutdown(context=context)
 
 
 @pytest.fixture(scope='module')
@@ -116,12 +138,17 @@ def squeezenet_settings(data_folder):
 @pytest.fixture(scope='session')
 def densenet_parameters():
     """Random parameters of DenseNet161, equal to the bit on every machine."""
+    from checkpoints import random_parameters
+    import networks
+
     return random_parameters(networks.densenet161_shapes())
 
 
 @pytest.fixture(scope='session')
 def densenet_file(densenet_parameters, tmp_path_factory) -> Path:
     """Their checkpoint as published: of Python 2, old names, a prefix, tensors of a GPU."""
+    from checkpoints import places365_file
+
     path = tmp_path_factory.mktemp('weights') / 'densenet161_places365.pth.tar'
     path.write_bytes(places365_file(densenet_parameters))
     return path
@@ -130,12 +157,17 @@ def densenet_file(densenet_parameters, tmp_path_factory) -> Path:
 @pytest.fixture(scope='session')
 def vgg_parameters():
     """Random parameters of VGG16, equal to the bit on every machine."""
+    from checkpoints import random_parameters
+    import networks
+
     return random_parameters(networks.vgg16_shapes())
 
 
 @pytest.fixture(scope='session')
 def vgg_file(vgg_parameters, tmp_path_factory) -> Path:
     """Their checkpoint, of Python 2 as the published one."""
+    from checkpoints import OldPickle
+
     path = tmp_path_factory.mktemp('weights') / 'vgg16.pth'
     path.write_bytes(OldPickle().file(OrderedDict(vgg_parameters)))
     return path

@@ -2,14 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pipelines on synthetic routes, and images for them."""
 
-from contextlib import contextmanager
-
 import numpy as np
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
 from stavpr_ros.pipeline.saving import write_map
 from stavpr_ros.sources.frame import ImageRecord
-from stavpr_ros.threads import limit_threads
 
 LENGTH, EXCLUDED = 5, 10
 SECOND = 10**9
@@ -70,13 +67,3 @@ def statuses(matches):
 
 def stamps_of(places):
     return [] if places is None else [int(stamp) // SECOND for stamp in places.stamps]
-
-
-@contextmanager
-def one_thread():
-    """Limit the threads: waiting ones spin, 100 ms an image on a busy machine."""
-    limit_threads(1)
-    try:
-        yield
-    finally:
-        limit_threads(0)

@@ -48,16 +48,11 @@ def padded(rows, padding):
 
 def message(encoding, height, width, big=False, padding=0):
     """Random pixels as a message's (step, bytes), and the RGB that must come out."""
-    channels = max(
-        4 if 'a' in encoding or encoding.endswith('4') else 0, max(CHANNELS[encoding]) + 1
-    )
+    alpha = 'a' in encoding or encoding.endswith('4')
+    channels = 4 if alpha else max(CHANNELS[encoding]) + 1
     deep = is_deep(encoding)
     dtype = np.dtype(np.uint16 if deep else np.uint8).newbyteorder('>' if big else '<')
-    values = (
-        np.random.default_rng(1)
-        .integers(0, np.iinfo(dtype).max + 1, (height, width, channels))
-        .astype(dtype)
-    )
+    values = np.random.default_rng(1).integers(0, 2**16, (height, width, channels)).astype(dtype)
     expected = (values >> 8 if deep else values)[..., CHANNELS[encoding]].astype(np.uint8)
     return *padded(values.reshape(height, -1).view(np.uint8), padding), expected
 

@@ -1,20 +1,28 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A node in the test's own process, and a robot beside it that publishes images and odometry."""
+"""A node in the test's own process, and a robot beside it: images, odometry, services."""
 
-from collections.abc import Sequence
+import array
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 import threading
+import time
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
-from image_messages import image_message
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 import numpy as np
-from processes import Bench, DOMAIN, RELIABLE, TAKEN_RELIABLY, TIMEOUT
+from processes import DOMAIN, SECOND, TIMEOUT
 from rcl_interfaces.msg import Log
+from rcl_interfaces.srv import SetParameters
 import rclpy
+from rclpy.client import Client
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_msgs.msg import MapInfo, PlaceMatch
@@ -22,7 +30,10 @@ from stavpr_ros.ros.node import PlaceRecognitionNode
 from stavpr_ros.ros.rclpy_workarounds import PromptExecutor
 from std_msgs.msg import Header
 
-LENGTH, SECOND = 5, 10**9
+LENGTH = 5
+ATTEMPTS = 1000  # to publish odometry before its image
+RESEND = 20  # attempts to receive a response until a probe is sent again
+RELIABLE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PARAMETERS = {
     'sequence_length': LENGTH,
@@ -30,6 +41,8 @@ PARAMETERS = {
     'threads': 1,
     'keyframe_change': 0.0,
     'diagnostics_period': 0.1,
+    'qos_overrides./image.subscription.reliability': 'reliable',
+    'qos_overrides./image.subscription.depth': 1000,
 }
 
 
@@ -48,10 +61,8 @@ class NodeThread:
     def __init__(self, arguments: Sequence[str], parameters: dict[str, object]) -> None:
         self._context = rclpy.Context()
         rclpy.init(context=self._context, args=['--ros-args', *arguments], domain_id=DOMAIN)
-        values = PARAMETERS | TAKEN_RELIABLY | parameters
-        self.node = PlaceRecognitionNode(
-            context=self._context, parameter_overrides=parameters_of(values)
-        )
+        overrides = parameters_of(PARAMETERS | parameters)
+        self.node = PlaceRecognitionNode(context=self._context, parameter_overrides=overrides)
         self._executor = PromptExecutor(PlaceRecognitionNode.THREADS, context=self._context)
         self._executor.add_node(self.node)
         self._end = threading.Event()
@@ -71,24 +82,55 @@ class NodeThread:
         rclpy.shutdown(context=self._context)
 
 
-class Robot(Bench):
-    """
-    A bench with odometry, whose images have increasing stamps.
+def image_message(image: np.ndarray, stamp: int = 0, encoding: str = 'rgb8') -> Image:
+    """Return an image, rgb8 or bgr8, as a message with padded rows."""
+    height, width, _ = image.shape
+    message = Image(height=height, width=width, encoding=encoding, step=3 * width + 5)
+    rows = np.pad(image[..., ::-1] if encoding == 'bgr8' else image, ((0, 0), (0, 2), (0, 0)))
+    message.data = array.array('B', rows.reshape(height, -1)[:, : message.step].tobytes())
+    message.header = Header(
+        frame_id='camera', stamp=Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
+    )
+    return message
 
-    ``log`` holds the lines that the node logs, ``infos`` its ``~/map_info``.
+
+class Robot:
+    """
+    A node beside the tested one: publishes images with increasing stamps, and odometry.
+
+    ``answers`` holds the matches, ``log`` the lines that the node logs, ``infos`` its
+    ``~/map_info``, ``arrays`` the diagnostics and ``diagnostics`` the last of each part.
     """
 
     def __init__(self) -> None:
-        super().__init__(RELIABLE)
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=DOMAIN)
+        self.node = rclpy.create_node('robot', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.publisher = self.node.create_publisher(Image, 'image', RELIABLE)
         self.odometry = self.node.create_publisher(Odometry, 'odom', 100)
+        self.answers: list[PlaceMatch] = self.listen(PlaceMatch, '/stavpr/match', RELIABLE)
         self.infos: list[MapInfo] = self.listen(MapInfo, '/stavpr/map_info', LATCHED)
-        self.arrays: list[DiagnosticArray] = self.listen(DiagnosticArray, '/diagnostics')
+        self.arrays: list[DiagnosticArray] = []
+        self.diagnostics: dict[str, DiagnosticStatus] = {}
         self.log: list[str] = []
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
         self.node.create_subscription(Log, '/rosout', self._on_log, LATCHED)
         self.stamp = 1_700_000_000 * SECOND
 
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
     def _on_log(self, line: Log) -> None:
         self.log.append(line.msg)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self.arrays.append(message)
+        for status in message.status:
+            self.diagnostics[status.name.partition(': ')[2]] = status
 
     def forget(self) -> None:
         """Remove all messages of previous nodes."""
@@ -103,7 +145,7 @@ class Robot(Bench):
     ) -> PlaceMatch:
         """Publish an image, or a message, stamped later than the last by so many ns."""
         self.stamp += later
-        message = image_message(image, 0) if isinstance(image, np.ndarray) else image
+        message = image_message(image) if isinstance(image, np.ndarray) else image
         message.header = Header(frame_id='camera', stamp=self.time())
         match = self.ask(message, publisher)
         assert match.header == message.header
@@ -128,15 +170,17 @@ class Robot(Bench):
         Both are published again while the node has no pose of that time yet.
         """
         self.stamp += SECOND
-        odometry, half = Odometry(header=Header(stamp=self.time())), np.radians(degrees) / 2
+        header, half = Header(frame_id='wheels', stamp=self.time()), np.radians(degrees) / 2
+        odometry = Odometry(header=header)
         odometry.pose.pose.position.x = float(x)
         orientation = odometry.pose.pose.orientation
         orientation.z, orientation.w = float(np.sin(half)), float(np.cos(half))
-        while True:
+        for _ in range(ATTEMPTS):
             self.odometry.publish(odometry)
             match = self.show(image, 0)
             if 'no odometry' not in match.reason:
                 return match
+        raise AssertionError('the node received no odometry')
 
     def until_logged(self, words: str) -> None:
         """Wait for a line of the log with these words."""
@@ -174,5 +218,138 @@ class Robot(Bench):
 
     def set(self, **values: object) -> None:
         """Set parameters of the node."""
-        for name, value in values.items():
-            assert self.set_parameter(name, value) == (True, '')
+        messages = [parameter.to_parameter_msg() for parameter in parameters_of(values)]
+        for result in self.call(SetParameters, 'set_parameters', parameters=messages).results:
+            assert result.successful, result.reason
+
+    def until(self, condition: Callable[[], bool], what: str) -> None:
+        end = time.monotonic() + TIMEOUT
+        while not condition():
+            assert time.monotonic() < end, f'{what}: not within {TIMEOUT:g} s'
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def wait_for_node(self, publisher: Publisher | None = None, kind: type = Image) -> None:
+        """
+        Wait until the node receives images and its matches arrive.
+
+        A matched publisher does not imply a matched subscriber on the other side, and a
+        best-effort one loses earlier images: so empty images are sent until one has a match.
+
+        :param publisher: another one than that of the robot, of messages of a kind.
+        """
+        publisher = publisher or self.publisher
+        self.until(lambda: publisher.get_subscription_count() > 0, 'the node')
+        before, sent = len(self.answers), 0
+        probe = kind()
+        probe.header.frame_id = 'probe'
+        while len(self.answers) == before:
+            sent += 1
+            assert sent < 2 * TIMEOUT
+            probe.header.stamp.nanosec = sent
+            publisher.publish(probe)
+            self.executor.spin_once(timeout_sec=0.5)
+        self.until(
+            lambda: self.answers[-1].header.stamp.nanosec == sent, 'the match of the last probe'
+        )
+
+    def wait_for_nobody(self) -> None:
+        """Wait until no node subscribes to the images."""
+        self.until(lambda: self.publisher.get_subscription_count() == 0, 'the node to be gone')
+
+    def ask(self, image: Any, publisher: Publisher | None = None) -> PlaceMatch:
+        """Publish one image and return its match."""
+        before = len(self.answers)
+        (publisher or self.publisher).publish(image)
+        self.until(lambda: len(self.answers) > before, 'a match')
+        assert len(self.answers) == before + 1
+        return self.answers[-1]
+
+    def call(self, kind: type, name: str, **fields: object) -> Any:
+        """Call a service of the node, such as ``reset``, and return its response."""
+        futures: list[Any] = []
+
+        def done() -> bool:
+            return bool(futures[0].done())
+
+        with self.request(futures, kind, name, done, **fields):
+            return futures[0].result()
+
+    @contextmanager
+    def request(
+        self,
+        futures: list[Any],
+        kind: type,
+        name: str,
+        effect: Callable[[], bool],
+        **fields: object,
+    ) -> Iterator[Client]:
+        """
+        Send a request to a service of the node and wait for an effect.
+
+        The client lives in the block.
+
+        :param futures: receives the future of the response.
+        """
+        client = self.node.create_client(kind, f'/stavpr/{name}')
+        try:
+            self._wait_for_discovery()
+            self.until(client.service_is_ready, f'the service {name}')
+            futures.append(client.call_async(kind.Request(**fields)))
+            self.until(effect, f'an effect of {name}')
+            yield client
+        finally:
+            self.node.destroy_client(client)
+
+    def _wait_for_discovery(self) -> None:
+        """
+        Wait until the node has discovered the endpoints made so far.
+
+        It has when it responds to a client that was made after them. A request of that client may
+        be lost, so it is repeated: the service may be that of a previous node.
+        """
+        probe = self.node.create_client(GetState, '/stavpr/get_state')
+        responses: list[Any] = []
+        attempts = 0
+
+        def responded() -> bool:
+            nonlocal attempts
+            if attempts % RESEND == 0 and probe.service_is_ready():
+                responses.append(probe.call_async(GetState.Request()))
+            attempts += bool(responses)
+            return any(response.done() for response in responses)
+
+        try:
+            self.until(responded, 'a response of the node')
+        finally:
+            self.node.destroy_client(probe)
+
+    def state(self) -> str:
+        """Label of the node's life-cycle state."""
+        return str(self.call(GetState, 'get_state').current_state.label)
+
+    def until_state(self, label: str) -> None:
+        """Wait until the node is in a state; the transition may still be under way."""
+        self.until(lambda: self.state() == label, f'state {label}')
+
+    def transition(self, label: str) -> bool:
+        """Request a transition: configure, activate, deactivate, cleanup, shutdown."""
+        return bool(
+            self.call(ChangeState, 'change_state', transition=Transition(label=label)).success
+        )
+
+    def listen(self, kind: type, topic: str, qos: object = 50) -> list[Any]:
+        """Return a list that fills with the messages of a topic; see ``until``."""
+        received: list[Any] = []
+        self.node.create_subscription(kind, topic, received.append, qos)
+        return received
+
+    def until_diagnosed(self, part: str, level: bytes, words: str = '') -> DiagnosticStatus:
+        """Wait for a level and words of a part: input, map, recognition, processing."""
+
+        def reported() -> bool:
+            status = self.diagnostics.get(part)
+            return status is not None and status.level == level and words in status.message
+
+        self.diagnostics.pop(part, None)
+        self.until(reported, f'diagnostics of {part} at level {level!r} with {words!r}')
+        return self.diagnostics[part]

@@ -9,14 +9,15 @@ import subprocess
 import time
 from types import SimpleNamespace
 
+from bags import SECOND, write_odometry
 from conftest import route_images
 import cv2
 from evaluation_commands import write_images
 import numpy as np
-from processes import executable, Process, TIMEOUT
+from processes import DOMAIN, executable, Process, TIMEOUT
 import pytest
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure, PlaceMatch
-from stavpr_ros.commands import build_map, demo, stavpr
+from stavpr_ros.commands import build_map, demo, node, record, replay, stavpr
 from stavpr_ros.commands.record import loop_closure_record, match_record
 from stavpr_ros.demonstration.loops import read_result
 from stavpr_ros.evaluation.ground_truth import GroundTruth
@@ -25,9 +26,7 @@ from stavpr_ros.mapping import load_map
 from stavpr_ros.recognition import Status
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
-from test_trajectory import write_odometry
 
-SECOND = 10**9
 HANGS = 5 * TIMEOUT  # seconds after which an executable counts as stuck
 
 
@@ -38,16 +37,18 @@ def run_process(name, *arguments):
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
+def run(monkeypatch, capfd):
     """Run the ``main`` of a command's module in this process, which keeps its signal handlers."""
+    monkeypatch.setattr('signal.signal', lambda *_: None)
+    monkeypatch.setattr('stavpr_ros.commands.replay.prepare_transport', lambda: None)
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
 
     def run_main(command, *arguments):
-        monkeypatch.setattr('stavpr_ros.commands.program.obey_signals', lambda: None)
         try:
             code = command.main([str(argument) for argument in arguments])
         except SystemExit as ended:  # of argparse
             code = ended.code
-        out, err = capsys.readouterr()
+        out, err = capfd.readouterr()
         assert 'Traceback' not in err
         return SimpleNamespace(code=code, out=out, err=err)
 
@@ -185,16 +186,30 @@ def test_build_map_with_damaged_image_fails_or_skips(run, tmp_path):
     assert load_map(tmp_path / 'map.stavpr').ids == ('000.png', '002.png')
 
 
-# --------------------------------------------------------------------------- ROS arguments, record
+# --------------------------------------------------------------------------- node, record, replay
 
 
-@pytest.mark.parametrize('name', ['node', 'record', 'replay'])
-def test_executable_with_wrong_ros_arguments_fails(name, traverse, tmp_path):
-    own = {'node': [], 'record': ['--output', tmp_path / 'x'], 'replay': [traverse]}[name]
-    result = run_process(name, *own, '--ros-args', '--params-file', '/missing.yaml')
-    assert result.returncode in (1, 2)
-    assert '--ros-args' in result.stderr
-    assert 'Traceback' not in result.stderr
+@pytest.mark.parametrize(
+    ('command', 'arguments', 'code', 'words'),
+    [
+        (node, ['-p', 'beta:=0.5'], 1, 'beta'),
+        (node, ['-p', 'threshold:=low'], 1, 'threshold'),
+        (node, ['--params-file', '/missing.yaml'], 1, '--ros-args'),
+        (record, ['--output', '{folder}/x', '--ros-args', '-r'], 2, '--ros-args'),
+        (replay, ['no/such.bag'], 1, 'no/such.bag does not exist'),
+        (replay, [], 2, 'BAG'),
+        (replay, ['.', '--rate', '0'], 2, '0: expected a number above 0'),
+        (replay, ['.', '--rate', '2', '--lossless'], 2, 'not allowed with'),
+        (replay, ['{folder}/bag', '--ros-args', '-r', 'image:=im%age'], 2, 'im%age'),
+        (replay, ['{folder}/bag', '--ros-args', '-r'], 2, 'remap'),
+        (replay, ['{folder}/bag', '--topic', '/other'], 1, 'expected one of /camera'),
+    ],
+)
+def test_command_with_wrong_arguments_names_them(run, tmp_path, command, arguments, code, words):
+    write_bag(tmp_path / 'bag', '/camera', image_records(1))
+    arguments = [argument.format(folder=tmp_path) for argument in arguments]
+    result = run(command, *(['--ros-args'] if command is node else []), *arguments)
+    assert (result.code, words in result.err) == (code, True), result.err
 
 
 def test_loop_closure_record_is_plain_json():
@@ -214,10 +229,9 @@ def test_loop_closure_record_is_plain_json():
 
 
 def test_match_record_names_every_status():
-    for name, value in ((status.name, status.value) for status in Status):
-        plain = match_record(PlaceMatch(status=value, inliers=12))
-        assert (plain['status'], plain['inliers']) == (name, 12)
-        assert getattr(PlaceMatch, name) == value
+    for status in Status:
+        plain = match_record(PlaceMatch(status=status, inliers=12))
+        assert (plain['status'], plain['inliers']) == (status.name, 12)
 
 
 # --------------------------------------------------------------------------- demo

@@ -3,15 +3,16 @@
 """The node in a process of another program: its executor, its context, its end."""
 
 import threading
+import time
 
 import cv2
-from image_messages import image_message
-from processes import DOMAIN, RELIABLE, TAKEN_RELIABLY
+import numpy as np
+from processes import SECOND, TIMEOUT
 import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from robot import PARAMETERS, parameters_of
+from robot import image_message, PARAMETERS, parameters_of, RELIABLE
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.mapping import load_map
@@ -20,14 +21,6 @@ from stavpr_ros.threads import limit_threads
 import torch
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
-
-
-@pytest.fixture
-def context():
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    yield context
-    rclpy.try_shutdown(context=context)
 
 
 @pytest.fixture
@@ -49,13 +42,73 @@ def set_parameter(node, name, value):
     return node.set_parameters([Parameter(name, value=value)])[0]
 
 
+def activated(node):
+    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+    return node
+
+
+def enqueue(node, images):
+    for i, image in enumerate(images, 1):
+        node.runtime.images.on_image(image_message(image, i * SECOND))
+
+
+def until_processed(node, count):
+    """Wait until so many images have a result or were dropped."""
+    end = time.monotonic() + TIMEOUT
+    while time.monotonic() < end:
+        counts = node.statistics.counts()
+        if counts.answered + sum(counts.drops.values()) == count:
+            return counts
+        node.runtime.worker.run(lambda: None)
+    raise AssertionError(counts)
+
+
+@pytest.mark.parametrize(
+    ('act', 'cause'),
+    [
+        (lambda node: node.runtime.reset(), 'window reset'),
+        (lambda node: node.trigger_deactivate(), 'deactivated'),
+    ],
+    ids=['reset', 'deactivate'],
+)
+def test_waiting_images_are_dropped(make, map_file, route, monkeypatch, act, cause):
+    """Images that came before a reset or the deactivation do not fill the window after it."""
+    node = activated(make(map_path=map_file, queue_size=10))
+    worker, free = node.runtime.worker, threading.Event()
+
+    def run(function):
+        future = worker.call(function)
+        free.set()  # until then, images wait
+        return future.result(TIMEOUT)
+
+    worker.call(free.wait)
+    enqueue(node, route[:3])
+    monkeypatch.setattr(worker, 'run', run)
+    act(node)
+    assert until_processed(node, 3).drops == {cause: 3}
+    assert node.runtime.pipeline.window_fill == 0
+
+
+def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(
+    make, route, monkeypatch
+):
+    node = activated(make(operation='mapping'))
+    with monkeypatch.context() as defect:
+        defect.setattr(node.runtime.pipeline.extractor, 'extract', lambda images: 1 / 0)
+        enqueue(node, route[:1])
+        assert until_processed(node, 1).drops == {'internal error': 1}
+    enqueue(node, route[:2])
+    counts = until_processed(node, 3)
+    assert (counts.received, counts.answered, counts.status, counts.place) == (3, 2, 'mapped', 1)
+    assert list(counts.stages) == ['waiting', 'decoding', 'extraction', 'matching', 'publishing']
+    assert min(stage.max for stage in counts.stages.values()) > 0
+
+
 def test_shutdown_of_ros_before_the_node_saves_the_map(make, context, route, tmp_path):
     """As with plain `rclpy.spin` and an interrupt; no thread is left."""
     path = tmp_path / 'route.stavpr'
-    node = make(operation='mapping', save_path=str(path), queue_size=100)
-    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
-    for i, image in enumerate(route[:20]):
-        node.runtime.images.on_image(image_message(image, i + 1))
+    node = activated(make(operation='mapping', save_path=str(path), queue_size=100))
+    enqueue(node, route[:20])
     while not len(node.runtime.pipeline.places):
         node.runtime.worker.run(lambda: None)
     rclpy.shutdown(context=context)
@@ -101,16 +154,14 @@ def test_operation_of_the_service_lasts_until_the_next_configuration(make, map_f
 def test_failed_odometry_subscription_is_the_problem(make, map_file):
     """Live parameters are applied; the error is logged and in the diagnostics."""
     topic = {'qos_overrides./odom.subscription.reliability': 'certain'}
-    node = make(map_path=map_file, **topic)
-    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+    node = activated(make(map_path=map_file, **topic))
     assert set_parameter(node, 'keyframe_distance', 1.0).successful
     assert 'correct qos_overrides./odom.subscription' in node.runtime.problem
     assert node.runtime.pipeline.settings.keyframes.distance == 1
 
 
 def test_odometry_is_subscribed_while_it_is_needed(make, map_file):
-    node = make(map_path=map_file)
-    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+    node = activated(make(map_path=map_file))
     for distance, count in ((1.0, 1), (2.0, 1), (0.0, 0)):
         assert set_parameter(node, 'keyframe_distance', distance).successful
         assert node.count_subscribers('/odom') == count
@@ -118,7 +169,25 @@ def test_odometry_is_subscribed_while_it_is_needed(make, map_file):
     assert node.count_subscribers('/odom') == 1
 
 
-def test_a_parameter_that_is_set_while_the_start_fails_starts_it_again(
+def test_restart_removes_the_poses_of_the_odometry(make, map_file):
+    node = activated(make(map_path=map_file, keyframe_distance=1.0))
+    trajectory = node.runtime.odometry.trajectory
+    trajectory.add(SECOND, np.array([0, 0, 0, 0, 0, 0, 1.0]))
+    node.runtime.restart('the stamps jumped back')
+    assert len(trajectory) == 0
+
+
+def test_place_has_the_pose_at_the_stamp_of_its_image(make, route):
+    node = activated(make(operation='mapping', keyframe_distance=0.1))
+    for seconds in (1, 2):
+        pose = np.array([10 * seconds, 0, 0, 0, 0, 0, 1.0])
+        node.runtime.odometry.trajectory.add(seconds * SECOND, pose)
+    node.runtime.images.on_image(image_message(route[0], SECOND * 5 // 4))
+    until_processed(node, 1)
+    assert node.runtime.pipeline.places.poses[0][0] == 12.5
+
+
+def test_start_that_fails_is_repeated_after_a_parameter_set_meanwhile(
     make, map_file, tmp_path, monkeypatch
 ):
     node = make(autostart=True, map_path=str(tmp_path / 'missing.stavpr'))
@@ -155,11 +224,6 @@ def test_save_path_that_cannot_be_written_is_rejected(make, tmp_path):
     assert node.trigger_configure() == SUCCESS
 
 
-def test_unknown_parameter_is_logged_with_the_most_similar_name(make, capfd):
-    make(treshold=0.5)
-    assert "parameter 'treshold' is unknown: did you mean threshold?" in capfd.readouterr().err
-
-
 def test_limit_of_threads_can_be_removed(make):
     """The limit of OpenCV holds for the process, that of torch for the worker."""
     limit_threads(0)
@@ -178,8 +242,7 @@ def test_node_with_another_name_and_namespace_uses_them_everywhere(robot, start,
     names = ('-r', '__ns:=/robot', '-r', '__node:=places', '-r', 'image:=front/camera')
     matches = robot.listen(PlaceMatch, '/robot/places/match')
     publisher = robot.node.create_publisher(Image, '/robot/front/camera', RELIABLE)
-    overrides = TAKEN_RELIABLY['qos_overrides./image.subscription.reliability']
-    reliably = {'qos_overrides./robot/front/camera.subscription.reliability': overrides}
+    reliably = {'qos_overrides./robot/front/camera.subscription.reliability': 'reliable'}
     start(*names, wait=False, sequence_lenght=5, **reliably)
     robot.until(lambda: publisher.get_subscription_count() > 0, 'the subscription')
 

@@ -12,16 +12,13 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import (
-    build_map,
     image_change,
     KeyframeSelector,
     KeyframeSettings,
     small_gray,
 )
 from stavpr_ros.sources import open_source
-from stavpr_ros.sources.frame import Frame
 
 SECOND = 10**9
 CHANGE = 0.004  # between a standing camera and the slowest of these drives
@@ -54,12 +51,6 @@ def test_keyframe_settings_out_of_range_are_rejected():
     KeyframeSettings(angle=180, change=2)
 
 
-def test_selector_without_rules_accepts_all():
-    made = selector()
-    assert made.too_soon(10 * SECOND, None) == ''
-    assert made.too_alike(BLACK) == ''
-
-
 def test_selector_interval_by_hand():
     made = selector(interval=0.1)
     reason = made.too_soon(10 * SECOND + 99_999_999, None)
@@ -90,13 +81,6 @@ def test_selector_motion_without_pose_rejects():
         assert 'no odometry' in made.too_soon(20 * SECOND, None)
     # the rule came on after the last keyframe, of which no pose is known
     assert selector(distance=1).too_soon(20 * SECOND, pose()) == ''
-
-
-def test_selector_requires_all_rules():
-    made = selector(where=pose(), interval=1, distance=1)
-    assert 's after' in made.too_soon(10_500_000_000, pose(5))
-    assert 'moved' in made.too_soon(12 * SECOND, pose(0.5))
-    assert made.too_soon(12 * SECOND, pose(5)) == ''
 
 
 def test_selector_change_by_hand(route):
@@ -244,31 +228,3 @@ def standing_changes(image):
     first = taken(noise=3)
     yield from (image_change(first, taken(noise=noise)) for noise in (3, 6, 10))
     yield from (image_change(first, taken(gain=gain)) for gain in (0.9, 1.1))
-
-
-# ------------------------------------------------------------------------------------------ maps
-
-
-def traverse(images, shown):
-    """Frames of a traverse, a second each; every image is repeated."""
-    images = [image for image in images for _ in range(shown)]
-    return [Frame(image, (i + 1) * SECOND, f'{i}') for i, image in enumerate(images)]
-
-
-def test_build_map_with_change_or_interval_selects_keyframes(route):
-    """Standing three seconds at every view: one place for each."""
-    frames = traverse(route[:20], shown=3)
-    settings = KeyframeSettings(change=0.1)
-    built = build_map(frames, FeatureExtractor(), progress=False, keyframes=settings)
-    assert built.ids == tuple(str(i) for i in range(0, 60, 3))
-    assert built.stamps.tolist() == [(i + 1) * SECOND for i in range(0, 60, 3)]
-    assert built.poses is None
-    alone = build_map(frames[57:58], FeatureExtractor(), progress=False)
-    np.testing.assert_allclose(
-        built.features.strips[:, 19], alone.features.strips[:, 0], atol=1e-6
-    )
-    assert built.thumbnails[19] == alone.thumbnails[0]
-    slow = build_map(
-        frames, FeatureExtractor(), progress=False, keyframes=KeyframeSettings(interval=7)
-    )
-    assert slow.ids == tuple(str(i) for i in range(0, 60, 7))

@@ -9,7 +9,6 @@ it runs one of the files as well.
 
 import ast
 import importlib.util
-import os
 from pathlib import Path
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from types import ModuleType, SimpleNamespace
 from ament_index_python.packages import get_package_share_directory
 from conftest import route_images
 import cv2
-from processes import DOMAIN, executable
+from processes import environment, executable
 import pytest
 from stavpr_ros.parameters import BY_NAME
 
@@ -32,57 +31,31 @@ class Recorded:
     """An action or substitution that keeps its arguments."""
 
     def __init__(self, *positional, **named):
-        self.positional = positional
+        self.first = self.entities = positional[0] if positional else None
         self.__dict__.update(named)
 
     def perform(self, context):
-        return context[self.positional[0]]
+        return context[self.first]
 
 
-class LaunchDescription:
-    def __init__(self, entities):
-        self.entities = entities
+class StandIn(ModuleType):
+    """A module in which every name is such a class."""
+
+    def __getattr__(self, name):
+        if name.startswith('__'):
+            raise AttributeError(name)
+        return vars(self).setdefault(name, type(name, (Recorded,), {}))
 
 
-class DeclareLaunchArgument(Recorded):
-    @property
-    def name(self):
-        return self.positional[0]
-
-
-class OpaqueFunction(Recorded):
-    pass
-
-
-class Node(Recorded):
-    pass
-
-
-class LaunchConfiguration(Recorded):
-    pass
-
-
-class ParameterValue(Recorded):
-    pass
-
-
-STAND_INS = {
-    'launch': {'LaunchDescription': LaunchDescription, 'LaunchContext': dict},
-    'launch.actions': {
-        'DeclareLaunchArgument': DeclareLaunchArgument,
-        'OpaqueFunction': OpaqueFunction,
-        'LogInfo': type('LogInfo', (Recorded,), {}),
-        'Shutdown': type('Shutdown', (Recorded,), {}),
-    },
-    'launch.substitutions': {
-        'LaunchConfiguration': LaunchConfiguration,
-        'PathJoinSubstitution': type('PathJoinSubstitution', (Recorded,), {}),
-    },
-    'launch_ros': {},
-    'launch_ros.actions': {'Node': Node},
-    'launch_ros.parameter_descriptions': {'ParameterValue': ParameterValue},
-    'launch_ros.substitutions': {'FindPackageShare': type('FindPackageShare', (Recorded,), {})},
-}
+STAND_INS = (
+    'launch',
+    'launch.actions',
+    'launch.substitutions',
+    'launch_ros',
+    'launch_ros.actions',
+    'launch_ros.parameter_descriptions',
+    'launch_ros.substitutions',
+)
 
 
 def describe(path):
@@ -95,23 +68,25 @@ def describe(path):
 @pytest.fixture
 def load(monkeypatch):
     """Return the description of a launch file, by the stand-in."""
-    for name, content in STAND_INS.items():
-        module = ModuleType(name)
-        module.__dict__.update(content)
-        monkeypatch.setitem(sys.modules, name, module)
+    for name in STAND_INS:
+        monkeypatch.setitem(sys.modules, name, StandIn(name))
     monkeypatch.delitem(sys.modules, 'stavpr_ros.ros.launching', raising=False)
 
     def load_by_name(name):
         entities = describe(ROOT / 'launch' / f'{name}.launch.py').entities
-        arguments = {e.name: e for e in entities if isinstance(e, DeclareLaunchArgument)}
-        assert len(arguments) == sum(isinstance(e, DeclareLaunchArgument) for e in entities)
+
+        def those(kind):
+            return [entity for entity in entities if type(entity).__name__ == kind]
+
+        declared = those('DeclareLaunchArgument')
+        arguments = {argument.first: argument for argument in declared}
+        assert len(arguments) == len(declared)
 
         def start(**given):
             context = {n: getattr(a, 'default_value', None) for n, a in arguments.items()} | given
-            functions = [e for e in entities if isinstance(e, OpaqueFunction)]
-            return [node for e in functions for node in e.function(context)]
+            return [node for e in those('OpaqueFunction') for node in e.function(context)]
 
-        return SimpleNamespace(arguments=arguments, start=start, entities=entities)
+        return SimpleNamespace(arguments=arguments, start=start)
 
     yield load_by_name
     sys.modules.pop('stavpr_ros.ros.launching', None)
@@ -121,10 +96,10 @@ def words(value):
     """Spell a text with substitutions as `${name}`."""
     if isinstance(value, list):
         return ''.join(map(words, value))
-    return f'${{{value.positional[0]}}}' if isinstance(value, LaunchConfiguration) else value
+    return f'${{{value.first}}}' if isinstance(value, Recorded) else value
 
 
-def test_every_launch_file_is_installed():
+def test_launch_files_are_all_installed():
     assert sorted(OPERATIONS) == NAMES
     folder = Path(get_package_share_directory('stavpr_ros')) / 'launch'
     for path in FILES:
@@ -142,7 +117,7 @@ def test_launching_imports_nothing_heavy():
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_every_parameter_is_an_argument(load, name):
+def test_launch_file_has_an_argument_for_every_parameter(load, name):
     """Everything is given at once: names and types are those of the table."""
     launch = load(name)
     fixed = {'operation'} if OPERATIONS[name] else set()
@@ -151,7 +126,7 @@ def test_every_parameter_is_an_argument(load, name):
     assert set(launch.arguments) == (set(BY_NAME) - fixed) | common | own
     for argument in launch.arguments.values():
         assert len(argument.description) > 10
-        assert hasattr(argument, 'default_value') or argument.name == 'bag'
+        assert hasattr(argument, 'default_value') or argument.first == 'bag'
     parameters = launch.start(**dict.fromkeys(launch.arguments, 'true'))[0].parameters[1]
     assert set(parameters) == set(BY_NAME) | {'use_sim_time'}
     assert parameters.pop('use_sim_time').value_type is bool
@@ -160,40 +135,33 @@ def test_every_parameter_is_an_argument(load, name):
             assert value == OPERATIONS[name]
         else:
             assert value.value_type is type(BY_NAME[parameter].default)
-            assert words(value.positional[0]) == f'${{{parameter}}}'
+            assert words(value.first) == f'${{{parameter}}}'
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_empty_arguments_are_left_to_the_parameter_file(load, name):
+def test_launch_file_leaves_empty_arguments_to_the_parameter_file(load, name):
     node = load(name).start()[0]
     fixed = {} if OPERATIONS[name] is None else {'operation': OPERATIONS[name]}
     assert words(node.parameters[0]) == '${params_file}'
     assert node.parameters[1:] == [fixed]
     assert Path(executable(node.executable)).exists()
-    assert (node.package, node.name, words(node.namespace)) == (
-        'stavpr_ros',
-        'stavpr',
-        '${namespace}',
-    )
+    assert (node.package, node.name) == ('stavpr_ros', 'stavpr')
+    assert words(node.namespace) == '${namespace}'
     topics = {topic: words(to) for topic, to in node.remappings}
     expected = {'image': '${image}', 'image/compressed': '${image}/compressed', 'odom': '${odom}'}
     assert topics == expected
 
 
-def test_replay_gets_its_options(load):
+def test_launch_of_replay_passes_its_options(load):
     launch = load('replay')
     _, replay = launch.start(bag='drive')
     assert [words(word) for word in replay.arguments] == ['${bag}']
     assert replay.on_exit is None
-    assert dict(replay.remappings)['image'].positional == ('image',)
+    assert words(dict(replay.remappings)['image']) == '${image}'
     assert Path(executable(replay.executable)).exists()
     _, replay = launch.start(bag='drive', topic='/camera', lossless='true', shutdown='true')
-    assert [words(word) for word in replay.arguments] == [
-        '${bag}',
-        '--topic',
-        '${topic}',
-        '--lossless',
-    ]
+    expected = ['${bag}', '--topic', '${topic}', '--lossless']
+    assert [words(word) for word in replay.arguments] == expected
     assert type(replay.on_exit[0]).__name__ == 'Shutdown'
     _, replay = launch.start(bag='drive', rate='2')
     assert [words(word) for word in replay.arguments] == ['${bag}', '--rate', '${rate}']
@@ -214,32 +182,16 @@ sys.exit(service.run())
 """
 
 
-def test_launch_replays_a_folder_in_a_namespace(tmp_path):
+def test_launch_of_replay_in_a_namespace_processes_a_folder(tmp_path):
     """By launch itself; it ends with the replay."""
     pytest.importorskip('launch_ros', reason='launch is not installed')
     for i, image in enumerate(route_images(24)):
         cv2.imwrite(str(tmp_path / f'{i}.png'), image)
-    given = [
-        'namespace:=robot',
-        'image:=/camera',
-        'lossless:=true',
-        'shutdown:=true',
-        'operation:=mapping',
-    ]
-    command = [
-        sys.executable,
-        '-c',
-        RUN,
-        str(ROOT / 'launch' / 'replay.launch.py'),
-        f'bag:={tmp_path}',
-    ]
-    environment = os.environ | {
-        'ROS_DOMAIN_ID': str(DOMAIN),
-        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-    }
+    given = ['namespace:=robot', 'image:=/camera', 'operation:=mapping', f'bag:={tmp_path}']
+    given += ['lossless:=true', 'shutdown:=true']
     done = subprocess.run(
-        [*command, *given],
-        env=environment,
+        [sys.executable, '-c', RUN, str(ROOT / 'launch' / 'replay.launch.py'), *given],
+        env=environment(),
         capture_output=True,
         text=True,
         timeout=120,

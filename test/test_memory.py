@@ -17,6 +17,7 @@ from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CACHE_LINE
 import torch
 
+pytestmark = pytest.mark.usefixtures('one_thread')
 # Resident bytes beside the features: the heap and the window; a copy of the features takes more.
 ALLOWANCE = 26e6
 
@@ -50,7 +51,7 @@ def test_features_read_from_a_file_begin_with_a_cache_line(path):
 
 @pytest.mark.parametrize('mode', ['paper', 'robust'])
 @pytest.mark.parametrize('precision', ['float32', 'float16'])
-def test_a_recognizer_on_an_opened_map_matches_as_on_a_loaded_one(path, mode, precision):
+def test_recognizer_on_an_opened_map_matches_as_on_a_loaded_one(path, mode, precision):
     settings = RecognizerSettings(1.0, mode=mode)
     opened, loaded = (
         PlaceRecognizer(read(path), settings, 'cpu', precision) for read in (open_map, load_map)
@@ -61,7 +62,7 @@ def test_a_recognizer_on_an_opened_map_matches_as_on_a_loaded_one(path, mode, pr
         assert repr(opened.update(image).sequence) == repr(loaded.update(image).sequence)
 
 
-def test_an_opened_map_saves_and_grows_bit_for_bit(path, small_map, tmp_path):
+def test_opened_map_saves_and_grows_bit_for_bit(path, small_map, tmp_path):
     opened = open_map(path)
     PlaceRecognizer(opened, RecognizerSettings(1.0, mode='robust'), precision='float16')
     save_map(opened, tmp_path / 'copy')
@@ -71,7 +72,7 @@ def test_an_opened_map_saves_and_grows_bit_for_bit(path, small_map, tmp_path):
 
 
 @pytest.mark.parametrize('change', ['replace', 'delete'])
-def test_an_opened_map_outlives_its_name(path, small_map, change):
+def test_opened_map_outlives_its_name(path, small_map, change):
     opened = open_map(path)
     if change == 'delete':
         path.unlink()
@@ -80,7 +81,7 @@ def test_an_opened_map_outlives_its_name(path, small_map, change):
     assert torch.equal(opened.features.strips, small_map.features.strips)
 
 
-def test_an_opened_map_that_is_overwritten_is_an_error(path, small_map):
+def test_opened_map_that_is_overwritten_is_an_error(path, small_map):
     opened = open_map(path)
     path.write_bytes(
         path.read_bytes().replace(small_map.features.strips.numpy().tobytes()[:64], bytes(64))
@@ -89,7 +90,7 @@ def test_an_opened_map_that_is_overwritten_is_an_error(path, small_map):
         _ = opened.features.strips
 
 
-def test_a_growing_map_may_leave_the_features_to_another_owner(small_map):
+def test_growing_map_may_leave_the_features_to_another_owner(small_map):
     kept = small_map.features
     growing = GrowingMap(
         small_map.settings,

@@ -8,10 +8,7 @@ from builtin_interfaces.msg import Time
 from conftest import route_images
 from nav_msgs.msg import Odometry
 import numpy as np
-from processes import Bench, DOMAIN
 import pytest
-import rclpy
-from rclpy.lifecycle import LifecycleNode
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import LoopClosure, PlaceMatch
@@ -20,7 +17,6 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap
 from stavpr_ros.pipeline import overlay
 from stavpr_ros.recognition import Candidate, Match, Status
-from stavpr_ros.ros import output
 from stavpr_ros.ros.output import (
     candidates_message,
     image_message,
@@ -286,41 +282,6 @@ def test_map_info_message_of_a_growing_map_and_of_none(extractor, features):
 
 
 # ------------------------------------------------ drawn images
-
-
-def test_match_image_is_drawn_for_subscribers_only(monkeypatch):
-    drawn = []
-    draw = output.draw_match
-    monkeypatch.setattr(output, 'draw_match', lambda *args: drawn.append(args) or draw(*args))
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    node = LifecycleNode('stavpr', context=context, enable_communication_interface=False)
-    publishers = output.Output(node, burst=5)
-    node.trigger_configure()
-    node.trigger_activate()
-    bench = Bench()
-    match = Match(Status.NOT_READY, 'no map', image=route_images(1)[0])
-    try:
-        for _ in range(3):
-            assert publishers.publish(HEADER, match).reason == 'no map'
-        assert drawn == []
-        images = bench.listen(Image, '/stavpr/match_image')
-        bench.until(lambda: publishers.match_image.get_subscription_count() > 0, 'a subscriber')
-        publishers.publish(HEADER, Match(Status.DROPPED, 'never decoded'))
-        assert drawn == []
-
-        def received():
-            publishers.publish(HEADER, match)
-            return bool(images)
-
-        bench.until(received, 'an image')
-        assert images[0].header == HEADER
-        assert len(drawn) >= 1
-    finally:
-        bench.close()
-        publishers.close()
-        node.destroy_node()
-        rclpy.shutdown(context=context)
 
 
 def test_match_image_shows_status_place_and_distance(monkeypatch, extractor, features):

@@ -1,20 +1,19 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The node over ROS: images in, matches out; parameters and maps that come later."""
+"""The node over ROS: images in, matches out; parameters that change meanwhile."""
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from image_messages import image_message
 import numpy as np
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from robot import LENGTH, SECOND
+from robot import image_message, LENGTH, SECOND
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceCandidates, PlaceMatch
-from stavpr_msgs.srv import LoadMap
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.ros import output
 from stavpr_ros.ros.output import nanoseconds
 from std_msgs.msg import Float32, Int32
 
@@ -51,24 +50,26 @@ def same_match(message, core):
 
 
 def test_node_publishes_the_matches_of_the_library(robot, start, small_map, route):
-    """Every field of ~/match, and the plain topics for accepted matches only."""
-    start(**PAPER)
+    """Every field of ~/match, candidates of every window, plain topics for accepted matches."""
+    start(**PAPER, candidates=3)
     places = robot.listen(Int32, '/stavpr/place_index')
     distances = robot.listen(Float32, '/stavpr/distance')
-    robot.until(lambda: robot.node.count_publishers('/stavpr/distance') > 0, 'the topics')
+    candidates = robot.listen(PlaceCandidates, '/stavpr/candidates')
+    robot.until(lambda: robot.node.count_publishers('/stavpr/candidates') > 0, 'the topics')
     info = robot.until_map(state='loaded')
     assert (info.places, info.features, info.strips, info.projected) == (60, 'gradient', 7, True)
     rng = np.random.default_rng(0)
     images = route[20:34] + [rng.integers(0, 256, (96, 128, 3), np.uint8) for _ in range(6)]
     cores = recognize(small_map, images)
-    stamps, matches = [], []
+    stamps, windows, matches = [], [], []
     for image, core in zip(images, cores, strict=True):
-        bgr = image_message(image, 0, 'bgr8', padding=5)
+        bgr = image_message(image, encoding='bgr8')
         message = robot.show(bgr, SECOND + 7)
         stamps.append(robot.stamp)
         same_match(message, core)
         assert message.threshold == pytest.approx(THRESHOLD)
         if core.sequence is not None:
+            windows.append(message)
             window = message.window_first, message.window_middle, message.window_last
             assert [nanoseconds(t) for t in window] == [stamps[-5], stamps[-3], stamps[-1]]
         if message.status == PlaceMatch.MATCH:
@@ -81,6 +82,13 @@ def test_node_publishes_the_matches_of_the_library(robot, start, small_map, rout
     robot.until(lambda: len(places) == len(distances) == len(matches), 'the plain topics')
     assert [place.data for place in places] == [match.place_index for match in matches]
     assert [distance.data for distance in distances] == [match.distance for match in matches]
+    robot.until(lambda: len(candidates) == len(windows), 'the candidates')
+    for listed, match in zip(candidates, windows, strict=True):
+        assert (listed.header, listed.threshold) == (match.header, match.threshold)
+        assert len(listed.candidates) == 3
+        best, second = listed.candidates[:2]
+        assert (best.place_index, best.distance) == (match.sequence_middle, match.distance)
+        assert second.place_index == match.second_best_index
 
 
 def test_node_after_a_burst_has_one_match_for_each_image(robot, start, route):
@@ -102,23 +110,6 @@ def test_node_after_a_burst_has_one_match_for_each_image(robot, start, route):
     assert int(robot.counts('processing').get(key, 0)) - counted == len(dropped)
     match = robot.drive(route[40:46])[-1]
     assert (match.status, match.newest_index) == (PlaceMatch.MATCH, 45)
-
-
-def test_node_without_map_and_threshold_takes_them_later(robot, start, map_file, route):
-    """The map by the service only, the threshold by the parameter; both without a restart."""
-    start(map_path='', mode='paper')
-    robot.until_logged('no map: call the service load_map')
-    match = robot.show(route[0])
-    assert (match.status, 'load_map' in match.reason) == (PlaceMatch.NOT_READY, True)
-    robot.does(LoadMap, 'load_map', path=map_file)
-    match = robot.show(route[0])
-    assert (match.status, 'threshold' in match.reason) == (PlaceMatch.NOT_READY, True)
-    robot.set(threshold=THRESHOLD)
-    match = robot.drive(route[:LENGTH])[-1]
-    assert (match.status, match.newest_index) == (PlaceMatch.MATCH, LENGTH - 1)
-    robot.set(threshold=1e-7)
-    match = robot.show(route[7])
-    assert (match.status, match.place_index) == (PlaceMatch.NO_MATCH, -1)
 
 
 def test_node_after_a_failed_start_starts_with_a_changed_parameter(
@@ -163,36 +154,23 @@ def test_node_with_changing_parameters_publishes_one_match_per_image(robot, star
     assert {PlaceMatch.WARMING_UP, PlaceMatch.SKIPPED} <= statuses
 
 
-def test_node_publishes_candidates_for_every_window(robot, start, route):
-    start(candidates=3)
-    received = robot.listen(PlaceCandidates, '/stavpr/candidates')
-    robot.until(lambda: robot.node.count_publishers('/stavpr/candidates') > 0, 'the candidates')
-    matches = robot.drive(route[10:18])
-    robot.until(lambda: len(received) == 4, 'candidates of four windows')
-    for shown, match in zip(received, matches[4:], strict=True):
-        assert (shown.header, shown.threshold) == (match.header, match.threshold)
-        assert len(shown.candidates) == 3
-        assert shown.candidates[0].place_index == match.sequence_middle
-        assert shown.candidates[0].distance == match.distance
-        assert shown.candidates[1].place_index == match.second_best_index
-    robot.set(candidates=0)
-    robot.drive(route[18:20])
-    robot.set(candidates=2)
-    robot.drive(route[20:21])
-    robot.until(lambda: len(received) == 5, 'candidates of one more window')
-    assert len(received[-1].candidates) == 2
-
-
-def test_node_draws_a_match_image_for_a_subscriber(robot, start, route):
+def test_node_draws_match_images_for_a_subscriber_only(robot, start, route, monkeypatch):
+    calls, draw = [], output.draw_match
+    monkeypatch.setattr(output, 'draw_match', lambda *args: calls.append(args) or draw(*args))
     start()
-    drawn = robot.listen(Image, '/stavpr/match_image')
     robot.drive(route[:4])
+    assert calls == []
+    drawn = robot.listen(Image, '/stavpr/match_image')
 
     def received():
         robot.show(route[4])
         return bool(drawn)
 
     robot.until(received, 'an image')
+    invalid = image_message(route[0])
+    invalid.encoding = 'none'
+    robot.show(invalid)  # there is nothing to draw
+    assert all(match.image is not None for match, _ in calls)
     match = robot.drive(route[5:10])[-1]
     robot.until(lambda: drawn[-1].header == match.header, 'the last image')
     shown = drawn[-1]

@@ -5,12 +5,12 @@
 import array
 
 from builtin_interfaces.msg import Time
+import cv2
 from diagnostic_msgs.msg import DiagnosticStatus
-from image_messages import compressed_message, image_message
 from nav_msgs.msg import Odometry
 import pytest
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile, ReliabilityPolicy
-from robot import SECOND
+from robot import image_message, RELIABLE, SECOND
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_msgs.msg import PlaceMatch
 from std_msgs.msg import Header
@@ -37,7 +37,7 @@ def publish(robot):
 
 def test_invalid_images_are_counted_and_explained_once_a_cause(robot, start, route):
     start()
-    invalid = {kind: image_message(route[0], 0) for kind in ('cut off', 'encoding', 'depth')}
+    invalid = {kind: image_message(route[0]) for kind in ('cut off', 'encoding', 'depth')}
     invalid['cut off'].height = 10**6
     invalid['encoding'].encoding = 'teleport8'
     invalid['depth'].encoding = '32FC1'
@@ -106,12 +106,14 @@ def test_compressed_images_on_a_remapped_topic_are_recognized(robot, start, publ
     robot.until_diagnosed('input', WARN, 'there, but silent')
     robot.wait_for_node(camera, CompressedImage)
     robot.until_diagnosed('input', ERROR, 'all images in the last 10 s were invalid')
-    text = compressed_message(route[0], 0)
-    text.data = array.array('B', b'not an image at all')
-    match = robot.show(text, publisher=camera)
+
+    def show(data):
+        message = CompressedImage(format='rgb8; jpeg compressed bgr8', data=array.array('B', data))
+        return robot.show(message, publisher=camera)
+
+    match = show(b'not an image at all')
     assert (match.status, 'rgb8' in match.reason) == (INVALID, True)
-    compressed = [compressed_message(image, 0, '.jpeg') for image in route[40:46]]
-    matches = [robot.show(message, publisher=camera) for message in compressed]
+    matches = [show(cv2.imencode('.jpeg', image[:, :, ::-1])[1]) for image in route[40:46]]
     assert [match.status for match in matches] == 4 * [WARMING_UP] + 2 * [MATCH]
     assert matches[-1].newest_index == 45
 
@@ -125,7 +127,7 @@ def test_incompatible_publishers_are_reported(robot, start, publish, route):
     offers = f'a publisher of /image offers another reliability: {remedy}'
     robot.until_diagnosed('input', ERROR, f'1 publisher refused for QoS: {offers}')
     robot.until_logged(f'images are not received: {offers}')
-    robot.publish_anew()
+    robot.publisher = robot.node.create_publisher(Image, 'image', RELIABLE)
     robot.wait_for_node()
 
     def reported():

@@ -3,6 +3,7 @@
 """Operation loop_closure over ROS: a synthetic loop with odometry."""
 
 from conftest import route_images
+from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 import pytest
 from robot import LENGTH, SECOND
@@ -27,6 +28,7 @@ def x_of(i):
 def laps(robot, start):
     """Two laps and a half: matches, loop closures by their last image, stamps."""
     closures = robot.listen(LoopClosure, '/stavpr/loop_closure', 1000)
+    poses = robot.listen(PoseWithCovarianceStamped, '/stavpr/pose')
     start(operation='loop_closure', map_path='', exclude_places=EXCLUDED, keyframe_distance=0.001)
     robot.until(lambda: robot.odometry.get_subscription_count() > 0, 'a subscriber of odometry')
     matches, stamps = [], []
@@ -37,6 +39,8 @@ def laps(robot, start):
         stamps.append(robot.stamp)
     count = sum(match.status == PlaceMatch.MATCH for match in matches)
     robot.until(lambda: len(closures) >= count, 'a loop closure for each match')
+    robot.until(lambda: bool(poses), 'poses')
+    assert {pose.header.frame_id for pose in poses} == {'wheels'}  # of the odometry
     return matches, {closure.header.stamp.sec: closure for closure in closures}, stamps
 
 

@@ -3,10 +3,9 @@
 """Time: rates, gaps and jumps of stamps, simulated time, bags that loop or pause."""
 
 from builtin_interfaces.msg import Time
-from image_messages import image_message
 import pytest
 from rclpy.qos import QoSProfile
-from robot import SECOND
+from robot import image_message, SECOND
 from rosgraph_msgs.msg import Clock
 from stavpr_msgs.msg import PlaceMatch
 
@@ -51,7 +50,7 @@ def test_max_rate_without_stamps_uses_arrival(robot, start, route):
     matches = [robot.ask(image_message(image, 0)) for image in route[:3]]
     assert [match.status for match in matches] == [WARMING_UP, SKIPPED, SKIPPED]
     robot.set(max_rate=5.0)
-    late = image_message(route[3], 0)
+    late = image_message(route[3])
     robot.until(lambda: robot.ask(late).status == WARMING_UP, 'an image that is late enough')
 
 

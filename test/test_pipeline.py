@@ -14,8 +14,8 @@ from pipelines import (
     LENGTH,
     localizing,
     mark_saved,
-    one_thread,
     process,
+    recorded,
     save,
     SECOND,
     settings_of,
@@ -32,11 +32,7 @@ from stavpr_ros.recognition import PlaceRecognizer, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 import torch
 
-
-@pytest.fixture(scope='module', autouse=True)
-def _one_thread():
-    with one_thread():
-        yield
+pytestmark = pytest.mark.usefixtures('one_thread')
 
 
 def same_recognition(match, core):
@@ -63,6 +59,7 @@ def test_localization_returns_the_matches_of_the_recognizer(
         assert set(match.stages) == {'decoding', 'extraction', 'matching', 'verification'}
     assert statuses(matches).count(Status.MATCH) >= 8
     assert (pipeline.map_state, pipeline.window_fill, pipeline.missing) == ('loaded', LENGTH, '')
+    assert (len(pipeline.places), pipeline.unsaved) == (60, 0)
 
 
 def test_missing_map_or_threshold_is_the_reason(map_file, route):
@@ -184,7 +181,7 @@ def test_loop_closure_evicts_places_and_indices_stay(route):
 
 
 @pytest.mark.parametrize('images', [(6, 0, 6), (6, 6, 6)])
-def test_every_change_of_operation_keeps_the_places(route, images):
+def test_change_of_operation_keeps_the_places(route, images):
     """A recorded route becomes the map, an empty one loses nothing: against a list of stamps."""
     for names in itertools.product(OPERATIONS, repeat=3):
         pipeline = Pipeline(settings_of(), names[0])
@@ -224,7 +221,7 @@ def test_every_change_of_operation_keeps_the_places(route, images):
             assert pipeline.map_state == state
 
 
-def test_unsaved_places_are_not_lost(map_file, route):
+def test_change_that_would_lose_unsaved_places_is_rejected(map_file, route):
     pipeline = Pipeline(settings_of(), 'mapping')
     process(pipeline, route[:7])
     loaded = read_map(map_file, pipeline.settings)
@@ -260,7 +257,7 @@ def test_saved_places_may_be_replaced(map_file, route, tmp_path):
     assert (pipeline.unsaved, len(pipeline.places)) == (1, 61)
 
 
-def test_a_failed_change_of_operation_changes_nothing(map_file, route):
+def test_change_of_operation_that_fails_changes_nothing(map_file, route):
     pipeline = localizing(map_file, max_places=50)  # less than the map: it cannot be extended
     process(pipeline, route[:LENGTH])
     places = pipeline.places
@@ -278,22 +275,19 @@ def test_a_failed_change_of_operation_changes_nothing(map_file, route):
 
 
 @pytest.mark.parametrize('operation', OPERATIONS)
-def test_a_map_that_does_not_fit_changes_nothing(operation, small_map, map_file, route, tmp_path):
-    """Three strips with xi = 5 (localization, loop closure); more than max_places (mapping)."""
-    pipeline = Pipeline(settings_of(spatial=SpatialSettings(xi=5), max_places=100), operation)
-    pipeline.change(loaded=read_map(map_file, pipeline.settings))
-    path = str(tmp_path / 'bad.stavpr')
-    if operation == 'mapping':
-        larger = Pipeline(settings_of(max_places=120), 'mapping')
-        larger.change(loaded=read_map(map_file, larger.settings))
-        process(larger, route[:50])
-        save(larger, path)
-    else:
+def test_change_to_a_map_that_does_not_fit_changes_nothing(
+    operation, small_map, map_file, route, tmp_path
+):
+    """More places than max_places (mapping); three strips with xi = 5 (the others)."""
+    pipeline = recorded(route, spatial=SpatialSettings(xi=5), max_places=50)
+    path = map_file
+    if operation != 'mapping':
+        pipeline.change(operation=operation)
+        path = str(tmp_path / 'bad.stavpr')
         features = FeatureExtractor(strips=3).extract(route)
         save_map(replace(small_map, features=features, projection=None), path)
-    if operation != 'loop_closure':  # whose recorded route would be lost
+    if operation == 'localization':
         process(pipeline, route[:LENGTH])
-        save(pipeline, tmp_path / 'saved.stavpr')
 
     def state():
         places = pipeline.places
@@ -303,9 +297,8 @@ def test_a_map_that_does_not_fit_changes_nothing(operation, small_map, map_file,
     with pytest.raises((InputError, SettingsError)):
         pipeline.change(loaded=loaded)
     assert state() == before
-    expected = {'localization': Status.MATCH, 'mapping': Status.MAPPED}
-    match = process(pipeline, route[5:6], first=5)[0]
-    assert match.status is expected.get(operation, Status.WARMING_UP)
+    expected = dict(zip(OPERATIONS, ('MATCH', 'MAPPED', 'WARMING_UP'), strict=True))
+    assert process(pipeline, route[5:6], first=5)[0].status.name == expected[operation]
 
 
 def test_loop_closure_takes_the_kind_of_features_of_the_map(map_file, route):

@@ -11,7 +11,6 @@ from pipelines import (
     LENGTH,
     localizing,
     message,
-    one_thread,
     process,
     recorded,
     save,
@@ -22,21 +21,18 @@ from pipelines import (
 )
 import pytest
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, MapFileError
-from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.mapping import load_map, place_thumbnail, save_map
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.pipeline import OPERATIONS, Pipeline
 from stavpr_ros.recognition import Status
-from stavpr_ros.recognition.verification import GeometricSettings
+from stavpr_ros.recognition.verification import GeometricSettings, GeometricVerifier
+
+pytestmark = pytest.mark.usefixtures('one_thread')
 
 
-@pytest.fixture(scope='module', autouse=True)
-def _one_thread():
-    with one_thread():
-        yield
-
-
-def test_threshold_and_candidates_change_with_a_full_window(map_file, route):
-    pipeline = localizing(map_file, candidates=3)
+@pytest.mark.parametrize(('operation', 'default'), [('localization', 1.0), ('loop_closure', 0.8)])
+def test_threshold_and_candidates_change_with_a_full_window(operation, default, route):
+    pipeline = recorded(route, operation, candidates=3)
     match = process(pipeline, route[:LENGTH])[-1]
     assert (match.status, len(match.candidates)) == (Status.MATCH, 3)
     assert match.candidates[0].place == match.sequence.middle
@@ -45,23 +41,10 @@ def test_threshold_and_candidates_change_with_a_full_window(map_file, route):
     assert (match.status, match.threshold, match.candidates) == (Status.NO_MATCH, 1e-9, ())
     pipeline.change(replace(pipeline.settings, threshold=None, candidates=1))
     match = process(pipeline, route[6:7], first=6)[0]  # the default of mode robust
-    assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 6, 1.0)
+    assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 6, default)
     assert len(match.candidates) == 1
-
-
-def test_candidates_are_listed_on_request_only(map_file, route):
-    pipeline = localizing(map_file, candidates=3)
     pipeline.list_candidates = False
-    assert process(pipeline, route[:LENGTH])[-1].candidates == ()
-
-
-def test_threshold_of_loop_closure_changes_with_a_full_window(route):
-    pipeline = Pipeline(settings_of(), 'loop_closure')
-    assert process(pipeline, route[:20] * 2)[-1].status is Status.MATCH
-    pipeline.change(replace(pipeline.settings, threshold=1e-9))
-    match = process(pipeline, route[:1])[0]
-    assert (match.status, match.threshold) == (Status.NO_MATCH, 1e-9)
-    assert len(pipeline.places) == 41
+    assert process(pipeline, route[7:8], first=7)[0].candidates == ()
 
 
 def test_live_settings_keep_a_growing_map_and_the_last_keyframe(route):
@@ -85,6 +68,7 @@ def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
         Status.WARMING_UP, Status.SKIPPED, Status.SKIPPED, *[Status.WARMING_UP] * 3, Status.MATCH
     ]  # fmt: skip
     assert matches[1].cause == 'not a keyframe'
+    assert {match.threshold for match in matches} == {1.0}
     assert 'differs by 0.0000' in matches[1].reason
     assert matches[-1].window_stamps == tuple(stamp * SECOND for stamp in (1, 4, 5, 6, 7))
     pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(interval=2.0)))
@@ -108,7 +92,8 @@ def test_geometric_check_accepts_and_rejects(operation, route):
     pipeline.change(replace(pipeline.settings, geometric=check))
     accepted = process(pipeline, route[5:6], first=5)[0]
     assert (accepted.status, accepted.reason, accepted.newest_index) == (Status.MATCH, '', 5)
-    assert accepted.inliers >= 100
+    thumbnail = place_thumbnail(pipeline.places, 5)
+    assert accepted.inliers == GeometricVerifier(check).inliers(route[5], thumbnail) >= 100
     for more, status in ((0, Status.MATCH), (1, Status.NO_MATCH)):  # the same images again
         pipeline.reset()
         process(pipeline, route[:LENGTH])
@@ -147,7 +132,7 @@ class Failing:
 
 
 @pytest.mark.parametrize('operation', OPERATIONS)
-def test_an_invalid_image_changes_nothing(operation, route, monkeypatch):
+def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypatch):
     """
     Another pipeline gets the valid images only: both return the same for these.
 
@@ -238,10 +223,9 @@ def test_relocalize_returns_the_match_of_the_window(map_file, route):
     [('loop_closure', 'threshold'), ('localization', 'map_path'), ('mapping', 'no places')],
 )
 def test_saving_nothing_is_an_error(operation, words, tmp_path):
+    pipeline = Pipeline(settings_of(mode='paper'), operation)
     with pytest.raises(InputError, match=words):
-        save(
-            Pipeline(settings_of(mode='paper'), operation), tmp_path / 'map.stavpr', overwrite=True
-        )
+        save(pipeline, tmp_path / 'map.stavpr', overwrite=True)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -11,7 +11,6 @@ import threading
 from unittest.mock import Mock
 import warnings
 
-from processes import DOMAIN
 import pytest
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -25,14 +24,6 @@ from std_srvs.srv import Trigger
 
 SPINS = 200  # of at most 50 ms each: until an event counts as missing
 LOST = 'failed to send response (timeout): client will not receive response'
-
-
-@pytest.fixture
-def context():
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    yield context
-    rclpy.try_shutdown(context=context)
 
 
 @pytest.fixture

@@ -1,51 +1,35 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The node as a process: invalid parameters, and signals in every state."""
+"""The node as a process: signals in every state, options of ROS."""
 
 import os
 import shutil
 import signal
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from image_messages import image_message
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import numpy as np
-from processes import Bench, node_process, RELIABLE, TAKEN_RELIABLY
+from processes import node_process
 import pytest
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from robot import image_message, PARAMETERS
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-@pytest.fixture(scope='module')
-def bench():
-    bench = Bench(RELIABLE)
-    yield bench
-    bench.close()
-
 
 @pytest.fixture
-def run(bench, tmp_path):
+def run(robot, tmp_path):
     """Start a node; it is ended with the test."""
     started = []
 
     def run(options=(), **parameters):
-        values = {
-            'sequence_length': 5,
-            'nms_radius': 5,
-            'keyframe_change': 0.0,
-            'diagnostics_period': 0.1,
-        }
-        values |= TAKEN_RELIABLY | parameters
+        values = PARAMETERS | parameters
         started.append(node_process(tmp_path / 'node.log', *options, **values))
         return started[0]
 
     yield run
     started[0].end()
-    bench.wait_for_nobody()
+    robot.wait_for_nobody()
 
 
 def ends_well(process, number):
@@ -59,60 +43,46 @@ def ends_well(process, number):
 
 
 @pytest.mark.parametrize(
-    ('parameters', 'word'),
-    [({'beta': 0.5}, 'beta'), ({'threshold': 'low'}, 'threshold')],
-)
-def test_node_with_invalid_parameters_ends_with_an_error(tmp_path, parameters, word):
-    process = node_process(tmp_path / 'node.log', **parameters)
-    assert process.wait() == 1
-    assert 'cannot start' in process.output()
-    assert word in process.output()
-    assert 'Traceback' not in process.output()
-
-
-@pytest.mark.parametrize(
     ('labels', 'number'),
     [
-        pytest.param(['configure'], signal.SIGTERM, marks=pytest.mark.long),
+        pytest.param(['configure'], signal.SIGINT, marks=pytest.mark.long),
         pytest.param([], signal.SIGINT, marks=pytest.mark.long),
-        (['configure', 'activate', 'shutdown'], signal.SIGINT),
+        (['configure', 'activate', 'shutdown'], signal.SIGTERM),
     ],
 )
-def test_node_after_a_signal_in_any_state_ends(bench, run, map_file, labels, number):
+def test_node_after_a_signal_in_any_state_ends(robot, run, map_file, labels, number):
     process = run(autostart=False, map_path=map_file)
     states = {'configure': 'inactive', 'activate': 'active', 'shutdown': 'finalized'}
-    bench.until_state('unconfigured')
+    robot.until_state('unconfigured')
     for label in labels:
-        assert bench.transition(label)
-        assert bench.state() == states[label]
+        assert robot.transition(label)
+        assert robot.state() == states[label]
     if labels[-1:] == ['shutdown']:
-        bench.wait_for_nobody()
-        bench.until_diagnosed(
+        robot.wait_for_nobody()
+        robot.until_diagnosed(
             'processing', DiagnosticStatus.OK, 'finalized: no image is processed'
         )
-        response = bench.call(LoadMap, 'load_map', path=map_file)
+        response = robot.call(LoadMap, 'load_map', path=map_file)
         assert (response.success, 'the node is finalized' in response.message) == (False, True)
         assert process.popen.poll() is None
     assert ends_well(process, number)
 
 
-@pytest.mark.parametrize('numbers', [[signal.SIGINT] * 2, [signal.SIGTERM]])
-def test_node_after_signals_during_an_image_ends(bench, run, map_file, route, numbers):
+def test_node_after_two_signals_during_an_image_ends(robot, run, map_file, route):
     """`ros2 launch` sends a second interrupt."""
     process = run(map_path=map_file, queue_size=1000)
-    bench.wait_for_node()
-    before, images = len(bench.answers), 400
+    robot.wait_for_node()
+    before, images = len(robot.answers), 400
     for i in range(images):
-        bench.publisher.publish(image_message(route[i % 60], 7000 + i))
-    bench.until(lambda: len(bench.answers) > before + 2, 'some matches')
-    for number in numbers[1:]:
-        process.popen.send_signal(number)
-    assert ends_well(process, numbers[0])
-    assert len(bench.answers) < before + images  # the signal came before the last image
+        robot.publisher.publish(image_message(route[i % 60], 7000 + i))
+    robot.until(lambda: len(robot.answers) > before + 2, 'some matches')
+    process.popen.send_signal(signal.SIGINT)
+    assert ends_well(process, signal.SIGINT)
+    assert len(robot.answers) < before + images  # the signal came before the last image
 
 
 @pytest.mark.long
-def test_node_after_a_signal_during_compilation_ends(bench, run, map_file, tmp_path, monkeypatch):
+def test_node_after_a_signal_during_compilation_ends(robot, run, map_file, tmp_path, monkeypatch):
     """Compilation takes ten seconds and cannot be interrupted; the node does not wait for it."""
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'cache'))
     process = run(autostart=False, map_path=map_file)
@@ -121,7 +91,7 @@ def test_node_after_a_signal_during_compilation_ends(bench, run, map_file, tmp_p
     def begun():
         return 'backend cpu' in process.output()
 
-    with bench.request(futures, ChangeState, 'change_state', begun, transition=configure):
+    with robot.request(futures, ChangeState, 'change_state', begun, transition=configure):
         assert not any(future.done() for future in futures)
         assert ends_well(process, signal.SIGINT)
     assert 'compil' in process.output()  # the thread was abandoned
@@ -135,7 +105,7 @@ def test_node_after_a_signal_during_compilation_ends(bench, run, map_file, tmp_p
         pytest.param('configure', marks=pytest.mark.long),
     ],
 )
-def test_node_after_a_signal_while_a_map_is_read_ends(bench, run, map_file, tmp_path, how):
+def test_node_after_a_signal_while_a_map_is_read_ends(robot, run, map_file, tmp_path, how):
     """The file is a pipe without a writer: reading it does not end."""
     pipe = tmp_path / 'pipe.stavpr'
     os.mkfifo(pipe)
@@ -144,29 +114,29 @@ def test_node_after_a_signal_while_a_map_is_read_ends(bench, run, map_file, tmp_
         shutil.copy(map_file, pipe)
     process = run(map_path=map_file if how == 'load_map' else pipe)
     if how != 'configure':
-        bench.wait_for_node()
+        robot.wait_for_node()
         pipe.unlink()
         os.mkfifo(pipe)
         futures = []
 
         def loading():
-            return f'loading {pipe}' in bench.diagnostics['map'].message
+            return f'loading {pipe}' in robot.diagnostics['map'].message
 
-        with bench.request(futures, LoadMap, 'load_map', loading, path=str(pipe)):
+        with robot.request(futures, LoadMap, 'load_map', loading, path=str(pipe)):
             assert not any(future.done() for future in futures)
-        answer = bench.ask(image_message(np.zeros((96, 128, 3), np.uint8), 1))  # meanwhile
+        answer = robot.ask(image_message(np.zeros((96, 128, 3), np.uint8), 1))  # meanwhile
         assert answer.status == PlaceMatch.WARMING_UP
     else:
-        bench.until_diagnosed('processing', DiagnosticStatus.OK, 'configuring')
-        bench.until_diagnosed('map', DiagnosticStatus.OK, f'loading {pipe}')
-        assert bench.state() == 'configuring'  # during the transition
-        assert not bench.transition('cleanup')
+        robot.until_diagnosed('processing', DiagnosticStatus.OK, 'configuring')
+        robot.until_diagnosed('map', DiagnosticStatus.OK, f'loading {pipe}')
+        assert robot.state() == 'configuring'  # during the transition
+        assert not robot.transition('cleanup')
         assert 'another is under way' in process.output()
     assert ends_well(process, signal.SIGINT)
 
 
-def test_node_with_a_log_level_option_keeps_it(bench, run):
+def test_node_with_a_log_level_option_keeps_it(robot, run):
     process = run(('--log-level', 'error'))
-    bench.wait_for_node()
+    robot.wait_for_node()
     assert process.stop() == 0
     assert '[INFO]' not in process.output()

@@ -32,7 +32,7 @@ def at_the_end(pipeline, path, on_worker=lambda function: function()):
     return log.lines
 
 
-def test_unsaved_places_are_saved_once(mapping, route, tmp_path):
+def test_save_recorded_map_writes_unsaved_places_once(mapping, route, tmp_path):
     path = tmp_path / 'route.stavpr'
     assert at_the_end(mapping, path)[-1] == ('info', f'7 places written to {path}')
     assert len(load_map(path)) == 7
@@ -41,7 +41,7 @@ def test_unsaved_places_are_saved_once(mapping, route, tmp_path):
     assert at_the_end(mapping, path)[-1] == ('info', f'9 places written to {path}')  # its own file
 
 
-def test_a_file_of_another_map_is_not_overwritten(mapping, route, tmp_path):
+def test_save_recorded_map_beside_another_map_takes_a_numbered_name(mapping, route, tmp_path):
     path = tmp_path / 'route.stavpr'
     for there in (path, tmp_path / 'route-2.stavpr'):
         there.write_bytes(b'yesterday')
@@ -52,7 +52,7 @@ def test_a_file_of_another_map_is_not_overwritten(mapping, route, tmp_path):
     assert len(load_map(tmp_path / 'route-3.stavpr')) == 9
 
 
-def test_a_map_saved_elsewhere_still_owns_its_file(small_map, route, tmp_path):
+def test_save_recorded_map_after_a_backup_overwrites_its_own_file(small_map, route, tmp_path):
     path = str(tmp_path / 'route.stavpr')
     save_map(small_map, path)
     pipeline = Pipeline(settings_of(), 'mapping')
@@ -62,7 +62,7 @@ def test_a_map_saved_elsewhere_still_owns_its_file(small_map, route, tmp_path):
     assert at_the_end(pipeline, path)[-1] == ('info', f'62 places written to {path}')
 
 
-def test_lost_places_are_logged(mapping, tmp_path):
+def test_save_recorded_map_that_fails_logs_the_loss(mapping, tmp_path):
     lost = [('warning', '7 recorded places are lost: set save_path, or call ~/save_map')]
     assert at_the_end(mapping, '') == lost
     level, text = at_the_end(mapping, tmp_path / 'missing' / 'route.stavpr')[-1]
@@ -71,7 +71,7 @@ def test_lost_places_are_logged(mapping, tmp_path):
     assert at_the_end(mapping, '') == lost
 
 
-def test_a_busy_worker_is_logged(mapping):
+def test_save_recorded_map_with_a_busy_worker_logs_it(mapping):
     def busy(function):
         raise TimeoutError
 
@@ -80,7 +80,7 @@ def test_a_busy_worker_is_logged(mapping):
     ]
 
 
-def test_a_route_of_loop_closure_is_saved_to_save_path_only(route, tmp_path):
+def test_save_recorded_map_of_a_route_writes_to_save_path_only(route, tmp_path):
     path = tmp_path / 'loop.stavpr'
     pipeline = Pipeline(settings_of(), 'loop_closure')
     process(pipeline, route[:9])
@@ -93,7 +93,7 @@ def test_a_route_of_loop_closure_is_saved_to_save_path_only(route, tmp_path):
     assert len(load_map(path)) == 11
 
 
-def test_a_route_does_not_overwrite_the_map_of_its_features(map_file, route, tmp_path):
+def test_save_recorded_map_of_a_route_keeps_the_map_of_its_features(map_file, route, tmp_path):
     pipeline = Pipeline(settings_of(), 'loop_closure')
     path = tmp_path / 'route.stavpr'
     save(localizing(map_file), path)
@@ -103,7 +103,7 @@ def test_a_route_does_not_overwrite_the_map_of_its_features(map_file, route, tmp
     assert (len(load_map(path)), len(load_map(tmp_path / 'route-2.stavpr'))) == (60, 9)
 
 
-def test_places_recorded_during_writing_are_unsaved(mapping, route, tmp_path):
+def test_write_map_leaves_places_recorded_meanwhile_unsaved(mapping, route, tmp_path):
     calls = []
 
     def on_worker(function):
@@ -118,7 +118,7 @@ def test_places_recorded_during_writing_are_unsaved(mapping, route, tmp_path):
 
 
 @pytest.mark.parametrize('another', [False, True])
-def test_a_map_loaded_during_writing_keeps_its_own_state(another, mapping, map_file, tmp_path):
+def test_write_map_keeps_the_state_of_a_map_loaded_meanwhile(another, mapping, map_file, tmp_path):
     path = str(tmp_path / 'route.stavpr')
 
     def on_worker(function):
@@ -133,7 +133,7 @@ def test_a_map_loaded_during_writing_keeps_its_own_state(another, mapping, map_f
     assert mapping.save_state.owns(map_file) == another
 
 
-def test_concurrent_writes_count_their_own_places(mapping, route, tmp_path):
+def test_mark_saved_in_any_order_counts_the_places_of_each_snapshot(mapping, route, tmp_path):
     """A service, and a transition on another thread: places after both are unsaved."""
     path = str(tmp_path / 'route.stavpr')
     snapshots = [mapping.snapshot(path, overwrite=True)]

@@ -6,12 +6,10 @@ import hashlib
 import shutil
 import sqlite3
 
+from bags import SECOND, TEXT, writing
 import cv2
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import Writer as Ros2Writer
-from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import BagSource, COMPRESSED, RAW
@@ -31,36 +29,16 @@ def records(count=5, stamped=True):
 
 
 def write_mixed(path, ros1=False, bad=()):
-    """Write a bag with /raw, /small (PNG, those in `bad` damaged) and /text."""
-    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
-    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
-    types = store.types
-    extra = {'seq': 0} if ros1 else {}
-    with Ros1Writer(path) if ros1 else Ros2Writer(path, version=9) as writer:
-        kinds = {'/raw': RAW, '/small': COMPRESSED, '/text': 'std_msgs/msg/String', '/silent': RAW}
-        topics = {
-            topic: writer.add_connection(topic, kind, typestore=store)
-            for topic, kind in kinds.items()
-        }
+    """Write a bag with /raw, /small (PNG, those in `bad` damaged) and /text; /silent is empty."""
+    with writing(path, ros1) as bag:
+        bag.topic('/silent', RAW)
         for i, record in enumerate(records()):
-            stamp = types['builtin_interfaces/msg/Time'](sec=i, nanosec=5)
-            header = types['std_msgs/msg/Header'](stamp=stamp, frame_id='camera', **extra)
-            raw = types[RAW](
-                header=header,
-                height=6,
-                width=8,
-                encoding='rgb8',
-                is_bigendian=0,
-                step=24,
-                data=record.data,
-            )
-            png = cv2.imencode('.png', record.data.reshape(6, 8, 3)[..., ::-1].copy())[1].ravel()
-            small = types[COMPRESSED](
-                header=header, format='png', data=png[:40] if i in bad else png
-            )
-            text = types['std_msgs/msg/String'](data='hello')
-            for topic, sent in (('/raw', raw), ('/small', small), ('/text', text)):
-                writer.write(topics[topic], record.time_ns, serialize(sent, kinds[topic]))
+            header, pixels = bag.header(i * SECOND + 5), record.data.reshape(6, 8, 3)
+            bag.write('/raw', RAW, record.time_ns, header, 6, 8, 'rgb8', 0, 24, record.data)
+            png = cv2.imencode('.png', pixels[..., ::-1].copy())[1].ravel()
+            png = png[:40] if i in bad else png
+            bag.write('/small', COMPRESSED, record.time_ns, header, 'png', png)
+            bag.write('/text', TEXT, record.time_ns, 'hello')
     return path
 
 
@@ -122,9 +100,8 @@ def test_bag_with_ambiguous_or_wrong_topic_lists_topics(tmp_path):
 
 
 def test_bag_without_images_lists_topics(tmp_path):
-    store = get_typestore(Stores.ROS2_JAZZY)
-    with Ros2Writer(tmp_path / 'bag', version=9) as writer:
-        writer.add_connection('/text', 'std_msgs/msg/String', typestore=store)
+    with writing(tmp_path / 'bag') as bag:
+        bag.topic('/text', TEXT)
     with pytest.raises(
         SourceError, match=r'no images.*there are /text \(std_msgs/msg/String, 0 messages\)'
     ):

@@ -22,15 +22,7 @@ from stavpr_ros.sources.encodings import (
 
 # the color at each pixel of the top-left 2x2, in reading order
 PATTERNS = {'rggb': (0, 1, 1, 2), 'bggr': (2, 1, 1, 0), 'gbrg': (1, 2, 0, 1), 'grbg': (1, 0, 2, 1)}
-GARBAGE = [
-    '',
-    ';',
-    'jpeg',
-    'png',
-    'rgb8; jpeg compressed bgr8',
-    'bayer_rggb8; png compressed ',
-    'compressed',
-]
+TRANSPORTS = ['', ';', 'png', 'rgb8; jpeg compressed bgr8', 'bayer_rggb8; png compressed ']
 
 
 def encoded(suffix, image):
@@ -49,18 +41,15 @@ def test_decode_compressed_of_lossless_file_is_exact(suffix):
 
 def test_decode_compressed_of_jpeg_is_close():
     rgb = np.full((16, 24, 3), (200, 100, 30), np.uint8)
-    assert (
-        np.abs(decode_compressed(encoded('.jpg', rgb[..., ::-1].copy())).astype(int) - rgb).max()
-        <= 4
-    )
+    image = decode_compressed(encoded('.jpg', rgb[..., ::-1].copy()))
+    assert np.abs(image.astype(int) - rgb).max() <= 4
 
 
 @pytest.mark.parametrize('suffix', ['.png', '.pgm', '.tiff'])
 def test_decode_compressed_of_16_bits_keeps_upper_byte(suffix):
     gray = (np.arange(12, dtype=np.uint16) * 5000).reshape(3, 4)
-    np.testing.assert_array_equal(
-        decode_compressed(encoded(suffix, gray)), np.dstack([gray >> 8] * 3)
-    )
+    image = decode_compressed(encoded(suffix, gray))
+    np.testing.assert_array_equal(image, np.dstack([gray >> 8] * 3))
 
 
 def test_decode_compressed_drops_transparency():
@@ -82,24 +71,6 @@ def test_decode_compressed_of_too_large_image_is_rejected_first(monkeypatch):
     assert caught.value.kind == 'too large'
 
 
-@pytest.mark.filterwarnings('ignore::UserWarning')  # Pillow's, on the way to the error
-@given(st.data())
-def test_decode_compressed_of_damaged_file_decodes_or_fails(data):
-    suffix = data.draw(st.sampled_from(['.jpg', '.png', '.bmp', '.tiff', '.pgm', '.webp']))
-    file = bytearray(encoded(suffix, np.arange(96, dtype=np.uint8).reshape(8, 12)))
-    for _ in range(data.draw(st.integers(1, 8))):
-        file[data.draw(st.integers(0, len(file) - 1))] = data.draw(st.integers(0, 255))
-    del file[data.draw(st.integers(0, len(file))) :]
-    try:
-        # a damaged header may claim the largest size: a lower limit keeps this test short
-        with mock.patch.object(files, 'MAX_PIXELS', 10**6):
-            image = decode_compressed(bytes(file))
-    except ImageError:
-        return  # the one error that is allowed
-    assert image.ndim == 3
-    assert image.dtype == np.uint8
-
-
 @pytest.mark.parametrize(
     'data', [b'', b'\xff', b'no image at all', b'\x89PNG\r\n\x1a\n', b'\xff\xd8\xff\xe0']
 )
@@ -111,9 +82,8 @@ def test_decode_compressed_of_no_image_fails(data):
 
 def test_decode_compressed_of_cut_off_png_fails():
     data = encoded('.png', np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8))
-    with pytest.raises(
-        ImageError, match='is damaged or cut off: copy or record it again'
-    ) as caught:
+    message = 'is damaged or cut off: copy or record it again'
+    with pytest.raises(ImageError, match=message) as caught:
         decode_compressed(data[:-30])
     assert caught.value.kind == 'damaged'
 
@@ -122,9 +92,8 @@ def test_decode_compressed_of_cut_off_jpeg_fails():
     rgb = np.full((64, 64, 3), (200, 100, 30), np.uint8)
     small = encoded('.jpg', rgb[:8, :8])
     data = encoded('.jpg', rgb[..., ::-1].copy())
-    segment = (
-        b'\xff\xe1' + (len(small) + 2).to_bytes(2, 'big') + small
-    )  # where cameras put a thumbnail
+    # where cameras put a thumbnail
+    segment = b'\xff\xe1' + (len(small) + 2).to_bytes(2, 'big') + small
     data = data[:2] + segment + data[2:]
     # cameras fill up with zeros
     assert np.abs(decode_compressed(data + bytes(50)).astype(int) - rgb).max() <= 4
@@ -172,15 +141,7 @@ def compressed(transport, data):
 
 @pytest.mark.parametrize(
     'transport',
-    [
-        'jpeg',
-        'png',
-        '',
-        'rgb8; jpeg compressed bgr8',
-        'mono16; png compressed ',
-        '16UC1; png compressed ',
-        'h264',
-    ],
+    ['', 'jpeg', 'rgb8; jpeg compressed bgr8', '16UC1; png compressed ', 'h264'],
 )
 def test_compressed_message_format_is_taken_from_bytes(transport):
     rgb = np.random.default_rng(0).integers(0, 256, (5, 6, 3), np.uint8)
@@ -191,10 +152,7 @@ def test_compressed_message_format_is_taken_from_bytes(transport):
 @pytest.mark.parametrize(
     'transport',
     [
-        '16UC1; compressedDepth png',
         '16UC1; compressedDepth rvl',
-        '32FC1; compressedDepth',
-        '; compressedDepth',
         'compressedDepth',
         'mono16; CompressedDepth',
         '32FC1; tiff compressed ',
@@ -240,13 +198,10 @@ def test_compressed_message_of_bayer_jpeg_is_close():
     'transport',
     [
         'bayer_rggb8; jpeg compressed mono8',
-        'bayer_rggb8; jpeg compressed bgr8',
         'bayer_rggb8',
         'bayer_rggb8; png',
         'bayer_none8; png compressed ',
         'mono8; png compressed ',
-        'rgb8; png compressed ',
-        'jpeg',
     ],
 )
 def test_compressed_message_of_converted_bayer_is_gray(transport):
@@ -276,25 +231,24 @@ def test_folder_with_unreadable_file_fails(tmp_path):
     assert caught.value.kind == 'unreadable'
 
 
-@pytest.mark.filterwarnings('ignore::UserWarning')
-@given(
-    transport=st.sampled_from(GARBAGE) | st.text(max_size=20),
-    start=st.sampled_from(
-        [b'', b'\xff\xd8\xff', b'\x89PNG\r\n\x1a\n', b'BM', b'II*\x00', b'P5 3 2 255\n', b'RIFF']
-    ),
-    rest=st.binary(max_size=60),
-)
-def test_compressed_message_of_random_bytes_decodes_or_fails(transport, start, rest):
-    data = start + rest
+@pytest.mark.filterwarnings('ignore::UserWarning')  # Pillow's, on the way to the error
+@given(st.data())
+def test_compressed_message_of_damaged_file_decodes_or_fails(data):
+    transport = data.draw(st.sampled_from(TRANSPORTS) | st.text(max_size=20))
+    suffix = data.draw(st.sampled_from(['.jpg', '.png', '.bmp', '.tiff', '.pgm', '.webp']))
+    file = bytearray(encoded(suffix, np.arange(96, dtype=np.uint8).reshape(8, 12)))
+    for _ in range(data.draw(st.integers(1, 8))):
+        file[data.draw(st.integers(0, len(file) - 1))] = data.draw(st.integers(0, 255))
+    del file[data.draw(st.integers(0, len(file))) :]
     try:
+        # a damaged header may claim the largest size: a lower limit keeps this test short
         with mock.patch.object(files, 'MAX_PIXELS', 10**6):
-            image = decode_compressed_message(compressed(transport, data))
-    except ImageError as error:
+            image = decode_compressed_message(compressed(transport, bytes(file)))
+    except ImageError as error:  # the one error that is allowed
         image, kind = None, error.kind
     if image is None:
         assert kind in {'cut off', 'damaged', 'depth', 'size', 'too large'}
         return
-    assert image.dtype == np.uint8
-    assert image.shape[2:] == (3,)
+    assert (image.dtype, image.shape[2:]) == (np.uint8, (3,))
     assert image.flags.c_contiguous
-    assert not np.shares_memory(image, np.frombuffer(data, np.uint8))
+    assert not np.shares_memory(image, np.frombuffer(file, np.uint8))

@@ -5,13 +5,12 @@
 import array
 from types import SimpleNamespace
 
+from bags import SECOND, writing
 from hypothesis import example, given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 from raw_images import BAYER, CHANNELS, message, PAIRS, YUV
-from rosbags.rosbag2 import Writer
-from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import ImageError
 from stavpr_ros.sources import files, open_source
 from stavpr_ros.sources.bag import RAW
@@ -79,17 +78,9 @@ def test_decode_image_without_last_padding_is_exact():
         ({'step': 2**32 - 1}, 'cut off', 'cut off'),
         ({'encoding': 'rgb16', 'step': 23}, 'step', 'expected 24'),
         ({'encoding': 'rgb16', 'step': 24}, 'cut off', 'expected 72'),
-        (
-            {'encoding': 'uyvy', 'width': 3},
-            'size',
-            r'3x3 .*multiple of 2 and a height that is a multiple of 1',
-        ),
+        ({'encoding': 'uyvy', 'width': 3}, 'size', r'3x3 .*multiple of 2 and .* multiple of 1'),
         ({'encoding': 'yuyv', 'step': 7}, 'step', 'expected 8'),
-        (
-            {'encoding': 'nv12'},
-            'size',
-            r'4x3 pixels: .*multiple of 2 and a height that is a multiple of 2',
-        ),
+        ({'encoding': 'nv12'}, 'size', r'4x3 pixels: .*multiple of 2 and .* multiple of 2'),
         ({'encoding': 'nv21', 'height': 2, 'width': 3}, 'size', '3x2 pixels'),
         (
             {'encoding': 'nv12', 'height': 4, 'step': 4, 'data': bytes(23)},
@@ -107,28 +98,16 @@ def test_decode_image_without_last_padding_is_exact():
             'expected 24',
         ),
         ({'encoding': 'bayer_rggb16', 'step': 7}, 'step', 'expected 8'),
-        ({'encoding': '32FC1'}, 'depth', 'depth'),
         ({'encoding': '32FC1x'}, 'encoding', "'32FC1x' is not supported"),
         ({'encoding': '8UC2'}, 'encoding', "'8UC2' is not supported"),
-        (
-            {'encoding': 'bayer_rggb9'},
-            'encoding',
-            "'bayer_rggb9' is not supported: expected one of rgb8",
-        ),
+        ({'encoding': 'bayer_rggb9'}, 'encoding', 'is not supported: expected one of rgb8'),
         ({'encoding': ''}, 'encoding', 'is not supported'),
     ],
 )
 def test_decode_image_with_wrong_header_is_rejected(change, kind, text):
-    fields = {
-        'height': 3,
-        'width': 4,
-        'encoding': 'rgb8',
-        'is_bigendian': False,
-        'step': 12,
-        'data': bytes(36),
-    }
+    fields = {'height': 3, 'width': 4, 'encoding': 'rgb8', 'step': 12, 'data': bytes(36)} | change
     with pytest.raises(ImageError, match=text) as caught:
-        decode_image(**(fields | change))
+        decode_image(is_bigendian=False, **fields)
     assert caught.value.kind == kind
 
 
@@ -161,15 +140,11 @@ def test_decode_message_of_either_type_is_exact():
 
 
 def test_bag_errors_keep_their_kind(tmp_path):
-    store = get_typestore(Stores.ROS2_JAZZY)
-    with Writer(tmp_path / 'bag', version=9) as writer:
-        topic = writer.add_connection('/image', RAW, typestore=store)
+    with writing(tmp_path / 'bag') as bag:
         for i, (encoding, step) in enumerate([('rgb8', 5), ('nv12', 2)]):
-            stamp = store.types['builtin_interfaces/msg/Time'](sec=i, nanosec=0)
-            header = store.types['std_msgs/msg/Header'](stamp=stamp, frame_id='')
-            sent = store.types[RAW](header, 2, 2, encoding, 0, step, np.full(6, 128, np.uint8))
-            writer.write(topic, i, store.serialize_cdr(sent, RAW))
-        writer.write(topic, 2, b'no message')
+            pixels = np.full(6, 128, np.uint8)
+            bag.write('/image', RAW, i, bag.header(i * SECOND), 2, 2, encoding, 0, step, pixels)
+        bag.write_bytes('/image', RAW, 2, b'no message')
     errors = []
     (frame,) = open_source(tmp_path / 'bag', on_error=errors.append)
     np.testing.assert_array_equal(frame.image, np.full((2, 2, 3), 130))
@@ -219,14 +194,9 @@ def test_decode_image_rejects_exactly_invalid_messages(
     else:
         row = width * (2 if encoding in PAIRS or encoding.endswith('16') else 1)
     step = row + padding
-    rows = {'nv12': height * 3 // 2, 'nv21': height * 3 // 2, 'nv24': 3 * height}.get(
-        encoding, height
-    )
-    data = (
-        np.random.default_rng(5)
-        .integers(0, 256, (rows - 1) * step + row - missing, np.uint8)
-        .tobytes()
-    )
+    both = {'nv12': height * 3 // 2, 'nv21': height * 3 // 2, 'nv24': 3 * height}
+    size = (both.get(encoding, height) - 1) * step + row - missing
+    data = np.random.default_rng(5).integers(0, 256, size, np.uint8).tobytes()
     fits = padding >= 0 and missing <= 0
     if encoding in BAYER:
         fits &= min(height, width) > 1

@@ -5,18 +5,14 @@
 import math
 from threading import Thread
 
+from bags import SECOND, write_odometry
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import Writer as Ros2Writer
-from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import InputError, SourceError
 from stavpr_ros.mapping import distance, rotation, Trajectory
-from stavpr_ros.sources.bag import ODOMETRY, RAW, read_odometry
-
-SECOND = 10**9
+from stavpr_ros.sources.bag import read_odometry
 
 
 def turned(degrees, x=0.0, axis=(0.0, 0.0, 1.0)):
@@ -209,60 +205,6 @@ def test_trajectory_is_read_while_another_thread_adds():
 
 
 # ------------------------------------------------------------------------------------------ bags
-
-
-def write_odometry(path, stamps, ros1=False, images=()):
-    """Write a bag with a pose at x = i for each stamp (ns), recorded at 100 s + i, and images."""
-    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
-    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
-    types, extra = store.types, {'seq': 0} if ros1 else {}
-    covariance = np.zeros(36)
-    with Ros1Writer(path) if ros1 else Ros2Writer(path, version=9) as writer:
-        connection = writer.add_connection('/odom', ODOMETRY, typestore=store)
-        text = writer.add_connection('/text', 'std_msgs/msg/String', typestore=store)
-        writer.write(
-            text,
-            99 * SECOND,
-            serialize(types['std_msgs/msg/String'](data='x'), 'std_msgs/msg/String'),
-        )
-        vector = types['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
-        twist = types['geometry_msgs/msg/Twist'](linear=vector, angular=vector)
-        for i, stamp in enumerate(stamps):
-            time = types['builtin_interfaces/msg/Time'](
-                sec=stamp // SECOND, nanosec=stamp % SECOND
-            )
-            pose = types['geometry_msgs/msg/Pose'](
-                position=types['geometry_msgs/msg/Point'](x=float(i), y=2.0, z=3.0),
-                orientation=types['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.6, w=0.8),
-            )
-            message = types[ODOMETRY](
-                header=types['std_msgs/msg/Header'](stamp=time, frame_id='odom', **extra),
-                child_frame_id='base_link',
-                pose=types['geometry_msgs/msg/PoseWithCovariance'](
-                    pose=pose, covariance=covariance
-                ),
-                twist=types['geometry_msgs/msg/TwistWithCovariance'](
-                    twist=twist, covariance=covariance
-                ),
-            )
-            writer.write(connection, (100 + i) * SECOND, serialize(message, ODOMETRY))
-        if images:
-            topic = writer.add_connection('/image', RAW, typestore=store)
-        for record in images:
-            time = types['builtin_interfaces/msg/Time'](
-                sec=record.stamp_ns // SECOND, nanosec=record.stamp_ns % SECOND
-            )
-            message = types[RAW](
-                header=types['std_msgs/msg/Header'](stamp=time, frame_id='camera', **extra),
-                height=record.height,
-                width=record.width,
-                encoding=record.encoding,
-                is_bigendian=0,
-                step=record.step,
-                data=record.data,
-            )
-            writer.write(topic, record.time_ns, serialize(message, RAW))
-    return path
 
 
 @pytest.mark.parametrize('ros1', [False, True])
