@@ -31,8 +31,8 @@ def kernel(function: Callable[..., None]) -> Any:
     """
     Make a kernel of a function: compiled at its first launch.
 
-    On a device without link-time optimization, so that the machine code is the one that ptxas
-    counts the registers of.
+    On a device without link-time optimization, so that the machine code is the one that the
+    registers are counted of (benchmarks/cuda_registers.py).
     """
     from numba import cuda
 
