@@ -13,7 +13,6 @@ from stavpr_ros.evaluation.plots import (
     MatchPair,
     precision_recall,
     reduced_matrix,
-    warping_path,
 )
 from stavpr_ros.pipeline.overlay import match_image, NO_MATCH, RIGHT
 
@@ -117,8 +116,6 @@ def test_plots_of_arrays_that_do_not_fit_raise(path, results):
         distance_matrix(path, np.zeros((0, 4)), matched[:0], truth[:0])
     with pytest.raises(InputError, match='39 outcomes'):
         distance_over_time(path, best, THRESHOLD, outcomes[1:], truth < 0)
-    with pytest.raises(InputError, match='not empty'):
-        warping_path(path, np.zeros((0, 4)), np.zeros((0, 2)))
 
 
 def test_precision_recall_draws_each_curve_and_its_best_point(path):

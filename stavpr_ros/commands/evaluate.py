@@ -231,11 +231,11 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
 
 def _report(arguments: argparse.Namespace) -> 'Report':
     from stavpr_ros.commands.evaluate_sequences import load_sequences
-    from stavpr_ros.evaluation.metrics import import_sklearn
+    from stavpr_ros.evaluation.extra import import_extra
     from stavpr_ros.evaluation.report import Report
 
     began = time.perf_counter()
-    import_sklearn()  # an error before the work, not after it
+    import_extra('sklearn.metrics')  # an error before the work, not after it
     settings = recognizer_settings(arguments)
     sequences = load_sequences(arguments)
     loaded = time.perf_counter()
@@ -282,15 +282,15 @@ def _print_metrics(report: 'Report') -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.evaluation.extra import import_extra
     from stavpr_ros.evaluation.report import chosen_window
     from stavpr_ros.evaluation.report_files import write_folder, write_json
-    from stavpr_ros.evaluation.report_page import import_jinja2
 
     folder = arguments.output or (None if arguments.json else OUTPUT)
     if arguments.json:
         require_room(arguments.json)
     if folder:
-        import_jinja2()
+        import_extra('jinja2')
         if Path(folder).is_file():
             raise SourceError(f'{folder} is a file: --output takes a folder')
     report = _report(arguments)

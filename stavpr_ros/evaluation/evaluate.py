@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 import time
-from typing import Protocol
 
 import numpy as np
 from stavpr_ros.errors import InputError
@@ -27,24 +26,12 @@ from stavpr_ros.evaluation.metrics import (
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.loop_closer import LoopCloser
 from tqdm import tqdm
 
 MARGIN = 8  # places beside the path of a window whose distances are kept
 MATRIX_SIDE = 900  # cells along a side of the reduced distance matrix
 WINDOWS = 1500  # windows whose distances are kept, spread over the traverse
-
-
-class OnlineRecognizer(Protocol):
-    """A recognizer with a map, or a loop closer: both take image by image."""
-
-    def update(self, features: LocalFeatures) -> Match:
-        """Append the next image and match the window that ends with it."""
-
-    def newest_row(self) -> np.ndarray:
-        """Scores of the newest image against every place, shape (n,), small is near."""
-
-    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return up to ``count`` places of the last window, nearest first, and their distances."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +151,7 @@ def recognize_all(recognizer: PlaceRecognizer, features: LocalFeatures) -> list[
 
 
 def recognize_traverse(
-    online: OnlineRecognizer,
+    online: PlaceRecognizer | LoopCloser,
     features: LocalFeatures,
     places: int,
     settings: RecognizerSettings,
@@ -266,8 +253,6 @@ def evaluate_loop_closures(
 
     The others are as in :func:`evaluate_on_map`.
     """
-    from stavpr_ros.recognition.loop_closer import LoopCloser
-
     centered_images(len(query), settings.sequence.length)
     closer = LoopCloser(settings, exclude_places, query.settings)
     label = 'closing loops' if progress else ''

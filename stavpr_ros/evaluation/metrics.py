@@ -10,13 +10,12 @@ is in the map is a false negative. Average precision is scikit-learn's, which co
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-import importlib
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from stavpr_ros.alignment import aligned_index
-from stavpr_ros.errors import InputError, UnavailableError
+from stavpr_ros.errors import InputError
+from stavpr_ros.evaluation.extra import import_extra
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.recognition import Match
 
@@ -69,13 +68,6 @@ class Ranking:
 
     places: np.ndarray
     scores: np.ndarray
-
-    def __post_init__(self) -> None:
-        if self.places.ndim != 2 or self.scores.shape != self.places.shape[:1]:
-            raise InputError(
-                f'places {self.places.shape} and scores {self.scores.shape}: expected (N, K) and '
-                '(N,)'
-            )
 
     def __len__(self) -> int:
         return len(self.scores)
@@ -182,9 +174,8 @@ def counts_at(
     :param distances: of each query's match, shape (N,); +inf or NaN = no match.
     :param correct: the match is within the tolerance of the ground truth, shape (N,), bool.
     :param has_match: the query's place is in the map, shape (N,), bool; None = all are.
-    :raises InputError: arrays of different shapes.
     """
-    return _counts(np.array([threshold]), *_checked(distances, correct, has_match))[0]
+    return _counts(np.array([threshold]), distances, correct, has_match)[0]
 
 
 def sweep(
@@ -195,7 +186,6 @@ def sweep(
 
     The parameters are those of :func:`counts_at`.
     """
-    distances, correct, has_match = _checked(distances, correct, has_match)
     finite = np.unique(distances[np.isfinite(distances)])
     thresholds = (
         np.append(finite, np.nextafter(finite[-1], np.inf)) if finite.size else np.zeros(1)
@@ -210,26 +200,17 @@ def best_f1(
     return max(sweep(distances, correct, has_match), key=lambda counts: counts.f1)
 
 
-def _checked(
-    distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    distances, correct = np.asarray(distances, float), np.asarray(correct, bool)
-    has_match = np.ones_like(correct) if has_match is None else np.asarray(has_match, bool)
-    if not distances.shape == correct.shape == has_match.shape or distances.ndim != 1:
-        raise InputError(
-            f'distances {distances.shape}, correct {correct.shape}, has_match {has_match.shape}: '
-            'expected one value a query each'
-        )
-    return distances, correct, has_match
-
-
 def _counts(
-    thresholds: np.ndarray, distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray
+    thresholds: np.ndarray,
+    distances: np.ndarray,
+    correct: np.ndarray,
+    has_match: np.ndarray | None,
 ) -> list[ConfusionCounts]:
     order = np.argsort(distances)  # NaN last, as +inf
     accepted = np.searchsorted(distances[order], thresholds)  # below, not at the threshold
     true_positives = np.append(0, np.cumsum(correct[order]))[accepted]
-    in_map = np.append(0, np.cumsum(has_match[order]))
+    relevant = np.ones_like(correct) if has_match is None else has_match
+    in_map = np.append(0, np.cumsum(relevant[order]))
     false_negatives = in_map[-1] - in_map[accepted]
     columns = (thresholds, true_positives, accepted - true_positives, false_negatives)
     return [
@@ -313,20 +294,6 @@ def smallest_indices(row: np.ndarray, k: int) -> np.ndarray:
     return usable[np.argsort(row[usable], kind='stable')][:k]
 
 
-def import_sklearn() -> ModuleType:
-    """
-    Import scikit-learn's metrics.
-
-    :raises UnavailableError: the extra ``evaluation`` is not installed.
-    """
-    try:
-        return importlib.import_module('sklearn.metrics')
-    except ImportError as error:
-        raise UnavailableError(
-            f'the evaluation needs scikit-learn ({error}): pip install scikit-learn'
-        ) from error
-
-
 def _recall_at(k: int, correct: np.ndarray, has_match: np.ndarray) -> float:
     """Return the share of queries with a place in the map; NaN where none has one."""
     found = correct[has_match, :k].any(axis=1)
@@ -335,7 +302,7 @@ def _recall_at(k: int, correct: np.ndarray, has_match: np.ndarray) -> float:
 
 def _sklearn_metrics(scores: np.ndarray, correct: np.ndarray) -> tuple[float, float, float]:
     """Return average precision, best F1 and recall at 100 % precision, as scikit-learn counts."""
-    metrics = import_sklearn()
+    metrics = import_extra('sklearn.metrics')
     if not correct.any():
         return 0.0, 0.0, 0.0
     finite = np.isfinite(scores)

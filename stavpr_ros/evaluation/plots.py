@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Literal, TYPE_CHECKING
 
 import numpy as np
-from stavpr_ros.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -69,10 +68,6 @@ class MatchPair:
     place: np.ndarray | None
     caption: str
     outcome: Outcome
-
-    def __post_init__(self) -> None:
-        if self.outcome not in COLORS:
-            raise InputError(f'outcome is {self.outcome!r}; expected one of {", ".join(COLORS)}')
 
 
 def match_overview(path: Path, pairs: Sequence[MatchPair], columns: int = 3) -> None:
@@ -170,27 +165,20 @@ def warping_path(path: Path, distances: np.ndarray, pairs: np.ndarray, first: in
     :param pairs: (query, place) along the path, counted within the matrix, shape (m, 2).
     :param first: map index of the stretch's first place.
     """
-    distances = np.asarray(distances, float)
-    if distances.ndim != 2 or 0 in distances.shape:
-        raise InputError(
-            f'distances of the window have shape {distances.shape}: expected (l, k), not empty'
-        )
-    pairs = np.asarray(pairs, int).reshape(-1, 2)
     l, k = distances.shape
     with page(path, 7.0, float(np.clip(1.4 + 5.3 * l / k, 2.6, 7))) as figure:
         axes = figure.add_subplot()
         extent = (first - 0.5, first + k - 0.5, l - 0.5, -0.5)
         image = axes.imshow(distances, cmap=SCALE, extent=extent, aspect='auto')
-        if len(pairs):
-            style: dict[str, Any] = {
-                'color': BRIGHT['right'],
-                'mec': INK,
-                'mew': 0.5,
-                'ms': 4,
-                'lw': 1.6,
-            }
-            axes.plot(pairs[:, 1] + first, pairs[:, 0], '-o', label='warping path', **style)
-            legend_above(axes, 1)
+        style: dict[str, Any] = {
+            'color': BRIGHT['right'],
+            'mec': INK,
+            'mew': 0.5,
+            'ms': 4,
+            'lw': 1.6,
+        }
+        axes.plot(pairs[:, 1] + first, pairs[:, 0], '-o', label='warping path', **style)
+        legend_above(axes, 1)
         axes.set(xlabel='place in the map', ylabel='image of the window')
         axes.locator_params(integer=True)
         color_bar(figure, image, axes)
