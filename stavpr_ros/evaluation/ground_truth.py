@@ -217,6 +217,18 @@ class GroundTruth:
         rows = np.repeat(np.arange(len(indices)), counts)
         return type(self)(len(indices), self.n, rows * self.n + self.keys[at] % self.n)
 
+    def on_places(self, places: np.ndarray) -> Self:
+        """
+        Return the ground truth on a map that keeps only some of the places.
+
+        :param places: those that are kept, ascending, shape (k,); they become 0 .. k - 1.
+        """
+        number = np.full(self.n, -1, np.int64)
+        number[places] = np.arange(len(places))
+        queries, found = self.keys // self.n, number[self.keys % self.n]
+        kept = found >= 0
+        return type(self)(self.N, len(places), queries[kept] * len(places) + found[kept])
+
     def loop_closures(self, exclude: int = 0) -> Self:
         """
         Return the ground truth of one traverse on its own past: the later image is the query.
