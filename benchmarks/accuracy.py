@@ -27,9 +27,9 @@ from stavpr_ros.evaluation.evaluate import (
     recognize_traverse,
 )
 from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import counts_at
-from stavpr_ros.evaluation.warp import cropped, KINDS, warp_indices
-from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.evaluation.metrics import accepted_counts
+from stavpr_ros.evaluation.warp import cropped, KINDS, select_features, warp_indices
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
@@ -135,9 +135,9 @@ def numbers(evaluation: Evaluation, threshold: float | None) -> dict[str, Any]:
         for name, metrics in (('sequence', evaluation.sequence), ('single', evaluation.single))
     }
     if threshold is not None:
-        ranking, truth = evaluation.results.sequence, evaluation.ground_truth
-        correct = truth.accepts(ranking.places)[:, 0]
-        counts = counts_at(threshold, ranking.scores, correct, truth.has_match)
+        results, truth = evaluation.results, evaluation.ground_truth
+        correct = truth.accepts(results.sequence.best)
+        counts = accepted_counts(results.accepted, correct, truth.has_match)
         found['at_default'] = {
             'threshold': threshold, 'precision': counts.precision, 'recall': counts.recall
         }  # fmt: skip
@@ -156,7 +156,7 @@ def evaluate_case(
             count = len(query)
             images = np.arange(count) if warp == 'same' else warp_indices(count, warp)
             evaluation = evaluate_on_map(
-                place_map, _selected(query.features, images), truth.select(images), settings
+                place_map, select_features(query.features, images), truth.select(images), settings
             )
             threshold = THRESHOLD if mode == 'robust' else None
             yield f'{case.name}/{feature}/{mode}/{warp}', numbers(evaluation, threshold)
@@ -195,11 +195,6 @@ def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict
 
 def _map(source: Any, making: FeatureExtractor) -> PlaceMap:
     return build_map(source, making, thumbnails=False, progress=False)
-
-
-def _selected(features: LocalFeatures, images: np.ndarray) -> LocalFeatures:
-    strips, weights = (x[:, images].contiguous() for x in (features.strips, features.weights))
-    return LocalFeatures(strips, weights, features.settings, features.cells)
 
 
 def measure(folder: Path, quick: bool) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -10,7 +10,7 @@ is in the map is a false negative. Average precision is scikit-learn's, which co
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from stavpr_ros.alignment import aligned_index
@@ -39,10 +39,14 @@ class ConfusionCounts:
     false_negatives: int
 
     @property
+    def accepted(self) -> int:
+        """Return the number of accepted matches."""
+        return self.true_positives + self.false_positives
+
+    @property
     def precision(self) -> float:
         """TP / (TP + FP); 1 when nothing is accepted."""
-        accepted = self.true_positives + self.false_positives
-        return self.true_positives / accepted if accepted else 1.0
+        return self.true_positives / self.accepted if self.accepted else 1.0
 
     @property
     def recall(self) -> float:
@@ -85,10 +89,24 @@ class ImageMatches:
 
     :param places: shape (N,), int64; -1 = none.
     :param distances: shape (N,), float64; +inf = none.
+    :param accepted: whether the recognizer matched the window, shape (N,), bool.
+    :param probabilities: that the match is right, shape (N,), float64; NaN = not declared.
     """
 
     places: np.ndarray
     distances: np.ndarray
+    accepted: np.ndarray
+    probabilities: np.ndarray
+
+    @classmethod
+    def none(cls, count: int) -> Self:
+        """Return the matches of images without any."""
+        return cls(
+            np.full(count, -1, np.int64),
+            np.full(count, np.inf),
+            np.zeros(count, bool),
+            np.full(count, np.nan),
+        )
 
     def within(self, true_places: np.ndarray, tolerance: int) -> np.ndarray:
         """
@@ -178,6 +196,22 @@ def counts_at(
     return _counts(np.array([threshold]), distances, correct, has_match)[0]
 
 
+def accepted_counts(
+    accepted: np.ndarray, correct: np.ndarray, has_match: np.ndarray
+) -> ConfusionCounts:
+    """
+    Count accepted matches, whatever they were accepted by; the threshold is NaN.
+
+    :param accepted: shape (N,), bool; the others are as in :func:`counts_at`.
+    """
+    return ConfusionCounts(
+        float('nan'),
+        int(np.count_nonzero(accepted & correct)),
+        int(np.count_nonzero(accepted & ~correct)),
+        int(np.count_nonzero(~accepted & has_match)),
+    )
+
+
 def sweep(
     distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None
 ) -> list[ConfusionCounts]:
@@ -228,15 +262,16 @@ def image_matches(matches: Sequence[Match], length: int) -> ImageMatches:
     :param matches: one an image, in order: that of the window that ends with the image.
     :param length: images in a window, l.
     """
-    places = np.full(len(matches), -1, np.int64)
-    distances = np.full(len(matches), np.inf)
+    found = ImageMatches.none(len(matches))
     middle = (length - 1) // 2
     ends = [end for end, match in enumerate(matches) if match.sequence is not None]
 
     def assign(end: int, position: int, place: int) -> None:
         image = end - (length - 1) + position
         if image >= 0:
-            places[image], distances[image] = place, matches[end].score
+            match = matches[end]
+            found.places[image], found.distances[image] = place, match.score
+            found.accepted[image], found.probabilities[image] = match.accepted, match.probability
 
     for end in ends:
         assign(end, middle, matches[end].sequence.middle)  # type: ignore[union-attr]
@@ -245,7 +280,7 @@ def image_matches(matches: Sequence[Match], length: int) -> ImageMatches:
             assign(ends[0], position, aligned_index(matches[ends[0]].path, position))
         for position in range(middle + 1, length):
             assign(ends[-1], position, aligned_index(matches[ends[-1]].path, position))
-    return ImageMatches(places, distances)
+    return found
 
 
 def evaluate_ranking(

@@ -55,7 +55,10 @@ def write_folder(report: Report, folder: Path) -> Path:
             'precision_recall': folder / 'precision_recall.png',
             'distances': folder / 'distances.png',
             'matrix': folder / 'similarity_matrix.png',
+            'drive': folder / 'drive.png',
         }
+        if report.evaluation.calibration is not None:
+            embedded['calibration'] = folder / 'calibration.png'
         contents = {name: path.read_bytes() for name, path in embedded.items()}
         mistakes = worst_mistakes(report.evaluation, PAGE_MISTAKES)
         page.write_text(html_page(report, mistakes, contents, boxes), encoding='utf-8')
@@ -79,6 +82,9 @@ def _write_matches(report: Report, path: Path) -> None:
         'single_place': single.best.tolist(),
         'single_distance': single.scores.tolist(),
         'single_right': truth.accepts(single.best).astype(int).tolist(),
+        'accepted': report.accepted.astype(int).tolist(),
+        'probability': results.probabilities.tolist(),
+        'recorded_image': report.drive.images.tolist(),
     }
     with path.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file)
@@ -98,7 +104,7 @@ def _write_curves(evaluation: Evaluation, path: Path) -> None:
 
 def _draw(report: Report, folder: Path) -> dict[str, Box]:
     """
-    Draw the curves, the distances, the worst mistakes and one window.
+    Draw the curves, the distances, the drive, the calibration, the worst mistakes, one window.
 
     :returns: where the axes of ``curves`` and ``matrix`` are in their plots.
     """
@@ -108,6 +114,9 @@ def _draw(report: Report, folder: Path) -> dict[str, Box]:
         'matrix': _draw_matrix(evaluation, folder / 'similarity_matrix.png'),
     }
     _draw_distances(evaluation, folder / 'distances.png')
+    _draw_drive(report, folder / 'drive.png')
+    if evaluation.calibration is not None:
+        plots.reliability(folder / 'calibration.png', evaluation.calibration)
     mistakes = worst_mistakes(evaluation, PLOT_MISTAKES)
     pairs = [pair for image in mistakes if (pair := _mistake(report, image))]
     if pairs:
@@ -148,6 +157,17 @@ def _draw_distances(evaluation: Evaluation, path: Path) -> None:
     if evaluation.unknown is not None:
         groups['unknown places'] = (plots.UNKNOWN, evaluation.unknown.sequence.scores)
     plots.distance_histogram(path, groups, evaluation.sequence.best.threshold)
+
+
+def _draw_drive(report: Report, path: Path) -> None:
+    truth, places = report.evaluation.ground_truth, report.evaluation.results.sequence.best
+    unseen = np.any([np.zeros(truth.N, bool), *report.drive.unseen()], axis=0)
+    outcomes = np.where(
+        report.accepted,
+        np.where(truth.accepts(places), 'right', 'wrong'),
+        np.where(truth.has_match, 'no match', 'unseen'),
+    )
+    plots.drive(path, truth.pairs, truth.n, places, outcomes, unseen)
 
 
 def _draw_matrix(evaluation: Evaluation, path: Path) -> Box:

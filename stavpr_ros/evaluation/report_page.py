@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from stavpr_ros.evaluation.drive import UNSEEN_DISTANCE
 from stavpr_ros.evaluation.evaluate import Evaluation, WindowDistances
 from stavpr_ros.evaluation.extra import import_extra
 from stavpr_ros.evaluation.ground_truth import GroundTruth
@@ -43,7 +44,8 @@ def html_page(
     Return the page.
 
     :param mistakes: images whose wrong matches are shown, the worst first.
-    :param plots: PNG files ``precision_recall``, ``distances`` and ``matrix``.
+    :param plots: PNG files ``precision_recall``, ``distances``, ``matrix``, ``drive`` and, where
+        probabilities are declared, ``calibration``.
     :param boxes: where the axes of ``curves`` and ``matrix`` are.
     :raises UnavailableError: jinja2 is not installed.
     """
@@ -64,6 +66,10 @@ def html_page(
         else None,
         colors={'right': COLORS['right'], 'wrong': COLORS['wrong'], 'sequence': SEQUENCE},
         cards=_cards(evaluation),
+        decision=report.decision(),
+        unseen=report.unseen(),
+        unseen_distance=UNSEEN_DISTANCE,
+        calibration=evaluation.calibration and evaluation.calibration.to_json(),
         plots={name: _data_url(content, 'png') for name, content in plots.items()},
         infinite=_infinite(evaluation),
         mistakes=[_mistake(report, image) for image in mistakes],
@@ -88,8 +94,8 @@ def _cards(evaluation: Evaluation) -> list[dict[str, Any]]:
     cards = [('F1 of sequences', sequence['f1'], single['f1'], SEQUENCE)]
     cards += [(name, sequence[NUMBERS[name]], single[NUMBERS[name]], SEQUENCE) for name in CARDS]
     if evaluation.unknown is not None:
-        rates = [evaluation.false_alarm_rate(kind) for kind in kinds]
-        cards.append(('false alarms', *rates, COLORS['wrong']))
+        rate, single_rate = (evaluation.false_alarm_rate(kind) for kind in kinds)
+        cards.append(('false alarms', rate, single_rate, COLORS['wrong']))
     return [dict(zip(('name', 'value', 'single', 'color'), card, strict=True)) for card in cards]
 
 

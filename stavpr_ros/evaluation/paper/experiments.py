@@ -165,8 +165,8 @@ class DatasetExperiment:
     def _evaluate_baseline(self, configuration: Configuration) -> Metrics:
         settings = SeqSlamSettings(length=configuration.sequence.length)
         sources = (self._dataset.map, self._dataset.query)
-        images = [(frame.image for frame in source) for source in sources]
-        places, scores = seqslam(*images, settings)
+        first, second = ((frame.image for frame in source) for source in sources)
+        places, scores = seqslam(first, second, settings)
         return evaluate_ranking(Ranking(places[:, None], scores), self._dataset.ground_truth)
 
     def _maps(self, configuration: Configuration) -> tuple[PlaceMap, PlaceMap]:
