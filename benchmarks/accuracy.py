@@ -170,7 +170,7 @@ def evaluate_hallway(
     file = folder / 'rtabmap_hallway_loop/samples_GT.bmp'
     truth = GroundTruth.from_file(file, len(route), len(route), 0).loop_closures(EXCLUDED - 1)
     for mode in MODES:
-        settings = RecognizerSettings(THRESHOLD, mode=mode)
+        settings = RecognizerSettings(LOOP_THRESHOLD, mode=mode)
         evaluation = evaluate_loop_closures(route.features, truth, settings, EXCLUDED)
         threshold = LOOP_THRESHOLD if mode == 'robust' else None
         yield f'hallway/{feature}/{mode}/same', numbers(evaluation, threshold)
@@ -189,7 +189,7 @@ def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict
                 recognizer = PlaceRecognizer(place_map, settings)
                 found = recognize_traverse(recognizer, query.features, len(place_map), settings)
                 images += len(query)
-                matched += int(np.count_nonzero(found.sequence.scores < THRESHOLD))
+                matched += int(np.count_nonzero(found.accepted))
     return {'images': images, 'matched': matched}
 
 

@@ -505,7 +505,9 @@ def test_evaluate_on_gardens_point_gives_the_measured_f1(data_folder, numbers):
 def test_evaluate_of_loop_closures_in_the_hallway_gives_the_measured_recall(data_folder, numbers):
     folder = data_folder / 'rtabmap_hallway_loop'
     options = ['--loop-closure', '--exclude-places', 20, '--sequence-length', 10]
-    truth = ['--truth', folder / 'samples_GT.bmp']
-    assert (
-        numbers('--query', folder / 'samples', *truth, *options)['sequence']['recall_at_1'] > 0.8
+    found = numbers(
+        *('--query', folder / 'samples', '--truth', folder / 'samples_GT.bmp'), *options
     )
+    assert found['sequence']['recall_at_1'] > 0.8
+    assert found['default_threshold']['threshold'] == 0.8  # the node's for loop closures
+    assert found['decision']['precision'] == found['default_threshold']['precision'] == 1
