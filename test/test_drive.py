@@ -84,6 +84,13 @@ def test_unseen_images_are_more_than_five_places_from_the_map():
     assert np.flatnonzero(wide).tolist() == [18, 19, 20, 21]
 
 
+def test_unseen_images_of_adjacent_stretches_count_once():
+    truth = GroundTruth.identity(40, 40)
+    first, second = DriveChanges(removed=((0, 12), (12, 20))).apply(truth).unseen()
+    assert np.flatnonzero(first).tolist() == list(range(12))
+    assert np.flatnonzero(second).tolist() == [12, 13, 14]
+
+
 def test_unseen_images_of_two_places_have_lost_both():
     """Image 0 shows 20 and 50, image 1 20 and 51, image 2 nothing; 50 and 51 are ten apart."""
     truth = by_hand([(0, 20), (0, 50), (1, 20)], 3, 60)
@@ -98,7 +105,7 @@ def test_unseen_images_of_two_places_have_lost_both():
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
-        ({'drop': 1.0}, 'drop = 1.0'),
+        ({'drop': 1.0}, 'drop = 1.0: expected a probability'),
         ({'drop': float('nan')}, 'drop = nan'),
         ({'seed': -1}, 'seed = -1'),
         ({'stops': ((2, 0),)}, 'stop 2:0: expected at least one'),

@@ -88,8 +88,7 @@ def calibrate(
         right = in_bins(correct[known].astype(float)) / images
     counts = sweep(np.where(known, 1 - probabilities, np.inf), correct, has_match)
     levels = {
-        level: accepted_counts(known & (probabilities >= level), correct, has_match)
-        for level in LEVELS
+        level: accepted_counts(probabilities >= level, correct, has_match) for level in LEVELS
     }
     best = max(counts, key=lambda each: each.f1)
     full = max(each.recall for each in counts if each.precision == 1)
