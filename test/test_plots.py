@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 from stavpr_ros.demonstration.sheet import demo_sheet, distance_matrix, distance_over_time
 from stavpr_ros.errors import InputError
+from stavpr_ros.evaluation.calibration import calibrate
 from stavpr_ros.evaluation.plots import (
     distance_histogram,
+    drive,
     match_overview,
     MatchPair,
     precision_recall,
     reduced_matrix,
+    reliability,
 )
 from stavpr_ros.pipeline.overlay import match_image, NO_MATCH, RIGHT
 
@@ -143,6 +146,25 @@ def test_distance_histogram_shows_groups_and_threshold(path):
     assert colors_of(path, GREEN, RED, AMBER) == [True, True, False]
     distance_histogram(path, {'correct': ('#2e8b57', np.array([np.inf]))}, np.nan)
     colors_of(path, spread=1.0)
+
+
+def test_drive_shows_outcomes_true_places_and_unseen_images(path):
+    queries = np.arange(40)
+    outcomes = np.repeat(['right', 'wrong', 'no match', 'unseen'], 10)
+    truth = np.stack([queries, queries], axis=1)[:30]
+    drive(path, truth, 50, np.where(outcomes == 'wrong', 45, queries), outcomes, queries >= 30)
+    assert all(colors_of(path, GREEN, RED, AMBER, GRAY, YELLOW, (233, 233, 228)))
+    drive(path, truth[:0], 50, queries, outcomes, queries < 0)
+    assert colors_of(path, YELLOW) == [False]
+
+
+def test_reliability_shows_bins_above_and_below_the_diagonal(path):
+    declared = np.array([0.25, 0.95, 0.95, 0.95])
+    correct = np.array([True, False, True, True])
+    calibration = calibrate(declared, correct, np.ones(4, bool))
+    assert calibration is not None
+    reliability(path, calibration)
+    assert all(colors_of(path, (35, 88, 165), (127, 168, 220)))
 
 
 def test_demo_sheet_with_and_without_matches(path, results):

@@ -120,19 +120,6 @@ class ImageMatches:
 
 
 @dataclass(frozen=True)
-class Curve:
-    """
-    Precision over recall, from rejecting all matches to accepting all.
-
-    :param thresholds, precision, recall: shape (T,), float64.
-    """
-
-    thresholds: np.ndarray
-    precision: np.ndarray
-    recall: np.ndarray
-
-
-@dataclass(frozen=True)
 class Metrics:
     """
     Metrics of the matches of some queries.
@@ -146,6 +133,8 @@ class Metrics:
     :param recall_at_full_precision: largest recall with precision 1.
     :param sklearn_f1: best F1 of scikit-learn's curve.
     :param sklearn_recall_at_full_precision: largest recall with precision 1 of that curve.
+    :param curve: threshold, precision and recall, from rejecting all matches to accepting all,
+        shape (T, 3).
     """
 
     queries: int
@@ -156,7 +145,7 @@ class Metrics:
     recall_at_full_precision: float
     sklearn_f1: float
     sklearn_recall_at_full_precision: float
-    curve: Curve
+    curve: np.ndarray
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers, without the curve, for a JSON file."""
@@ -309,9 +298,7 @@ def evaluate_ranking(
         recall_at_full_precision=max(each.recall for each in counts if each.precision == 1),
         sklearn_f1=sklearn_f1,
         sklearn_recall_at_full_precision=sklearn_recall,
-        curve=Curve(
-            *np.array([(each.threshold, each.precision, each.recall) for each in counts]).T
-        ),
+        curve=np.array([(each.threshold, each.precision, each.recall) for each in counts]),
     )
 
 

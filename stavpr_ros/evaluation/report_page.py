@@ -14,7 +14,7 @@ from stavpr_ros.evaluation.drive import UNSEEN_DISTANCE
 from stavpr_ros.evaluation.evaluate import Evaluation, WindowDistances
 from stavpr_ros.evaluation.extra import import_extra
 from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import Curve, RANKS
+from stavpr_ros.evaluation.metrics import RANKS
 from stavpr_ros.evaluation.plots import Box, COLORS, SEQUENCE
 from stavpr_ros.evaluation.report import jsonable, METRICS, Report
 from stavpr_ros.mapping import PlaceMap
@@ -173,12 +173,10 @@ def _data(report: Report, mistakes: list[int]) -> dict[str, Any]:
     }
 
 
-def _points(curve: Curve) -> list[list[float]]:
-    """Return threshold, precision and recall of some points: the first, the last, some between."""
-    count = len(curve.thresholds)
-    kept = np.unique(np.linspace(0, count - 1, min(count, POINTS)).round().astype(int))
-    points = np.stack([curve.thresholds, curve.precision, curve.recall], axis=1)[kept]
-    return np.round(points, 6).tolist()
+def _points(curve: np.ndarray) -> list[list[float]]:
+    """Return some points of a curve: the first, the last, some between."""
+    kept = np.unique(np.linspace(0, len(curve) - 1, min(len(curve), POINTS)).round().astype(int))
+    return np.round(curve[kept], 6).tolist()
 
 
 def _view(evaluation: Evaluation, window: WindowDistances) -> dict[str, Any]:
