@@ -113,7 +113,8 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
     add('--stop', metavar='IMAGE:COUNT', help=stop, **pairs)
     drop = 'leave each image of the query out with this probability (%(default)g)'
     add('--drop', type=float, default=0.0, metavar='P', help=drop)
-    add('--drop-seed', type=int, default=0, help='of the images that are left out (%(default)s)')
+    seed = 'of the images that are left out (%(default)s)'
+    add('--drop-seed', type=int, default=0, metavar='N', help=seed)
     add('--warp', choices=KINDS, help='a speed or a stop in the middle, as in the benchmarks')
 
 

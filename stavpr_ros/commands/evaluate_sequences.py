@@ -267,7 +267,10 @@ def _description(arguments: argparse.Namespace) -> str:
     """Return the changes of the drive as text of the title."""
     parts = [f'without places {a} .. {b - 1}' for a, b in arguments.remove_from_map]
     parts += [name for name in ('mirror', 'reverse') if getattr(arguments, name)]
-    numbers = {'speed': arguments.warp or arguments.speed, 'drop': arguments.drop}
-    parts += [f'{name} {value}' for name, value in numbers.items() if value]
+    if arguments.warp or arguments.speed is not None:
+        speed = arguments.warp or arguments.speed
+        parts.append(f'speed {speed if isinstance(speed, str) else format(speed, "g")}')
+    if arguments.drop:
+        parts.append(f'drop {arguments.drop:g}')
     parts += [f'stop {image}:{count}' for image, count in arguments.stop]
     return ', '.join(parts)
