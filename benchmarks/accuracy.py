@@ -27,7 +27,7 @@ from stavpr_ros.evaluation.evaluate import (
     recognize_traverse,
 )
 from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import counts_at
+from stavpr_ros.evaluation.metrics import accepted_counts
 from stavpr_ros.evaluation.warp import cropped, KINDS, warp_indices
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class
@@ -135,9 +135,9 @@ def numbers(evaluation: Evaluation, threshold: float | None) -> dict[str, Any]:
         for name, metrics in (('sequence', evaluation.sequence), ('single', evaluation.single))
     }
     if threshold is not None:
-        ranking, truth = evaluation.results.sequence, evaluation.ground_truth
-        correct = truth.accepts(ranking.places)[:, 0]
-        counts = counts_at(threshold, ranking.scores, correct, truth.has_match)
+        results, truth = evaluation.results, evaluation.ground_truth
+        correct = truth.accepts(results.sequence.best)
+        counts = accepted_counts(results.accepted, correct, truth.has_match)
         found['at_default'] = {
             'threshold': threshold, 'precision': counts.precision, 'recall': counts.recall
         }  # fmt: skip
@@ -170,7 +170,7 @@ def evaluate_hallway(
     file = folder / 'rtabmap_hallway_loop/samples_GT.bmp'
     truth = GroundTruth.from_file(file, len(route), len(route), 0).loop_closures(EXCLUDED - 1)
     for mode in MODES:
-        settings = RecognizerSettings(THRESHOLD, mode=mode)
+        settings = RecognizerSettings(LOOP_THRESHOLD, mode=mode)
         evaluation = evaluate_loop_closures(route.features, truth, settings, EXCLUDED)
         threshold = LOOP_THRESHOLD if mode == 'robust' else None
         yield f'hallway/{feature}/{mode}/same', numbers(evaluation, threshold)
@@ -189,7 +189,7 @@ def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict
                 recognizer = PlaceRecognizer(place_map, settings)
                 found = recognize_traverse(recognizer, query.features, len(place_map), settings)
                 images += len(query)
-                matched += int(np.count_nonzero(found.sequence.scores < THRESHOLD))
+                matched += int(np.count_nonzero(found.accepted))
     return {'images': images, 'matched': matched}
 
 

@@ -3,6 +3,7 @@
 """The command ``evaluate``, on synthetic traverses and on real ones."""
 
 import csv
+from dataclasses import replace
 import os
 import re
 
@@ -250,6 +251,119 @@ def test_evaluate_with_loop_closure_matches_the_second_lap(tmp_path, numbers):
     assert (settings['loop_closure'], settings['exclude_places']) == (True, 50)
 
 
+# ---------------------------------------------------------------------------------- drives
+
+
+@pytest.fixture
+def report(run, tmp_path):
+    """Run the command with some options; return its JSON, the rows of its matches, its text."""
+
+    def call(*arguments):
+        folder = tmp_path / 'report'
+        code, text, errors = run(*arguments, '--output', folder)
+        assert code == 0, errors
+        with (folder / 'answers.csv').open() as file:
+            rows = list(csv.DictReader(file))
+        return read_json((folder / 'results.json').read_text()), rows, text
+
+    return call
+
+
+@pytest.mark.parametrize('mode', ['robust', 'paper'])
+def test_evaluate_with_places_removed_counts_unseen_images(folders, report, mode):
+    """Without places 20 .. 39, images 25 .. 34 are more than five places from the map."""
+    options = ['--mode', mode, '--remove-from-map', '20:40', '--remove-from-map', '50:53']
+    found, rows, text = report(*pair(folders), *options, '--tolerance', 0)
+    assert (found['places'], found['images']) == (PLACES - 23, PLACES)
+    assert found['sequence']['queries_with_match'] == PLACES - 23
+    assert [int(row['true_place']) for row in rows[:60:10]] == [0, 10, -1, -1, 20, -1]
+    accepted = [int(row['accepted']) for row in rows]
+    matched = sum(accepted[25:35])
+    assert found['unseen'] == [
+        {'first': 20, 'last': 40, 'images': 10, 'matched': matched},
+        {'first': 50, 'last': 53, 'images': 0, 'matched': 0},
+    ]
+    assert f'20 .. 39: {matched} of 10 unseen images matched' in text
+    right = [int(row['sequence_right']) for row in rows]
+    wrong = sum(a and not r for a, r in zip(accepted, right, strict=True))
+    decision = found['decision']
+    assert (decision['matched'], decision['wrongly_matched']) == (sum(accepted), wrong)
+    if mode == 'robust':
+        distances = [float(row['sequence_distance']) for row in rows]
+        assert accepted == [int(distance < 1) for distance in distances]
+        assert decision['rule'] == 'default'
+        assert found['default_threshold']['precision'] == decision['precision']
+    else:
+        counts = found['sequence']
+        assert sum(accepted) == counts['true_positives'] + counts['false_positives']
+        assert decision['rule'] == 'best F1'
+
+
+def test_evaluate_combines_drive_options(folders, report):
+    """Reversed at double speed with a stop: the removed places are unseen, the others found."""
+    options = ['--speed', 2, '--stop', '30:12', '--reverse', '--remove-from-map', '20:40']
+    found, rows, _ = report(*pair(folders), *options, '--mode', 'paper', '--tolerance', 0)
+    images = [*range(0, 30, 2), *[30] * 13, *range(32, PLACES, 2)][::-1]
+    assert [int(row['recorded_image']) for row in rows] == images
+    assert [row['identifier'] for row in rows] == [f'{i:03}.png' for i in images]
+    number = {place: i for i, place in enumerate([*range(20), *range(40, PLACES)])}
+    assert [int(row['true_place']) for row in rows] == [number.get(i, -1) for i in images]
+    assert [stretch['images'] for stretch in found['unseen']] == [13 + len((26, 28, 32, 34))]
+    assert found['single']['recall_at_1'] == 1
+    settings = found['settings']
+    assert (settings['speed'], settings['stop']) == (2, [[30, 12]])
+    assert settings['remove_from_map'] == [[20, 40]]
+
+
+def test_evaluate_with_drop_leaves_images_out_by_the_seed(folders, report):
+    found, rows, _ = report(*pair(folders), '--drop', 0.3, '--drop-seed', 4, '--tolerance', 0)
+    kept = np.flatnonzero(np.random.default_rng(4).random(PLACES) >= 0.3)
+    assert [int(row['recorded_image']) for row in rows] == kept.tolist()
+    assert [int(row['true_place']) for row in rows] == kept.tolist()
+    assert found['images'] == len(kept)
+
+
+def test_evaluate_mirrored_equals_images_mirrored_before(folders, report, run, tmp_path):
+    """No match of them is right; the map's images are not mirrored."""
+    files = sorted((folders / 'query').iterdir())
+    images = [cv2.imread(str(file))[:, ::-1, ::-1] for file in files]
+    before = report('--map', folders / 'map', '--query', write_images(tmp_path / 'm', images))[1]
+    found, rows, _ = report(*pair(folders), '--mirror')
+    assert [row['sequence_distance'] for row in rows] == [r['sequence_distance'] for r in before]
+    assert found['sequence']['queries_with_match'] == 0
+    assert found['decision']['wrongly_matched'] == found['decision']['matched']
+    assert {row['sequence_right'] for row in rows} == {'0'}
+    query = open_source(folders / 'query')
+    save_map(build_map(query, FeatureExtractor(), progress=False), tmp_path / 'q.stavpr')
+    code, _, errors = run('--map', folders / 'map', '--query', tmp_path / 'q.stavpr', '--mirror')
+    assert (code, 'has no images' in errors) == (2, True)
+
+
+def test_evaluate_with_declared_probabilities_shows_their_calibration(
+    folders, report, monkeypatch, tmp_path
+):
+    """Every window is declared to be right with 97 %, and is."""
+    update = PlaceRecognizer.update
+
+    def declaring(self, *arguments):
+        match = update(self, *arguments)
+        return replace(match, probability=0.97 if match.sequence else float('nan'))
+
+    assert report(*pair(folders))[0]['calibration'] is None
+    monkeypatch.setattr(PlaceRecognizer, 'update', declaring)
+    found, rows, text = report(*pair(folders))
+    assert [float(row['probability']) for row in rows] == [0.97] * PLACES
+    calibration = found['calibration']
+    assert calibration['images'] == calibration['bins'][9]['images'] == PLACES
+    right = np.mean([int(row['sequence_right']) for row in rows])
+    error = calibration['expected_calibration_error']
+    assert error == pytest.approx(abs(0.97 - right))
+    assert f'expected calibration error {error:.4f}' in text
+    page = (tmp_path / 'report' / 'report.html').read_text(encoding='utf-8')
+    assert f'Expected calibration error {error:.4f}' in page
+    assert cv2.imread(str(tmp_path / 'report' / 'calibration.png')).std() > 5
+
+
 # ---------------------------------------------------------------------------------- report
 
 
@@ -259,7 +373,7 @@ def test_report_holds_numbers_matches_plots_and_page(folders, run, tmp_path):
     code, text, errors = run(*pair(folders), *options)
     assert code == 0, errors
     assert 'false alarm rate' in text
-    plots = {'precision_recall', 'distances', 'similarity_matrix', 'window_30'}
+    plots = {'precision_recall', 'distances', 'similarity_matrix', 'drive', 'window_30'}
     assert plots <= {file.stem for file in folder.glob('*.png')}
     for file in folder.glob('*.png'):
         assert cv2.imread(str(file)).std() > 5, f'{file} is empty'
@@ -333,6 +447,13 @@ LOOP = ['--query', 'x', '--loop-closure', '--truth', 'y']
         (['--query', 'x', '--loop-closure'], 2, '--truth'),
         ([*LOOP, '--exclude-places', '0'], 2, 'at least 1'),
         ([*LOOP, '--warp', '2x'], 2, '--warp'),
+        ([*LOOP, '--remove-from-map', '3:4'], 2, '--remove-from-map needs a --map'),
+        (
+            ['--map', 'x', '--query', 'y', '--remove-from-map', '3-4'],
+            2,
+            "'3-4': expected two whole",
+        ),
+        (['--map', 'x', '--query', 'y', '--warp', '2x', '--speed', '3'], 2, 'give one of them'),
         ([*LOOP, '--backend', 'auto'], 2, '--backend'),
         ([*LOOP[:-1], 'poses', '--map-poses', 'y'], 2, '--map-poses'),
         (['--map', 'x', '--query', 'y', '--exclude-places', '9'], 2, 'goes with --loop-closure'),
@@ -355,6 +476,11 @@ def test_evaluate_of_inputs_that_do_not_fit_fails(folders, run, tmp_path):
     for options, code, word in (
         (['--query', folders / 'elsewhere'], 1, '40 query images and 60 places'),
         (['--strips', 0], 2, 'W = 0'),
+        (['--remove-from-map', '50:61'], 2, 'FIRST < LAST <= 60'),
+        (['--stop', '60:5'], 2, 'the query has the images 0 .. 59'),
+        (['--speed', 'fast'], 2, 'a number or varying'),
+        (['--drop', 1.5], 2, 'drop = 1.5'),
+        (['--speed', 4], 1, 'at least l = 20'),
         (['--sequence-length', 61], 1, 'at least l = 61'),
         (['--window', 3, '--output', folder], 2, '9 .. 49'),
         (['--truth', pickled], 1, 'pickle'),
@@ -379,7 +505,9 @@ def test_evaluate_on_gardens_point_gives_the_measured_f1(data_folder, numbers):
 def test_evaluate_of_loop_closures_in_the_hallway_gives_the_measured_recall(data_folder, numbers):
     folder = data_folder / 'rtabmap_hallway_loop'
     options = ['--loop-closure', '--exclude-places', 20, '--sequence-length', 10]
-    truth = ['--truth', folder / 'samples_GT.bmp']
-    assert (
-        numbers('--query', folder / 'samples', *truth, *options)['sequence']['recall_at_1'] > 0.8
+    found = numbers(
+        *('--query', folder / 'samples', '--truth', folder / 'samples_GT.bmp'), *options
     )
+    assert found['sequence']['recall_at_1'] > 0.8
+    assert found['default_threshold']['threshold'] == 0.8  # the node's for loop closures
+    assert found['decision']['precision'] == found['default_threshold']['precision'] == 1

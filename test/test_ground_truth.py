@@ -49,19 +49,10 @@ def test_accepts_minus_one_is_false_after_an_accepted_last_place():
     assert truth.accepts(np.array([4, -1])).tolist() == [True, False]
 
 
-@pytest.mark.parametrize(
-    'places',
-    [
-        np.array([0, 1]),
-        np.array([0.0, 1, 2]),
-        np.array([0, 1, 5]),
-        np.array([0, 1, -2]),
-        np.array(1),
-    ],
-)
-def test_accepts_of_invalid_places_raises(places):
-    with pytest.raises(InputError, match='places'):
-        by_hand().accepts(places)
+def test_accepts_of_places_outside_the_map_raises():
+    for outside in (5, -2):
+        with pytest.raises(InputError, match='places'):
+            by_hand().accepts(np.array([0, 1, outside]))
 
 
 def test_identity_accepts_the_same_index_within_the_tolerance():
@@ -112,8 +103,6 @@ def test_loop_closures_of_either_triangle_are_the_same():
         assert truth.loop_closures(exclude=3).pairs.tolist() == []
     with pytest.raises(InputError, match='one traverse'):
         by_hand().loop_closures()
-    with pytest.raises(InputError, match='excluded'):
-        GroundTruth.identity(3, 3).loop_closures(-1)
 
 
 def test_from_pairs_outside_the_range_raises():

@@ -115,9 +115,10 @@ def test_evaluate_ranking_of_five_queries_by_hand():
     """
     truth = GroundTruth.from_pairs([0, 1, 2, 3], [0, 1, 2, 3], N=5, n=9)
     metrics = evaluate_ranking(ranking([0, 8, 2, -1, 4], [0.1, 0.2, 0.3, np.inf, 0.4]), truth)
-    np.testing.assert_allclose(metrics.curve.precision, [1, 1, 1 / 2, 2 / 3, 1 / 2])
-    np.testing.assert_allclose(metrics.curve.recall, [0, 1 / 4, 1 / 3, 2 / 3, 2 / 3])
-    np.testing.assert_allclose(metrics.curve.thresholds, [0.1, 0.2, 0.3, 0.4, 0.4])
+    thresholds, precision, recall = metrics.curve.T
+    np.testing.assert_allclose(precision, [1, 1, 1 / 2, 2 / 3, 1 / 2])
+    np.testing.assert_allclose(recall, [0, 1 / 4, 1 / 3, 2 / 3, 2 / 3])
+    np.testing.assert_allclose(thresholds, [0.1, 0.2, 0.3, 0.4, 0.4])
     assert (metrics.best.threshold, metrics.best.f1) == (0.4, pytest.approx(2 / 3))
     assert (metrics.queries, metrics.with_match) == (5, 4)
     assert metrics.recall_at_full_precision == 1 / 4

@@ -8,15 +8,16 @@ import cv2
 import numpy as np
 import pytest
 from stavpr_ros.demonstration.plots import demo_sheet
-from stavpr_ros.errors import InputError
+from stavpr_ros.evaluation.calibration import calibrate
 from stavpr_ros.evaluation.metrics import ImageMatches
 from stavpr_ros.evaluation.plots import (
     distance_histogram,
+    drive,
     match_overview,
     MatchPair,
     precision_recall,
     reduced_matrix,
-    warping_path,
+    reliability,
 )
 from stavpr_ros.evaluation.records import TraverseEvaluation
 from stavpr_ros.pipeline.overlay import match_image, NO_MATCH, RIGHT
@@ -103,11 +104,6 @@ def test_reduced_matrix_returns_where_its_axes_are(path):
     assert red_over_blue[0] > 60 > red_over_blue[1]  # the diagonal is yellow
 
 
-def test_warping_path_of_an_empty_window_raises(path):
-    with pytest.raises(InputError, match='not empty'):
-        warping_path(path, np.zeros((0, 4)), np.zeros((0, 2)))
-
-
 def test_precision_recall_draws_each_curve_and_its_best_point(path):
     recall = np.linspace(0, 1, 20)
     curves = {
@@ -146,6 +142,25 @@ def test_demo_sheet_shows_matches_and_ground_truth_as_far_as_known(path, results
     nothing = replace(result, matches=none, accepted=np.zeros(QUERIES, bool))
     demo_sheet(path, [], distances, nothing, THRESHOLD, 'Title')
     assert colors_of(path, *bright) == [False, False, True]
+
+
+def test_drive_shows_outcomes_true_places_and_unseen_images(path):
+    queries = np.arange(40)
+    outcomes = np.repeat(['right', 'wrong', 'no match', 'unseen'], 10)
+    truth = np.stack([queries, queries], axis=1)[:30]
+    drive(path, truth, 50, np.where(outcomes == 'wrong', 45, queries), outcomes, queries >= 30)
+    assert all(colors_of(path, GREEN, RED, AMBER, GRAY, YELLOW, (233, 233, 228)))
+    drive(path, truth[:0], 50, queries, outcomes, queries < 0)
+    assert colors_of(path, YELLOW) == [False]
+
+
+def test_reliability_shows_bins_above_and_below_the_diagonal(path):
+    declared = np.array([0.25, 0.95, 0.95, 0.95])
+    correct = np.array([True, False, True, True])
+    calibration = calibrate(declared, correct, np.ones(4, bool))
+    assert calibration is not None
+    reliability(path, calibration)
+    assert all(colors_of(path, (35, 88, 165), (127, 168, 220)))
 
 
 @pytest.mark.parametrize(('accepted', 'color'), [(True, RIGHT), (False, NO_MATCH)])

@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from stavpr_ros.commands.evaluate_sequences import Sequences
     from stavpr_ros.evaluation.evaluate import Evaluation
     from stavpr_ros.evaluation.report import Report
+    from stavpr_ros.pipeline.settings import PipelineSettings
     from stavpr_ros.recognition import RecognizerSettings
 
 OUTPUT = 'evaluation_output'
-WARPS = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')
 EXCLUDE_PLACES = 50  # as the node's parameter
 
 DESCRIPTION = """
 Recognizes a second traverse on the map of a first one, image by image as the node does, and
 compares the matches with the ground truth: precision and recall, F1, average precision, recall@k,
-recall at 100 % precision, false alarms; for sequences and for single images. Writes JSON, CSV,
-plots and an HTML page.
+recall at 100 % precision, false alarms, calibration; for sequences and for single images. Writes
+JSON, CSV, plots and an HTML page.
 """
 
 EPILOG = """
@@ -37,11 +37,20 @@ ground truth (--truth):
                pairs, or a place a query; an image: white at row i, column j accepts place j for
                query i; --tolerance is 0 then
 
+another drive (they combine; applied in the order speed, stop, reverse, drop):
+  --remove-from-map 100:150   the map lacks the places 100 to 149: are images of them matched?
+  --mirror                    every image mirrored left-right: no match is right
+  --reverse                   the last image comes first
+  --speed 3, 0.5, varying     images are left out or repeated; varying: 1/2 to 2
+  --stop 60:100               the query stands still at image 60 for 100 images more
+  --drop 0.2                  each image is left out with probability 0.2
+
 examples:
   evaluate --map summer/ --query winter/
   evaluate --map route.stavpr --query tuesday.bag --truth pairs.csv --mode paper --json result.json
   evaluate --map summer/ --query winter/ --crop-map 0.3 --crop-query 0.1 --warp vary
   evaluate --map monday/ --query tuesday/ --unknown another_town/ --output report/
+  evaluate --map monday/ --query tuesday/ --remove-from-map 40:90 --remove-from-map 200:260
   evaluate --query loop/ --loop-closure --exclude-places 50 --truth closures.png
   evaluate --dataset gardens_point=data/gardens_point --strategy vanilla
 
@@ -70,7 +79,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar='N',
         help=f'the latest N images are not part of that map ({EXCLUDE_PLACES})',
     )
-    add('--warp', choices=WARPS, help='change the speed of the query')
     for name, side in (('map', 'right'), ('query', 'left')):
         add(
             f'--crop-{name}',
@@ -79,6 +87,7 @@ def _parser() -> argparse.ArgumentParser:
             metavar='X',
             help=f'crop this share of the {side} of every image of the {name} (%(default)g)',
         )
+    _add_drive_options(parser)
     _add_ground_truth_options(parser)
     _add_method_options(parser)
     add = parser.add_argument_group('output').add_argument
@@ -87,6 +96,40 @@ def _parser() -> argparse.ArgumentParser:
     add('--window', type=int, metavar='I', help='plot the warping path around query image I')
     add_feature_options(parser)
     return parser
+
+
+def _add_drive_options(parser: argparse.ArgumentParser) -> None:
+    from stavpr_ros.evaluation.warp import KINDS
+
+    add = parser.add_argument_group('another drive').add_argument
+    pairs: dict[str, Any] = {'type': _pair, 'action': 'append', 'default': []}
+    removal = 'leave places FIRST .. LAST - 1 out of the map; may be repeated'
+    add('--remove-from-map', metavar='FIRST:LAST', help=removal, **pairs)
+    add('--mirror', action='store_true', help='mirror the images of the query left-right')
+    add('--reverse', action='store_true', help='drive the query in reverse order')
+    speed = 'images of the query per image, or varying'
+    add('--speed', type=_speed, metavar='X', help=speed)
+    stop = 'stand still at image IMAGE of the query for COUNT more; may be repeated'
+    add('--stop', metavar='IMAGE:COUNT', help=stop, **pairs)
+    drop = 'leave each image of the query out with this probability (%(default)g)'
+    add('--drop', type=float, default=0.0, metavar='P', help=drop)
+    seed = 'of the images that are left out (%(default)s)'
+    add('--drop-seed', type=int, default=0, metavar='N', help=seed)
+    add('--warp', choices=KINDS, help='a speed or a stop in the middle, as in the benchmarks')
+
+
+def _pair(text: str) -> tuple[int, int]:
+    numbers = text.split(':')
+    if len(numbers) != 2 or not all(number.isdecimal() for number in numbers):
+        raise argparse.ArgumentTypeError(f'{text!r}: expected two whole numbers, as 60:100')
+    return int(numbers[0]), int(numbers[1])
+
+
+def _speed(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _add_ground_truth_options(parser: argparse.ArgumentParser) -> None:
@@ -136,6 +179,8 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         parser.error('--exclude-places goes with --loop-closure')
     if loop:
         _check_loop_closure(parser, arguments)
+    if arguments.warp and arguments.speed is not None:
+        parser.error('--warp and --speed: give one of them')
     if arguments.tolerance is not None and arguments.tolerance < 0:
         parser.error(f'--tolerance {arguments.tolerance} must be at least 0')
     if arguments.truth != 'poses' and (arguments.query_poses or arguments.map_poses):
@@ -145,8 +190,10 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
 def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     if arguments.exclude_places is None:
         arguments.exclude_places = EXCLUDE_PLACES
-    if arguments.warp or arguments.unknown:
-        parser.error('--loop-closure: --warp and --unknown need a --map')
+    names = ('unknown', 'remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop', 'warp')
+    for name in names:
+        if getattr(arguments, name):
+            parser.error(f'--loop-closure: --{name.replace("_", "-")} needs a --map')
     cuda = arguments.backend != 'cpu' or arguments.precision != 'float32'
     if cuda or arguments.crop_map or arguments.map_poses:
         parser.error(
@@ -159,23 +206,22 @@ def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Nam
         parser.error(f'--exclude-places {arguments.exclude_places} must be at least 1')
 
 
-def recognizer_settings(arguments: argparse.Namespace) -> 'RecognizerSettings':
+def node_settings(arguments: argparse.Namespace) -> 'PipelineSettings':
     """
-    Return the settings of the parsed options; the metrics do not depend on their threshold.
+    Return the settings of the parsed options as the node has them, without a given threshold.
 
     :raises SettingsError: one is out of its range.
     """
     from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-    from stavpr_ros.recognition import RecognizerSettings
+    from stavpr_ros.pipeline.settings import PipelineSettings
 
-    return RecognizerSettings(
-        threshold=1.0,
+    return PipelineSettings(
+        mode=arguments.mode,
         spatial=SpatialSettings(
             arguments.strategy, arguments.sigma, arguments.xi, arguments.vertical
         ),
         sequence=SequenceSettings(arguments.sequence_length, arguments.beta),
         nms_radius=arguments.nms_radius,
-        mode=arguments.mode,
     )
 
 
@@ -185,7 +231,7 @@ def _evaluate(
     from stavpr_ros.evaluation.evaluate import evaluate_loop_closures, evaluate_on_map
 
     shown = () if arguments.window is None else (arguments.window,)
-    query, ground_truth = sequences.query.features, sequences.ground_truth
+    query, ground_truth = sequences.query.features, sequences.drive.truth
     if sequences.reference is None:
         return evaluate_loop_closures(
             query, ground_truth, settings, arguments.exclude_places, shown, progress=True
@@ -210,6 +256,7 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
     poses = ('query_poses', 'map_poses', 'meters', 'degrees') if sequences.posed else ()
     names = [
         *('map', 'query', 'dataset', 'topic', 'unknown', 'loop_closure', 'exclude_places', 'warp'),
+        *('remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
         *('crop_map', 'crop_query', 'truth', *poses),
         *('mode', 'sequence_length', 'beta', 'strategy', 'sigma', 'xi', 'vertical', 'nms_radius'),
         *('backend', 'precision'),
@@ -222,18 +269,21 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
     return {**settings, 'tolerance': sequences.tolerance, 'features': features}
 
 
+def _operation(arguments: argparse.Namespace) -> str:
+    return 'loop_closure' if arguments.loop_closure else 'localization'
+
+
 def _report(arguments: argparse.Namespace) -> 'Report':
     from stavpr_ros.commands.evaluate_sequences import load_sequences
-    from stavpr_ros.evaluation.metrics import import_sklearn
+    from stavpr_ros.evaluation.extra import import_extra
     from stavpr_ros.evaluation.report import Report
-    from stavpr_ros.recognition.robust import THRESHOLD
 
     began = time.perf_counter()
-    import_sklearn()  # an error before the work, not after it
-    settings = recognizer_settings(arguments)
+    import_extra('sklearn.metrics')  # an error before the work, not after it
+    settings, operation = node_settings(arguments), _operation(arguments)
     sequences = load_sequences(arguments)
     loaded = time.perf_counter()
-    evaluation = _evaluate(arguments, sequences, settings)
+    evaluation = _evaluate(arguments, sequences, settings.recognition(operation))
     ended = time.perf_counter()
     milliseconds = evaluation.results.seconds * 1e3
     times = {
@@ -250,7 +300,8 @@ def _report(arguments: argparse.Namespace) -> 'Report':
         title=sequences.title,
         settings=_settings_json(arguments, sequences),
         times=times,
-        default_threshold=THRESHOLD if arguments.mode == 'robust' else None,
+        drive=sequences.drive,
+        default_threshold=settings.applied_threshold(operation),
         window=arguments.window,
     )
 
@@ -269,6 +320,21 @@ def _print_metrics(report: 'Report') -> None:
     alarms = [report.evaluation.false_alarm_rate(kind) for kind in ('sequence', 'single')]
     if alarms[0] is not None:
         print(f'{"false alarm rate":28}{alarms[0]:12.4f}{"":12}{alarms[1]:12.4f}')
+    decision, calibration = report.decision(), report.evaluation.calibration
+    print(
+        f'matched, {decision["rule"]}: {decision["matched"]} of {decision["images"]} images, '
+        f'{decision["wrongly_matched"]} of them wrongly'
+    )
+    for stretch in report.unseen():
+        print(
+            f'without places {stretch["first"]} .. {stretch["last"] - 1}: {stretch["matched"]} of '
+            f'{stretch["images"]} unseen images matched'
+        )
+    if calibration is not None:
+        print(
+            f'declared probability: expected calibration error {calibration.expected_error:.4f}, '
+            f'recall at 100 precision {calibration.recall_at_full_precision:.4f}'
+        )
     print(
         f'{report.times["recognition_median_ms"]:.2f} ms an image for recognition (median), '
         f'{report.times["total_s"]:.1f} s in all'
@@ -276,15 +342,15 @@ def _print_metrics(report: 'Report') -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.evaluation.extra import import_extra
     from stavpr_ros.evaluation.report import chosen_window
     from stavpr_ros.evaluation.report_files import write_folder, write_json
-    from stavpr_ros.evaluation.report_page import import_jinja2
 
     folder = arguments.output or (None if arguments.json else OUTPUT)
     if arguments.json:
         require_room(arguments.json)
     if folder:
-        import_jinja2()
+        import_extra('jinja2')
         if Path(folder).is_file():
             raise SourceError(f'{folder} is a file: --output takes a folder')
     report = _report(arguments)

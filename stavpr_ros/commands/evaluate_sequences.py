@@ -13,10 +13,17 @@ import numpy as np
 from stavpr_ros.commands.feature_options import kind_options, make_extractor
 from stavpr_ros.devices import choose_device
 from stavpr_ros.errors import SettingsError, SourceError
+from stavpr_ros.evaluation.drive import Drive, DriveChanges
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.ground_truth_files import read_poses
 from stavpr_ros.evaluation.paper.datasets import open_dataset
-from stavpr_ros.evaluation.warp import cropped, FrameSource, warp_indices
+from stavpr_ros.evaluation.warp import (
+    cropped,
+    FrameSource,
+    mirrored,
+    select_places,
+    warp_changes,
+)
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, load_map, PlaceMap
 from stavpr_ros.sources import open_source
@@ -33,9 +40,9 @@ class Sequences:
     The inputs of an evaluation.
 
     :param reference: the map; None for loop closures.
-    :param query: the query, with the changes of speed and width that the options name.
+    :param query: the query, with the changes that the options name.
     :param unknown: a traverse through places that are not in the map, if there is one.
-    :param ground_truth: of the query's images.
+    :param drive: these changes, and the ground truth of the query's images.
     :param tolerance: places.
     :param posed: the ground truth comes from poses.
     :param title: names of the inputs, a line.
@@ -45,7 +52,7 @@ class Sequences:
     reference: PlaceMap | None
     query: PlaceMap
     unknown: PlaceMap | None
-    ground_truth: GroundTruth
+    drive: Drive
     tolerance: int
     posed: bool
     title: str
@@ -70,7 +77,7 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
             if path is not None
         }
         sequences = _of_paths(arguments, opened, loader.times)
-    return sequences if arguments.warp is None else _warped(sequences, arguments.warp)
+    return _changed(sequences, arguments)
 
 
 def is_saved_map(path: str | None) -> bool:
@@ -89,21 +96,29 @@ class _Loader:
 
     def load(self, name: str, path: str) -> PlaceMap:
         """Open a folder, a bag or a saved map."""
-        # unknown places are cropped as the query is
-        kind = 'map' if name == 'map' else 'query'
-        share = getattr(self._arguments, f'crop_{kind}')
         if is_saved_map(path):
-            if share:
-                raise SettingsError(f'--crop-{kind}: {path} is a saved map, which has no images')
+            crop = 'crop_map' if name == 'map' else 'crop_query'
+            unusable = (crop, 'mirror') if name == 'query' else (crop,)
+            for option in unusable:
+                if getattr(self._arguments, option):
+                    raise SettingsError(
+                        f'--{option.replace("_", "-")}: {path} is a saved map, which has no images'
+                    )
             return self._load_map(path)
         if Path(path).suffix == '.stavpr':
             return load_map(path)  # raises the reason why it is none
         source = open_source(path, self._arguments.topic if is_bag(Path(path)) else None)
-        return self.extract(name, cropped(source, *((0, share) if kind == 'map' else (share, 0))))
+        return self.extract(name, source)
 
     def extract(self, name: str, source: FrameSource) -> PlaceMap:
-        """Extract the features of a source."""
-        extractor = self._chosen()
+        """Extract the features of a source, cropped and mirrored as the options want it."""
+        given, extractor = self._arguments, self._chosen()
+        # unknown places are cropped as the query is
+        source = cropped(
+            source, *((0, given.crop_map) if name == 'map' else (given.crop_query, 0))
+        )
+        if name == 'query' and given.mirror:
+            source = mirrored(source)
         began = time.perf_counter()
         extracted = build_map(source, extractor)
         milliseconds = (time.perf_counter() - began) * 1e3
@@ -155,10 +170,10 @@ def _of_dataset(arguments: argparse.Namespace, loader: _Loader) -> Sequences:
         raise SettingsError(f'--dataset {arguments.dataset}: expected NAME=FOLDER')
     found = open_dataset(name, root, arguments.tolerance)
     return Sequences(
-        reference=loader.extract('map', cropped(found.map, 0, arguments.crop_map)),
-        query=loader.extract('query', cropped(found.query, arguments.crop_query, 0)),
+        reference=loader.extract('map', found.map),
+        query=loader.extract('query', found.query),
         unknown=loader.load('unknown', arguments.unknown) if arguments.unknown else None,
-        ground_truth=found.ground_truth,
+        drive=DriveChanges().apply(found.ground_truth),
         tolerance=found.tolerance,
         posed=False,
         title=name.replace('_', ' '),
@@ -182,7 +197,8 @@ def _of_paths(
         title = f'{_name(arguments.query)} on the map {_name(arguments.map)}'
     posed = arguments.truth == 'poses'
     unknown = opened.get('unknown')
-    return Sequences(reference, query, unknown, ground_truth, tolerance, posed, title, times)
+    drive = DriveChanges().apply(ground_truth)
+    return Sequences(reference, query, unknown, drive, tolerance, posed, title, times)
 
 
 def _name(path: str) -> str:
@@ -221,21 +237,40 @@ def _poses(path: str | None, place_map: PlaceMap, name: str, degrees: float | No
     return poses
 
 
-def _warped(sequences: Sequences, kind: str) -> Sequences:
-    """Change the query's speed: its images and their ground truth alike."""
-    query = sequences.query
-    indices = warp_indices(len(query), kind)
-    changed = replace(
-        query,
-        features=query.features[indices],
-        stamps=query.stamps[indices],
-        ids=tuple(query.ids[i] for i in indices),
-        poses=None if query.poses is None else query.poses[indices],
-        thumbnails=tuple(query.thumbnails[i] for i in indices) if query.thumbnails else (),
+def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
+    """Drive the query as the options want it, on a map without the places that they remove."""
+    query, reference = sequences.query, sequences.reference
+    if arguments.warp is None:
+        warp = DriveChanges(speed=1.0 if arguments.speed is None else arguments.speed)
+    else:
+        warp = warp_changes(len(query), arguments.warp)
+    changes = replace(
+        warp,
+        removed=tuple(arguments.remove_from_map),
+        mirror=arguments.mirror,
+        reverse=arguments.reverse,
+        drop=arguments.drop,
+        seed=arguments.drop_seed,
+        stops=(*warp.stops, *arguments.stop),
     )
-    return replace(
-        sequences,
-        query=changed,
-        ground_truth=sequences.ground_truth.select(indices),
-        title=f'{sequences.title}, speed {kind}',
-    )
+    if changes == DriveChanges(seed=changes.seed):
+        return sequences
+    drive = changes.apply(sequences.drive.recorded)
+    if reference is not None and changes.removed:
+        reference = select_places(reference, drive.places)
+    title = f'{sequences.title}, {_description(arguments)}'
+    query = select_places(query, drive.images)
+    return replace(sequences, reference=reference, query=query, drive=drive, title=title)
+
+
+def _description(arguments: argparse.Namespace) -> str:
+    """Return the changes of the drive as text of the title."""
+    parts = [f'without places {a} .. {b - 1}' for a, b in arguments.remove_from_map]
+    parts += [name for name in ('mirror', 'reverse') if getattr(arguments, name)]
+    if arguments.warp or arguments.speed is not None:
+        speed = arguments.warp or arguments.speed
+        parts.append(f'speed {speed if isinstance(speed, str) else format(speed, "g")}')
+    if arguments.drop:
+        parts.append(f'drop {arguments.drop:g}')
+    parts += [f'stop {image}:{count}' for image, count in arguments.stop]
+    return ', '.join(parts)

@@ -171,10 +171,10 @@ def _number(value: float | None) -> str:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from stavpr_ros.evaluation.metrics import import_sklearn
+    from stavpr_ros.evaluation.extra import import_extra
     from stavpr_ros.evaluation.report import jsonable
 
-    import_sklearn()
+    import_extra('sklearn.metrics')
     if arguments.json:
         require_room(arguments.json)
     _check_features(arguments)

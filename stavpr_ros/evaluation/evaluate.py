@@ -10,11 +10,12 @@ around it was matched with. The rows of distances are not kept: memory does not 
 from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 import time
-from typing import Protocol
 
 import numpy as np
 from stavpr_ros.errors import InputError
+from stavpr_ros.evaluation.calibration import calibrate, Calibration
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.metrics import (
     evaluate_ranking,
@@ -27,24 +28,12 @@ from stavpr_ros.evaluation.metrics import (
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.loop_closer import LoopCloser
 from tqdm import tqdm
 
 MARGIN = 8  # places beside the path of a window whose distances are kept
 MATRIX_SIDE = 900  # cells along a side of the reduced distance matrix
 WINDOWS = 1500  # windows whose distances are kept, spread over the traverse
-
-
-class OnlineRecognizer(Protocol):
-    """A recognizer with a map, or a loop closer: both take image by image."""
-
-    def update(self, features: LocalFeatures) -> Match:
-        """Append the next image and match the window that ends with it."""
-
-    def newest_row(self) -> np.ndarray:
-        """Scores of the newest image against every place, shape (n,), small is near."""
-
-    def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return up to ``count`` places of the last window, nearest first, and their distances."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +79,8 @@ class TraverseResults:
     :param seconds: to match each image, features excluded, shape (N,).
     :param windows: distances of some windows.
     :param distances: of all images.
+    :param accepted: of the windows' matches, those that the recognizer accepts, shape (N,), bool.
+    :param probabilities: declared for them, shape (N,); NaN = not declared.
     """
 
     sequence: Ranking
@@ -97,6 +88,8 @@ class TraverseResults:
     seconds: np.ndarray
     windows: tuple[WindowDistances, ...] = field(repr=False)
     distances: ReducedDistances = field(repr=False)
+    accepted: np.ndarray = field(repr=False)
+    probabilities: np.ndarray = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -123,19 +116,23 @@ class Evaluation:
         """Return the images that have a window centered on them."""
         return centered_images(len(self.results.single), self.sequence_length)
 
-    def false_alarm_rate(self, kind: str, threshold: float | None = None) -> float | None:
+    def false_alarm_rate(self, kind: str) -> float | None:
         """
         Return the share of unknown images that are accepted; None without any.
 
-        :param kind: ``sequence`` or ``single``.
-        :param threshold: that of the best F1 by default.
+        :param kind: ``sequence`` or ``single``; at the threshold of its best F1.
         """
         if self.unknown is None:
             return None
         metrics: Metrics = getattr(self, kind)
         scores = getattr(self.unknown, kind).scores
-        limit = metrics.best.threshold if threshold is None else threshold
-        return int(np.count_nonzero(scores < limit)) / len(scores)
+        return int(np.count_nonzero(scores < metrics.best.threshold)) / len(scores)
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """Return how far the declared probabilities hold; None without any."""
+        correct = self.ground_truth.accepts(self.results.sequence.best)
+        return calibrate(self.results.probabilities, correct, self.ground_truth.has_match)
 
 
 def centered_images(count: int, length: int) -> slice:
@@ -164,7 +161,7 @@ def recognize_all(recognizer: PlaceRecognizer, features: LocalFeatures) -> list[
 
 
 def recognize_traverse(
-    online: OnlineRecognizer,
+    online: PlaceRecognizer | LoopCloser,
     features: LocalFeatures,
     places: int,
     settings: RecognizerSettings,
@@ -212,7 +209,15 @@ def recognize_traverse(
     matched = image_matches(matches, length)
     ranked = np.stack([_ranked(*pair) for pair in zip(matched.places, candidates, strict=True)])
     sequence = Ranking(ranked, matched.distances)
-    return TraverseResults(sequence, single, seconds, tuple(windows), reduced.result())
+    return TraverseResults(
+        sequence,
+        single,
+        seconds,
+        tuple(windows),
+        reduced.result(),
+        matched.accepted,
+        matched.probabilities,
+    )
 
 
 def evaluate_on_map(
@@ -231,7 +236,7 @@ def evaluate_on_map(
 
     :param query: features of N images.
     :param ground_truth: of the same images.
-    :param settings: of the recognizer; the metrics are of all matches, whatever its threshold.
+    :param settings: of the recognizer; only what it accepts depends on its threshold.
     :param unknown: features of a traverse through places that are not in the map.
     :param shown: images whose windows' distances are kept in any case.
     :param backend, precision: see :class:`stavpr_ros.recognition.PlaceRecognizer`.
@@ -266,8 +271,6 @@ def evaluate_loop_closures(
 
     The others are as in :func:`evaluate_on_map`.
     """
-    from stavpr_ros.recognition.loop_closer import LoopCloser
-
     centered_images(len(query), settings.sequence.length)
     closer = LoopCloser(settings, exclude_places, query.settings)
     label = 'closing loops' if progress else ''

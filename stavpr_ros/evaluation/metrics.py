@@ -10,13 +10,12 @@ is in the map is a false negative. Average precision is scikit-learn's, which co
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-import importlib
-from types import ModuleType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from stavpr_ros.alignment import aligned_index
-from stavpr_ros.errors import InputError, UnavailableError
+from stavpr_ros.errors import InputError
+from stavpr_ros.evaluation.extra import import_extra
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.recognition import Match
 
@@ -40,10 +39,14 @@ class ConfusionCounts:
     false_negatives: int
 
     @property
+    def accepted(self) -> int:
+        """Return the number of accepted matches."""
+        return self.true_positives + self.false_positives
+
+    @property
     def precision(self) -> float:
         """TP / (TP + FP); 1 when nothing is accepted."""
-        accepted = self.true_positives + self.false_positives
-        return self.true_positives / accepted if accepted else 1.0
+        return self.true_positives / self.accepted if self.accepted else 1.0
 
     @property
     def recall(self) -> float:
@@ -70,13 +73,6 @@ class Ranking:
     places: np.ndarray
     scores: np.ndarray
 
-    def __post_init__(self) -> None:
-        if self.places.ndim != 2 or self.scores.shape != self.places.shape[:1]:
-            raise InputError(
-                f'places {self.places.shape} and scores {self.scores.shape}: expected (N, K) and '
-                '(N,)'
-            )
-
     def __len__(self) -> int:
         return len(self.scores)
 
@@ -93,10 +89,24 @@ class ImageMatches:
 
     :param places: shape (N,), int64; -1 = none.
     :param distances: shape (N,), float64; +inf = none.
+    :param accepted: whether the recognizer matched the window, shape (N,), bool.
+    :param probabilities: that the match is right, shape (N,), float64; NaN = not declared.
     """
 
     places: np.ndarray
     distances: np.ndarray
+    accepted: np.ndarray
+    probabilities: np.ndarray
+
+    @classmethod
+    def none(cls, count: int) -> Self:
+        """Return the matches of images without any."""
+        return cls(
+            np.full(count, -1, np.int64),
+            np.full(count, np.inf),
+            np.zeros(count, bool),
+            np.full(count, np.nan),
+        )
 
     def within(self, true_places: np.ndarray, tolerance: int) -> np.ndarray:
         """
@@ -107,19 +117,6 @@ class ImageMatches:
         true_places = np.asarray(true_places)
         known = (self.places >= 0) & (true_places >= 0)
         return known & (np.abs(self.places - true_places) <= tolerance)
-
-
-@dataclass(frozen=True)
-class Curve:
-    """
-    Precision over recall, from rejecting all matches to accepting all.
-
-    :param thresholds, precision, recall: shape (T,), float64.
-    """
-
-    thresholds: np.ndarray
-    precision: np.ndarray
-    recall: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -136,6 +133,8 @@ class Metrics:
     :param recall_at_full_precision: largest recall with precision 1.
     :param sklearn_f1: best F1 of scikit-learn's curve.
     :param sklearn_recall_at_full_precision: largest recall with precision 1 of that curve.
+    :param curve: threshold, precision and recall, from rejecting all matches to accepting all,
+        shape (T, 3).
     """
 
     queries: int
@@ -146,7 +145,7 @@ class Metrics:
     recall_at_full_precision: float
     sklearn_f1: float
     sklearn_recall_at_full_precision: float
-    curve: Curve
+    curve: np.ndarray
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers, without the curve, for a JSON file."""
@@ -182,9 +181,24 @@ def counts_at(
     :param distances: of each query's match, shape (N,); +inf or NaN = no match.
     :param correct: the match is within the tolerance of the ground truth, shape (N,), bool.
     :param has_match: the query's place is in the map, shape (N,), bool; None = all are.
-    :raises InputError: arrays of different shapes.
     """
-    return _counts(np.array([threshold]), *_checked(distances, correct, has_match))[0]
+    return _counts(np.array([threshold]), distances, correct, has_match)[0]
+
+
+def accepted_counts(
+    accepted: np.ndarray, correct: np.ndarray, has_match: np.ndarray
+) -> ConfusionCounts:
+    """
+    Count accepted matches, whatever they were accepted by; the threshold is NaN.
+
+    :param accepted: shape (N,), bool; the others are as in :func:`counts_at`.
+    """
+    return ConfusionCounts(
+        float('nan'),
+        int(np.count_nonzero(accepted & correct)),
+        int(np.count_nonzero(accepted & ~correct)),
+        int(np.count_nonzero(~accepted & has_match)),
+    )
 
 
 def sweep(
@@ -195,7 +209,6 @@ def sweep(
 
     The parameters are those of :func:`counts_at`.
     """
-    distances, correct, has_match = _checked(distances, correct, has_match)
     finite = np.unique(distances[np.isfinite(distances)])
     thresholds = (
         np.append(finite, np.nextafter(finite[-1], np.inf)) if finite.size else np.zeros(1)
@@ -210,26 +223,17 @@ def best_f1(
     return max(sweep(distances, correct, has_match), key=lambda counts: counts.f1)
 
 
-def _checked(
-    distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    distances, correct = np.asarray(distances, float), np.asarray(correct, bool)
-    has_match = np.ones_like(correct) if has_match is None else np.asarray(has_match, bool)
-    if not distances.shape == correct.shape == has_match.shape or distances.ndim != 1:
-        raise InputError(
-            f'distances {distances.shape}, correct {correct.shape}, has_match {has_match.shape}: '
-            'expected one value a query each'
-        )
-    return distances, correct, has_match
-
-
 def _counts(
-    thresholds: np.ndarray, distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray
+    thresholds: np.ndarray,
+    distances: np.ndarray,
+    correct: np.ndarray,
+    has_match: np.ndarray | None,
 ) -> list[ConfusionCounts]:
     order = np.argsort(distances)  # NaN last, as +inf
     accepted = np.searchsorted(distances[order], thresholds)  # below, not at the threshold
     true_positives = np.append(0, np.cumsum(correct[order]))[accepted]
-    in_map = np.append(0, np.cumsum(has_match[order]))
+    relevant = np.ones_like(correct) if has_match is None else has_match
+    in_map = np.append(0, np.cumsum(relevant[order]))
     false_negatives = in_map[-1] - in_map[accepted]
     columns = (thresholds, true_positives, accepted - true_positives, false_negatives)
     return [
@@ -247,15 +251,16 @@ def image_matches(matches: Sequence[Match], length: int) -> ImageMatches:
     :param matches: one an image, in order: that of the window that ends with the image.
     :param length: images in a window, l.
     """
-    places = np.full(len(matches), -1, np.int64)
-    distances = np.full(len(matches), np.inf)
+    found = ImageMatches.none(len(matches))
     middle = (length - 1) // 2
     ends = [end for end, match in enumerate(matches) if match.sequence is not None]
 
     def assign(end: int, position: int, place: int) -> None:
         image = end - (length - 1) + position
         if image >= 0:
-            places[image], distances[image] = place, matches[end].score
+            match = matches[end]
+            found.places[image], found.distances[image] = place, match.score
+            found.accepted[image], found.probabilities[image] = match.accepted, match.probability
 
     for end in ends:
         assign(end, middle, matches[end].sequence.middle)  # type: ignore[union-attr]
@@ -264,7 +269,7 @@ def image_matches(matches: Sequence[Match], length: int) -> ImageMatches:
             assign(ends[0], position, aligned_index(matches[ends[0]].path, position))
         for position in range(middle + 1, length):
             assign(ends[-1], position, aligned_index(matches[ends[-1]].path, position))
-    return ImageMatches(places, distances)
+    return found
 
 
 def evaluate_ranking(
@@ -293,9 +298,7 @@ def evaluate_ranking(
         recall_at_full_precision=max(each.recall for each in counts if each.precision == 1),
         sklearn_f1=sklearn_f1,
         sklearn_recall_at_full_precision=sklearn_recall,
-        curve=Curve(
-            *np.array([(each.threshold, each.precision, each.recall) for each in counts]).T
-        ),
+        curve=np.array([(each.threshold, each.precision, each.recall) for each in counts]),
     )
 
 
@@ -313,20 +316,6 @@ def smallest_indices(row: np.ndarray, k: int) -> np.ndarray:
     return usable[np.argsort(row[usable], kind='stable')][:k]
 
 
-def import_sklearn() -> ModuleType:
-    """
-    Import scikit-learn's metrics.
-
-    :raises UnavailableError: the extra ``evaluation`` is not installed.
-    """
-    try:
-        return importlib.import_module('sklearn.metrics')
-    except ImportError as error:
-        raise UnavailableError(
-            f'the evaluation needs scikit-learn ({error}): pip install scikit-learn'
-        ) from error
-
-
 def _recall_at(k: int, correct: np.ndarray, has_match: np.ndarray) -> float:
     """Return the share of queries with a place in the map; NaN where none has one."""
     found = correct[has_match, :k].any(axis=1)
@@ -335,7 +324,7 @@ def _recall_at(k: int, correct: np.ndarray, has_match: np.ndarray) -> float:
 
 def _sklearn_metrics(scores: np.ndarray, correct: np.ndarray) -> tuple[float, float, float]:
     """Return average precision, best F1 and recall at 100 % precision, as scikit-learn counts."""
-    metrics = import_sklearn()
+    metrics = import_extra('sklearn.metrics')
     if not correct.any():
         return 0.0, 0.0, 0.0
     finite = np.isfinite(scores)

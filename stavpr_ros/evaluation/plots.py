@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, TYPE_CHECKING
 
 import numpy as np
-from stavpr_ros.errors import InputError
+from stavpr_ros.evaluation.calibration import Calibration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -69,10 +69,6 @@ class MatchPair:
     place: np.ndarray | None
     caption: str
     outcome: Outcome
-
-    def __post_init__(self) -> None:
-        if self.outcome not in COLORS:
-            raise InputError(f'outcome is {self.outcome!r}; expected one of {", ".join(COLORS)}')
 
 
 def match_overview(path: Path, pairs: Sequence[MatchPair], columns: int = 3) -> None:
@@ -170,30 +166,80 @@ def warping_path(path: Path, distances: np.ndarray, pairs: np.ndarray, first: in
     :param pairs: (query, place) along the path, counted within the matrix, shape (m, 2).
     :param first: map index of the stretch's first place.
     """
-    distances = np.asarray(distances, float)
-    if distances.ndim != 2 or 0 in distances.shape:
-        raise InputError(
-            f'distances of the window have shape {distances.shape}: expected (l, k), not empty'
-        )
-    pairs = np.asarray(pairs, int).reshape(-1, 2)
     l, k = distances.shape
     with page(path, 7.0, float(np.clip(1.4 + 5.3 * l / k, 2.6, 7))) as figure:
         axes = figure.add_subplot()
         extent = (first - 0.5, first + k - 0.5, l - 0.5, -0.5)
         image = axes.imshow(distances, cmap=SCALE, extent=extent, aspect='auto')
-        if len(pairs):
-            style: dict[str, Any] = {
-                'color': BRIGHT['right'],
-                'mec': INK,
-                'mew': 0.5,
-                'ms': 4,
-                'lw': 1.6,
-            }
-            axes.plot(pairs[:, 1] + first, pairs[:, 0], '-o', label='warping path', **style)
-            legend_above(axes, 1)
+        style: dict[str, Any] = {
+            'color': BRIGHT['right'],
+            'mec': INK,
+            'mew': 0.5,
+            'ms': 4,
+            'lw': 1.6,
+        }
+        axes.plot(pairs[:, 1] + first, pairs[:, 0], '-o', label='warping path', **style)
+        legend_above(axes, 1)
         axes.set(xlabel='place in the map', ylabel='image of the window')
         axes.locator_params(integer=True)
         color_bar(figure, image, axes)
+
+
+def drive(
+    path: Path,
+    truth: np.ndarray,
+    places: int,
+    matched: np.ndarray,
+    outcomes: np.ndarray,
+    unseen: np.ndarray,
+) -> None:
+    """
+    Draw the matched and the true places of a query, image by image, and what was not matched.
+
+    :param truth: correct (query, place), shape (M, 2).
+    :param places: number of places n.
+    :param matched: place of each query, shape (N,).
+    :param outcomes: of each query, an :data:`Outcome`, shape (N,).
+    :param unseen: whether the map lacks its place and those around, shape (N,), bool.
+    """
+    index = np.arange(len(matched))
+    with page(path, 10, 4.2) as figure:
+        axes = figure.add_subplot()
+        axes.plot(truth[:, 0], truth[:, 1], '.', color=TRUTH, ms=3, mew=0, label='true place')
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], unseen, [False]]).astype(int)))
+        for number, (first, end) in enumerate(edges.reshape(-1, 2)):
+            label = '' if number else 'unseen'
+            axes.axvspan(first - 0.5, end - 0.5, color='#e9e9e4', lw=0, zorder=0, label=label)
+        rejected = -0.04 * places  # below the axis of the places
+        for outcome, color in COLORS.items():
+            at = index[outcomes == outcome]
+            if len(at):
+                height = matched[at] if outcome in BRIGHT else np.full(len(at), rejected)
+                marker = '.' if outcome in BRIGHT else '|'
+                style: dict[str, Any] = {'color': color, 'ms': 5, 'label': MEANING[outcome]}
+                axes.plot(at, height, marker, **style)
+        axes.set(xlabel='query image', ylabel='place in the map', xlim=(-1, len(index)))
+        axes.grid(color=GRID, lw=0.7)
+        legend_above(axes, 6)
+
+
+def reliability(path: Path, calibration: Calibration) -> None:
+    """Draw the share of correct matches over their declared probability, and their numbers."""
+    filled = calibration.images > 0
+    with page(path, 5.2, 5.6) as figure:
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+        above.plot([0, 1], [0, 1], color=QUIET, lw=1.2, ls=(0, (5, 3)), label='as declared')
+        points = calibration.declared[filled], calibration.right[filled]
+        label = f'expected error {calibration.expected_error:.3f}'
+        above.plot(*points, '-o', color=SEQUENCE, lw=1.8, ms=6, clip_on=False, label=label)
+        above.set(ylabel='share of correct matches', xlim=(0, 1), ylim=(0, 1))
+        above.grid(color=GRID, lw=0.7)
+        legend_above(above, 2)
+        width = 1 / len(filled)
+        starts = np.arange(len(filled)) * width
+        below.bar(starts, calibration.images, 0.9 * width, align='edge', color=SEQUENCE_INNER)
+        below.set(xlabel='declared probability', ylabel='images')
+        below.locator_params(axis='y', integer=True, nbins=4)
 
 
 @contextmanager

@@ -112,8 +112,9 @@ def evaluate_records(
     assigned = image_matches(
         [match_of(record) for record in records if record['status'] in IN_WINDOW], length
     )
-    matches = ImageMatches(np.full(len(records), -1, np.int64), np.full(len(records), np.inf))
-    matches.places[in_window], matches.distances[in_window] = assigned.places, assigned.distances
+    matches = ImageMatches.none(len(records))
+    for name in ('places', 'distances', 'accepted', 'probabilities'):
+        getattr(matches, name)[in_window] = getattr(assigned, name)
     counts = None
     if true_places is not None:
         correct = matches.within(true_places, tolerance)

@@ -3,13 +3,15 @@
 """An evaluation and its surroundings: the numbers of a report, and the examples that it shows."""
 
 from dataclasses import dataclass
+from functools import cached_property
 import math
 from typing import Any
 
 import numpy as np
 from stavpr_ros.errors import SettingsError
+from stavpr_ros.evaluation.drive import Drive
 from stavpr_ros.evaluation.evaluate import Evaluation, WindowDistances
-from stavpr_ros.evaluation.metrics import counts_at
+from stavpr_ros.evaluation.metrics import accepted_counts, ConfusionCounts
 from stavpr_ros.mapping import PlaceMap
 
 METRICS = ('sequence', 'sequence_without_ends', 'single', 'single_without_ends')
@@ -25,7 +27,8 @@ class Report:
     :param title: names of both, a line.
     :param settings: of the run: everything that decides the numbers.
     :param times: of the run, by name; seconds, or milliseconds where the name has them.
-    :param default_threshold: the mode's own, if it has one.
+    :param drive: how the query was driven and what the map lacks.
+    :param default_threshold: the mode's own, with which the recognizer ran; None = it has none.
     :param window: query image whose window is plotted; None = the worst mistake.
     """
 
@@ -35,6 +38,7 @@ class Report:
     title: str
     settings: dict[str, Any]
     times: dict[str, float]
+    drive: Drive
     default_threshold: float | None = None
     window: int | None = None
 
@@ -44,7 +48,11 @@ class Report:
         numbers: dict[str, Any] = {name: getattr(evaluation, name).to_json() for name in METRICS}
         numbers['recommended_threshold'] = evaluation.sequence.best.threshold
         if self.default_threshold is not None:
-            numbers['default_threshold'] = self._at_threshold(self.default_threshold)
+            numbers['default_threshold'] = self._at_default()
+        numbers['decision'] = self.decision()
+        numbers['unseen'] = self.unseen()
+        calibration = evaluation.calibration
+        numbers['calibration'] = None if calibration is None else calibration.to_json()
         if evaluation.unknown is not None:
             for kind in ('sequence', 'single'):
                 numbers[kind]['false_alarm_rate'] = evaluation.false_alarm_rate(kind)
@@ -54,15 +62,56 @@ class Report:
         numbers |= {'settings': self.settings, 'times': self.times}
         return jsonable(numbers)
 
-    def _at_threshold(self, threshold: float) -> dict[str, Any]:
-        """Return the metrics of the windows' matches at one threshold."""
-        evaluation, matches = self.evaluation, self.evaluation.results.sequence
-        correct = evaluation.ground_truth.accepts(matches.best)
-        counts = counts_at(threshold, matches.scores, correct, evaluation.ground_truth.has_match)
-        numbers: dict[str, Any] = {'threshold': threshold}
+    @cached_property
+    def accepted(self) -> np.ndarray:
+        """
+        Return which matches a robot would get, shape (N,), bool.
+
+        Those that the recognizer accepts by default; in mode paper, which has no default, those
+        below the threshold of the best F1.
+        """
+        results = self.evaluation.results
+        if self.default_threshold is None:
+            return results.sequence.scores < self.evaluation.sequence.best.threshold
+        return results.accepted
+
+    @cached_property
+    def counts(self) -> ConfusionCounts:
+        """Return the counts of :attr:`accepted`."""
+        truth = self.evaluation.ground_truth
+        correct = truth.accepts(self.evaluation.results.sequence.best)
+        return accepted_counts(self.accepted, correct, truth.has_match)
+
+    def decision(self) -> dict[str, Any]:
+        """Return how many images are matched, and how many of them wrongly."""
+        counts = self.counts
+        return {
+            'rule': 'best F1' if self.default_threshold is None else 'default',
+            'images': len(self.accepted),
+            'matched': counts.accepted,
+            'wrongly_matched': counts.false_positives,
+            'precision': counts.precision,
+            'recall': counts.recall,
+        }
+
+    def unseen(self) -> list[dict[str, int]]:
+        """Return, for each stretch removed from the map, its unseen images and those matched."""
+        return [
+            {
+                'first': first,
+                'last': last,
+                'images': int(np.count_nonzero(mask)),
+                'matched': int(np.count_nonzero(mask & self.accepted)),
+            }
+            for (first, last), mask in zip(self.drive.removed, self.drive.unseen(), strict=True)
+        ]
+
+    def _at_default(self) -> dict[str, Any]:
+        counts, unknown = self.counts, self.evaluation.unknown
+        numbers: dict[str, Any] = {'threshold': self.default_threshold}
         numbers |= {'precision': counts.precision, 'recall': counts.recall, 'f1': counts.f1}
-        if evaluation.unknown is not None:
-            numbers['false_alarm_rate'] = evaluation.false_alarm_rate('sequence', threshold)
+        if unknown is not None:
+            numbers['false_alarm_rate'] = float(np.mean(unknown.accepted))
         return numbers
 
 

@@ -6,12 +6,11 @@ import csv
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 from stavpr_ros.errors import SourceError
 from stavpr_ros.evaluation import plots
 from stavpr_ros.evaluation.evaluate import Evaluation
-from stavpr_ros.evaluation.plots import Box, MatchPair
+from stavpr_ros.evaluation.plots import Box
 from stavpr_ros.evaluation.report import (
     accepted_matches,
     chosen_window,
@@ -21,7 +20,7 @@ from stavpr_ros.evaluation.report import (
 )
 from stavpr_ros.evaluation.report_page import html_page
 
-PAGE_MISTAKES, PLOT_MISTAKES = 9, 6
+MISTAKES = 9  # on the page
 
 
 def write_json(report: Report, path: Path) -> None:
@@ -55,9 +54,12 @@ def write_folder(report: Report, folder: Path) -> Path:
             'precision_recall': folder / 'precision_recall.png',
             'distances': folder / 'distances.png',
             'matrix': folder / 'similarity_matrix.png',
+            'drive': folder / 'drive.png',
         }
+        if report.evaluation.calibration is not None:
+            embedded['calibration'] = folder / 'calibration.png'
         contents = {name: path.read_bytes() for name, path in embedded.items()}
-        mistakes = worst_mistakes(report.evaluation, PAGE_MISTAKES)
+        mistakes = worst_mistakes(report.evaluation, MISTAKES)
         page.write_text(html_page(report, mistakes, contents, boxes), encoding='utf-8')
     except OSError as error:
         raise SourceError(f'the report cannot be written into {folder}: {error}') from error
@@ -79,6 +81,9 @@ def _write_matches(report: Report, path: Path) -> None:
         'single_place': single.best.tolist(),
         'single_distance': single.scores.tolist(),
         'single_right': truth.accepts(single.best).astype(int).tolist(),
+        'accepted': report.accepted.astype(int).tolist(),
+        'probability': results.probabilities.tolist(),
+        'recorded_image': report.drive.images.tolist(),
     }
     with path.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file)
@@ -91,14 +96,12 @@ def _write_curves(evaluation: Evaluation, path: Path) -> None:
         writer = csv.writer(file)
         writer.writerow(['answers', 'threshold', 'precision', 'recall'])
         for name in METRICS:
-            curve = getattr(evaluation, name).curve
-            for point in zip(curve.thresholds, curve.precision, curve.recall, strict=True):
-                writer.writerow([name, *map(float, point)])
+            writer.writerows([name, *point] for point in getattr(evaluation, name).curve.tolist())
 
 
 def _draw(report: Report, folder: Path) -> dict[str, Box]:
     """
-    Draw the curves, the distances, the worst mistakes and one window.
+    Draw the curves, the distances, the drive, the calibration and one window.
 
     :returns: where the axes of ``curves`` and ``matrix`` are in their plots.
     """
@@ -108,10 +111,9 @@ def _draw(report: Report, folder: Path) -> dict[str, Box]:
         'matrix': _draw_matrix(evaluation, folder / 'similarity_matrix.png'),
     }
     _draw_distances(evaluation, folder / 'distances.png')
-    mistakes = worst_mistakes(evaluation, PLOT_MISTAKES)
-    pairs = [pair for image in mistakes if (pair := _mistake(report, image))]
-    if pairs:
-        plots.match_overview(folder / 'mistakes.png', pairs, columns=2)
+    _draw_drive(report, folder / 'drive.png')
+    if evaluation.calibration is not None:
+        plots.reliability(folder / 'calibration.png', evaluation.calibration)
     window = chosen_window(evaluation, report.window)
     if window is not None:
         local = window.path - [0, window.first]
@@ -129,8 +131,8 @@ def _draw_curves(evaluation: Evaluation, path: Path) -> Box:
     curves = {
         name: (
             color,
-            metrics.curve.recall,
-            metrics.curve.precision,
+            metrics.curve[:, 2],
+            metrics.curve[:, 1],
             (metrics.best.recall, metrics.best.precision),
         )
         for name, (color, metrics) in kinds.items()
@@ -150,6 +152,17 @@ def _draw_distances(evaluation: Evaluation, path: Path) -> None:
     plots.distance_histogram(path, groups, evaluation.sequence.best.threshold)
 
 
+def _draw_drive(report: Report, path: Path) -> None:
+    truth, places = report.evaluation.ground_truth, report.evaluation.results.sequence.best
+    unseen = np.any([np.zeros(truth.N, bool), *report.drive.unseen()], axis=0)
+    outcomes = np.where(
+        report.accepted,
+        np.where(truth.accepts(places), 'right', 'wrong'),
+        np.where(truth.has_match, 'no match', 'unseen'),
+    )
+    plots.drive(path, truth.pairs, truth.n, places, outcomes, unseen)
+
+
 def _draw_matrix(evaluation: Evaluation, path: Path) -> Box:
     reduced, truth = evaluation.results.distances, evaluation.ground_truth
     true_blocks = np.zeros(reduced.values.shape, bool)
@@ -159,16 +172,3 @@ def _draw_matrix(evaluation: Evaluation, path: Path) -> Box:
     return plots.reduced_matrix(
         path, reduced.values, shape, true_blocks, accepted_matches(evaluation)
     )
-
-
-def _mistake(report: Report, image: int) -> MatchPair | None:
-    """Return a wrong match beside its query, with the true place in the caption."""
-    matches = report.evaluation.results.sequence
-    place, true = int(matches.best[image]), int(report.evaluation.ground_truth.middles[image])
-    query, shown = report.query.thumbnail(image), report.reference.thumbnail(place)
-    if query is None or shown is None:
-        return None
-    shown = cv2.resize(shown, query.shape[1::-1], interpolation=cv2.INTER_AREA)
-    where = f'true place {true}' if true >= 0 else 'not in the map'
-    caption = f'image {image}: place {place}, {where}, distance {matches.scores[image]:.3f}'
-    return MatchPair(query, shown, caption, 'wrong')

@@ -4,18 +4,17 @@
 
 import base64
 from collections.abc import Mapping
-import importlib
 from importlib import resources
 import json
-from types import ModuleType
 from typing import Any
 
 import cv2
 import numpy as np
-from stavpr_ros.errors import UnavailableError
+from stavpr_ros.evaluation.drive import UNSEEN_DISTANCE
 from stavpr_ros.evaluation.evaluate import Evaluation, WindowDistances
+from stavpr_ros.evaluation.extra import import_extra
 from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import Curve
+from stavpr_ros.evaluation.metrics import RANKS
 from stavpr_ros.evaluation.plots import Box, COLORS, SEQUENCE
 from stavpr_ros.evaluation.report import jsonable, METRICS, Report
 from stavpr_ros.mapping import PlaceMap
@@ -25,20 +24,17 @@ VIEWS = 240  # windows that can be looked at: more would make a large file
 POINTS = 400  # of a curve
 WIDTH, LARGE = 160, 4000  # of an image, pixels; bytes from which one is made smaller
 
+# rows of the table: keys of Metrics.to_json
 NUMBERS = {
-    'F1': lambda metrics: metrics.best.f1,
-    'threshold of the best F1': lambda metrics: metrics.best.threshold,
-    'precision there': lambda metrics: metrics.best.precision,
-    'recall there': lambda metrics: metrics.best.recall,
-    'average precision': lambda metrics: metrics.average_precision,
-    'recall@1': lambda metrics: metrics.recall_at[1],
-    'recall@5': lambda metrics: metrics.recall_at[5],
-    'recall@10': lambda metrics: metrics.recall_at[10],
-    'recall@20': lambda metrics: metrics.recall_at[20],
-    'recall at 100 % precision': lambda metrics: metrics.recall_at_full_precision,
-    'scikit-learn’s F1': lambda metrics: metrics.sklearn_f1,
+    'F1': 'f1',
+    'threshold of the best F1': 'threshold',
+    'precision there': 'precision',
+    'recall there': 'recall',
+    'average precision': 'average_precision',
+    **{f'recall@{k}': f'recall_at_{k}' for k in RANKS},
+    'recall at 100 % precision': 'recall_at_100_precision',
 }
-CARDS = ('F1', 'recall@1', 'average precision', 'recall at 100 % precision')
+CARDS = ('recall@1', 'average precision', 'recall at 100 % precision')
 
 
 def html_page(
@@ -48,11 +44,12 @@ def html_page(
     Return the page.
 
     :param mistakes: images whose wrong matches are shown, the worst first.
-    :param plots: PNG files ``precision_recall``, ``distances`` and ``matrix``.
+    :param plots: PNG files ``precision_recall``, ``distances``, ``matrix``, ``drive`` and, where
+        probabilities are declared, ``calibration``.
     :param boxes: where the axes of ``curves`` and ``matrix`` are.
     :raises UnavailableError: jinja2 is not installed.
     """
-    jinja2 = import_jinja2()
+    jinja2 = import_extra('jinja2')
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     environment.policies['json.dumps_kwargs'] = {'separators': (',', ':')}
     template = resources.files('stavpr_ros.evaluation').joinpath(TEMPLATE).read_text('utf-8')
@@ -69,6 +66,10 @@ def html_page(
         else None,
         colors={'right': COLORS['right'], 'wrong': COLORS['wrong'], 'sequence': SEQUENCE},
         cards=_cards(evaluation),
+        decision=report.decision(),
+        unseen=report.unseen(),
+        unseen_distance=UNSEEN_DISTANCE,
+        calibration=evaluation.calibration and evaluation.calibration.to_json(),
         plots={name: _data_url(content, 'png') for name, content in plots.items()},
         infinite=_infinite(evaluation),
         mistakes=[_mistake(report, image) for image in mistakes],
@@ -77,18 +78,6 @@ def html_page(
         times={name: f'{value:.3g}' for name, value in report.times.items()},
         data=jsonable({**_data(report, mistakes), 'boxes': boxes}),
     )
-
-
-def import_jinja2() -> ModuleType:
-    """
-    Import jinja2.
-
-    :raises UnavailableError: the extra ``evaluation`` is not installed.
-    """
-    try:
-        return importlib.import_module('jinja2')
-    except ImportError as error:
-        raise UnavailableError(f'the report needs jinja2 ({error}): pip install jinja2') from error
 
 
 def _data_url(content: bytes, kind: str) -> str:
@@ -100,26 +89,14 @@ def _text(value: Any) -> str:
 
 
 def _cards(evaluation: Evaluation) -> list[dict[str, Any]]:
-    cards = [
-        {
-            'name': f'{name} of sequences' if name == 'F1' else name,
-            'value': NUMBERS[name](evaluation.sequence),
-            'single': NUMBERS[name](evaluation.single),
-            'color': SEQUENCE,
-        }
-        for name in CARDS
-    ]
+    kinds = ('sequence', 'single')
+    sequence, single = (getattr(evaluation, kind).to_json() for kind in kinds)
+    cards = [('F1 of sequences', sequence['f1'], single['f1'], SEQUENCE)]
+    cards += [(name, sequence[NUMBERS[name]], single[NUMBERS[name]], SEQUENCE) for name in CARDS]
     if evaluation.unknown is not None:
-        rates = [evaluation.false_alarm_rate(kind) for kind in ('sequence', 'single')]
-        cards.append(
-            {
-                'name': 'false alarms',
-                'value': rates[0],
-                'single': rates[1],
-                'color': COLORS['wrong'],
-            }
-        )
-    return cards
+        rate, single_rate = (evaluation.false_alarm_rate(kind) for kind in kinds)
+        cards.append(('false alarms', rate, single_rate, COLORS['wrong']))
+    return [dict(zip(('name', 'value', 'single', 'color'), card, strict=True)) for card in cards]
 
 
 def _infinite(evaluation: Evaluation) -> dict[str, int]:
@@ -134,15 +111,14 @@ def _infinite(evaluation: Evaluation) -> dict[str, int]:
 
 def _rows(evaluation: Evaluation) -> dict[str, list[str]]:
     """Return the table of all numbers: a row a number, a column a kind of metrics."""
-    columns = [getattr(evaluation, name) for name in METRICS]
-    rows = {
-        name: [f'{number(metrics):.4f}' for metrics in columns] for name, number in NUMBERS.items()
-    }
+    columns = [getattr(evaluation, name).to_json() for name in METRICS]
+    rows = {name: [f'{column[key]:.4f}' for column in columns] for name, key in NUMBERS.items()}
+    rows['scikit-learn’s F1'] = [f'{column["scikit_learn"]["f1"]:.4f}' for column in columns]
     if evaluation.unknown is not None:
         rates = [f'{evaluation.false_alarm_rate(kind):.4f}' for kind in ('sequence', 'single')]
         rows['false alarms'] = [rates[0], '', rates[1], '']
-    rows['queries'] = [str(metrics.queries) for metrics in columns]
-    rows['with a place in the map'] = [str(metrics.with_match) for metrics in columns]
+    rows['queries'] = [str(column['queries']) for column in columns]
+    rows['with a place in the map'] = [str(column['queries_with_match']) for column in columns]
     return rows
 
 
@@ -197,12 +173,10 @@ def _data(report: Report, mistakes: list[int]) -> dict[str, Any]:
     }
 
 
-def _points(curve: Curve) -> list[list[float]]:
-    """Return threshold, precision and recall of some points: the first, the last, some between."""
-    count = len(curve.thresholds)
-    kept = np.unique(np.linspace(0, count - 1, min(count, POINTS)).round().astype(int))
-    points = np.stack([curve.thresholds, curve.precision, curve.recall], axis=1)[kept]
-    return np.round(points, 6).tolist()
+def _points(curve: np.ndarray) -> list[list[float]]:
+    """Return some points of a curve: the first, the last, some between."""
+    kept = np.unique(np.linspace(0, len(curve) - 1, min(len(curve), POINTS)).round().astype(int))
+    return np.round(curve[kept], 6).tolist()
 
 
 def _view(evaluation: Evaluation, window: WindowDistances) -> dict[str, Any]:

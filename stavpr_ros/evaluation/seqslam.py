@@ -15,12 +15,8 @@ import math
 
 import cv2
 import numpy as np
-from stavpr_ros.checks import float_array, no_nan
-from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.sources.frame import Frame
 import torch
 
-SCORES = ('sum', 'uniqueness')
 BATCH = 256  # query images whose differences are made at a time
 
 
@@ -38,8 +34,6 @@ class SeqSlamSettings:
     :param slowest: map images per query image (V_min), > 0.
     :param fastest: the same (V_max), >= slowest.
     :param speed_step: between the speeds of the search (V_step), > 0.
-    :param score: ``sum``: the line's mean enhanced difference; ``uniqueness``: that minus the mean
-        of the best line whose place is more than contrast_window / 2 from this one's (mu).
     """
 
     width: int = 64
@@ -50,38 +44,6 @@ class SeqSlamSettings:
     slowest: float = 0.8
     fastest: float = 1.2
     speed_step: float = 0.1
-    score: str = 'sum'
-
-    def __post_init__(self) -> None:
-        if (
-            min(self.width, self.height, self.patch) < 1
-            or self.width % self.patch
-            or self.height % self.patch
-        ):
-            raise SettingsError(
-                f'images of {self.width} x {self.height} in patches of {self.patch}: expected '
-                'whole patches'
-            )
-        if self.contrast_window < 2:
-            raise SettingsError(
-                f'contrast_window = {self.contrast_window} must be at least 2 places'
-            )
-        if self.length < 2:
-            raise SettingsError(f'length = {self.length} must be at least 2 images')
-        speeds = (self.slowest, self.fastest, self.speed_step)
-        if not (
-            all(map(math.isfinite, speeds))
-            and 0 < self.slowest <= self.fastest
-            and self.speed_step > 0
-        ):
-            raise SettingsError(
-                f'speeds {self.slowest} .. {self.fastest} in steps of {self.speed_step}: expected '
-                'finite numbers above 0, ascending'
-            )
-        if self.score not in SCORES:
-            raise SettingsError(
-                f'score {self.score!r} is unknown: take one of {", ".join(SCORES)}'
-            )
 
     @property
     def middle(self) -> int:
@@ -97,17 +59,16 @@ class SeqSlamSettings:
 
 
 def seqslam(
-    map_images: Iterable[Frame | np.ndarray],
-    query_images: Iterable[Frame | np.ndarray],
+    map_images: Iterable[np.ndarray],
+    query_images: Iterable[np.ndarray],
     settings: SeqSlamSettings | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """
     Match each query image with the map.
 
-    :param map_images: n frames, or images: uint8, RGB (h, w, 3) or gray (h, w).
+    :param map_images: n images, at least one: uint8, RGB (h, w, 3) or gray (h, w).
     :param query_images: N of the same kind.
     :returns: see :func:`match_differences`.
-    :raises InputError: no images.
     """
     settings = settings or SeqSlamSettings()
     places = preprocess(map_images, settings)
@@ -123,14 +84,10 @@ def match_differences(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndar
     in the middle of no window, take place and score from the line of the first and last window, as
     in the sequences of this package (in the paper they have none).
 
-    :param D: differences, shape (N, n), float32 or float64; row = query image, in order.
+    :param D: differences, shape (N, n), finite, float32 or float64; row = query image, in order.
     :returns: places, shape (N,), int64, and scores, shape (N,), float64, lower is better; -1 and
         +inf where there are too few images for a window, or too few places for a line.
-    :raises InputError: wrong shape or type, NaN.
     """
-    D = no_nan(float_array(D, 'differences', 2), 'differences')
-    if not np.isfinite(D).all():
-        raise InputError('differences hold +inf: SeqSLAM bans no pair, expected finite numbers')
     N, n = D.shape
     places, scores = np.full(N, -1, np.int64), np.full(N, np.inf)
     windows = N - settings.length + 1
@@ -141,12 +98,6 @@ def match_differences(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndar
     rows = np.arange(windows)
     lines = settings.lines[speeds[rows, starts]] + starts[:, None]
     found = totals[rows, starts] / settings.length
-    if settings.score == 'uniqueness':
-        found = (
-            found
-            - _best_elsewhere(totals, speeds, lines[:, settings.middle], settings)
-            / settings.length
-        )
     middle = settings.middle
     places[middle : middle + windows] = lines[:, middle]
     scores[middle : middle + windows] = found
@@ -155,30 +106,16 @@ def match_differences(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndar
     return places, scores
 
 
-def preprocess(images: Iterable[Frame | np.ndarray], settings: SeqSlamSettings) -> np.ndarray:
+def preprocess(images: Iterable[np.ndarray], settings: SeqSlamSettings) -> np.ndarray:
     """
     Return small patch-normalized images: in every patch the mean is 0 and the deviation 1.
 
     :returns: shape (images, height * width), float32; a patch of one gray level is 0.
-    :raises InputError: no images, or one that is no uint8 image.
     """
-    processed = [
-        _normalized(item.image if isinstance(item, Frame) else item, settings) for item in images
-    ]
-    if not processed:
-        raise InputError(
-            'no images for SeqSLAM: expected at least one of the map and of the query'
-        )
-    return np.stack(processed)
+    return np.stack([_normalized(image, settings) for image in images])
 
 
 def _normalized(image: np.ndarray, settings: SeqSlamSettings) -> np.ndarray:
-    if image.dtype != np.uint8 or not (
-        image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
-    ):
-        raise InputError(
-            f'image is {image.dtype} of shape {image.shape}: expected uint8, (h, w) or (h, w, 3)'
-        )
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
     shrinks = gray.shape[0] >= settings.height and gray.shape[1] >= settings.width
     method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
@@ -255,18 +192,3 @@ def _line_totals(enhanced: np.ndarray, settings: SeqSlamSettings) -> tuple[np.nd
         best[:, :starts][better] = total[better]
         speeds[:, :starts][better] = speed
     return best, speeds
-
-
-def _best_elsewhere(
-    totals: np.ndarray, speeds: np.ndarray, middles: np.ndarray, settings: SeqSlamSettings
-) -> np.ndarray:
-    """Return the sum of each window's best line at another place; without one 0, the mean."""
-    found = np.zeros(len(totals))
-    starts = np.arange(totals.shape[1])
-    offsets = settings.lines[:, settings.middle]
-    for i, row in enumerate(totals):
-        near = np.abs(starts + offsets[speeds[i]] - middles[i]) <= settings.contrast_window // 2
-        second = np.min(np.where(near, np.inf, row))
-        if np.isfinite(second):
-            found[i] = second
-    return found

@@ -1,24 +1,20 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Changed traverses: another speed, a stop, narrower images."""
+"""Changed traverses: another speed, a stop, narrower or mirrored images."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 import math
 from typing import Protocol
 
 import numpy as np
 from stavpr_ros.errors import ImageError, SettingsError
+from stavpr_ros.evaluation.drive import DriveChanges, VARYING
+from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.sources.frame import Frame
 
 STOP = 30  # images that a stop adds
-PERIOD = 60  # images of one period of the varying speed: 1, 2, 1, 1/2, 1
-RATES = {
-    '2x': (2, 1),
-    '1.5x': (3, 2),
-    '0.7x': (7, 10),
-    '0.5x': (1, 2),
-}  # places per image, a fraction
+RATES = ('2x', '1.5x', '0.7x', '0.5x')  # places per image
 KINDS = (*RATES, 'vary', 'stop')
 
 
@@ -32,6 +28,23 @@ class FrameSource(Protocol):
         """Yield one image after the other."""
 
 
+def warp_changes(n: int, kind: str) -> DriveChanges:
+    """
+    Return the changes of a warp.
+
+    :param n: images of the original traverse.
+    :param kind: see :func:`warp_indices`.
+    :raises SettingsError: an unknown kind.
+    """
+    if kind in RATES:
+        return DriveChanges(speed=float(kind[:-1]))
+    if kind == 'vary':
+        return DriveChanges(speed=VARYING)
+    if kind == 'stop':
+        return DriveChanges(stops=((n // 2, STOP),))
+    raise SettingsError(f'warp {kind!r} is unknown: take one of {", ".join(KINDS)}')
+
+
 def warp_indices(n: int, kind: str) -> np.ndarray:
     """
     Return the image of the original traverse that each image of the changed one is.
@@ -41,63 +54,34 @@ def warp_indices(n: int, kind: str) -> np.ndarray:
         images are repeated; ``vary``: speed 2 ** sin(2 pi i / 60) at image i, from 1/2 to 2;
         ``stop``: the image in the middle is repeated 30 times.
     :returns: shape (N,), int64, ascending.
-    :raises SettingsError: an unknown kind, or no image.
+    :raises SettingsError: an unknown kind.
     """
-    if n < 1:
-        raise SettingsError(f'a traverse of {n} images: expected at least one')
-    if kind in RATES:
-        numerator, denominator = RATES[kind]
-        count = -(
-            -n * denominator // numerator
-        )  # images whose place, rounded down, is still below n
-        return np.arange(count, dtype=np.int64) * numerator // denominator
-    if kind == 'vary':
-        positions = [0.0]
-        while positions[-1] < n:
-            positions.append(
-                positions[-1] + 2 ** math.sin(2 * math.pi * (len(positions) - 1) / PERIOD)
-            )
-        return np.floor(positions[:-1]).astype(np.int64)
-    if kind == 'stop':
-        return np.insert(np.arange(n), n // 2, [n // 2] * STOP)
-    raise SettingsError(f'warp {kind!r} is unknown: take one of {", ".join(KINDS)}')
+    return warp_changes(n, kind).images(n)
 
 
-class CroppedSource:
+class ChangedSource:
     """
-    A source whose images are cropped on the left and on the right; stamps and identifiers stay.
+    A source whose images are changed one by one; stamps and identifiers stay.
 
-    :param source: of the whole images.
-    :param left: fraction of the width that is cropped on the left, rounded to pixels.
-    :param right: the same on the right.
+    :param change: returns the changed image of a frame.
     """
 
-    def __init__(self, source: FrameSource, left: float, right: float) -> None:
-        if not (left >= 0 and right >= 0 and left + right < 1):
-            raise SettingsError(
-                f'cropping {left} on the left and {right} on the right: expected fractions >= 0, '
-                'below 1 together'
-            )
-        self.source, self.left, self.right = source, left, right
+    def __init__(self, source: FrameSource, change: Callable[[Frame], np.ndarray]) -> None:
+        self._source, self._change = source, change
 
     def __len__(self) -> int:
         """Return the number of images."""
-        return len(self.source)
+        return len(self._source)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield one cropped image after the other."""
-        for frame in self.source:
-            yield replace(frame, image=self._crop(frame))
+        """Yield one changed image after the other."""
+        for frame in self._source:
+            yield replace(frame, image=np.ascontiguousarray(self._change(frame)))
 
-    def _crop(self, frame: Frame) -> np.ndarray:
-        width = frame.image.shape[1]
-        first, last = _pixels(self.left * width), width - _pixels(self.right * width)
-        if first >= last:
-            raise ImageError(
-                f'{frame.identifier} is {width} pixels wide: cropping {self.left} on the left and '
-                f'{self.right} on the right leaves none'
-            )
-        return np.ascontiguousarray(frame.image[:, first:last])
+
+def mirrored(source: FrameSource) -> FrameSource:
+    """Mirror every image of a source left-right."""
+    return ChangedSource(source, lambda frame: frame.image[:, ::-1])
 
 
 def _pixels(width: float) -> int:
@@ -108,8 +92,36 @@ def cropped(source: FrameSource, left: float, right: float) -> FrameSource:
     """
     Crop every image of a source.
 
-    :param left, right: fractions of the width.
-    :returns: the source itself where nothing is cropped; else a :class:`CroppedSource`.
+    :param left, right: fractions of the width, rounded to pixels.
+    :returns: the source itself where nothing is cropped.
     :raises SettingsError: negative fractions, or 1 and more together.
     """
-    return source if left == right == 0 else CroppedSource(source, left, right)
+    if not (left >= 0 and right >= 0 and left + right < 1):
+        raise SettingsError(
+            f'cropping {left} on the left and {right} on the right: expected fractions >= 0, '
+            'below 1 together'
+        )
+
+    def crop(frame: Frame) -> np.ndarray:
+        width = frame.image.shape[1]
+        first, last = _pixels(left * width), width - _pixels(right * width)
+        if first >= last:
+            raise ImageError(
+                f'{frame.identifier} is {width} pixels wide: cropping {left} on the left and '
+                f'{right} on the right leaves none'
+            )
+        return frame.image[:, first:last]
+
+    return source if left == right == 0 else ChangedSource(source, crop)
+
+
+def select_places(place_map: PlaceMap, indices: np.ndarray) -> PlaceMap:
+    """Return some places of a map, or images of a query, in any order, repeated or not."""
+    return replace(
+        place_map,
+        features=place_map.features[indices],
+        stamps=place_map.stamps[indices],
+        ids=tuple(place_map.ids[i] for i in indices),
+        poses=None if place_map.poses is None else place_map.poses[indices],
+        thumbnails=tuple(place_map.thumbnails[i] for i in indices) if place_map.thumbnails else (),
+    )

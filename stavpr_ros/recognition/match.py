@@ -50,7 +50,7 @@ class Match:
     """
     The result for one image; indices are 0-based places of the map.
 
-    The recognizer fills the first six fields, the pipeline the others.
+    The recognizer fills the first seven fields, the pipeline the others.
 
     :param status: only ``MATCH`` names a place.
     :param reason: why there is no match, one sentence; empty for ``MATCH`` and ``MAPPED``.
@@ -59,6 +59,7 @@ class Match:
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
     :param relative: distances are scores of mode robust, with memory and with the chance level at
         1 (:mod:`stavpr_ros.recognition.robust`).
+    :param probability: that the nearest sequence is the right place; NaN = unknown.
     :param window_stamps: stamps (ns) of the images in the window, oldest first, this one the last.
     :param image_index: place of a growing map that this image has become, -1 = none.
     :param inliers: of the geometric verification, -1 = not verified.
@@ -75,6 +76,7 @@ class Match:
     sequence: SequenceMatch | None = None
     path: np.ndarray = field(default_factory=lambda: NO_PATH, repr=False)
     relative: bool = False
+    probability: float = math.nan
     window_stamps: tuple[int, ...] = field(default=(), repr=False)
     image_index: int = -1
     inliers: int = -1

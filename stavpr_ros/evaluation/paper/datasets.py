@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's data sets on disk: the folders of map and query, and their ground truth."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 import re
 
@@ -69,17 +69,6 @@ class Dataset:
     ground_truth: GroundTruth
     tolerance: int
 
-    def synth(self, crop_map: float = CROP_MAP, crop_query: float = CROP_QUERY) -> 'Dataset':
-        """
-        Change the viewpoint as the paper's synth-Nord does.
-
-        :param crop_map: fraction of the width cut away on the right of every map image.
-        :param crop_query: the same on the left of every query image.
-        """
-        return replace(
-            self, map=cropped(self.map, 0, crop_map), query=cropped(self.query, crop_query, 0)
-        )
-
 
 def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> Dataset:
     """
@@ -95,15 +84,17 @@ def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> D
         raise SettingsError(f'data set {name!r} is unknown: take one of {", ".join(NAMES)}')
     layout = LAYOUTS[name.removeprefix(SYNTH)]
     folder, map_folder, query_folder = _find(name, layout, Path(root))
-    places, query = FolderSource(map_folder), FolderSource(query_folder)
+    places: FrameSource = FolderSource(map_folder)
+    query: FrameSource = FolderSource(query_folder)
     tolerance = layout.tolerance if tolerance is None else tolerance
     if layout.paired and len(query) == len(places):
         ground_truth = GroundTruth.identity(len(query), len(places), tolerance)
     else:
         file = _ground_truth_file(name, folder, len(query), len(places))
         ground_truth = GroundTruth.from_file(file, len(query), len(places), tolerance)
-    dataset = Dataset(places, query, ground_truth, tolerance)
-    return dataset.synth() if name.startswith(SYNTH) else dataset
+    if name.startswith(SYNTH):
+        places, query = cropped(places, 0, CROP_MAP), cropped(query, CROP_QUERY, 0)
+    return Dataset(places, query, ground_truth, tolerance)
 
 
 def _letters(name: str) -> str:

@@ -164,7 +164,9 @@ class DatasetExperiment:
 
     def _evaluate_baseline(self, configuration: Configuration) -> Metrics:
         settings = SeqSlamSettings(length=configuration.sequence.length)
-        places, scores = seqslam(self._dataset.map, self._dataset.query, settings)
+        sources = (self._dataset.map, self._dataset.query)
+        first, second = ((frame.image for frame in source) for source in sources)
+        places, scores = seqslam(first, second, settings)
         return evaluate_ranking(Ranking(places[:, None], scores), self._dataset.ground_truth)
 
     def _maps(self, configuration: Configuration) -> tuple[PlaceMap, PlaceMap]:
