@@ -21,7 +21,7 @@ from pipelines import (
 )
 import pytest
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, MapFileError
-from stavpr_ros.mapping import load_map, place_thumbnail, save_map
+from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.pipeline import OPERATIONS, Pipeline
 from stavpr_ros.recognition import Status
@@ -92,7 +92,7 @@ def test_geometric_check_accepts_and_rejects(operation, route):
     pipeline.change(replace(pipeline.settings, geometric=check))
     accepted = process(pipeline, route[5:6], first=5)[0]
     assert (accepted.status, accepted.reason, accepted.newest_index) == (Status.MATCH, '', 5)
-    thumbnail = place_thumbnail(pipeline.places, 5)
+    thumbnail = pipeline.places.thumbnail(5)
     assert accepted.inliers == GeometricVerifier(check).inliers(route[5], thumbnail) >= 100
     for more, status in ((0, Status.MATCH), (1, Status.NO_MATCH)):  # the same images again
         pipeline.reset()
