@@ -69,7 +69,7 @@ class PipelineSettings:
         """Return the threshold in force; distances of mode robust mean the same on every route."""
         if self.threshold is not None:
             return self.threshold
-        if not options_of(self.mode).second_best_margin:
+        if not options_of(self.mode).place_filter:
             return None
         return LOOP_THRESHOLD if operation == 'loop_closure' else THRESHOLD
 

@@ -12,9 +12,12 @@ from stavpr_ros.alignment.spatial import adaptive_weights
 from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.recognition.filter_search import FilterSearch
 from stavpr_ros.recognition.match import Match, Status
 from stavpr_ros.recognition.recognizer import RecognizerSettings, SequenceRecognizer
+from stavpr_ros.recognition.robust import ZNormalization
 from stavpr_ros.recognition.route_features import RouteFeatures
+from stavpr_ros.recognition.sequence_search import SequenceBuffer
 import torch
 
 EVICTED = 8  # the oldest one in so many is evicted at a time
@@ -128,7 +131,8 @@ class LoopCloser(SequenceRecognizer):
         """
         self._require_one_image(features, 'the route so far')
         self._append(features, stamp)
-        match = self._match(torch.from_numpy(self._distances()), stamp)
+        newest = self._route.newest[:, 0]
+        match = self._match(torch.from_numpy(self._distances()), newest, stamp)
         if match.status is Status.NO_MATCH and match.sequence is None:
             return replace(match, reason='no earlier place is old enough to be matched with')
         return match
@@ -146,15 +150,22 @@ class LoopCloser(SequenceRecognizer):
         route = self._route
         if route.count == self._limit:
             evicted = max(1, self._limit // EVICTED)
-            for part in (route, self._buffer, self._znorm):
+            for part in (route, *self._parts()):
                 part.evict(evicted)
             while len(self._young) > route.count:
                 self._young.popleft()
         if route.append(features):
-            self._buffer.grow(route.room)
-            self._znorm.grow(route.room)
+            for part in self._parts():
+                part.grow(route.room)
+        if self._filter is not None:
+            self._filter.change.learn_newest(route.strips[:, : route.count].numpy())
         self._young.append(stamp)
         self._places = max(0, route.count - max(self._exclude, self._count_young(stamp)))
+
+    def _parts(self) -> list[SequenceBuffer | ZNormalization | FilterSearch]:
+        """Return what has an entry for each place."""
+        own = [self._filter] if self._filter is not None else []
+        return [self._buffer, self._znorm, *own]
 
     def _count_young(self, stamp: int) -> int:
         """Count the latest places, the newest included, that are too young for this stamp."""

@@ -11,7 +11,6 @@ import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.path import aligned_index, NO_PATH
 from stavpr_ros.errors import InputError
-from stavpr_ros.recognition.robust import evidence, score
 
 
 class Status(enum.IntEnum):
@@ -130,7 +129,6 @@ def ranked_candidates(
     sequences: tuple[np.ndarray, np.ndarray],
     count: int,
     nms_radius: int,
-    relative: bool,
 ) -> list[Candidate]:
     """
     Rank places by non-maximum suppression: around a place that is taken no other one is.
@@ -142,8 +140,6 @@ def ranked_candidates(
         places, shape (n,), whole numbers, in any order; of equal costs the first is taken.
     :param count: most candidates, at least 0.
     :param nms_radius: candidates are more than so many places from each other.
-    :param relative: the distance of the nearest is a score of mode robust; those of the others are
-        then scores of their evidence against the nearest.
     :raises InputError: count below 0.
     """
     if count < 0:
@@ -151,7 +147,6 @@ def ranked_candidates(
     if nearest is None or not count:
         return []
     costs, places = sequences[0].copy(), sequences[1]
-    best = float(costs.min())
     found = [Candidate(nearest.middle, nearest.distance)]
     while len(found) < count:
         costs[np.abs(places - found[-1].place) <= nms_radius] = np.inf
@@ -159,8 +154,7 @@ def ranked_candidates(
         cost = float(costs[at])
         if math.isinf(cost):
             break
-        distance = score(evidence(cost, best)) if relative else cost
-        found.append(Candidate(int(places[at]), distance))
+        found.append(Candidate(int(places[at]), cost))
     return found
 
 

@@ -12,6 +12,7 @@ from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition.filter_search import FilterSearch
 from stavpr_ros.recognition.match import (
     Candidate,
     distinct_places,
@@ -21,20 +22,15 @@ from stavpr_ros.recognition.match import (
 )
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust import (
-    evidence,
-    expected_second_best,
-    Hysteresis,
     MeanCentering,
     options_of,
     RobustOptions,
-    score,
     ZNormalization,
 )
 from stavpr_ros.recognition.sequence_search import (
     LmDtwSearch,
     Search,
     SequenceBuffer,
-    VelocitySearch,
     WindowMatch,
 )
 import torch
@@ -72,13 +68,13 @@ class RecognizerSettings:
         if self.nms_radius < 0:
             raise SettingsError(f'nms_radius = {self.nms_radius} must be at least 0 places')
         if (
-            options_of(self.mode).second_best_margin
+            options_of(self.mode).place_filter
             and self.robust_options is None
             and self.threshold > 1
         ):
             raise SettingsError(
                 f'threshold = {self.threshold}: distances of mode robust end at 1, '
-                'the chance level'
+                'where no probability is left'
             )
 
     @property
@@ -103,9 +99,8 @@ class SequenceRecognizer:
         self._settings, self._feature_settings = settings, feature_settings
         self._znorm = ZNormalization(places, options.query_znorm, options.reference_znorm)
         self._buffer = SequenceBuffer(sequence.length, places, sequence.k)
-        search = VelocitySearch if options.velocity_search else LmDtwSearch
-        self._search: Search = search(self._buffer, self._znorm)
-        self._hysteresis = Hysteresis()
+        self._filter = FilterSearch(self._buffer) if options.place_filter else None
+        self._search: Search = self._filter or LmDtwSearch(self._buffer, self._znorm)
         self._window = WindowMatch()  # of the newest image
         self._nearest: SequenceMatch | None = None
 
@@ -152,7 +147,6 @@ class SequenceRecognizer:
             self._window.sequences(),
             count,
             settings.nms_radius,
-            settings.applied_options.second_best_margin,
         )
 
     def newest_row(self) -> np.ndarray:
@@ -166,7 +160,8 @@ class SequenceRecognizer:
 
     def _clear_window(self) -> None:
         self._buffer.clear()
-        self._hysteresis.reset()
+        if self._filter is not None:
+            self._filter.reset()
         self._window, self._nearest = WindowMatch(), None
 
     def _require_one_image(self, features: LocalFeatures, where: str) -> None:
@@ -175,9 +170,15 @@ class SequenceRecognizer:
             raise InputError(f'features of {len(features)} images came: expected those of one')
         require_finite(features, 'the image')
 
-    def _match(self, row: torch.Tensor, stamp: int) -> Match:
-        """Push the distances of the newest image; match the window, if it is full."""
-        if self._znorm.query or self._znorm.reference:
+    def _match(self, row: torch.Tensor, strips: torch.Tensor, stamp: int) -> Match:
+        """
+        Push the distances of the newest image; match the window, if it is full.
+
+        :param strips: the image's features, centered, shape (W, d).
+        """
+        if self._filter is not None:
+            self._push(row.cpu().numpy(), self._filter, strips.cpu().numpy(), stamp)
+        elif self._znorm.query or self._znorm.reference:
             normalized = self._znorm.normalized(row.cpu().numpy())
             self._buffer.push(torch.from_numpy(normalized), stamp)
             self._znorm.observe(normalized)
@@ -185,40 +186,40 @@ class SequenceRecognizer:
             self._buffer.push(row.to(self._buffer.memory.device), stamp)
         return replace(self._match_window(), window_stamps=self._buffer.stamps)
 
+    def _push(
+        self, row: np.ndarray, place_filter: FilterSearch, strips: np.ndarray, stamp: int
+    ) -> None:
+        """Push a row and advance the filter; images of a camera that stands are observed once."""
+        normalized = self._znorm.normalized(row)
+        self._buffer.push(torch.from_numpy(normalized), stamp)
+        change = place_filter.change.next_query(strips)
+        standstill = place_filter.change.is_standstill(change)
+        if not standstill:
+            self._znorm.observe(normalized)
+        place_filter.update(self._znorm.scaled(normalized), change, standstill)
+
     def _match_window(self) -> Match:
         threshold, length = self._settings.threshold, self._settings.sequence.length
         if not self._buffer.full:
             reason = f'{len(self._buffer)} of {length} images in the window'
             return Match(Status.WARMING_UP, reason, threshold)
         self._window = self._search(self._settings.nms_radius)
-        self._nearest, relative = (
-            self._window.nearest,
-            self._settings.applied_options.second_best_margin,
-        )
-        if self._nearest is None:
+        self._nearest = nearest = self._window.nearest
+        if nearest is None:
             return Match(Status.NO_MATCH, 'the map is empty', threshold)
-        if relative:
-            self._nearest = self._scored(self._nearest)
+        relative = self._filter is not None
+        probability = 1 - nearest.distance if relative else math.nan
         status, reason = Status.MATCH, ''
-        if not self._nearest.distance < threshold:
+        if not nearest.distance < threshold:
             status = Status.NO_MATCH
             reason = (
-                f'nearest distance {self._nearest.distance:.4f} is not below the threshold '
+                f'the probability of the best place, {probability:.3f}, is not above '
+                f'{1 - threshold:.3f}'
+                if relative
+                else f'nearest distance {nearest.distance:.4f} is not below the threshold '
                 f'{threshold:.4f}'
             )
-        return Match(status, reason, threshold, self._nearest, self._window.path, relative)
-
-    def _scored(self, nearest: SequenceMatch) -> SequenceMatch:
-        """Return the match with scores of mode robust for distances; the nearest has memory."""
-        cost, other = nearest.distance, nearest.second_best_distance
-        costs, places = self._window.sequences()
-        elsewhere = np.abs(places - nearest.middle) > self._settings.nms_radius
-        sequences = int(np.count_nonzero(np.isfinite(costs) & elsewhere))
-        value = evidence(cost, expected_second_best(other, sequences))
-        if self._settings.applied_options.hysteresis:
-            value = self._hysteresis.follow(nearest.middle, value)
-        second_best = other if math.isnan(other) else score(evidence(other, cost))
-        return replace(nearest, distance=score(value), second_best_distance=second_best)
+        return Match(status, reason, threshold, nearest, self._window.path, relative, probability)
 
 
 class PlaceRecognizer(SequenceRecognizer):
@@ -257,6 +258,8 @@ class PlaceRecognizer(SequenceRecognizer):
         self._matcher = make_matcher(features, settings.spatial, backend, precision)
         if options.reference_znorm:
             self._znorm.start_from(self._distances_to_itself(features))
+        if self._filter is not None:
+            self._filter.change.learn(features.strips.cpu().numpy())
         if backend == 'cuda' and not options.any:
             from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
@@ -315,7 +318,7 @@ class PlaceRecognizer(SequenceRecognizer):
         strips = features.strips[:, 0]
         if self._centering is not None:
             strips = self._centering.next_query(strips)
-        return self._match(self._matcher.distances(strips, features.weights[:, 0]), stamp)
+        return self._match(self._matcher.distances(strips, features.weights[:, 0]), strips, stamp)
 
 
 def require_finite(features: LocalFeatures, where: str) -> None:

@@ -3,13 +3,12 @@
 """
 Mode robust: options beyond the paper, each a switch against one failure mode.
 
-Everything is causal: only images that have arrived count. With hysteresis the score has memory,
-and successive scores are correlated.
+Everything is causal: only images that have arrived count. The probability of a match has memory,
+and successive ones are correlated.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-import math
 
 import numpy as np
 from stavpr_ros.errors import SettingsError
@@ -17,23 +16,13 @@ from stavpr_ros.features import LocalFeatures
 import torch
 
 MODES = ('paper', 'robust')
-THRESHOLD = 1.0  # of mode robust; smaller is stricter
+THRESHOLD = 0.5  # of mode robust: 1 less the probability above which a window is matched
 # For loop closure, where every image is a query and a false match bends a map.
-LOOP_THRESHOLD = 0.8
+LOOP_THRESHOLD = 0.5
 PRIOR = 20  # images that the statistics of the map count for in those of the query
 PIECE = 8192  # images centered at a time
 MEMORY = 150  # rows after which old ones fade
 MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
-# The evidence that windows from unknown places show as well, in deviations: at most one in thirty
-# of them shows more on every pair of data sets that was tried.
-CHANCE = -2.2
-# The best of few sequences is far away: on a short map, or at the start of a route, every window
-# would have a large margin. The second best is then taken to be at least as near as the best of
-# many in windows from unknown places.
-FEW_SEQUENCES = 20
-USUAL_SECOND_BEST = -0.8
-FADING = 0.05  # deviations that evidence loses with each image
-BACK, AHEAD = 1, 3  # places that the matched place may move with each image of a track
 
 
 @dataclass(frozen=True)
@@ -48,20 +37,15 @@ class RobustOptions:
         from all.
     :param reference_znorm: z-normalize the distances of a place to the latest images, against
         hubness: some places are near to all images.
-    :param velocity_search: match windows along lines of several velocities
-        (:mod:`stavpr_ros.alignment.velocity`) instead of by LM-DTW, where one place may absorb a
-        window.
-    :param second_best_margin: score the nearest sequence by its margin to the second best as well.
-    :param hysteresis: keep evidence for some images while the matched place moves on steadily;
-        needs ``second_best_margin``.
+    :param place_filter: follow place and speed with a Bayes filter that knows of being off the
+        map (:mod:`stavpr_ros.recognition.place_filter`) instead of matching each window by LM-DTW,
+        where one place may absorb a window.
     """
 
     mean_centering: bool = True
     query_znorm: bool = True
     reference_znorm: bool = True
-    velocity_search: bool = True
-    second_best_margin: bool = True
-    hysteresis: bool = True
+    place_filter: bool = True
 
     @property
     def any(self) -> bool:
@@ -94,7 +78,7 @@ class RobustOptions:
         return RobustOptions(**values)
 
 
-PAPER = RobustOptions(False, False, False, False, False, False)
+PAPER = RobustOptions(False, False, False, False)
 ROBUST = RobustOptions()
 
 
@@ -267,64 +251,3 @@ class ZNormalization:
             return rows
         shift, scale = self.shift_and_scale(rows.shape[-1])
         return (rows - shift) * scale
-
-
-def evidence(cost: float, other: float) -> float:
-    """
-    Return the cost of a sequence plus its margin to another one, in deviations; lower is better.
-
-    A sequence is scored by its mean z-normalized distance and its margin to the second best.
-
-    :param cost: mean z-normalized distance of the sequence.
-    :param other: that of the nearest sequence elsewhere; NaN if there is none.
-    """
-    return 2 * cost - (0.0 if math.isnan(other) else other)
-
-
-def expected_second_best(other: float, sequences: int) -> float:
-    """
-    Return the cost that a second best should be expected to have.
-
-    :param other: that of the nearest sequence elsewhere; NaN if there is none.
-    :param sequences: number of sequences elsewhere.
-    """
-    if sequences >= FEW_SEQUENCES:
-        return other
-    return USUAL_SECOND_BEST if math.isnan(other) else min(other, USUAL_SECOND_BEST)
-
-
-def score(value: float) -> float:
-    """
-    Map evidence to 0 (certain) .. 1 (chance level), the same scale on every route.
-
-    1 is as near as windows from unknown places come; beyond it nothing is distinguished.
-    """
-    return min(1.0, math.exp(min(value - CHANCE, 0) / 2))
-
-
-class Hysteresis:
-    """
-    Evidence with memory.
-
-    Strong evidence of earlier windows lasts, fading, while the matched place moves on steadily.
-    """
-
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Drop the track."""
-        self._middle: int | None = None
-        self._evidence = math.inf
-
-    def follow(self, middle: int, value: float) -> float:
-        """
-        Return the evidence for the place of the newest window, that of its track included.
-
-        :param middle: the place.
-        :param value: the evidence of this window alone.
-        """
-        if self._middle is not None and -BACK <= middle - self._middle <= AHEAD:
-            value = min(value, self._evidence + FADING)
-        self._middle, self._evidence = middle, value
-        return value

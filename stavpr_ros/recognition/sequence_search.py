@@ -15,10 +15,8 @@ from stavpr_ros.alignment.lm_dtw import (
     trace_sequence,
 )
 from stavpr_ros.alignment.path import NO_PATH
-from stavpr_ros.alignment.settings import VelocitySettings
-from stavpr_ros.alignment.velocity import best_velocity_match, match_scaled, trace_velocity
 from stavpr_ros.checks import no_nan
-from stavpr_ros.recognition.robust import MIN_DEVIATION, ZNormalization
+from stavpr_ros.recognition.robust import ZNormalization
 import torch
 
 Sequences = tuple[np.ndarray, np.ndarray]
@@ -183,48 +181,6 @@ class LmDtwSearch:
         path = NO_PATH
         if nearest is not None:
             path = trace_sequence(window[:, :n], nearest.first, k).path
-        return _renumbered(
-            nearest, path, lambda: (matches.distances, matches.middles + first), first
-        )
-
-
-class VelocitySearch:
-    """
-    Search along lines of constant velocity (:mod:`stavpr_ros.alignment.velocity`), on the CPU.
-
-    :param buffer: the window.
-    :param znorm: applied to the distances. Without any z-normalization they are divided by the
-        standard deviation of the window, since the penalty of the search is meant in deviations.
-    :param settings: velocities and penalty.
-    """
-
-    def __init__(
-        self,
-        buffer: SequenceBuffer,
-        znorm: ZNormalization,
-        settings: VelocitySettings | None = None,
-    ) -> None:
-        self.buffer, self._znorm = buffer, znorm
-        settings = settings or VelocitySettings()
-        self._steps, self._penalty = settings.steps(buffer.length), settings.penalty
-        # most places that a path passes
-        self._reach = int(self._steps.sum(axis=1).max()) + buffer.length
-
-    def __call__(self, nms_radius: int) -> WindowMatch:
-        rows, n, first = self.buffer.rows().numpy(), self.buffer.known, self.buffer.first
-        shift, scale = self._znorm.shift_and_scale(n)
-        if not (self._znorm.query or self._znorm.reference):
-            known = rows[:, :n][np.isfinite(rows[:, :n])]
-            scale = scale / np.float32(max(known.std() if known.size else 0, MIN_DEVIATION))
-        matches = match_scaled(rows, shift, scale, self._steps, self._penalty)
-        nearest = best_velocity_match(matches, nms_radius)
-        path = NO_PATH
-        if nearest is not None:
-            near = slice(max(0, nearest.last - self._reach), nearest.last + 1)
-            costs = (rows[:, near] - shift[near]) * scale[near]
-            steps = self._steps[matches.speeds[nearest.last]]
-            path = trace_velocity(costs, nearest.last - near.start, steps, self._penalty)
-            path[:, 1] += near.start
         return _renumbered(
             nearest, path, lambda: (matches.distances, matches.middles + first), first
         )
