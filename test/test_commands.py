@@ -362,7 +362,7 @@ def test_read_result_counts_images_not_places():
     ]
     result = read_result(statuses, closures, truth, 2)
     assert result.closures.tolist() == [[4, 0], [5, 0]]
-    assert result.correct.tolist() == [True, False]
+    assert result.are_correct(result.closures).tolist() == [True, False]
     assert result.pairs.tolist() == [[3, 0], [4, 0], [5, 0]]
     first, second, third = result.summary().splitlines()
     assert first == '2 loop closures in 6 images (1 too similar to the last)'

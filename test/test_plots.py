@@ -44,7 +44,7 @@ def results():
     matched[5], matched[30] = 25, -1
     best = distances.min(axis=1)
     best[0] = np.inf
-    matches = ImageMatches(matched, best)
+    matches = ImageMatches(matched, best, matched >= 0, np.full(QUERIES, np.nan))
     result = TraverseEvaluation(matches, matched >= 0, truth, 2, None, np.zeros(0))
     return distances, result
 
@@ -138,8 +138,8 @@ def test_demo_sheet_shows_matches_and_ground_truth_as_far_as_known(path, results
     assert all(colors_of(path, BLUE, *bright, least=(1000, 1500)))
     demo_sheet(path, [], distances, replace(result, true_places=None), THRESHOLD, 'Title')
     assert colors_of(path, (79, 179, 255), *bright) == [True, False, False, False]
-    none = ImageMatches(np.full(QUERIES, -1), np.full(QUERIES, np.inf))
-    nothing = replace(result, matches=none, accepted=np.zeros(QUERIES, bool))
+    none = ImageMatches.none(QUERIES)
+    nothing = replace(result, matches=none, accepted=none.accepted)
     demo_sheet(path, [], distances, nothing, THRESHOLD, 'Title')
     assert colors_of(path, *bright) == [False, False, True]
 
