@@ -33,7 +33,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.robust import LOOP_THRESHOLD, THRESHOLD
+from stavpr_ros.recognition.robust import THRESHOLD
 from stavpr_ros.sources import open_source
 
 MODES = ('paper', 'robust')
@@ -170,9 +170,9 @@ def evaluate_hallway(
     file = folder / 'rtabmap_hallway_loop/samples_GT.bmp'
     truth = GroundTruth.from_file(file, len(route), len(route), 0).loop_closures(EXCLUDED - 1)
     for mode in MODES:
-        settings = RecognizerSettings(LOOP_THRESHOLD, mode=mode)
+        settings = RecognizerSettings(THRESHOLD, mode=mode)
         evaluation = evaluate_loop_closures(route.features, truth, settings, EXCLUDED)
-        threshold = LOOP_THRESHOLD if mode == 'robust' else None
+        threshold = THRESHOLD if mode == 'robust' else None
         yield f'hallway/{feature}/{mode}/same', numbers(evaluation, threshold)
 
 

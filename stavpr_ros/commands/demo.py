@@ -216,7 +216,7 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
     """Find the loop closures of one traverse."""
     from stavpr_ros.commands.feature_options import make_extractor
     from stavpr_ros.demonstration.loops import draw_loops, read_result
-    from stavpr_ros.recognition.robust import LOOP_THRESHOLD
+    from stavpr_ros.recognition.robust import THRESHOLD
     from stavpr_ros.ros.live import run_live
 
     exclude = arguments.exclude_places or EXCLUDE_PLACES
@@ -240,7 +240,7 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
         'operation': 'loop_closure',
         'map_path': features,
         'mode': arguments.mode,
-        'threshold': arguments.threshold or LOOP_THRESHOLD,
+        'threshold': arguments.threshold or THRESHOLD,
         'sequence_length': length,
         'exclude_places': exclude,
         'geometric_check': arguments.geometric_check or GEOMETRIC_CHECK,

@@ -15,7 +15,7 @@ from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.loop_closer import least_limit
-from stavpr_ros.recognition.robust import LOOP_THRESHOLD, options_of, THRESHOLD
+from stavpr_ros.recognition.robust import options_of, THRESHOLD
 from stavpr_ros.recognition.verification import GeometricSettings
 
 OPERATIONS = ('localization', 'mapping', 'loop_closure')
@@ -71,7 +71,7 @@ class PipelineSettings:
             return self.threshold
         if not options_of(self.mode).place_filter:
             return None
-        return LOOP_THRESHOLD if operation == 'loop_closure' else THRESHOLD
+        return THRESHOLD
 
     def recognition(self, operation: str) -> RecognizerSettings:
         """Return settings of the recognizer; without a threshold, with one that is not applied."""

@@ -28,12 +28,15 @@ class FilterSearch:
         self.change = ImageChange(buffer.places, settings)
         self._speeds = settings.speeds
         self._images: deque[int] = deque(maxlen=buffer.length)  # the filter's image of each
+        # alpha and speed weights of each image until the window is full; None = nothing was added
+        self._first: list[tuple[float, np.ndarray] | None] = []
 
     def reset(self) -> None:
         """Forget the query."""
         self.filter.reset()
         self.change.reset()
         self._images.clear()
+        self._first.clear()
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -56,15 +59,35 @@ class FilterSearch:
         :param change, standstill: of the image, from :class:`ImageChange`.
         """
         still = standstill and self.filter.count > 0
-        unlit = still and self.change.unlit(self.filter.places_of_states()[: len(z)])
-        if unlit:
-            self.filter.update(z, 0.0, np.ones(len(self._speeds)))
-        elif not still:
-            speeds = self.change.speed_weights(change) if self.filter.count else None
-            if speeds is None:
-                speeds = np.ones(len(self._speeds))
-            self.filter.update(z, self.change.weight(change), speeds)
+        evidence: tuple[float, np.ndarray] | None = None
+        if not still:
+            evidence = self.change.weight(change), self._speed_weights(change)
+        elif self.change.unlit(self.filter.places_of_states()[: len(z)]):
+            evidence = 0.0, np.ones(len(self._speeds))
+        self._advance(z, evidence)
+        if len(self._first) < self.buffer.length:
+            self._first.append(evidence)
+
+    def start_again(self, rows: np.ndarray) -> None:
+        """
+        Repeat the first window with the z-normalization that is known at its end.
+
+        :param rows: z-normalized distances of the window, (l, n).
+        """
+        self.filter.reset()
+        self._images.clear()
+        for row, evidence in zip(rows, self._first, strict=True):
+            self._advance(row, evidence)
+
+    def _advance(self, z: np.ndarray, evidence: tuple[float, np.ndarray] | None) -> None:
+        if evidence is not None:
+            self.filter.update(z, *evidence)
         self._images.append(self.filter.count - 1)
+
+    def _speed_weights(self, change: float) -> np.ndarray:
+        if not self.filter.count:
+            return np.ones(len(self._speeds))  # of the first image no change is known
+        return self.change.speed_weights(change)
 
     def __call__(self, nms_radius: int) -> WindowMatch:
         n, first = self.buffer.known, self.buffer.first
@@ -108,7 +131,8 @@ class FilterSearch:
         back = images[-1] - images
         lag = int(back[self._middle])
         places = self.filter.way(way, lag)
-        earlier = np.maximum(back - lag, 0) * self._speeds[way[3]]
+        slope = (places[0] - places[lag]) / lag if lag else self._speeds[way[3]]
+        earlier = np.maximum(back - lag, 0) * slope
         path = places[np.minimum(back, lag)] - np.rint(earlier).astype(np.int32)
         return np.stack([np.arange(len(path)), np.maximum(path, 0)], axis=1).astype(np.int32)
 

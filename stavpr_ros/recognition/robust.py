@@ -16,9 +16,8 @@ from stavpr_ros.features import LocalFeatures
 import torch
 
 MODES = ('paper', 'robust')
-THRESHOLD = 0.5  # of mode robust: 1 less the probability above which a window is matched
-# For loop closure, where every image is a query and a false match bends a map.
-LOOP_THRESHOLD = 0.5
+MIN_PROBABILITY = 0.3  # above which mode robust matches a window
+THRESHOLD = 1 - MIN_PROBABILITY  # of the distance, 1 less the probability
 PRIOR = 20  # images that the statistics of the map count for in those of the query
 PIECE = 8192  # images centered at a time
 MEMORY = 150  # rows after which old ones fade
