@@ -52,7 +52,7 @@ class FilterSettings:
 
     speeds: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
     levels: tuple[float, ...] = (-1.0, -2.0, -3.25)
-    weight: float = 0.2
+    weight: float = 0.25
     most_change: float = 2.0
     least_change: float = 0.2
     standstill: float = 0.1
@@ -61,7 +61,7 @@ class FilterSettings:
     spread: float = 0.05
     leave: float = 0.01
     enter: float = 0.01
-    start: float = 0.5
+    start: float = 0.7
     change_deviation: float = 0.5
 
     def level_changes(self) -> np.ndarray:
