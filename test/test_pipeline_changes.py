@@ -30,18 +30,20 @@ from stavpr_ros.recognition.verification import GeometricSettings, GeometricVeri
 pytestmark = pytest.mark.usefixtures('one_thread')
 
 
-@pytest.mark.parametrize(('operation', 'default'), [('localization', 1.0), ('loop_closure', 0.8)])
-def test_threshold_and_candidates_change_with_a_full_window(operation, default, route):
+@pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
+def test_min_probability_and_candidates_change_with_a_full_window(operation, route):
     pipeline = recorded(route, operation, candidates=3)
     match = process(pipeline, route[:LENGTH])[-1]
     assert (match.status, len(match.candidates)) == (Status.MATCH, 3)
     assert match.candidates[0].place == match.sequence.middle
-    pipeline.change(replace(pipeline.settings, threshold=1e-9, candidates=0))
+    strict = 1 - 1e-9
+    pipeline.change(replace(pipeline.settings, min_probability=strict, candidates=0))
     match = process(pipeline, route[5:6], first=5)[0]
-    assert (match.status, match.threshold, match.candidates) == (Status.NO_MATCH, 1e-9, ())
-    pipeline.change(replace(pipeline.settings, threshold=None, candidates=1))
-    match = process(pipeline, route[6:7], first=6)[0]  # the default of mode robust
-    assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 6, default)
+    assert (match.status, match.threshold, match.candidates) == (Status.NO_MATCH, 1 - strict, ())
+    assert match.probability > 0.9
+    pipeline.change(replace(pipeline.settings, min_probability=0.4, candidates=1))
+    match = process(pipeline, route[6:7], first=6)[0]
+    assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 6, 0.6)
     assert len(match.candidates) == 1
     pipeline.list_candidates = False
     assert process(pipeline, route[7:8], first=7)[0].candidates == ()
@@ -68,7 +70,7 @@ def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
         Status.WARMING_UP, Status.SKIPPED, Status.SKIPPED, *[Status.WARMING_UP] * 3, Status.MATCH
     ]  # fmt: skip
     assert matches[1].cause == 'not a keyframe'
-    assert {match.threshold for match in matches} == {1.0}
+    assert {match.threshold for match in matches} == {0.7}
     assert 'differs by 0.0000' in matches[1].reason
     assert matches[-1].window_stamps == tuple(stamp * SECOND for stamp in (1, 4, 5, 6, 7))
     pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(interval=2.0)))

@@ -145,7 +145,7 @@ def ranked_candidates(
         return []
     costs, places = sequences[0].copy(), sequences[1]
     found = [Candidate(nearest.middle, nearest.distance)]
-    while len(found) < count:
+    while len(found) < count and len(costs):
         costs[np.abs(places - found[-1].place) <= nms_radius] = np.inf
         at = int(np.argmin(costs))
         cost = float(costs[at])
