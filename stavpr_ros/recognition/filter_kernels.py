@@ -15,7 +15,7 @@ contributed most are kept in one byte, so that the most probable way here can be
 
 import numba as nb
 import numpy as np
-from stavpr_ros.compilation import kernel, parallel_kernel
+from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
 
 F = np.float32
 PLACES = 2048  # that a thread takes at a time
@@ -54,11 +54,33 @@ def _mixed(a, k, levels, speeds, low, mixed, source):
         stay, after, row = speeds[0, v], speeds[3, v], b[v]
         up = speeds[1, v - 1] if v > 0 else F(0)
         down = speeds[1, v + 1] if v < V - 1 else F(0)
+        target, origin = mixed[v], source[v]
         for i in range(width):
             same, lower, upper = row[i] * stay, below[i] * up, above[i] * down
-            mixed[v, i] = after * (same + lower + upper + anywhere[i])
-            best = np.int8(1) if lower > same else np.int8(0)
-            source[v, i] = np.int8(2) if upper > max(same, lower) else best
+            target[i] = after * (same + lower + upper + anywhere[i])
+            most = same if same > lower else lower
+            origin[i] = np.int8(2) if upper > most else np.int8(lower > same)
+    return total
+
+
+@reassociating_kernel
+def _sum(values):
+    total = np.float32(0)
+    for i in range(len(values)):
+        total += values[i]
+    return total
+
+
+@kernel
+def _lost(mixed, steps, spread):
+    """Return what the last block loses over the end of the map, whose last place is its last."""
+    total = F(0)
+    for v in range(len(steps)):
+        r, row = steps[v], mixed[v]
+        end = len(row)
+        slow = r - 1 if r > 0 else 0
+        total += (F(1) - F(2) * spread) * row[end - r :].sum()
+        total += spread * (row[end - r - 1 :].sum() + row[end - slow :].sum())
     return total
 
 
@@ -78,41 +100,55 @@ def advance(
     :param stay_on: probability of staying on the map.
     :param births: probability of each state of a level to come from off the map, (K,).
     :param out: written like a, not normalized; origins: (K, V, n or more), int8, written.
-    :param totals: (blocks, K, 3), written: sums before moving, after it, and with the image.
+    :param totals: (blocks, K, 3), written: sums before moving, of what moved over the map's end,
+        and with the image.
     """
     K, V = a.shape[:2]
     reach = steps.max() + 1
-    center = F(1) - F(2) * spread
     for block in nb.prange((n + PLACES - 1) // PLACES):
         first = block * PLACES
         count = min(PLACES, n - first)
         mixed = np.empty((V, reach + count), np.float32)
         source = np.empty((V, reach + count), np.int8)
         for k in range(K):
-            before = _mixed(a, k, levels, speeds, first - reach, mixed, source)[reach:].sum()
-            moved, after, birth = 0.0, 0.0, births[k]
-            seen = likelihood[k, first : first + count]
+            total = _mixed(a, k, levels, speeds, first - reach, mixed, source)
+            totals[block, k, 0] = _sum(total[reach:])
+            if first + count == n:
+                totals[block, k, 1] = _lost(mixed, steps, spread)
+            birth, seen = births[k], likelihood[k, first : first + count]
+            after = F(0)
             for v in range(V):
                 at = reach - steps[v]
-                slow = at + 1 if steps[v] > 0 else at
-                row, change = mixed[v], source[v]
-                target, origin = out[k, v, first : first + count], origins[k, v, first:]
-                for i in range(count):
-                    straight = center * row[at + i]
-                    faster, slower = spread * row[at - 1 + i], spread * row[slow + i]
-                    s = straight + faster + slower
-                    moved += s
-                    code = change[at + i]
-                    if faster > straight:
-                        code = np.int8(3) + change[at - 1 + i]
-                    if slower > max(straight, faster):
-                        code = np.int8(6) + change[slow + i]
-                    s *= stay_on
-                    origin[i] = code if s > birth else np.int8(BORN)
-                    x = (s + birth) * seen[i]
-                    target[i] = x
-                    after += x
-            totals[block, k, 0], totals[block, k, 1], totals[block, k, 2] = before, moved, after
+                target = out[k, v, first : first + count]
+                _move(
+                    mixed[v], source[v], at, at + 1 if steps[v] > 0 else at, spread, stay_on,
+                    birth, seen, target, origins[k, v, first : first + count],
+                )  # fmt: skip
+                after += _sum(target)
+            totals[block, k, 2] = after
+
+
+@kernel
+def _move(row, change, at, slow, spread, stay_on, birth, seen, target, origin):
+    """Move the states of one level and speed on, and weigh them by the image; see advance."""
+    count = len(target)
+    center = F(1) - F(2) * spread
+    straight_row, straight_change = row[at : at + count], change[at : at + count]
+    faster_row, faster_change = row[at - 1 : at - 1 + count], change[at - 1 : at - 1 + count]
+    slower_row, slower_change = row[slow : slow + count], change[slow : slow + count]
+    for i in range(count):
+        straight = center * straight_row[i]
+        faster, slower = spread * faster_row[i], spread * slower_row[i]
+        s = (straight + faster + slower) * stay_on
+        target[i] = (s + birth) * seen[i]
+    for i in range(count):
+        straight = center * straight_row[i]
+        faster, slower = spread * faster_row[i], spread * slower_row[i]
+        s = (straight + faster + slower) * stay_on
+        most = straight if straight > faster else faster
+        code = np.int8(3 + faster_change[i]) if faster > straight else straight_change[i]
+        code = np.int8(6 + slower_change[i]) if slower > most else code
+        origin[i] = code if s > birth else np.int8(BORN)
 
 
 @kernel

@@ -185,8 +185,8 @@ class PlaceFilter:
                 np.float32(1 - s.leave), births, self._next, self._origins[slot], totals,
             )  # fmt: skip
             self._a, self._next = self._next, self._a
-        before, after, seen = totals.sum(axis=0).T if n else np.zeros((3, len(off)))
-        off = off * (1 - s.enter) + after * s.leave + np.maximum(before - after, 0)
+        before, lost, seen = totals.sum(axis=0).T if n else np.zeros((3, len(off)))
+        off = off * (1 - s.enter) + (before - lost) * s.leave + lost
         total = float(off.sum() + seen.sum())
         self._off = off / total
         self._a[:, :, :n] *= np.float32(1 / total)
