@@ -84,15 +84,6 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             choices=('paper', 'robust'),
         ),
         NodeParameter(
-            'threshold',
-            -1.0,
-            'Mode paper: a window is matched when its distance is below this; negative = not set, '
-            'the node waits for a value. Mode robust rejects it, see min_probability.',
-            'distance',
-            'live',
-            bounds=(-1.0, 1e6),
-        ),
-        NodeParameter(
             'min_probability',
             0.3,
             'Mode robust: a window is matched when the probability that its place is right is '
@@ -228,6 +219,15 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         ),
     ),
     'Recognition': (
+        NodeParameter(
+            'threshold',
+            -1.0,
+            'Mode paper: a window is matched when its distance is below this; negative = not set, '
+            'the node waits for a value. Mode robust rejects it, see min_probability.',
+            'distance',
+            'live',
+            bounds=(-1.0, 1e6),
+        ),
         NodeParameter(
             'beta',
             2.0,

@@ -125,7 +125,7 @@ def test_parameters_that_are_rejected_change_nothing(make, map_file):
         ('map_path', 'other.stavpr', 'call the service ~/load_map'),
         ('operation', 'mapping', 'call the service ~/set_operation'),
         ('beta', 3.0, 'while the node is unconfigured'),
-        ('threshold', 0.8, 'min_probability = 0.3; set that'),
+        ('threshold', 0.8, 'is of mode paper'),
         ('min_probability', 1.0, 'below 1'),
         ('save_path', '/missing/route.stavpr', 'save_path'),
         ('geometric_check', 'eye', 'take one of none'),
