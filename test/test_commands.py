@@ -321,8 +321,9 @@ def test_demo_of_loop_closure_reports_closures(run, tmp_path):
     assert (last['query_index'], last['place_index']) == (67, 31)  # the fourth of 64 to 71
     assert [pair[0] - pair[2] for pair in last['pairs']] == [36] * len(last['pairs'])
     assert last['query_pose'] is None
+    assert last['probability'] > 0.9
     correct = sum(c['query_index'] - c['place_index'] == 36 for c in closures)
-    assert correct >= 28
+    assert correct >= 22  # the first of the second lap are not probable yet
     assert f'{correct} of {len(closures)} loop closures are correct' in result.stdout
     assert cv2.imread(str(output / 'loop.png')).std() > 5
     (traverse / '80.png').write_bytes(b'no image')
