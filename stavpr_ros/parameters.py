@@ -84,14 +84,12 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             choices=('paper', 'robust'),
         ),
         NodeParameter(
-            'threshold',
-            -1.0,
-            'A window is matched when its distance is below this. Negative: the default of mode '
-            'robust, 1 (chance level), or 0.8 for loop_closure; mode paper has no default and '
-            'waits for a value.',
-            'distance',
-            'live',
-            bounds=(-1.0, 1e6),
+            'min_probability',
+            0.3,
+            'Mode robust: a window is matched when the probability that its place is right is '
+            'above this, between 0 and 1; greater is stricter. No effect in mode paper.',
+            when='live',
+            bounds=(0.0, 1.0),
         ),
         NodeParameter(
             'sequence_length', 20, 'Length l of the query window.', 'images', bounds=(2, 1000)
@@ -221,6 +219,15 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         ),
     ),
     'Recognition': (
+        NodeParameter(
+            'threshold',
+            -1.0,
+            'Mode paper: a window is matched when its distance is below this; negative = not set, '
+            'the node waits for a value. Mode robust rejects it, see min_probability.',
+            'distance',
+            'live',
+            bounds=(-1.0, 1e6),
+        ),
         NodeParameter(
             'beta',
             2.0,

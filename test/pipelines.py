@@ -9,11 +9,13 @@ from stavpr_ros.pipeline.saving import write_map
 from stavpr_ros.sources.frame import ImageRecord
 
 LENGTH, EXCLUDED = 5, 10
+MIN_PROBABILITY = 0.05  # windows as short as these are certain of nothing
 SECOND = 10**9
 
 
 def settings_of(**changes):
     short = {'sequence': SequenceSettings(LENGTH), 'nms_radius': 5, 'exclude_places': EXCLUDED}
+    short['min_probability'] = MIN_PROBABILITY
     return PipelineSettings(**{'backend': 'cpu'} | short | changes)
 
 

@@ -38,6 +38,7 @@ LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PARAMETERS = {
     'sequence_length': LENGTH,
     'nms_radius': 5,
+    'min_probability': 0.05,  # windows as short as these are certain of nothing
     'threads': 1,
     'keyframe_change': 0.0,
     'diagnostics_period': 0.1,

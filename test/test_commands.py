@@ -242,7 +242,9 @@ def test_match_record_names_every_status():
     [
         (['--map', 'x'], 'go together'),
         (['--truth', 'identity'], '--truth'),
-        (['--threshold', '-1'], '--threshold'),
+        (['--mode', 'paper', '--threshold', '-1'], '--threshold'),
+        (['--threshold', '0.8'], 'give --min-probability'),
+        (['--min-probability', '1'], '--min-probability'),
         (['--map', 'x', '--query', 'y', '--truth', 'file.csv'], 'expected identity'),
         (['--loop', '--map', 'x', '--query', 'y'], 'leave --map'),
         (['--loop', 'synthetic', '--truth', 'file.csv'], 'is known'),
@@ -281,7 +283,7 @@ def test_demo_on_bag_and_folder_reports_matches(run, traverse, tmp_path):
     query = write_images(tmp_path / 'query', dim)
     (query / '24.png').write_bytes(b'no image')
     output = tmp_path / 'output'
-    options = ['--query', query, '--topic', '/front', '--threshold', 0.3, '--output', output]
+    options = ['--query', query, '--topic', '/front', '--output', output]
     result = run(demo, '--map', traverse, *options)
     assert result.code == 2
     assert 'neither recording is a bag' in result.err
@@ -319,8 +321,9 @@ def test_demo_of_loop_closure_reports_closures(run, tmp_path):
     assert (last['query_index'], last['place_index']) == (67, 31)  # the fourth of 64 to 71
     assert [pair[0] - pair[2] for pair in last['pairs']] == [36] * len(last['pairs'])
     assert last['query_pose'] is None
+    assert last['probability'] > 0.9
     correct = sum(c['query_index'] - c['place_index'] == 36 for c in closures)
-    assert correct >= 28
+    assert correct >= 22  # the first of the second lap are not probable yet
     assert f'{correct} of {len(closures)} loop closures are correct' in result.stdout
     assert cv2.imread(str(output / 'loop.png')).std() > 5
     (traverse / '80.png').write_bytes(b'no image')
@@ -331,7 +334,7 @@ def test_demo_of_loop_closure_reports_closures(run, tmp_path):
 
 def test_demo_terminated_ends_its_processes(traverse, tmp_path):
     output = tmp_path / 'output'
-    arguments = ['--map', traverse, '--query', traverse, '--threshold', '0.3', '--output', output]
+    arguments = ['--map', traverse, '--query', traverse, '--output', output]
     process = Process(tmp_path / 'demo.log', 'demo', *map(str, arguments))
     end = time.monotonic() + TIMEOUT
     while not (output / 'record.log').exists():
@@ -377,7 +380,7 @@ def test_read_result_counts_images_not_places():
 def plain_match(status, place=-1):
     path = [[0, place - 1], [1, place], [2, place + 1]] if place >= 0 else []
     match = {'status': status, 'sequence_middle': place, 'distance': 0.1, 'path': path}
-    return match | {'received': 0}
+    return match | {'received': 0, 'probability': 0.9}
 
 
 def test_evaluate_records_with_invalid_image_keeps_others_aligned():
@@ -386,5 +389,6 @@ def test_evaluate_records_with_invalid_image_keeps_others_aligned():
     records += [plain_match('INVALID_IMAGE'), plain_match('MATCH', 2), plain_match('MATCH', 4)]
     result = evaluate_records(records, 3, 0.5, np.arange(6), 0)
     assert result.matches.places.tolist() == [0, 1, 2, -1, 4, 5]
+    np.testing.assert_equal(result.matches.probabilities, [0.9, 0.9, 0.9, np.nan, 0.9, 0.9])
     assert result.counts.true_positives == 5
     assert result.counts.false_negatives == 1

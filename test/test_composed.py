@@ -125,7 +125,8 @@ def test_parameters_that_are_rejected_change_nothing(make, map_file):
         ('map_path', 'other.stavpr', 'call the service ~/load_map'),
         ('operation', 'mapping', 'call the service ~/set_operation'),
         ('beta', 3.0, 'while the node is unconfigured'),
-        ('threshold', 1.5, 'chance'),
+        ('threshold', 0.8, 'is of mode paper'),
+        ('min_probability', 1.0, 'below 1'),
         ('save_path', '/missing/route.stavpr', 'save_path'),
         ('geometric_check', 'eye', 'take one of none'),
     ):
@@ -134,7 +135,7 @@ def test_parameters_that_are_rejected_change_nothing(make, map_file):
         assert node.get_parameter(name).value != value
         assert node.settings is before
     assert set_parameter(node, 'map_path', map_file).successful  # the current value
-    together = [Parameter('candidates', value=3), Parameter('threshold', value=1.5)]
+    together = [Parameter('candidates', value=3), Parameter('min_probability', value=1.0)]
     assert not node.set_parameters_atomically(together).successful
     assert node.settings.pipeline.candidates == 10
     assert set_parameter(node, 'candidates', 3).successful

@@ -37,7 +37,7 @@ COUNTS = ImageCounts(
     total=StageTime(12.5, 24.0),
     work=StageTime(11.5, 22.25),
 )
-SETTINGS = {row.name: row.default for row in PARAMETERS} | {'backend': 'cpu', 'threshold': 1.0}
+SETTINGS = {row.name: row.default for row in PARAMETERS} | {'backend': 'cpu'}
 HEALTH = Health(
     state='active',
     settings=node_settings(SETTINGS),
@@ -364,7 +364,7 @@ def test_values_of_recognition_are_complete():
     assert values('recognition', answered_age=None) == {
         'operation': 'localization',
         'mode': 'robust',
-        'threshold': '1.000',
+        'min_probability': '0.300',
         'window': '20',
         'length': '20',
         'last_status': 'match',

@@ -72,7 +72,7 @@ def places(extractor, features):
 BLANK = (
     dict.fromkeys(('place_index', 'newest_index', 'second_best_index', 'inliers'), -1)
     | dict.fromkeys(('sequence_first', 'sequence_last', 'sequence_middle'), -1)
-    | dict.fromkeys(('distance', 'second_best_distance'), math.nan)
+    | dict.fromkeys(('distance', 'probability', 'second_best_distance'), math.nan)
     | dict.fromkeys(('window_first', 'window_middle', 'window_last'), HEADER.stamp)
     | dict.fromkeys(('place_stamp', 'newest_stamp'), Time())
     | dict.fromkeys(('place_id', 'newest_id'), '')
@@ -144,6 +144,12 @@ def test_match_message_of_a_match(places):
          place_id='id 32', newest_id='id 35', inliers=40)  # fmt: skip
 
 
+def test_match_message_of_mode_robust_has_the_probability(places):
+    message = match_message(HEADER, rejected(relative=True, probability=0.75), places)
+    same(message, **SEQUENCE, status=PlaceMatch.NO_MATCH, reason='too far', path=path_of(message),
+         probability=0.75)  # fmt: skip
+
+
 def test_match_message_without_match_has_the_sequence_but_no_place(places):
     message = match_message(HEADER, rejected(inliers=3), places)
     same(message, **SEQUENCE, status=PlaceMatch.NO_MATCH, reason='too far', path=path_of(message),
@@ -153,19 +159,24 @@ def test_match_message_without_match_has_the_sequence_but_no_place(places):
 # ------------------------------------------------ candidates, loop closures, poses
 
 
-def test_candidates_message_lists_places(places):
-    match = rejected(candidates=(Candidate(32, 0.25), Candidate(50, 0.5)))
+@pytest.mark.parametrize(
+    ('relative', 'probabilities'), [(False, [math.nan, math.nan]), (True, [0.75, 0.5])]
+)
+def test_candidates_message_lists_places(places, relative, probabilities):
+    match = rejected(candidates=(Candidate(32, 0.25), Candidate(50, 0.5)), relative=relative)
     message = candidates_message(HEADER, match, places)
     assert message.header == HEADER
     assert message.threshold == pytest.approx(0.3)
     rows = [(c.place_index, c.distance, c.place_stamp.sec, c.place_id) for c in message.candidates]
     assert rows == [(32, 0.25, 33, 'id 32'), (50, 0.5, 51, 'id 50')]
+    found = [candidate.probability for candidate in message.candidates]
+    np.testing.assert_equal(found, probabilities)
 
 
 @pytest.mark.parametrize(('first_image', 'has_poses'), [(55, True), (39, False)])
 def test_loop_closure_message_of_a_match(places, first_image, has_poses):
     """The middle of the window is image first + 2; image 41 has no pose."""
-    match = accepted(image_index=first_image + 4, inliers=9)
+    match = accepted(image_index=first_image + 4, inliers=9, probability=0.75)
     message = loop_closure_message(HEADER, match, places)
     pairs = [(first_image + q, m) for q, m in PATH.tolist()]
     assert [(pair.query_index, pair.place_index) for pair in message.pairs] == pairs
@@ -175,7 +186,7 @@ def test_loop_closure_message_of_a_match(places, first_image, has_poses):
     expected = LoopClosure(
         header=HEADER, query_index=query, query_stamp=Time(sec=query + 1), place_index=32,
         place_stamp=Time(sec=33), has_poses=has_poses, distance=0.25, threshold=message.threshold,
-        inliers=9, pairs=message.pairs,
+        probability=0.75, inliers=9, pairs=message.pairs,
     )  # fmt: skip
     if has_poses:
         expected.query_pose = pose_message(np.array([query, query**2, 0, 0, 0, 0, 1]))
@@ -284,7 +295,9 @@ def test_map_info_message_of_a_growing_map_and_of_none(extractor, features):
 # ------------------------------------------------ drawn images
 
 
-def test_match_image_shows_status_place_and_distance(monkeypatch, extractor, features):
+def test_match_image_shows_status_place_and_distance_or_probability(
+    monkeypatch, extractor, features
+):
     query, image = route_images(2)
     route = GrowingMap(extractor.settings, extractor.projection, 40)
     for i in range(40):
@@ -298,9 +311,11 @@ def test_match_image_shows_status_place_and_distance(monkeypatch, extractor, fea
     monkeypatch.setattr(overlay, 'match_image', draw)
     overlay.draw_match(accepted(image=query, inliers=20), route)
     overlay.draw_match(rejected(image=query), route)
+    overlay.draw_match(rejected(image=query, inliers=3, relative=True, probability=0.934), route)
     overlay.draw_match(Match(Status.SKIPPED, 'because', image=query), None)
     assert texts == [
         (False, 'match: place 35, distance 0.250 (threshold 0.300), 20 inliers', True),
         (True, 'no match: place 32, distance 0.250 (threshold 0.300)', False),
+        (True, 'no match: place 32, p 0.93, 3 inliers', False),
         (False, 'skipped because', False),
     ]

@@ -131,7 +131,7 @@ def test_node_with_changing_parameters_publishes_one_match_per_image(robot, star
     start(queue_size=1000)
     before, count, futures = len(robot.answers), 60, []
     changes = [
-        ('threshold', (0.1, 0.3)),
+        ('min_probability', (0.1, 0.3)),
         ('max_rate', (10.0, 0.0)),
         ('verbosity', ('warn', 'info')),
     ]

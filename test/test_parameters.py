@@ -78,7 +78,7 @@ def test_default_values_give_default_settings():
         ('vertical', True, 'spatial.vertical', True),
         ('sequence_length', 7, 'sequence.length', 7),
         ('beta', 3.0, 'sequence.beta', 3.0),
-        ('threshold', 0.3, 'threshold', 0.3),
+        ('min_probability', 0.25, 'applied_threshold', 0.75),
         ('keyframe_interval', 1.5, 'keyframes.interval', 1.5),
         ('keyframe_distance', 2.5, 'keyframes.distance', 2.5),
         ('keyframe_angle', 3.5, 'keyframes.angle', 3.5),
@@ -92,11 +92,23 @@ def test_node_settings_of_value_contain_it(name, value, attribute, expected):
     assert setting == expected
 
 
+@pytest.mark.parametrize(('threshold', 'applied'), [(0.25, 0.25), (-1.0, None)])
+def test_threshold_in_mode_paper_is_applied_instead_of_min_probability(threshold, applied):
+    values = {'mode': 'paper', 'threshold': threshold, 'min_probability': 0.9}
+    assert node_settings(DEFAULTS | values).pipeline.applied_threshold == applied
+
+
 @pytest.mark.parametrize(
     ('values', 'words'),
     [
         ({'strategy': 'teleport'}, "strategy = 'teleport' is unknown: take one of adaptive"),
-        ({'threshold': 0.0}, 'threshold = 0 would match nothing'),
+        ({'mode': 'paper', 'threshold': 0.0}, 'threshold = 0 would match nothing'),
+        (
+            {'threshold': 0.8},
+            'threshold = 0.8 is of mode paper: .* min_probability = 0.3; set that',
+        ),
+        ({'min_probability': 0.0}, 'min_probability = 0.0 must be above 0 and below 1'),
+        ({'min_probability': 1.0}, 'min_probability = 1.0 must be above 0 and below 1'),
         (
             {'operation': 'loop_closure', 'backend': 'cuda'},
             'backend cuda, precision float32: loop',

@@ -14,6 +14,7 @@ from pipelines import (
     LENGTH,
     localizing,
     mark_saved,
+    MIN_PROBABILITY,
     process,
     recorded,
     save,
@@ -49,13 +50,13 @@ def test_localization_returns_the_matches_of_the_recognizer(
 ):
     pipeline = localizing(map_file, mode=mode, threshold=threshold)
     images = route[20:32] + route_images(4, seed=9)
-    core = PlaceRecognizer(small_map, pipeline.settings.recognition('localization'))
+    core = PlaceRecognizer(small_map, pipeline.settings.recognition())
     matches = process(pipeline, images)
     for i, match in enumerate(matches):
         same_recognition(match, core.update(pipeline.extractor.extract([images[i]])))
         assert match.window_stamps == tuple((j + 1) * SECOND for j in range(max(0, i - 4), i + 1))
         assert (match.image_index, match.first_image_index, match.inliers) == (-1, -1, -1)
-        assert match.threshold == (threshold or 1.0)
+        assert match.threshold == (threshold or 1 - MIN_PROBABILITY)
         assert set(match.stages) == {'decoding', 'extraction', 'matching', 'verification'}
     assert statuses(matches).count(Status.MATCH) >= 8
     assert (pipeline.map_state, pipeline.window_fill, pipeline.missing) == ('loaded', LENGTH, '')
@@ -128,7 +129,7 @@ def test_loop_closure_returns_the_matches_of_the_loop_closer(route, exclude_seco
     pipeline = Pipeline(settings_of(exclude_seconds=exclude_seconds), 'loop_closure')
     images = route[:40] * 2
     core = LoopCloser(
-        replace(pipeline.settings.recognition('loop_closure'), threshold=0.8),
+        pipeline.settings.recognition(),
         EXCLUDED,
         pipeline.extractor.settings,
         limit=20000,
@@ -142,7 +143,7 @@ def test_loop_closure_returns_the_matches_of_the_loop_closer(route, exclude_seco
         assert match.first_image_index == max(0, i - LENGTH + 1)
         if match.sequence is not None:
             assert match.path[:, 1].max() <= i - max(EXCLUDED, exclude_seconds)
-        if i >= 40 + LENGTH:
+        if i >= 40 + 2 * LENGTH:
             assert (match.status, match.newest_index) == (Status.MATCH, i - 40)
     assert (pipeline.map_state, len(pipeline.places)) == ('growing', 80)
 
@@ -266,9 +267,9 @@ def test_change_of_operation_that_fails_changes_nothing(map_file, route):
         ('mapping', InputError, 'a map of 60 places does not fit'),
     ):
         with pytest.raises(error, match=words):
-            pipeline.change(replace(pipeline.settings, threshold=1e-9), name)
+            pipeline.change(replace(pipeline.settings, min_probability=0.9), name)
         assert (pipeline.operation, pipeline.places) == ('localization', places)
-        assert (pipeline.window_fill, pipeline.threshold) == (LENGTH, 1.0)
+        assert (pipeline.window_fill, pipeline.threshold) == (LENGTH, 1 - MIN_PROBABILITY)
     assert process(pipeline, route[5:6], first=5)[0].newest_index == 5
     pipeline.change(operation='localization')  # the current one: the window stays
     assert process(pipeline, route[6:7], first=6)[0].newest_index == 6

@@ -11,6 +11,7 @@ from pipelines import (
     LENGTH,
     localizing,
     message,
+    MIN_PROBABILITY,
     process,
     recorded,
     save,
@@ -29,22 +30,25 @@ from stavpr_ros.recognition.verification import GeometricSettings, GeometricVeri
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 
+CERTAIN = 7  # images after which the place is probable, in loop closure, too
 
-@pytest.mark.parametrize(('operation', 'default'), [('localization', 1.0), ('loop_closure', 0.8)])
-def test_threshold_and_candidates_change_with_a_full_window(operation, default, route):
+
+@pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
+def test_min_probability_and_candidates_change_with_a_full_window(operation, route):
     pipeline = recorded(route, operation, candidates=3)
-    match = process(pipeline, route[:LENGTH])[-1]
+    match = process(pipeline, route[:CERTAIN])[-1]
     assert (match.status, len(match.candidates)) == (Status.MATCH, 3)
     assert match.candidates[0].place == match.sequence.middle
-    pipeline.change(replace(pipeline.settings, threshold=1e-9, candidates=0))
-    match = process(pipeline, route[5:6], first=5)[0]
-    assert (match.status, match.threshold, match.candidates) == (Status.NO_MATCH, 1e-9, ())
-    pipeline.change(replace(pipeline.settings, threshold=None, candidates=1))
-    match = process(pipeline, route[6:7], first=6)[0]  # the default of mode robust
-    assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 6, default)
+    strict = 1 - 1e-9
+    pipeline.change(replace(pipeline.settings, min_probability=strict, candidates=0))
+    match = process(pipeline, route[7:8], first=7)[0]
+    assert (match.status, match.threshold, match.candidates) == (Status.NO_MATCH, 1 - strict, ())
+    pipeline.change(replace(pipeline.settings, min_probability=0.1, candidates=1))
+    match = process(pipeline, route[8:9], first=8)[0]
+    assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 8, 0.9)
     assert len(match.candidates) == 1
     pipeline.list_candidates = False
-    assert process(pipeline, route[7:8], first=7)[0].candidates == ()
+    assert process(pipeline, route[9:10], first=9)[0].candidates == ()
 
 
 def test_live_settings_keep_a_growing_map_and_the_last_keyframe(route):
@@ -68,7 +72,7 @@ def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
         Status.WARMING_UP, Status.SKIPPED, Status.SKIPPED, *[Status.WARMING_UP] * 3, Status.MATCH
     ]  # fmt: skip
     assert matches[1].cause == 'not a keyframe'
-    assert {match.threshold for match in matches} == {1.0}
+    assert {match.threshold for match in matches} == {1 - MIN_PROBABILITY}
     assert 'differs by 0.0000' in matches[1].reason
     assert matches[-1].window_stamps == tuple(stamp * SECOND for stamp in (1, 4, 5, 6, 7))
     pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(interval=2.0)))
@@ -87,25 +91,25 @@ def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
 def test_geometric_check_accepts_and_rejects(operation, route):
     pipeline = recorded(route, operation, candidates=2)
-    assert {match.inliers for match in process(pipeline, route[:LENGTH])} == {-1}
+    assert {match.inliers for match in process(pipeline, route[:CERTAIN])} == {-1}
     check = GeometricSettings(min_inliers=100)
     pipeline.change(replace(pipeline.settings, geometric=check))
-    accepted = process(pipeline, route[5:6], first=5)[0]
-    assert (accepted.status, accepted.reason, accepted.newest_index) == (Status.MATCH, '', 5)
-    thumbnail = pipeline.places.thumbnail(5)
-    assert accepted.inliers == GeometricVerifier(check).inliers(route[5], thumbnail) >= 100
+    accepted = process(pipeline, route[7:8], first=7)[0]
+    assert (accepted.status, accepted.reason, accepted.newest_index) == (Status.MATCH, '', 7)
+    thumbnail = pipeline.places.thumbnail(7)
+    assert accepted.inliers == GeometricVerifier(check).inliers(route[7], thumbnail) >= 100
     for more, status in ((0, Status.MATCH), (1, Status.NO_MATCH)):  # the same images again
         pipeline.reset()
-        process(pipeline, route[:LENGTH])
+        process(pipeline, route[:CERTAIN])
         just = replace(check, min_inliers=accepted.inliers + more)
         pipeline.change(replace(pipeline.settings, geometric=just))
-        match = process(pipeline, route[5:6], first=5)[0]
+        match = process(pipeline, route[7:8], first=7)[0]
         assert (match.status, match.inliers) == (status, accepted.inliers)
-    assert (match.place_index, match.sequence.middle % 30) == (-1, 3)
+    assert (match.place_index, match.sequence.middle % 30) == (-1, 5)
     assert f'{match.inliers} inliers are fewer than {match.inliers + 1}' in match.reason
-    assert len(match.candidates) == 2
+    assert match.candidates[0].place == match.sequence.middle
     pipeline.change(replace(pipeline.settings, geometric=None))
-    assert statuses(process(pipeline, route[7:8])) == [Status.MATCH]
+    assert statuses(process(pipeline, route[8:9])) == [Status.MATCH]
 
 
 def test_geometric_check_rejects_without_thumbnails(small_map, route, tmp_path):

@@ -229,7 +229,7 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
     except InputError as error:
         print(f'no threshold is suggested for mode paper: {error}')
         return
-    print(f'suggested threshold for mode paper: {suggestion.threshold:.3f} (mode robust: 1)')
+    print(f'suggested threshold for mode paper: {suggestion.threshold:.3f}')
 
 
 def main(args: list[str] | None = None) -> int:

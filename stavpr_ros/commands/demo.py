@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import InputError, SettingsError, SourceError, StavprError
+from stavpr_ros.parameters import BY_NAME
 
 if TYPE_CHECKING:
     from stavpr_ros.demonstration.recordings import LoopTraverse, TraversePair
@@ -33,7 +34,7 @@ EPILOG = """
 examples:
   demo
   demo --map monday/ --query tuesday/ --truth identity --tolerance 3
-  demo --map monday.bag --query tuesday.bag --topic /camera/image_raw --threshold 0.2
+  demo --map monday.bag --query tuesday.bag --topic /camera/image_raw --min-probability 0.8
   demo --loop synthetic
   demo --loop round/ --truth closures.png --exclude-places 100
 
@@ -65,8 +66,12 @@ def _parser() -> argparse.ArgumentParser:
         '(%(default)s)')  # fmt: skip
     add('--mode', default='robust', choices=('paper', 'robust'), help='of the node (%(default)s)')
     add(
-        '--threshold', type=float,
-        help='of the node (robust: 1, with --loop 0.8; paper: estimated from the first traverse)',
+        '--min-probability', type=float, default=BY_NAME['min_probability'].default, metavar='P',
+        help='of the node, mode robust: matches have a greater probability (%(default)g)',
+    )  # fmt: skip
+    add(
+        '--threshold', type=float, metavar='DISTANCE',
+        help='of the node, mode paper (estimated from the first traverse)',
     )  # fmt: skip
     add(
         '--exclude-places', type=int, metavar='N',
@@ -82,8 +87,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """Reject options that contradict each other."""
-    if arguments.threshold is not None and not arguments.threshold > 0:
-        parser.error(f'--threshold {arguments.threshold} must be above 0')
+    _check_limits(parser, arguments)
     for name, least in (('tolerance', 0), ('exclude_places', 1), ('sequence_length', 2)):
         value = getattr(arguments, name)
         if value is not None and value < least:
@@ -107,6 +111,18 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         parser.error('--truth goes with --map and --query')
     if truth not in (None, 'identity'):
         parser.error(f'--truth {truth}: expected identity; files are for --loop, and for evaluate')
+
+
+def _check_limits(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    least, threshold = arguments.min_probability, arguments.threshold
+    if not 0 < least < 1:
+        parser.error(f'--min-probability {least} must be above 0 and below 1')
+    if threshold is None:
+        return
+    if arguments.mode != 'paper':
+        parser.error('--threshold is of mode paper: give --min-probability in mode robust')
+    if not threshold > 0:
+        parser.error(f'--threshold {threshold} must be above 0')
 
 
 def _print(text: object) -> None:
@@ -151,14 +167,21 @@ def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair
     return own_pair(arguments.map, arguments.query, arguments.topic, identity, length)
 
 
-def _threshold(place_map: 'PlaceMap', mode: str, given: float | None) -> float:
-    from stavpr_ros.recognition.robust import THRESHOLD
+def _limit(arguments: argparse.Namespace, threshold: float | None) -> dict[str, object]:
+    """Return the parameters of the node that decide what is a match."""
+    if arguments.mode == 'robust':
+        return {'mode': 'robust', 'min_probability': arguments.min_probability}
+    return {'mode': 'paper', 'threshold': threshold}
+
+
+def _threshold(place_map: 'PlaceMap', arguments: argparse.Namespace) -> float:
+    """Return the distance below which a window is matched."""
     from stavpr_ros.recognition.threshold import suggest_threshold
 
-    if given is not None:
-        return given
-    if mode == 'robust':
-        return THRESHOLD
+    if arguments.mode == 'robust':
+        return 1 - arguments.min_probability
+    if arguments.threshold is not None:
+        return arguments.threshold
     try:
         threshold = suggest_threshold(place_map, progress=True).threshold
     except InputError as error:
@@ -180,7 +203,7 @@ def _localization(arguments: argparse.Namespace, folder: Path) -> None:
     _print(f'2. The map of the first traverse: {map_path}')
     place_map = pair.reference.build_map(make_extractor(arguments), _skip)
     save_map(place_map, map_path)
-    threshold = _threshold(place_map, arguments.mode, arguments.threshold)
+    threshold = _threshold(place_map, arguments)
 
     _print('3. The second traverse through the node, over ROS, with a replay and a recorder')
     query = pair.query.build_map(place_map.extractor(), _skip)
@@ -188,8 +211,7 @@ def _localization(arguments: argparse.Namespace, folder: Path) -> None:
         _require_all(query, len(pair.true_places))
     parameters = {
         'map_path': map_path,
-        'mode': arguments.mode,
-        'threshold': threshold,
+        **_limit(arguments, threshold),
         'sequence_length': length,
         'keyframe_change': 0.0,  # every image is evaluated
     }
@@ -216,7 +238,6 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
     """Find the loop closures of one traverse."""
     from stavpr_ros.commands.feature_options import make_extractor
     from stavpr_ros.demonstration.loops import draw_loops, read_result
-    from stavpr_ros.recognition.robust import THRESHOLD
     from stavpr_ros.ros.live import run_live
 
     exclude = arguments.exclude_places or EXCLUDE_PLACES
@@ -239,8 +260,7 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
     parameters = {
         'operation': 'loop_closure',
         'map_path': features,
-        'mode': arguments.mode,
-        'threshold': arguments.threshold or THRESHOLD,
+        **_limit(arguments, arguments.threshold),
         'sequence_length': length,
         'exclude_places': exclude,
         'geometric_check': arguments.geometric_check or GEOMETRIC_CHECK,

@@ -11,6 +11,7 @@ from typing import Any, TYPE_CHECKING
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import require_room
+from stavpr_ros.parameters import BY_NAME
 
 if TYPE_CHECKING:
     from stavpr_ros.commands.evaluate_sequences import Sequences
@@ -148,6 +149,9 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group('method').add_argument
     mode = 'paper: as published; robust: with mitigations of failure modes (%(default)s)'
     add('--mode', choices=('paper', 'robust'), default='robust', help=mode)
+    least = 'mode robust: matches have a greater probability (%(default)g)'
+    default = BY_NAME['min_probability'].default
+    add('--min-probability', type=float, default=default, metavar='P', help=least)
     length = 'images in a window (%(default)s)'
     add('--sequence-length', type=int, default=20, metavar='L', help=length)
     add('--beta', type=float, default=2.0, help='places per image of a window (%(default)g)')
@@ -208,7 +212,7 @@ def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Nam
 
 def node_settings(arguments: argparse.Namespace) -> 'PipelineSettings':
     """
-    Return the settings of the parsed options as the node has them, without a given threshold.
+    Return the settings of the parsed options as the node has them, without a threshold.
 
     :raises SettingsError: one is out of its range.
     """
@@ -217,6 +221,7 @@ def node_settings(arguments: argparse.Namespace) -> 'PipelineSettings':
 
     return PipelineSettings(
         mode=arguments.mode,
+        min_probability=arguments.min_probability,
         spatial=SpatialSettings(
             arguments.strategy, arguments.sigma, arguments.xi, arguments.vertical
         ),
@@ -258,7 +263,8 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
         *('map', 'query', 'dataset', 'topic', 'unknown', 'loop_closure', 'exclude_places', 'warp'),
         *('remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
         *('crop_map', 'crop_query', 'truth', *poses),
-        *('mode', 'sequence_length', 'beta', 'strategy', 'sigma', 'xi', 'vertical', 'nms_radius'),
+        *('mode', 'min_probability', 'sequence_length', 'beta', 'nms_radius'),
+        *('strategy', 'sigma', 'xi', 'vertical'),
         *('backend', 'precision'),
     ]
     settings: dict[str, Any] = {}
@@ -269,10 +275,6 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
     return {**settings, 'tolerance': sequences.tolerance, 'features': features}
 
 
-def _operation(arguments: argparse.Namespace) -> str:
-    return 'loop_closure' if arguments.loop_closure else 'localization'
-
-
 def _report(arguments: argparse.Namespace) -> 'Report':
     from stavpr_ros.commands.evaluate_sequences import load_sequences
     from stavpr_ros.evaluation.extra import import_extra
@@ -280,10 +282,10 @@ def _report(arguments: argparse.Namespace) -> 'Report':
 
     began = time.perf_counter()
     import_extra('sklearn.metrics')  # an error before the work, not after it
-    settings, operation = node_settings(arguments), _operation(arguments)
+    settings = node_settings(arguments)
     sequences = load_sequences(arguments)
     loaded = time.perf_counter()
-    evaluation = _evaluate(arguments, sequences, settings.recognition(operation))
+    evaluation = _evaluate(arguments, sequences, settings.recognition())
     ended = time.perf_counter()
     milliseconds = evaluation.results.seconds * 1e3
     times = {
@@ -301,7 +303,7 @@ def _report(arguments: argparse.Namespace) -> 'Report':
         settings=_settings_json(arguments, sequences),
         times=times,
         drive=sequences.drive,
-        default_threshold=settings.applied_threshold(operation),
+        default_threshold=settings.applied_threshold,
         window=arguments.window,
     )
 

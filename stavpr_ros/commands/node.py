@@ -9,8 +9,7 @@ from stavpr_ros.parameters import PARAMETERS
 from stavpr_ros.signals import interrupted, obey_signals
 from stavpr_ros.threads import wait_passively
 
-HELP = """usage: node [--ros-args -p map_path:=FILE -p threshold:=VALUE [-p NAME:=VALUE ...]
-            [-r image:=TOPIC]]
+HELP = """usage: node [--ros-args -p map_path:=FILE [-p NAME:=VALUE ...] [-r image:=TOPIC]]
 
 A lifecycle node that configures and activates itself. It recognizes the places of the images on
 the topic `image` (sensor_msgs/Image) on the route of a map (operation localization), records a map

@@ -3,7 +3,7 @@
 """Evaluation of the matches that a node published for one traverse, as ``record`` wrote them."""
 
 from dataclasses import dataclass
-from math import nan
+from math import isnan, nan
 from typing import Any
 
 import numpy as np
@@ -89,7 +89,14 @@ def match_of(record: dict[str, Any]) -> Match:
         sequence = SequenceMatch(
             first, last, record['sequence_middle'], record['distance'], -1, nan
         )
-    return Match(Status[record['status']], sequence=sequence, path=path)
+    probability = nan if record['probability'] is None else record['probability']
+    return Match(
+        Status[record['status']],
+        sequence=sequence,
+        path=path,
+        relative=not isnan(probability),
+        probability=probability,
+    )
 
 
 def evaluate_records(

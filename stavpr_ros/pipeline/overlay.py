@@ -16,7 +16,7 @@ _INK, _PAPER, _EMPTY = (32, 34, 38), (250, 250, 248), (226, 226, 222)
 
 def draw_match(match: Match, places: PlaceMap | GrowingMap | None) -> np.ndarray:
     """
-    Draw an image beside its nearest place, with status and distance.
+    Draw an image beside its nearest place, with status and probability, or distance.
 
     :returns: RGB, uint8.
     """
@@ -26,8 +26,12 @@ def draw_match(match: Match, places: PlaceMap | GrowingMap | None) -> np.ndarray
             match.image, None, f'{match.status.label} {match.reason}'.strip(), False
         )
     place = match.newest_index if match.accepted else match.sequence.middle
-    text = f'{match.status.label}: place {place}, distance {match.distance:.3f}'
-    if not math.isnan(match.threshold):
+    text = f'{match.status.label}: place {place}, '
+    if match.relative:
+        text += f'p {match.probability:.2f}'
+    else:
+        text += f'distance {match.distance:.3f}'
+    if not (match.relative or math.isnan(match.threshold)):
         text += f' (threshold {match.threshold:.3f})'
     if match.inliers >= 0:
         text += f', {match.inliers} inliers'

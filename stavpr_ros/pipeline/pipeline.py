@@ -49,7 +49,7 @@ class Pipeline:
         self._extractor: FeatureExtractor | None = None
         self._operation: Operation | None = None
         self._name = operation
-        self.threshold = settings.applied_threshold(operation)
+        self.threshold = settings.applied_threshold
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
         self._last: Match | None = None
@@ -118,7 +118,8 @@ class Pipeline:
         Change settings, operation and map, all or nothing; None keeps the current one.
 
         A route that was recorded becomes the map of the next operation. Settings alone cannot fail
-        when they differ in threshold, keyframes, candidates and geometric check only.
+        when they differ in threshold, min_probability, keyframes, candidates and geometric check
+        only.
 
         :param settings: other settings than these take effect with the next operation or map.
         :param loaded: the map to localize on, to extend, or (loop closure) whose kind of features
@@ -128,7 +129,7 @@ class Pipeline:
         """
         settings, name = settings or self.settings, operation or self._name
         settings.require_operation(name)
-        threshold, before = settings.applied_threshold(name), self.threshold
+        threshold, before = settings.applied_threshold, self.threshold
         if loaded is not None or name != self._name:
             self._require_no_loss(name, loaded)
             self._start(name, settings, loaded)

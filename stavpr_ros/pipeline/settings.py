@@ -15,7 +15,7 @@ from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.loop_closer import least_limit
-from stavpr_ros.recognition.robust import options_of, THRESHOLD
+from stavpr_ros.recognition.robust import MIN_PROBABILITY, options_of
 from stavpr_ros.recognition.verification import GeometricSettings
 
 OPERATIONS = ('localization', 'mapping', 'loop_closure')
@@ -28,8 +28,9 @@ class PipelineSettings:
 
     Fields that are not explained here are parameters, see :mod:`stavpr_ros.parameters`.
 
-    :param threshold: a window is matched when its distance is below it; None = the default of the
-        mode, mode paper has none.
+    :param threshold: mode paper: a window is matched when its distance is below it; None = not
+        set.
+    :param min_probability: mode robust: a window is matched when its probability is above it.
     :param features: kind of the features of a route that starts without a map.
     :param feature_settings: settings of that kind as a JSON object, '' = its defaults.
     :param candidates: nearest places that every match lists.
@@ -38,6 +39,7 @@ class PipelineSettings:
     """
 
     threshold: float | None = None
+    min_probability: float = MIN_PROBABILITY
     spatial: SpatialSettings = field(default_factory=SpatialSettings)
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
     nms_radius: int = 20
@@ -56,6 +58,16 @@ class PipelineSettings:
     geometric: GeometricSettings | None = None
 
     def __post_init__(self) -> None:
+        if not 0 < self.min_probability < 1:
+            raise SettingsError(
+                f'min_probability = {self.min_probability} must be above 0 and below 1'
+            )
+        if self.threshold is not None and self._has_probability:
+            raise SettingsError(
+                f'threshold = {self.threshold} is of mode paper: mode {self.mode} matches above '
+                f'the probability min_probability = {self.min_probability}; set that, and leave '
+                'threshold negative = not set'
+            )
         if self.threshold == 0:
             raise SettingsError(
                 'threshold = 0 would match nothing: set it above 0, or negative = not set'
@@ -63,19 +75,21 @@ class PipelineSettings:
         settings_class(self.features)  # rejects an unknown kind
         if self.feature_settings:
             settings_from_json(self.features, self.feature_settings)
-        self.recognition('localization')
+        self.recognition()
 
-    def applied_threshold(self, operation: str) -> float | None:
-        """Return the threshold in force; distances of mode robust mean the same on every route."""
-        if self.threshold is not None:
-            return self.threshold
-        if not options_of(self.mode).place_filter:
-            return None
-        return THRESHOLD
+    @property
+    def _has_probability(self) -> bool:
+        """Matches have a probability, and distances are 1 - probability."""
+        return options_of(self.mode).place_filter
 
-    def recognition(self, operation: str) -> RecognizerSettings:
+    @property
+    def applied_threshold(self) -> float | None:
+        """Return the distance below which a window is matched, None = not set."""
+        return 1 - self.min_probability if self._has_probability else self.threshold
+
+    def recognition(self) -> RecognizerSettings:
         """Return settings of the recognizer; without a threshold, with one that is not applied."""
-        threshold = self.applied_threshold(operation) or THRESHOLD
+        threshold = self.applied_threshold or 1.0
         return RecognizerSettings(
             threshold, self.spatial, self.sequence, self.nms_radius, self.mode
         )

@@ -55,7 +55,7 @@ def start_operation(
             return None
         recognizer = PlaceRecognizer(
             place_map,
-            settings.recognition(name),
+            settings.recognition(),
             settings.matching_backend(name),
             settings.precision,
         )
@@ -86,7 +86,7 @@ def _loop_closer(
     settings: PipelineSettings, exclude: int, extractor: FeatureExtractor
 ) -> LoopCloser:
     return LoopCloser(
-        settings.recognition('loop_closure'),
+        settings.recognition(),
         exclude,
         extractor.settings,
         limit=settings.max_places,

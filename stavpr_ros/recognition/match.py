@@ -56,9 +56,8 @@ class Match:
     :param threshold: a window is matched below it; NaN = not set.
     :param sequence: the nearest sequence of the map, accepted or not; None where there is none.
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
-    :param relative: distances are scores of mode robust, with memory and with the chance level at
-        1 (:mod:`stavpr_ros.recognition.robust`).
-    :param probability: that the nearest sequence is the right place; NaN = unknown.
+    :param relative: distances are those of mode robust, 1 - probability.
+    :param probability: that the nearest sequence is the right place; NaN = unknown (mode paper).
     :param window_stamps: stamps (ns) of the images in the window, oldest first, this one the last.
     :param image_index: place of a growing map that this image has become, -1 = none.
     :param inliers: of the geometric verification, -1 = not verified.
@@ -105,15 +104,13 @@ class Match:
         Distance of the nearest sequence, accepted or not; NaN without one.
 
         In mode paper, q_m of LM-DTW: a mean image distance of this window alone. In mode robust
-        (``relative``), a score with memory from 0 (certain) to 1 (chance level): see
-        :mod:`stavpr_ros.recognition.robust`. Successive scores are correlated, since hysteresis
-        keeps strong evidence for some images; they are not independent measurements.
+        (``relative``), 1 - probability, which has memory: successive values are correlated.
         """
         return self.sequence.distance if self.sequence else math.nan
 
     @property
     def score(self) -> float:
-        """Return the distance; +inf without a sequence, or not below the chance level."""
+        """Return the distance; +inf without a sequence, or without any probability."""
         if self.sequence is None or (self.relative and self.sequence.distance >= 1):
             return math.inf
         return self.sequence.distance
@@ -148,7 +145,7 @@ def ranked_candidates(
         return []
     costs, places = sequences[0].copy(), sequences[1]
     found = [Candidate(nearest.middle, nearest.distance)]
-    while len(found) < count:
+    while len(found) < count and len(costs):
         costs[np.abs(places - found[-1].place) <= nms_radius] = np.inf
         at = int(np.argmin(costs))
         cost = float(costs[at])

@@ -125,13 +125,14 @@ def _map_values(health: Health) -> dict[str, Value]:
 
 
 def _recognition_values(health: Health) -> dict[str, Value]:
-    counts = health.counts
+    counts, settings = health.counts, health.settings.pipeline
+    limit = 'min_probability' if settings.mode == 'robust' else 'threshold'
     return {
         'operation': health.settings.operation,
-        'mode': health.settings.pipeline.mode,
-        'threshold': health.settings.pipeline.applied_threshold(health.settings.operation),
+        'mode': settings.mode,
+        limit: getattr(settings, limit),
         'window': health.window,
-        'length': health.settings.pipeline.sequence.length,
+        'length': settings.sequence.length,
         'last_status': counts.status or None,
         'last_reason': counts.reason or None,
         'last_place': counts.place if counts.place >= 0 else None,

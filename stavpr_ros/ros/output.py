@@ -76,6 +76,7 @@ def match_message(
         newest_index=match.image_index if match.status is Status.MAPPED else match.newest_index,
         distance=match.distance,
         threshold=match.threshold,
+        probability=match.probability,
         sequence_first=-1,
         sequence_last=-1,
         sequence_middle=-1,
@@ -117,6 +118,7 @@ def candidates_message(
             PlaceCandidate(
                 place_index=candidate.place,
                 distance=candidate.distance,
+                probability=1 - candidate.distance if match.relative else math.nan,
                 place_stamp=time_message(place.stamp),
                 place_id=place.identifier,
             )
@@ -150,6 +152,7 @@ def loop_closure_message(
         place_stamp=time_message(place.stamp),
         distance=match.distance,
         threshold=match.threshold,
+        probability=match.probability,
         inliers=match.inliers,
         pairs=pairs,
     )
