@@ -148,7 +148,7 @@ def ranked_candidates(
         return []
     costs, places = sequences[0].copy(), sequences[1]
     found = [Candidate(nearest.middle, nearest.distance)]
-    while len(found) < count:
+    while len(costs) and len(found) < count:
         costs[np.abs(places - found[-1].place) <= nms_radius] = np.inf
         at = int(np.argmin(costs))
         cost = float(costs[at])
