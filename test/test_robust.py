@@ -15,6 +15,7 @@ from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import extract_features, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.recognition.place_filter import CLOSE
 from stavpr_ros.recognition.robust import (
     MeanCentering,
     MEMORY,
@@ -193,8 +194,8 @@ def test_recognizer_without_one_option_finds_places(small_map, without, strategy
     assert np.mean(np.abs(np.array(middles) - np.arange(12, 28)) <= 1) > 0.9
     assert int(np.argmin(one.newest_row())) == 29
     places, distances = one.candidates(7)
-    assert places[0] == answers[-1].sequence.middle
-    assert len(set(places.tolist())) == len(places) == 7
+    assert abs(places[0] - answers[-1].sequence.middle) <= CLOSE
+    assert len(set(places.tolist())) == len(places) >= 5
     assert (np.diff(distances) >= 0).all()
 
 
