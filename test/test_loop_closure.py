@@ -13,13 +13,13 @@ from stavpr_ros.alignment.spatial import adaptive_weights
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition import RecognizerSettings, Status
+from stavpr_ros.recognition.image_change import ImageChange
 from stavpr_ros.recognition.loop_closer import (
     choose_loop_backend,
     EVICTED,
     LEAST_PLACES,
     LoopCloser,
 )
-from stavpr_ros.recognition.image_change import ImageChange
 from stavpr_ros.recognition.place_filter import CLOSE, FilterSettings, PlaceFilter
 from stavpr_ros.recognition.robust import MEMORY, MIN_DEVIATION, PAPER, PRIOR, ROBUST, THRESHOLD
 from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures

@@ -126,7 +126,9 @@ def assert_belief_equal(one, plain, n, images_ago):
     np.testing.assert_allclose(found.probabilities, np.minimum(close, 1), rtol=1e-4, atol=1e-5)
     for place, (p, *way) in ways.items():
         assert found.ways[place].tolist() == way, (place, p)
-        places = [-1 if state is None else state[2] for state in plain.way(tuple(way[:3]), images_ago)]
+        places = [
+            -1 if state is None else state[2] for state in plain.way(tuple(way[:3]), images_ago)
+        ]
         np.testing.assert_array_equal(one.way(np.array(way), images_ago), places)
 
 

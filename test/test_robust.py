@@ -294,7 +294,9 @@ def test_hallway_loop_is_closed(traverses, data_folder):
     closer = LoopCloser(RecognizerSettings(THRESHOLD, mode='robust'), 20, features.settings)
     answers = [closer.update(features[i : i + 1]) for i in range(84)]
     answered = image_matches(answers, 20)
-    score = counts_at(THRESHOLD, answered.distances, truth.accepts(answered.places), truth.has_match)
+    score = counts_at(
+        THRESHOLD, answered.distances, truth.accepts(answered.places), truth.has_match
+    )
     print(f'hallway: precision {score.precision:.3f}, recall {score.recall:.3f}')
     assert score.precision >= 0.95
     assert score.recall >= 0.7

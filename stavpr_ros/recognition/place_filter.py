@@ -164,7 +164,7 @@ class PlaceFilter:
         Advance by an image.
 
         :param z: z-normalized distances to the first m places, (m,), float32; +inf bans a place.
-        :param weight: alpha; 0 = the image says nothing.
+        :param weight: alpha; 0 = the image is no evidence.
         :param speed_weights: relative probability of each speed, (V,).
         """
         s, n = self.settings, len(z)
