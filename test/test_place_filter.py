@@ -133,9 +133,10 @@ def assert_belief_equal(one, plain, n, images_ago):
 
 
 @pytest.mark.parametrize('sizes', [[1] * 5, [5] * 6, [40] * 7, [90] * 9, [6, 8, 9, 12, 5, 5]])
-def test_belief_equals_plain_ways_back(sizes):
+@pytest.mark.parametrize('spread', [0.12, 0.4])  # 0.4: most ways are not straight
+def test_belief_equals_plain_ways_back(sizes, spread):
     """At every turn of the ring, up to the oldest image in it."""
-    s = replace(LIVELY, enter=0.02, spread=0.12)
+    s = replace(LIVELY, enter=0.02, spread=spread)
     one, plain = driven(s, sizes, 2)
     for images_ago in range(LAG + 1):
         assert_belief_equal(one, plain, sizes[-1], images_ago)
