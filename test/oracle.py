@@ -304,6 +304,116 @@ def aligned_index(path: Cells, query_index: int) -> int:
     return middle(min(frames), max(frames))
 
 
+# ------------------------------------------------ the filter of mode robust
+
+
+class PlaceFilter:
+    """
+    Bayes filter over level k, speed v and place y, in plain loops over states.
+
+    An image: the level changes; the speed changes, to likely ones sooner; the camera moves; it may
+    leave the map, over its end or elsewhere, or return to it, anywhere; the image is seen.
+    """
+
+    def __init__(self, settings: Any) -> None:
+        self.settings = settings
+        self.K, self.V = len(settings.levels), len(settings.speeds)
+        self.a: Array = np.zeros((self.K, self.V, 0))
+        self.off = [1 / self.K] * self.K
+        self.images = 0
+        self.came: list[dict[tuple[int, int, int], tuple[int, int] | None]] = []
+
+    def level_change(self, j: int, k: int) -> float:
+        """Return the probability of level k after level j."""
+        if self.K == 1:
+            return 1.0
+        neighbors = [i for i in (j - 1, j + 1) if 0 <= i < self.K]
+        keep = self.settings.keep_level
+        return keep if j == k else (1 - keep) / len(neighbors) if k in neighbors else 0.0
+
+    def speed_change(self, w: int, v: int) -> float:
+        """Return the probability of speed v after speed w, equally likely by the image."""
+        rest = 1 - self.settings.keep_speed
+        return (
+            self.settings.keep_speed * (v == w) + 0.4 * rest * (abs(v - w) == 1)
+            + 0.2 * rest / self.V
+        )  # fmt: skip
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places."""
+        self.a = self.a[:, :, count:]
+        self.came = [
+            {
+                (k, v, y - count): origin and (origin[0], origin[1] - count)
+                for (k, v, y), origin in image.items()
+            }
+            for image in self.came
+        ]
+
+    def update(self, z: Array, alpha: float, likely: Array) -> None:
+        """Advance by an image with z-normalized distances to n places."""
+        s, n, V = self.settings, len(z), self.V
+        levels, speeds = range(self.K), range(V)
+        a: Array = np.zeros((self.K, V, n))
+        kept = min(n, self.a.shape[2])
+        a[:, :, :kept] = self.a[:, :, :kept]
+        off = self.off
+        if not self.images and n:
+            a[:] = s.start / (self.K * V * n)
+            off = [(1 - s.start) / self.K] * self.K
+        off = [sum(off[j] * self.level_change(j, k) for j in levels) for k in levels]
+        b = [
+            [[sum(a[j, v, y] * self.level_change(j, k) for j in levels) for y in range(n)]
+             for v in speeds]
+            for k in levels
+        ]  # fmt: skip
+        sums = [sum(self.speed_change(w, u) * likely[u] for u in speeds) for w in speeds]
+        G = [[self.speed_change(w, v) * likely[v] / sums[w] for v in speeds] for w in speeds]
+        step = [round(v * (self.images + 1)) - round(v * self.images) for v in s.speeds]
+        new: Array = np.zeros_like(a)
+        came: dict[tuple[int, int, int], tuple[int, int] | None] = {}
+        for k in levels:
+            m = [[sum(G[w][v] * b[k][w][y] for w in speeds) for y in range(n)] for v in speeds]
+            birth = off[k] * s.enter / (V * max(n, 1))
+            moved = 0.0
+            for v in speeds:
+                steps = [(1 - 2 * s.spread, step[v]), (s.spread, step[v] + 1)]
+                steps.append((s.spread, max(step[v] - 1, 0)))
+                for y in range(n):
+                    from_places = [(p * m[v][y - r], y - r) for p, r in steps if y >= r]
+                    arrived = sum(p for p, _ in from_places)
+                    moved += arrived
+                    new[k, v, y] = (1 - s.leave) * arrived + birth
+                    came[k, v, y] = None
+                    if (1 - s.leave) * arrived > birth:
+                        place = max(from_places)[1]
+                        near = [w for w in (v - 1, v, v + 1) if 0 <= w < V]
+                        share = {w: self.speed_change(w, v) / sums[w] for w in near}
+                        far = 0.2 * (1 - s.keep_speed) / V
+                        before = max(
+                            near, key=lambda w: (share[w] - far / sums[w]) * b[k][w][place]
+                        )
+                        came[k, v, y] = before, place
+                    if alpha:
+                        mu = s.levels[k]
+                        new[k, v, y] *= np.exp(alpha * (mu * z[y] - mu * mu / 2))
+            on_map = sum(sum(row) for row in b[k])
+            off[k] = off[k] * (1 - s.enter) + s.leave * moved + on_map - moved
+        total = float(new.sum()) + sum(off)
+        self.a, self.off = new / total, [p / total for p in off]
+        self.came.append(came)
+        self.images += 1
+
+    def way(self, state: tuple[int, int, int], images: int) -> list[tuple[int, int, int] | None]:
+        """Return the states of the most probable way to a state, newest first; None = no more."""
+        way: list[tuple[int, int, int] | None] = [state]
+        for image in range(images):
+            last = way[-1]
+            origin = self.came[-1 - image].get(last) if last else None
+            way.append((last[0], *origin) if last and origin else None)
+        return way
+
+
 # ------------------------------------------------ evaluation (section 6)
 
 

@@ -105,7 +105,7 @@ def test_every_configuration_reaches_the_recognizer(tmp_path):
     assert numbers['spatial'] == plain.single.to_json()
     different = ('no_alignment', 'temporal', 'sta_vpr_fast', 'grp', 'ra', 'vanilla', 'robust')
     pairs = [('sta_vpr', other) for other in (*different, 'seqslam', 'spatial')]
-    pairs += [('no_alignment', 'temporal'), ('without_velocity_search', 'robust')]
+    pairs += [('no_alignment', 'temporal'), ('without_place_filter', 'robust')]
     for one, other in pairs:
         assert numbers[one]['threshold'] != numbers[other]['threshold'], (one, other)
 

@@ -9,34 +9,26 @@ import numpy as np
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
-from stavpr_ros.alignment.settings import VelocitySettings
 from stavpr_ros.alignment.spatial import adaptive_weights
-from stavpr_ros.alignment.velocity import best_velocity_match, match_velocities
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition import RecognizerSettings, Status
+from stavpr_ros.recognition.image_change import ImageChange
 from stavpr_ros.recognition.loop_closer import (
     choose_loop_backend,
     EVICTED,
     LEAST_PLACES,
     LoopCloser,
 )
-from stavpr_ros.recognition.robust import (
-    evidence,
-    Hysteresis,
-    MEMORY,
-    MIN_DEVIATION,
-    PAPER,
-    PRIOR,
-    ROBUST,
-    score,
-)
+from stavpr_ros.recognition.place_filter import CLOSE, FilterSettings, PlaceFilter
+from stavpr_ros.recognition.robust import MEMORY, MIN_DEVIATION, PAPER, PRIOR, ROBUST, THRESHOLD
 from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 SHORT = SequenceSettings(length=5, beta=2.0)
 SECOND = 10**9
+LM_DTW = ROBUST.without('mean_centering', 'place_filter')
 
 
 def features_of(strips):
@@ -64,9 +56,8 @@ def laps():
 
 
 def settings_of(robust_options, **changes):
-    mode = 'robust' if robust_options.second_best_margin else 'paper'
     return RecognizerSettings(
-        1.0, sequence=SHORT, nms_radius=5, mode=mode, robust_options=robust_options, **changes
+        THRESHOLD, sequence=SHORT, nms_radius=5, robust_options=robust_options, **changes
     )
 
 
@@ -95,7 +86,7 @@ class PlainCloser:
         self.a = adaptive_weights(W, settings.spatial, np.dtype(np.float32))
         self.mean, self.variance = np.zeros(n, np.float32), np.ones(n, np.float32)
         self.seen = np.full(n, PRIOR, np.float32)
-        self.rows, self.track = [], Hysteresis()
+        self.rows = []
 
     def distances(self, image, last):
         from stavpr_ros.alignment.cpu import dot
@@ -110,23 +101,34 @@ class PlainCloser:
         )
         return out[0]
 
+    def normalized(self, image, first, last):
+        """Return the row of an image to places first..last-1, none if they are too few."""
+        if last - first < LEAST_PLACES:
+            return np.empty(0, np.float32)
+        live = self.distances(image, last)[first:]
+        if self.settings.applied_options.query_znorm:
+            live = (live - live.mean()) / np.float32(max(live.std(), MIN_DEVIATION))
+        if self.settings.applied_options.reference_znorm:
+            self.learn(slice(first, last), live)
+        return live
+
+    def seen_row(self, image, first, last):
+        """Return it z-normalized by place, too."""
+        row = self.normalized(image, first, last)
+        live = slice(first, first + len(row))
+        return (row - self.mean[live]) / np.sqrt(np.maximum(self.variance[live], 1e-6))
+
     def add(self, image, first, last):
         """Return the sequence of an image that may be matched with places first..last-1."""
-        robust_options = self.settings.applied_options
         row = np.full(self.all.shape[1], np.inf, np.float32)
-        if last - first >= LEAST_PLACES:
-            live = self.distances(image, last)[first:]
-            if robust_options.query_znorm:
-                live = (live - live.mean()) / np.float32(max(live.std(), MIN_DEVIATION))
-            row[first:last] = live
-            if robust_options.reference_znorm:
-                self.learn(slice(first, last), live)
+        live = self.normalized(image, first, last)
+        row[first : first + len(live)] = live
         self.rows = [*self.rows, row][-self.settings.sequence.length :]
         if len(self.rows) < self.settings.sequence.length:
             return None
         window = np.stack(self.rows)
         window[:, :first] = np.inf
-        return self.match(window, robust_options)
+        return self.match(window)
 
     def learn(self, live, row):
         self.seen[live] = np.minimum(self.seen[live] + 1, MEMORY)
@@ -136,51 +138,22 @@ class PlainCloser:
             live
         ]
 
-    def match(self, window, robust_options):
+    def match(self, window):
         scale = np.ones_like(self.mean)
-        if robust_options.reference_znorm:
+        if self.settings.applied_options.reference_znorm:
             scale = 1 / np.sqrt(np.maximum(self.variance, 1e-6))
-        if not robust_options.velocity_search:
-            self.found = found = match_sequence(
-                (window - self.mean) * scale, self.settings.sequence
-            )
-            return best_match(found, self.settings.nms_radius)
-        if not (robust_options.query_znorm or robust_options.reference_znorm):
-            known = window[np.isfinite(window)]
-            scale = scale / np.float32(max(known.std() if known.size else 0, MIN_DEVIATION))
-        self.found = found = match_velocities(window, VelocitySettings(), self.mean, scale)
-        return best_velocity_match(found, self.settings.nms_radius)
-
-    def scored(self, nearest):
-        """Return the distances of a sequence and its second best."""
-        if nearest is None or not self.settings.applied_options.second_best_margin:
-            return nearest and (nearest.distance, nearest.second_best_distance)
-        cost, other = nearest.distance, nearest.second_best_distance
-        far = [
-            abs(int(middle) - nearest.middle) > self.settings.nms_radius
-            for distance, middle in zip(self.found.distances, self.found.middles, strict=True)
-            if distance < math.inf
-        ]
-        if sum(far) < 20:
-            other = -0.8 if math.isnan(other) else min(other, -0.8)
-        seen = evidence(cost, other)
-        other = nearest.second_best_distance
-        if self.settings.applied_options.hysteresis:
-            seen = self.track.follow(nearest.middle, seen)
-        second = other if math.isnan(other) else score(evidence(other, cost))
-        return score(seen), second
+        found = match_sequence((window - self.mean) * scale, self.settings.sequence)
+        return best_match(found, self.settings.nms_radius)
 
 
 @pytest.mark.parametrize(
     ('options', 'limit', 'exclude', 'sequence'),
     [
-        (ROBUST.without('mean_centering'), 41, 12, SHORT),
-        (ROBUST.without('mean_centering'), 48, 2, SequenceSettings()),
         (PAPER, 64, 12, SHORT),
-        (ROBUST.without('mean_centering', 'velocity_search'), 64, 12, SHORT),
-        (PAPER.only('velocity_search'), 64, 12, SHORT),
+        (LM_DTW, 41, 12, SHORT),
+        (LM_DTW, 48, 2, SequenceSettings()),
     ],
-    ids=['robust', 'robust, default sequence', 'paper', 'lm_dtw', 'velocity search alone'],
+    ids=['paper', 'z-normalized', 'z-normalized, default sequence'],
 )
 def test_loop_closer_with_limit_equals_plain_loop_with_bans(
     laps, options, limit, exclude, sequence
@@ -206,7 +179,8 @@ def test_loop_closer_with_limit_equals_plain_loop_with_bans(
         )
         assert found.second_best_index == expected.second_best_index
         np.testing.assert_array_equal(
-            [found.distance, found.second_best_distance], plain.scored(expected)
+            [found.distance, found.second_best_distance],
+            [expected.distance, expected.second_best_distance],
         )
         assert answer.path[:, 1].min() == found.first >= closer.first
         assert answer.path[-1].tolist() == [sequence.length - 1, found.last]
@@ -280,27 +254,43 @@ def test_route_features_are_centered_by_recent_mean(laps):
     torch.testing.assert_close(route.mean, laps.strips[:, :last].mean(dim=1), atol=1e-6, rtol=0)
 
 
-def blurred(features, seed=0, noise=0.25):
-    noise = noise * torch.randn(
-        features.strips.shape, generator=torch.Generator().manual_seed(seed)
-    )
-    return features_of(torch.nn.functional.normalize(features.strips + noise, dim=2))
-
-
-def test_hysteresis_continues_over_eviction(laps):
-    persistent, alone = (
-        LoopCloser(settings_of(robust_options), 12, laps.settings, limit=160)
-        for robust_options in (ROBUST, ROBUST.without('hysteresis'))
-    )
-    drive(persistent, laps[:157])
-    drive(alone, laps[:157])
-    blur = blurred(laps[157:162])
-    for i in range(5):
-        assert persistent.first == (20 if i > 3 else 0)
-        one, other = persistent.update(blur[i : i + 1]), alone.update(blur[i : i + 1])
-    assert persistent.first == 20
-    assert one.sequence.middle == other.sequence.middle
-    assert one.sequence.distance < other.sequence.distance
+def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
+    """Rows as they are matched with LM-DTW, images' changes, and one filter over all of them."""
+    options, exclude, l = ROBUST.without('mean_centering'), 12, SHORT.length
+    closer = LoopCloser(settings_of(options), exclude, laps.settings, limit=90)
+    plain = PlainCloser(settings_of(options), exclude, laps)
+    s = FilterSettings()
+    change, filtered, first = ImageChange(300, s), PlaceFilter(300, 2, s), 0
+    rows, known = [], []
+    for i in range(len(laps)):
+        answer = closer.update(laps[i : i + 1])
+        if closer.first > first:
+            filtered.evict(closer.first - first)
+            change.evict(closer.first - first)
+            first = closer.first
+        strips = laps.strips[:, first : i + 1].contiguous().numpy()
+        change.learn_newest(strips)
+        places = max(0, i + 1 - first - exclude)
+        z = plain.seen_row(i, first, first + places)
+        seen = change.next_query(strips[:, -1])
+        assert not change.is_standstill(seen)
+        speeds = change.speed_weights(seen) if i else np.ones(len(s.speeds))
+        evidence = change.weight(seen), speeds
+        filtered.update(z, *evidence)
+        rows, known = [*rows, z], [*known, evidence]
+        if i + 1 == l:  # the first window again; it has no places, and so no rows
+            filtered.reset()
+            for row, one in zip(rows, known, strict=True):
+                filtered.update(row, *one)
+        if answer.sequence is None:
+            assert not len(z)
+            continue
+        belief = filtered.belief(len(z), 2)
+        assert answer.probability == pytest.approx(belief.probabilities.max(), abs=1e-4)
+        if answer.accepted:
+            middle = first + int(np.argmax(belief.probabilities))
+            assert answer.place_index == pytest.approx(middle, abs=2)
+    assert first > 0
 
 
 # ------------------------------------------------ seconds
@@ -371,23 +361,22 @@ def test_reset_after_clock_jump_keeps_route(laps):
             assert (i - answer.newest_index) % 60 == 0
 
 
-def test_reset_keeps_znorm_of_places_and_ends_hysteresis(laps):
+def test_reset_keeps_znorm_of_places_and_forgets_place(laps):
     one, other = (LoopCloser(settings_of(ROBUST), 12, laps.settings) for _ in range(2))
     drive(one, laps[:100])
     drive(other, laps[:100])
     one.reset()
-    blur = blurred(laps[100:105])
-    for i in range(5):
-        fresh, tracked = (closer.update(blur[i : i + 1]) for closer in (one, other))
+    for i in range(100, 105):
+        fresh, tracked = (closer.update(laps[i : i + 1]) for closer in (one, other))
         np.testing.assert_array_equal(one.newest_row(), other.newest_row())
     assert fresh.sequence.middle == tracked.sequence.middle == 42
-    assert fresh.sequence.distance > tracked.sequence.distance
+    assert fresh.probability < tracked.probability
 
 
 # ------------------------------------------------ candidates, errors
 
 
-@pytest.mark.parametrize('robust_options', [PAPER, ROBUST, ROBUST.without('velocity_search')])
+@pytest.mark.parametrize('robust_options', [PAPER, ROBUST, ROBUST.without('place_filter')])
 def test_ranked_places_are_numbered_from_start_of_route(laps, robust_options):
     closer = LoopCloser(settings_of(robust_options), 12, laps.settings, limit=200)
     assert closer.ranked(5) == []
@@ -398,10 +387,10 @@ def test_ranked_places_are_numbered_from_start_of_route(laps, robust_options):
             assert ranked == []
             continue
         assert (ranked[0].place, ranked[0].distance) == (nearest.middle, nearest.distance)
-        assert closer.candidates(1)[0].tolist() == [nearest.middle]
+        assert closer.candidates(1)[0] == pytest.approx([nearest.middle], abs=CLOSE)
         if len(ranked) > 1:
             assert ranked[1].place == nearest.second_best_index
-            assert ranked[1].distance == nearest.second_best_distance
+            assert ranked[1].distance == pytest.approx(nearest.second_best_distance, abs=1e-6)
         if i > 220:
             assert {i - 2 - c.place for c in ranked[:2]} < {60, 120, 180}
             assert closer.first > 0

@@ -15,16 +15,14 @@ from stavpr_ros.alignment import (
     SequenceSettings,
     SpatialSettings,
     strip_distances,
-    VelocitySettings,
 )
-from stavpr_ros.alignment.velocity import best_velocity_match, match_velocities
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust import ZNormalization
-from stavpr_ros.recognition.sequence_search import LmDtwSearch, SequenceBuffer, VelocitySearch
+from stavpr_ros.recognition.sequence_search import LmDtwSearch, SequenceBuffer
 import torch
 
 # of a number kept in float16, relative; so also of a product of unit-norm features, at most
@@ -103,12 +101,11 @@ def test_distances_of_features_not_contiguous_are_equal():
 # ------------------------------------------------ the window
 
 
-def window_and_search(n, velocity=False):
+def window_and_search(n):
     """Return an empty window over n places, and its search without z-normalization."""
     sequence = SequenceSettings(5)
     buffer = SequenceBuffer(5, n, sequence.k)
-    search = VelocitySearch if velocity else LmDtwSearch
-    return buffer, search(buffer, ZNormalization(n, False, False))
+    return buffer, LmDtwSearch(buffer, ZNormalization(n, False, False))
 
 
 @pytest.mark.parametrize('n', [1, 7, 100])
@@ -132,24 +129,8 @@ def test_lm_dtw_search_equals_plain_functions(n):
                 np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize('n', [1, 1050])
-def test_velocity_search_equals_plain_functions(n):
-    buffer, search = window_and_search(n, velocity=True)
-    rows = np.random.default_rng(1).random((13, n), np.float32)
-    for i, row in enumerate(rows):
-        buffer.push(torch.from_numpy(row))
-        if buffer.full:
-            found, window = search(3), rows[i - 4 : i + 1]
-            scale = np.full(n, 1 / max(window.std(), np.float32(1e-3)), np.float32)
-            matches = match_velocities(window, VelocitySettings(), np.zeros(n, np.float32), scale)
-            assert repr(found.nearest) == repr(best_velocity_match(matches, 3))
-            np.testing.assert_array_equal(found.sequences()[0], matches.distances)
-            assert found.path[[0, -1], 1].tolist() == [found.nearest.first, found.nearest.last]
-
-
-@pytest.mark.parametrize('velocity', [False, True])
-def test_search_without_places_has_no_match(velocity):
-    buffer, search = window_and_search(0, velocity)
+def test_search_without_places_has_no_match():
+    buffer, search = window_and_search(0)
     for _ in range(5):
         buffer.push(torch.empty(0))
     found = search(3)

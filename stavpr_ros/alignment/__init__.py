@@ -14,7 +14,6 @@ from stavpr_ros.alignment.settings import (
     SequenceSettings,
     SpatialSettings,
     STRATEGIES,
-    VelocitySettings,
 )
 from stavpr_ros.alignment.similarity import holistic_distances, strip_distances
 from stavpr_ros.alignment.spatial import align_images, image_distances
@@ -26,7 +25,6 @@ __all__ = [
     'SequenceMatch',
     'SequenceSettings',
     'SpatialSettings',
-    'VelocitySettings',
     'align_images',
     'align_sequence',
     'aligned_index',

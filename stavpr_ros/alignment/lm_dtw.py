@@ -38,8 +38,8 @@ class SequenceMatch:
 
     :param first: its first map image.
     :param last: its last map image.
-    :param middle: the matched place: floor((first + last) / 2), or in the velocity search the
-        place of the window's middle image.
+    :param middle: the matched place: floor((first + last) / 2), or in mode robust the place of
+        the window's middle image.
     :param distance: its q_m.
     :param second_best_index: midpoint of the nearest sequence outside the nms_radius; -1 if none.
     :param second_best_distance: its distance; NaN if none.

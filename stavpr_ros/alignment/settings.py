@@ -5,7 +5,6 @@
 from dataclasses import dataclass
 import math
 
-import numpy as np
 from stavpr_ros.errors import SettingsError
 
 STRATEGIES = ('adaptive', 'vanilla', 'sliding_window', 'none')
@@ -81,30 +80,3 @@ class SequenceSettings:
     def k(self) -> int:
         """Map images seen by one start: ceil(beta l), which is 55 for 1.1 * 50 as well."""
         return math.ceil(self.beta * self.length - 1e-9)
-
-
-@dataclass(frozen=True)
-class VelocitySettings:
-    """
-    How a window of query images is matched with the map at several speeds.
-
-    :param speeds: places of the map that the query passes an image; each finite and >= 0.
-    :param penalty: cost of moving on by one place more or less than the speed's, in the unit of
-        the distances; >= 0.
-    """
-
-    speeds: tuple[float, ...] = (0.0, 0.5, 0.75, 1.0, 1.33, 2.0)
-    penalty: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not self.speeds or not all(math.isfinite(v) and 0 <= v <= 100 for v in self.speeds):
-            raise SettingsError(
-                f'speeds = {self.speeds} must be one or more numbers from 0 to 100'
-            )
-        if not (math.isfinite(self.penalty) and self.penalty >= 0):
-            raise SettingsError(f'penalty = {self.penalty} must be a finite number >= 0')
-
-    def steps(self, length: int) -> np.ndarray:
-        """Return the places that each speed moves on before each image, shape (V, l), int32."""
-        line = np.floor(np.outer(self.speeds, np.arange(length)) + 0.5).astype(np.int32)
-        return np.diff(line, axis=1, prepend=0)

@@ -131,7 +131,7 @@ class PlaceFilter:
 
     def reset(self) -> None:
         """Forget where the camera was."""
-        self._a[:] = 0
+        self._a[:] = self._next[:] = 0
         self._off = np.full(len(self._levels), 1 / len(self._levels))
         self._count = self._known = 0
 
@@ -164,7 +164,7 @@ class PlaceFilter:
         Advance by an image.
 
         :param z: z-normalized distances to the first m places, (m,), float32; +inf bans a place.
-        :param weight: alpha; 0 = the image says nothing.
+        :param weight: alpha; 0 = the image is no evidence.
         :param speed_weights: relative probability of each speed, (V,).
         """
         s, n = self.settings, len(z)
@@ -191,7 +191,7 @@ class PlaceFilter:
         self._off = off / total
         self._a[:, :, :n] *= np.float32(1 / total)
         if n < self._known:
-            self._a[:, :, n:] = 0
+            self._a[:, :, n:] = self._next[:, :, n:] = 0
         self._known = n
         self._count += 1
 

@@ -1,0 +1,218 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The search of mode robust: matches of a drive at any speed, off the map and standing."""
+
+import numpy as np
+import pytest
+from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition.filter_search import FilterSearch
+from stavpr_ros.recognition.robust import THRESHOLD
+from stavpr_ros.recognition.sequence_search import SequenceBuffer
+import torch
+
+pytestmark = pytest.mark.usefixtures('one_thread')
+PLACES, W, D, LENGTH = 240, 7, 24, 12
+MIDDLE = (LENGTH - 1) // 2
+
+
+def strips_of(seed):
+    """Return a route of PLACES places, each like its neighbors, (W, n, d)."""
+    rng = np.random.default_rng(seed)
+    strips = rng.standard_normal((W, PLACES + 3, D))
+    return sum(strips[:, i : i + PLACES] for i in range(4))
+
+
+def features_of(strips, noise=0.0, seed=0):
+    strips = strips + noise * np.random.default_rng(seed).standard_normal(strips.shape)
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+    return LocalFeatures(
+        torch.from_numpy(strips).float(),
+        torch.ones(strips.shape[:2]),
+        FeatureSettings('gradient', None, W),
+    )
+
+
+@pytest.fixture(scope='module')
+def route():
+    return strips_of(0)
+
+
+@pytest.fixture
+def recognizer(route):
+    features = features_of(route)
+    place_map = PlaceMap(features, None, np.zeros(PLACES, np.int64), ('',) * PLACES)
+    settings = RecognizerSettings(
+        THRESHOLD, sequence=SequenceSettings(LENGTH), nms_radius=10, mode='robust'
+    )
+    return PlaceRecognizer(place_map, settings)
+
+
+def drive(recognizer, strips, noise=1.0, seed=1):
+    features = features_of(strips, noise, seed)
+    return [recognizer.update(features[i : i + 1]) for i in range(len(features))]
+
+
+def at_speed(first, last, speed):
+    return np.rint(np.arange(first, last, speed)).astype(int)
+
+
+@pytest.mark.parametrize('speed', [1 / 3, 0.5, 1, 1.5, 2, 3])
+def test_query_at_other_speed_is_matched(recognizer, route, speed):
+    places = at_speed(20, 230, speed)
+    answers = drive(recognizer, route[:, places])[LENGTH:]
+    middles = places[1 + MIDDLE :][: len(answers)]
+    matched = np.array([answer.place_index for answer in answers])
+    assert np.mean(matched >= 0) > 0.9
+    right = np.abs(matched - middles) <= 2
+    assert right[matched >= 0].mean() > 0.95
+
+
+def test_match_is_path_and_second_best_of_its_window(recognizer, route):
+    answers = drive(recognizer, route[:, 20:120])
+    for answer in answers[: LENGTH - 1]:
+        assert answer.status is Status.WARMING_UP
+    for i, answer in enumerate(answers[LENGTH + 3 :], LENGTH + 3):
+        found, path = answer.sequence, answer.path
+        assert answer.status is Status.MATCH
+        assert path.shape == (LENGTH, 2)
+        assert path[:, 0].tolist() == list(range(LENGTH))
+        assert (np.diff(path[:, 1]) >= 0).all()
+        assert path.min() >= 0
+        assert path[:, 1].max() < PLACES
+        assert (path[0, 1], path[-1, 1]) == (found.first, found.last)
+        assert abs(path[MIDDLE, 1] - found.middle) <= 2
+        assert np.abs(path[:, 1] - np.arange(20 + i - LENGTH + 1, 20 + i + 1)).max() <= 4
+        assert answer.probability == pytest.approx(1 - found.distance)
+        assert 0 <= found.distance <= found.second_best_distance or found.second_best_index < 0
+        if found.second_best_index >= 0:
+            assert abs(found.second_best_index - found.middle) > 10
+        ranked = recognizer.ranked(3)
+        assert [c.place for c in ranked[1:2]] in ([], [answers[-1].sequence.second_best_index])
+
+
+def test_path_at_start_of_map_stays_on_it(recognizer, route):
+    answers = drive(recognizer, route[:, :30])
+    for answer in answers[LENGTH - 1 :]:
+        assert answer.path[:, 1].min() >= 0
+    assert answers[LENGTH + 2].place_index == pytest.approx(3 + MIDDLE, abs=2)
+
+
+def test_standing_camera_changes_no_probability(recognizer, route):
+    features = features_of(route[:, 50:90], 1.0)
+    for i in range(40):
+        before = recognizer.update(features[i : i + 1])
+    for _ in range(100):
+        after = recognizer.update(features[39:40])
+        assert after.status is Status.MATCH
+    # the middle of the window has caught up with the newest image, nothing else has changed
+    assert after.place_index == pytest.approx(before.newest_index, abs=1)
+    assert after.path[0, 1] == after.path[-1, 1]
+    again = recognizer.update(features[39:40])
+    assert repr(again.sequence) == repr(after.sequence)  # NaN like NaN
+
+
+def test_standing_start_is_one_image(route):
+    """The filter after 100 equal images is that after one."""
+    buffer = SequenceBuffer(4, 50, 8)
+    searches = [FilterSearch(buffer) for _ in range(2)]
+    row = np.random.default_rng(0).standard_normal(50).astype(np.float32)
+    for search, images in zip(searches, (1, 100), strict=True):
+        search.change.learn(features_of(route[:, :50]).strips.numpy())
+        for i in range(images):
+            search.update(row, 1.0 if i == 0 else 0.0, standstill=i > 0)
+    one, other = (search.filter for search in searches)
+    assert one.count == other.count == 1
+    np.testing.assert_array_equal(one.places_of_states(), other.places_of_states())
+
+
+def test_equal_images_in_dark_stretch_of_map_move_on(route):
+    """Without evidence, at the speed before: the camera may move there."""
+    dark = features_of(route).strips.numpy().copy()
+    dark[:, 20:50] = 0
+    search = FilterSearch(SequenceBuffer(4, PLACES, 8))
+    search.change.learn(dark)
+    at, images = np.arange(PLACES), 30
+    for i in range(images):
+        z = np.where(np.abs(at - i) < 2, -4, 0).astype(np.float32)
+        lit = i < 18
+        search.update(z if lit else np.zeros_like(z), search.change.curve[1] * lit, not lit)
+    assert search.filter.count == images
+    mean = search.filter.places_of_states() @ at / search.filter.places_of_states().sum()
+    assert 25 < mean < 34
+
+
+def test_drive_that_leaves_map_and_returns_is_followed(recognizer, route):
+    elsewhere = strips_of(7)[:, :60]
+    strips = np.concatenate([route[:, 20:80], elsewhere, route[:, 120:200]], axis=1)
+    answers = drive(recognizer, strips)
+    probability = np.array([answer.probability for answer in answers])
+    assert (probability[20:60] > 0.6).all()
+    gone = 60 + LENGTH // 2 + MIDDLE + 1  # the middle has left half a window ago
+    assert (probability[gone:120] < 0.3).all()
+    assert not any(answer.accepted for answer in answers[gone:120])
+    assert (probability[120 + 2 * LENGTH :] > 0.6).all()
+    middles = np.array([answer.place_index for answer in answers[120 + 2 * LENGTH :]])
+    expected = np.arange(120 + 2 * LENGTH, 200) - (LENGTH - 1 - MIDDLE)
+    assert (np.abs(middles - expected) <= 2).all()
+
+
+def test_drive_in_reverse_is_not_matched_wrongly(recognizer, route):
+    answers = drive(recognizer, route[:, 200:40:-1])[LENGTH:]
+    for i, answer in enumerate(answers, LENGTH):
+        there = 200 - i + LENGTH - 1 - MIDDLE
+        assert not answer.accepted or abs(answer.place_index - there) <= LENGTH
+
+
+def test_start_again_repeats_window_from_its_first_image(route):
+    searches = [FilterSearch(SequenceBuffer(5, 50, 10)) for _ in range(2)]
+    rng = np.random.default_rng(0)
+    rows = rng.standard_normal((2, 5, 50)).astype(np.float32)
+    changes = [1.0, 0.3, 0.0, 0.5, 0.4]
+    for search, known in zip(searches, rows, strict=True):
+        search.change.learn(features_of(route[:, :50]).strips.numpy())
+        for row, change in zip(known, changes, strict=True):
+            search.update(row, change, standstill=not change)
+    searches[0].start_again(rows[1])
+    one, other = (search.filter for search in searches)
+    assert one.count == other.count == 4
+    np.testing.assert_array_equal(one.places_of_states(), other.places_of_states())
+    searches[0].reset()
+    assert one.count == 0
+
+
+def test_search_over_no_places_has_no_match():
+    buffer = SequenceBuffer(3, 0, 6)
+    search = FilterSearch(buffer)
+    for _ in range(3):
+        buffer.push(torch.empty(0))
+        search.update(np.empty(0, np.float32), 1.0, standstill=False)
+    found = search(5)
+    assert found.nearest is None
+    assert found.path.shape == (0, 2)
+    assert [len(values) for values in found.sequences()] == [0, 0]
+
+
+def test_search_counts_places_from_first_ever():
+    """After eviction, by the buffer's number of the first place that is held."""
+    rng = np.random.default_rng(0)
+    rows = rng.standard_normal((9, 30)).astype(np.float32)
+    rows[np.arange(9), np.arange(12, 21)] = -6
+    buffers = [SequenceBuffer(5, 30, 10) for _ in range(2)]
+    searches = [FilterSearch(buffer) for buffer in buffers]
+    for i, row in enumerate(rows):
+        for number, (buffer, search) in enumerate(zip(buffers, searches, strict=True)):
+            seen = row
+            if number and i == 8:
+                buffer.evict(4)
+                search.evict(4)
+            if number and i >= 8:
+                seen = row[4:]
+            buffer.push(torch.from_numpy(seen))
+            search.update(seen, 1.0, standstill=False)
+    one, other = (search(3) for search in searches)
+    assert one.nearest.middle == other.nearest.middle == 18
+    assert one.path.tolist() == other.path.tolist()
+    assert other.sequences()[1].tolist() == list(range(4, 30))

@@ -1,0 +1,169 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Changes of the map and of the query: what they say about speed, standstill and darkness."""
+
+import numpy as np
+import pytest
+from stavpr_ros.recognition.image_change import (
+    AHEAD,
+    APART,
+    change_between,
+    FLOOR,
+    ImageChange,
+    OFFSET,
+    SMOOTHED,
+)
+from stavpr_ros.recognition.place_filter import FilterSettings
+
+pytestmark = pytest.mark.usefixtures('one_thread')
+SETTINGS = FilterSettings()
+
+
+def drive_strips(places, seed=0, smooth=4):
+    """Return unit-norm strips (3, places, 24) that change from place to place."""
+    rng = np.random.default_rng(seed)
+    strips = rng.standard_normal((3, places + smooth, 24))
+    strips = sum(strips[:, i : i + places] for i in range(smooth))
+    return (strips / np.linalg.norm(strips, axis=2, keepdims=True)).astype(np.float32)
+
+
+def plain_change(a, b):
+    pairs = list(zip(a, b, strict=True))
+    return 1 - np.mean([1.0 if not x.any() and not y.any() else x @ y for x, y in pairs])
+
+
+def learned(strips):
+    change = ImageChange(strips.shape[1], SETTINGS)
+    change.learn(strips)
+    return change
+
+
+def test_curve_is_mean_change_of_places_apart():
+    strips = drive_strips(40)
+    strips[0, 7:9] = strips[1, 20] = 0  # one strip, and two in the same place, without features
+    expected = [0.0] + [
+        np.mean([plain_change(strips[:, y], strips[:, y - apart]) for y in range(apart, 40)])
+        for apart in range(1, APART + 1)
+    ]
+    np.testing.assert_allclose(learned(strips).curve, expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize('places', [0, 1, 3])
+def test_curve_beyond_short_map_is_that_of_unrelated_images(places):
+    curve = learned(drive_strips(places)).curve
+    np.testing.assert_array_equal(curve[max(places, 1) :], 1)
+    assert curve[0] == 0
+    assert (curve[1 : max(places, 1)] < 1).all()
+
+
+def test_learn_newest_of_each_place_equals_learn():
+    strips = drive_strips(30)
+    route = ImageChange(5, SETTINGS)
+    for n in range(1, 31):
+        if n == 6:
+            route.grow(32)
+        route.learn_newest(strips[:, :n])
+    np.testing.assert_allclose(route.curve, learned(strips).curve, rtol=1e-5)
+
+
+def test_learn_newest_of_standing_camera_leaves_curve():
+    strips = drive_strips(30)
+    route = ImageChange(60, SETTINGS)
+    for n in range(1, 31):
+        route.learn_newest(strips[:, :n])
+    before = route.curve
+    stood = np.concatenate([strips, strips[:, -1:]], axis=1)
+    route.learn_newest(stood)
+    np.testing.assert_array_equal(route.curve, before)
+
+
+def test_next_query_is_change_from_image_before():
+    strips = drive_strips(3)
+    strips[1, :2] = strips[2, 1] = 0
+    change = learned(drive_strips(9))
+    assert change.next_query(strips[:, 0]) == 1
+    found = change.next_query(strips[:, 1])
+    assert found == pytest.approx(plain_change(strips[:, 0], strips[:, 1]), abs=1e-6)
+    assert found == pytest.approx(change_between(strips[:, 1], strips[:, 0]))
+    change.reset()
+    assert change.next_query(strips[:, 2]) == 1
+
+
+def test_standstill_and_weight_are_relative_to_neighboring_places():
+    change = learned(drive_strips(200))
+    near = change.curve[1]
+    assert change.is_standstill(0.99 * SETTINGS.standstill * near)
+    assert not change.is_standstill(1.01 * SETTINGS.standstill * near)
+    for relative, alpha in ((0.0, 0.2), (0.1, 0.2), (0.5, 0.5), (1, 1), (1.5, 1.5), (3, 2)):
+        assert change.weight(relative * near) == pytest.approx(SETTINGS.weight * alpha)
+
+
+def test_speed_weights_are_of_smoothed_change_over_curve():
+    change = learned(drive_strips(300))
+    curve, came = change.curve, []
+    for seen in (0.1, 0.5, 0.9, 0.3, 0.2, 0.05, 0.6):
+        came.append(seen)
+        mean = np.log(np.mean(came[-SMOOTHED:]) + OFFSET)
+        expected = []
+        for speed in SETTINGS.speeds:
+            low = min(int(speed), APART - 1)
+            there = curve[low] + (speed - low) * (curve[low + 1] - curve[low])
+            off = (mean - np.log(there + OFFSET)) / SETTINGS.change_deviation
+            expected.append(np.exp(-(off**2) / 2) + FLOOR)
+        np.testing.assert_allclose(change.speed_weights(seen), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize('apart', [1, 2, 3])
+def test_speed_weights_are_highest_at_speed_of_query(apart):
+    strips = drive_strips(400)
+    change = learned(strips)
+    query = drive_strips(60, seed=1)[:, ::apart]
+    change.next_query(query[:, 0])
+    for y in range(1, 12):
+        weights = change.speed_weights(change.next_query(query[:, y]))
+    assert abs(SETTINGS.speeds[int(np.argmax(weights))] - apart) <= 0.34
+
+
+def test_speed_weights_after_reset_forget_query():
+    one, other = (learned(drive_strips(50)) for _ in range(2))
+    one.speed_weights(0.9)
+    one.reset()
+    np.testing.assert_array_equal(one.speed_weights(0.2), other.speed_weights(0.2))
+
+
+def probable_at(place, n):
+    by_place = np.full(n, 0.2 / n)
+    by_place[place] += 0.8
+    return by_place
+
+
+def test_unlit_is_where_places_of_map_are_equal_or_soon_will_be():
+    strips = drive_strips(60)
+    strips[:, 30:41] = 0  # 31..40 equal the one before
+    change = learned(strips)
+    dark = [change.unlit(probable_at(place, 60)) for place in range(60)]
+    assert dark == [31 - AHEAD < place <= 40 for place in range(60)]
+    assert not change.unlit(np.zeros(60))
+    change.evict(5)
+    assert [change.unlit(probable_at(place, 55)) for place in range(55)] == dark[5:]
+
+
+def test_unlit_needs_probability_of_such_places():
+    strips = drive_strips(60)
+    strips[:, 30:41] = 0
+    change, by_place = learned(strips), np.zeros(60)
+    by_place[5], by_place[35] = 0.72, 0.28
+    assert not change.unlit(by_place)
+    by_place[5], by_place[35] = 0.68, 0.32
+    assert change.unlit(by_place)
+    assert change.unlit(by_place / 100)  # relative to the probability on the map
+
+
+def test_unlit_of_route_knows_its_newest_places():
+    strips = drive_strips(30)
+    strips[:, 20:26] = 0
+    route = ImageChange(30, SETTINGS)
+    for n in range(1, 31):
+        route.learn_newest(strips[:, :n])
+    assert route.unlit(probable_at(22, 30))
+    assert not route.unlit(probable_at(28, 30))

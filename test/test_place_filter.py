@@ -1,0 +1,151 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The Bayes filter of mode robust against plain loops over its states."""
+
+from dataclasses import replace
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import oracle
+import pytest
+from stavpr_ros.recognition.place_filter import CLOSE, FilterSettings, NEGLIGIBLE, PlaceFilter, TOP
+
+pytestmark = pytest.mark.usefixtures('one_thread')
+# Every probability large enough to matter, and the levels not as likely as each other
+LIVELY = FilterSettings(
+    keep_level=0.7, keep_speed=0.6, spread=0.15, leave=0.07, enter=0.2, start=0.6
+)
+FEW = replace(LIVELY, speeds=(0.0, 1.0, 2.5), levels=(-1.0, -2.0))
+LAG = 4
+
+
+def random_image(rng, n, s):
+    z = rng.standard_normal(n).astype(np.float32)
+    z[rng.random(n) < 0.1] = np.inf
+    return z, float(rng.uniform(0.1, 0.5)), rng.uniform(0.1, 1, len(s.speeds))
+
+
+def assert_equal(one, plain):
+    n = plain.a.shape[2]
+    of_places = one.places_of_states()
+    np.testing.assert_allclose(of_places[:n], plain.a.sum(axis=(0, 1)), rtol=1e-4, atol=2e-6)
+    assert not of_places[n:].any()
+    assert one.off_map == pytest.approx(sum(plain.off), abs=2e-5)
+    assert float(of_places.sum(dtype=np.float64)) + one.off_map == pytest.approx(1, abs=1e-5)
+
+
+def driven(s, sizes, seed=0):
+    """Return filter and oracle after random images of so many places each, compared at each."""
+    rng = np.random.default_rng(seed)
+    one, plain = PlaceFilter(max(sizes) + 3, LAG, s), oracle.PlaceFilter(s)
+    for n in sizes:
+        image = random_image(rng, n, s)
+        one.update(*image)
+        plain.update(*image)
+        assert_equal(one, plain)
+    return one, plain
+
+
+@pytest.mark.parametrize(
+    ('s', 'sizes'),
+    [
+        (LIVELY, [1] * 6),
+        (LIVELY, [2] * 6),
+        (LIVELY, [5] * 9),
+        (FilterSettings(), [30] * 8),
+        (replace(LIVELY, levels=(-2.0,), speeds=(1.33,)), [9] * 5),
+        (LIVELY, [300] * 3),
+        (FEW, [2060] * 3),  # two blocks
+        (LIVELY, [0, 0, 4, 5]),
+        (LIVELY, [6, 7, 9, 9, 4, 4, 5, 8]),  # after fewer places, more again
+    ],
+)
+def test_filter_equals_plain_loops(s, sizes):
+    driven(s, sizes)
+
+
+@settings(max_examples=15)
+@given(st.lists(st.integers(0, 12), min_size=1, max_size=8), st.integers(0, 999))
+def test_filter_of_any_number_of_places_equals_plain_loops(sizes, seed):
+    driven(FEW, sizes, seed)
+
+
+def test_filter_that_evicts_and_grows_equals_plain_loops():
+    one, plain = driven(LIVELY, [12] * 5)
+    rng = np.random.default_rng(1)
+    for n, evicted, room in ((9, 4, 15), (10, 0, 30), (25, 0, 30), (20, 6, 30), (21, 0, 30)):
+        if evicted:
+            one.evict(evicted)
+            plain.evict(evicted)
+        one.grow(room)
+        image = random_image(rng, n, LIVELY)
+        one.update(*image)
+        plain.update(*image)
+        assert_equal(one, plain)
+        assert_belief_equal(one, plain, n, LAG)
+
+
+def test_filter_after_reset_is_as_new():
+    one, _ = driven(FEW, [9] * 5)
+    one.reset()
+    assert one.count == 0
+    plain, rng = oracle.PlaceFilter(FEW), np.random.default_rng(3)
+    for n in (4, 5, 8):
+        image = random_image(rng, n, FEW)
+        one.update(*image)
+        plain.update(*image)
+        assert_equal(one, plain)
+
+
+def test_filter_without_weight_sees_nothing():
+    one, other = (PlaceFilter(20, LAG) for _ in range(2))
+    for z in (np.zeros(20, np.float32), np.linspace(-9, 9, 20, dtype=np.float32)):
+        for each, seen in ((one, z), (other, -z)):
+            each.update(seen, 0.0, np.ones(9))
+    np.testing.assert_array_equal(one.places_of_states(), other.places_of_states())
+
+
+# ------------------------------------------------ where the camera was
+
+
+def assert_belief_equal(one, plain, n, images_ago):
+    found = one.belief(n, images_ago)
+    by_place = plain.a.sum(axis=(0, 1))
+    tops = set(np.argsort(by_place)[-TOP:].tolist())
+    largest = plain.a.max()
+    weights, ways = np.zeros(n), {}
+    for state in np.ndindex(plain.a.shape):
+        p = plain.a[state]
+        there = plain.way(state, images_ago)[-1]
+        if state[2] in tops and p >= NEGLIGIBLE * largest > 0 and there and there[2] >= 0:
+            weights[there[2]] += p
+            ways[there[2]] = max(ways.get(there[2], (0,)), (p, *state, there[1]))
+    np.testing.assert_allclose(found.weights, weights, rtol=1e-4, atol=1e-5)
+    close = [weights[max(y - CLOSE, 0) : y + CLOSE + 1].sum() for y in range(n)]
+    np.testing.assert_allclose(found.probabilities, np.minimum(close, 1), rtol=1e-4, atol=1e-5)
+    for place, (p, *way) in ways.items():
+        assert found.ways[place].tolist() == way, (place, p)
+        places = [
+            -1 if state is None else state[2] for state in plain.way(tuple(way[:3]), images_ago)
+        ]
+        np.testing.assert_array_equal(one.way(np.array(way), images_ago), places)
+
+
+@pytest.mark.parametrize('sizes', [[1] * 5, [5] * 6, [40] * 7, [90] * 9, [6, 8, 9, 12, 5, 5]])
+@pytest.mark.parametrize('spread', [0.12, 0.4])  # 0.4: most ways are not straight
+def test_belief_equals_plain_ways_back(sizes, spread):
+    """At every turn of the ring, up to the oldest image in it."""
+    s = replace(LIVELY, enter=0.02, spread=spread)
+    one, plain = driven(s, sizes, 2)
+    for images_ago in range(LAG + 1):
+        assert_belief_equal(one, plain, sizes[-1], images_ago)
+
+
+def test_belief_of_places_born_on_map_since_then_is_nothing():
+    """Ways that came onto the map later were nowhere on it."""
+    one = PlaceFilter(9, LAG, replace(FEW, enter=0.9))
+    for places in (0, 0, 9):
+        one.update(np.zeros(places, np.float32), 0.1, np.ones(3))
+    assert one.belief(9, 0).weights.sum() > 0.5
+    assert not one.belief(9, 1).probabilities.any()
