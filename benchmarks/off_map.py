@@ -500,11 +500,15 @@ def calibration_section(results: Results) -> list[str]:
 
 def markdown(about: dict[str, Any], results: Results) -> list[str]:
     """Return the lines of the page."""
+    steps, coarse = about.get('steps', 1), []
+    if steps > 1:
+        coarse = [f'Steps between positions are {steps} times as coarse as below.', '']
     lines = [
         *heading('Off the map, at night, at other speeds', about),
         'Mode robust with its defaults on all data sets, by `make off-map`. '
         'Data sets: benchmarks/README.md; the method: [robust mode](robust_mode.md).',
         '',
+        *coarse,
         *summary_section(results),
     ]
     for section, title, text, head, cells in SECTIONS:
@@ -587,8 +591,11 @@ def main(arguments: list[str] | None = None) -> int:
     path = options.output / f'off_map{"-quick" if options.quick else ""}.json'
     page = path.with_suffix('.md') if options.quick else options.page
     path.parent.mkdir(parents=True, exist_ok=True)
-    document = about | {'steps': steps, 'results': results}
-    path.write_text(json.dumps(document, indent=1, allow_nan=False) + '\n', encoding='utf-8')
+    about |= {'steps': steps}
+    path.write_text(
+        json.dumps(about | {'results': results}, indent=1, allow_nan=False) + '\n',
+        encoding='utf-8',
+    )
     page.write_text('\n'.join(markdown(about, results)).rstrip() + '\n', encoding='utf-8')
     print(*summary_section(results), sep='\n')
     print(f'took {time.perf_counter() - began:.0f} s\nwrote {path} and {page}')
