@@ -60,7 +60,7 @@ class Pair:
 
     @property
     def long(self) -> bool:
-        """The route is driven only around the removed stretch."""
+        """Whether the route is driven only around the removed stretch."""
         return len(self.places) >= LONG
 
 
