@@ -21,8 +21,8 @@ OPTIONS = --torch-index '$(TORCH_INDEX)' --with
 TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN) pytest test
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 
-.PHONY: help setup build demo evaluate test test-long lint docs bench bench-quick accuracy shell \
-	clean distclean development
+.PHONY: help setup build demo evaluate test test-long lint docs bench bench-quick accuracy off-map \
+	shell clean distclean development
 
 help: ## list the targets (the default)
 	@echo 'make TARGET [NAME=VALUE ...]'
@@ -73,6 +73,10 @@ bench-quick: build ## the same for up to 20,000 places, in under two minutes (AR
 accuracy: override EXTRAS += evaluation
 accuracy: build ## measure the accuracy on the data sets (ARGS=)
 	@$(RUN) python benchmarks/accuracy.py $(ARGS)
+
+off-map: override EXTRAS += evaluation
+off-map: build ## measure mode robust off the map, at night, at other speeds (ARGS=)
+	@OMP_WAIT_POLICY=PASSIVE $(RUN) python benchmarks/off_map.py $(ARGS)
 
 shell: build ## open a bash in which the built packages are found
 	@echo 'The executables are in $(EXECUTABLES)/. Leave with exit.'

@@ -5,7 +5,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from stavpr_ros.alignment.settings import VelocitySettings
+from stavpr_ros.recognition.place_filter import FilterSettings
 
 ITEM_BYTES = {'float32': 4, 'bfloat16': 2, 'float16': 2}
 BEYOND_CACHES = 2**28  # bytes; below, a stage may read faster than memory
@@ -135,21 +135,23 @@ def reference_znorm(sizes: Sizes) -> Work:
     return Work(16 * sizes.n, 13 * sizes.n)
 
 
-def velocity_search(sizes: Sizes, settings: VelocitySettings) -> Work:
+def filter_update(sizes: Sizes, settings: FilterSettings) -> Work:
     """
-    Search at several velocities: window, shift and scale are read once.
+    Advance the filter: states and row are read once; states and their origins are written once.
 
-    A cell adds its cost to the best of its predecessors; each of the one or two besides the first
-    costs a sum, a minimum and a selection of the path's first place, after the middle row also of
-    its middle.
+    A likelihood takes an exponential (1), a product and a difference. A state mixes levels (2
+    each) and speeds (9, where it comes from 2), moves (5, 2), is joined by births and weighed (4).
     """
-    operations = 2 * sizes.l  # cost (D - shift) * scale
-    for steps in settings.steps(sizes.l):
-        for i in range(1, sizes.l):
-            others = 2 if steps[i] > 0 else 1
-            operations += 1 + others * (4 if i > (sizes.l - 1) // 2 else 3)
-        operations += 5  # mean, minimum over the velocities, three selections
-    return Work(4 * sizes.n * (sizes.l + 2), operations * sizes.n)
+    K = len(settings.levels)
+    states = K * len(settings.speeds)
+    each = 3 * K + states * (2 * K + 9 + 2 + 5 + 2 + 4)
+    return Work(sizes.n * (4 + states * (4 + 4 + 1)), sizes.n * each)
+
+
+def filter_belief(sizes: Sizes, settings: FilterSettings) -> Work:
+    """Sum the states by place; sums over neighbors (3) and their largest (1) of the way back."""
+    states = len(settings.levels) * len(settings.speeds)
+    return Work(4 * sizes.n * (states + 1), sizes.n * (states + 4))
 
 
 def lm_dtw(sizes: Sizes) -> Work:

@@ -16,9 +16,8 @@ ROBUST_STAGES = (
     'query_znorm',
     'window_push',
     'reference_znorm',
-    'velocity_search',
-    'selection',
-    'path_trace',
+    'filter_update',
+    'filter_belief',
 )
 SIZES = ('stage', 'mode', 'n', 'd', 'precision')  # head of a row's first cells
 OUTCOME = {True: 'reached', False: '**not reached**', None: 'not measured'}

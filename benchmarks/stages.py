@@ -8,7 +8,7 @@ import gc
 from itertools import cycle
 from typing import Any
 
-from baselines import accumulated, prange, prange_velocities, sample
+from baselines import accumulated, PlainFilter, prange, sample
 from data import free_bytes, make_features, make_window
 import lower_bounds as bounds
 from lower_bounds import Sizes
@@ -22,19 +22,19 @@ from stavpr_ros.alignment.lm_dtw import (
     SequenceDistances,
     trace_sequence,
 )
-from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings, VelocitySettings
-from stavpr_ros.alignment.velocity import best_velocity_match, match_scaled, trace_velocity
+from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.matcher import make_matcher
+from stavpr_ros.recognition.place_filter import FilterSettings, PlaceFilter
 from stavpr_ros.recognition.robust import MeanCentering, ZNormalization
 from stavpr_ros.recognition.sequence_search import SequenceBuffer
 from timing import measure, synchronizer, timed
 import torch
 
 MODES = ('robust', 'paper')  # the default first
-SEQUENCE, SPATIAL, VELOCITY = SequenceSettings(), SpatialSettings(), VelocitySettings()
+SEQUENCE, SPATIAL, FILTER = SequenceSettings(), SpatialSettings(), FilterSettings()
 NMS_RADIUS = 20
 STRIPS = 7
 FRAMES = 20  # of the distance matrix
@@ -75,41 +75,45 @@ def robust_stages(run: Run, n: int, seed: int) -> None:
         znorm.shift_and_scale(n)
 
     add('reference_znorm', call=reference_znorm, works=[bounds.reference_znorm(sizes)])
-    shift, scale = znorm.shift_and_scale(n)
-    window = buffer.rows().numpy()
-    steps = VELOCITY.steps(SEQUENCE.length)
-    search = partial(match_scaled, window, shift, scale, steps, VELOCITY.penalty)
-    matches = search()
+    window = znorm.scaled(buffer.rows().numpy()[:, :n])
+    middle = (SEQUENCE.length - 1) // 2
+    lag = SEQUENCE.length - 1 - middle
+    place_filter = PlaceFilter(n, lag, FILTER)
+    speed_weights = np.ones(len(FILTER.speeds))
+    peer = _plain_filter(place_filter, window, speed_weights)
+    states = len(FILTER.levels) * len(FILTER.speeds)
     add(
-        'velocity_search',
-        call=search,
-        works=[bounds.velocity_search(sizes, VELOCITY)],
-        peers=[_prange_velocities((window[:, :n] - shift) * scale, steps, matches.distances)],
-        extra={'cells': n * steps.size},
+        'filter_update',
+        call=partial(place_filter.update, window[-1], FILTER.weight, speed_weights),
+        works=[bounds.filter_update(sizes, FILTER)],
+        peers=[peer],
+        extra={'cells': n * states},
     )
-    select = partial(best_velocity_match, matches, NMS_RADIUS)
-    add('selection', call=select, works=[bounds.selection(sizes)])
-    nearest = select()
-    speed = int(matches.speeds[nearest.last])
-    reach = int(steps.sum(axis=1).max()) + SEQUENCE.length
-    near = slice(max(0, nearest.last - reach), nearest.last + 1)
 
-    def trace() -> np.ndarray:
-        costs = (window[:, near] - shift[near]) * scale[near]
-        return trace_velocity(costs, nearest.last - near.start, steps[speed], VELOCITY.penalty)
+    def belief() -> np.ndarray:
+        found = place_filter.belief(n, lag)
+        return place_filter.way(found.ways[int(np.argmax(found.weights))], lag)
 
-    width = min(nearest.last + 1, int(steps[speed].sum()) + SEQUENCE.length)
-    add('path_trace', call=trace, works=[bounds.path_trace(SEQUENCE.length, width)])
+    add('filter_belief', call=belief, works=[bounds.filter_belief(sizes, FILTER)])
 
 
-def _prange_velocities(costs: np.ndarray, steps: np.ndarray, expected: np.ndarray) -> Peer:
-    """Return the plain program of the velocity search as a peer; its distances must be ours."""
-    kernel, penalty = prange_velocities(), np.float32(VELOCITY.penalty)
-    np.testing.assert_array_equal(kernel(costs, steps, penalty), expected)
-    note = (
-        'plain numba, all cores; the same distances bit for bit, without the places of the paths'
+def _plain_filter(place_filter: PlaceFilter, rows: np.ndarray, speed_weights: np.ndarray) -> Peer:
+    """
+    Return the plain program of the filter as a peer; its probabilities must be ours.
+
+    :param place_filter: new; advanced by the rows.
+    """
+    plain = PlainFilter(rows.shape[1], FILTER)
+    for row in rows:
+        for each in (place_filter, plain):
+            each.update(row, FILTER.weight, speed_weights)
+    found, expected = place_filter.places_of_states(), plain.a.sum(axis=(0, 1))
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-7)
+    np.testing.assert_allclose(place_filter.off_map, plain.off.sum(), rtol=1e-3)
+    note = 'plain numba, all cores; the same probabilities up to rounding, without the ways back'
+    return Peer(
+        'prange', timed(partial(plain.update, rows[-1], FILTER.weight, speed_weights)), note
     )
-    return Peer('prange', timed(lambda: kernel(costs, steps, penalty)), note)
 
 
 # ------------------------------------------------ on windows of distances, mode paper
@@ -224,11 +228,12 @@ def feature_stages(run: Run, n: int, d: int, precisions: Sequence[str], seed: in
 def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
     """Return the work of a whole frame; the trace of one path is too short to matter."""
     works = [bounds.product(sizes, precision), bounds.spatial_alignment(sizes)]
-    works += [bounds.window_push(sizes), bounds.selection(sizes)]
+    works += [bounds.window_push(sizes)]
     if mode == 'paper':
-        return [*works, bounds.lm_dtw(sizes)]
+        return [*works, bounds.lm_dtw(sizes), bounds.selection(sizes)]
     znorms = [bounds.query_znorm(sizes), bounds.reference_znorm(sizes)]
-    return [bounds.mean_centering(sizes), *works, *znorms, bounds.velocity_search(sizes, VELOCITY)]
+    filters = [bounds.filter_update(sizes, FILTER), bounds.filter_belief(sizes, FILTER)]
+    return [bounds.mean_centering(sizes), *works, *znorms, *filters]
 
 
 def products(

@@ -85,7 +85,7 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         ),
         NodeParameter(
             'min_probability',
-            0.3,
+            0.5,
             'Mode robust: a window is matched when the probability that its place is right is '
             'above this, between 0 and 1; greater is stricter. No effect in mode paper.',
             when='live',

@@ -22,6 +22,7 @@ import data
 import lower_bounds as bounds
 import matching
 import memory
+import off_map
 import peaks
 import report
 import results
@@ -29,6 +30,11 @@ from results import PeerTime, Row
 from run import Peer, Run
 import stages
 from stavpr_ros.alignment import match_sequence, SequenceDistances
+from stavpr_ros.alignment.lm_dtw import SequenceMatch
+from stavpr_ros.evaluation.drive import DriveChanges
+from stavpr_ros.evaluation.ground_truth import GroundTruth
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition.match import Match, Status
 import targets
 import timing
 from timing import Timing
@@ -175,7 +181,7 @@ def test_report_counts_losses_and_sums_stages_of_frame():
         report.report(about, rows, [held], PEAKS, [results.Skipped('x', 1, 0, 'why')])
     )
     assert 'Commit abc' in text
-    assert '| 9 ms | 10 ms | 1 ms | 5 ms | 2 |' in text  # seven stages of 1 ms, one of 2 ms
+    assert '| 8 ms | 10 ms | 1 ms | 5 ms | 2 |' in text  # six stages of 1 ms, one of 2 ms
     assert '## Beside peers (1 of 1 lost)' in text
     assert '| 1 MB | 3 MB | 3 | <= 1.1 | **not reached** |' in text
     assert (
@@ -278,6 +284,99 @@ def test_committed_accuracy_table_has_all_rows_and_its_markdown():
     text = '\n'.join(accuracy.markdown(document, document['results'])).rstrip() + '\n'
     assert path.with_suffix('.md').read_text() == text
     assert document['results']['gardens_point/g/robust/same']['sequence']['f1'] > 0.99
+
+
+# ------------------------------------------------ off the map
+
+
+def outcome_of(accepted, probabilities, correct, has_match, unseen):
+    columns = [np.array(values, bool) for values in (accepted, correct, has_match, unseen)]
+    return off_map.Outcome(columns[0], np.array(probabilities, float), *columns[1:])
+
+
+OUTCOME = outcome_of(
+    [1, 1, 1, 0, 0], [0.9, 0.8, 0.6, 0.2, np.nan], [1, 1, 0, 1, 0], [1, 1, 0, 1, 1],
+    [0, 0, 1, 0, 0],
+)  # fmt: skip
+
+
+def test_outcome_counts_right_wrong_and_unseen_matches():
+    found = off_map.Outcome.pooled([OUTCOME, OUTCOME]).numbers()
+    assert (found['images'], found['matched'], found['wrong']) == (10, 6, 2)
+    assert (found['precision'], found['recall']) == (4 / 6, 4 / 8)
+    assert (found['unseen'], found['unseen_matched']) == (2, 2)
+    assert found['recall_at_100_precision'] == 0.5  # above 0.6
+    assert found['f1'] == 3 / 4  # three of four right, one wrong
+    calibration = OUTCOME.calibration()
+    assert [(row['images'], row['right']) for row in calibration['bins']] == [
+        (1, 1.0), (1, 0.0), (1, 1.0), (1, 1.0)
+    ]  # fmt: skip
+
+
+@pytest.fixture
+def route():
+    """Sixty places and the same images with noise."""
+    places = data.make_features(60, 24, 7, 'cpu', 0)
+    noise = data.make_features(60, 24, 7, 'cpu', 1)
+    seen = places.strips + 0.3 * noise.strips
+    query = replace(places, strips=seen / seen.norm(dim=2, keepdim=True))
+    stamps, ids = np.zeros(60, np.int64), ('',) * 60
+    maps = [PlaceMap(features, None, stamps, ids) for features in (places, query)]
+    return off_map.Pair('route', *maps, GroundTruth.identity(60, 60, 2))
+
+
+def test_table_of_synthetic_route_has_every_section(route, monkeypatch):
+    monkeypatch.setattr(off_map, 'REMOVED', (20, 40))  # more than half of the map: no row
+    monkeypatch.setattr(off_map, 'STEP', 20)
+    measurement = off_map.Measurement('g')
+    measurement.pair(route)
+    measurement.floors({'first': route.places, 'second': route.query})
+    rows = measurement.finish()
+    same = rows['drives/g/route/same']
+    assert (same['images'], same['precision'], same['recall']) == (60, 1, 1)
+    detour = rows['detours/g/route/20']
+    assert detour['positions'] == 3  # 0:20, 20:40, 40:60
+    assert detour['unseen'] == 15 + 10 + 15  # those within five places of the map are left out
+    assert 'detours/g/route/40' not in rows
+    start = rows['start/g/route/whole map']
+    assert (start['starts'], start['right']) == (1, 1)  # at 20; one at 40 leaves no 30 images
+    assert start['longest'] == off_map.SETTINGS.sequence.length
+    floors = rows['floors/g/tower']
+    assert (floors['pairs'], floors['images']) == (2, 120)
+    assert floors['matched'] >= 100  # the same place under another name
+    about = results.environment(named_commit='abc')
+    text = '\n'.join(off_map.markdown(about, json.loads(json.dumps(rows, allow_nan=False))))
+    for title in ('Detours', 'Floors', 'Drives', 'The route in reverse', 'Start', 'Calibration'):
+        assert f'## {title}' in text
+    assert (
+        f'| detours: unseen images matched | {detour["unseen_matched"] / 40:.1%} of 40 |' in text
+    )
+
+
+def test_first_right_match_counts_images_since_start():
+    truth = GroundTruth.identity(6, 6)
+
+    def match(status, place):
+        return Match(status, '', 1.0, SequenceMatch(place, place, place, 0.5, -1, np.nan))
+
+    matches = [Match(Status.WARMING_UP, '', 1.0)] * 3
+    matches += [match(Status.MATCH, 5), match(Status.NO_MATCH, 2), match(Status.MATCH, 3)]
+    assert off_map.first_right(matches, truth, 4) == 6  # windows of 4: image 3 is the middle
+    assert off_map.first_right(matches[:5], truth, 4) is None
+
+
+@pytest.mark.parametrize(
+    ('name', 'changes'),
+    [
+        ('same', DriveChanges()),
+        ('3x', DriveChanges(speed=3)),
+        ('varying', DriveChanges(speed='varying')),
+        ('stop 30', DriveChanges(stops=((50, 30),))),
+        ('drop 0.3', DriveChanges(drop=0.3)),
+    ],
+)
+def test_change_by_name_is_drive(name, changes):
+    assert off_map.change_of(name, 100) == changes
 
 
 # ------------------------------------------------ the command

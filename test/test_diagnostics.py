@@ -364,7 +364,7 @@ def test_values_of_recognition_are_complete():
     assert values('recognition', answered_age=None) == {
         'operation': 'localization',
         'mode': 'robust',
-        'min_probability': '0.300',
+        'min_probability': '0.500',
         'window': '20',
         'length': '20',
         'last_status': 'match',

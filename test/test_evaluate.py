@@ -403,7 +403,7 @@ def test_report_holds_numbers_matches_plots_and_page(folders, run, tmp_path):
     assert f'<td>{results["sequence"]["f1"]:.4f}</td>' in page
     default = results['default_threshold']  # mode robust has one
     assert 0 <= default['f1'] <= results['sequence']['f1']
-    assert default['threshold'] == 1 - results['settings']['min_probability'] == 0.7
+    assert default['threshold'] == 1 - results['settings']['min_probability'] == 0.5
 
 
 def test_report_of_matches_no_nearer_than_chance_has_no_distance(folders, run, tmp_path):
@@ -509,5 +509,5 @@ def test_evaluate_of_loop_closures_in_the_hallway_gives_the_measured_recall(data
         *('--query', folder / 'samples', '--truth', folder / 'samples_GT.bmp'), *options
     )
     assert found['sequence']['recall_at_1'] > 0.8
-    assert found['default_threshold']['threshold'] == 0.7  # 1 - min_probability
+    assert found['default_threshold']['threshold'] == 0.5  # 1 - min_probability
     assert found['decision']['precision'] == found['default_threshold']['precision'] == 1

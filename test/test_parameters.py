@@ -105,7 +105,7 @@ def test_threshold_in_mode_paper_is_applied_instead_of_min_probability(threshold
         ({'mode': 'paper', 'threshold': 0.0}, 'threshold = 0 would match nothing'),
         (
             {'threshold': 0.8},
-            'threshold = 0.8 is of mode paper: .* min_probability = 0.3; set that',
+            'threshold = 0.8 is of mode paper: .* min_probability = 0.5; set that',
         ),
         ({'min_probability': 0.0}, 'min_probability = 0.0 must be above 0 and below 1'),
         ({'min_probability': 1.0}, 'min_probability = 1.0 must be above 0 and below 1'),

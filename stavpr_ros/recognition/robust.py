@@ -16,7 +16,7 @@ from stavpr_ros.features import LocalFeatures
 import torch
 
 MODES = ('paper', 'robust')
-MIN_PROBABILITY = 0.3  # above which mode robust matches a window
+MIN_PROBABILITY = 0.5  # above which mode robust matches a window
 THRESHOLD = 1 - MIN_PROBABILITY  # of the distance, 1 less the probability
 PRIOR = 20  # images that the statistics of the map count for in those of the query
 PIECE = 8192  # images centered at a time

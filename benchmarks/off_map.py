@@ -1,0 +1,606 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Off the map, at night, at other speeds: mode robust with its defaults on all data sets.
+
+``make off-map``, ``make off-map ARGS=--quick``. Writes docs/off_map.md and its JSON to
+benchmarks/results/. Rows: benchmarks/README.md.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+import json
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+from accuracy import extractor, FEATURES, long_cases, short_cases
+from data import data_folder, NoDataError
+import numpy as np
+from results import environment, heading, RESULTS, ROOT, table
+from stavpr_ros.errors import UnavailableError
+from stavpr_ros.evaluation.calibration import calibrate
+from stavpr_ros.evaluation.drive import DriveChanges
+from stavpr_ros.evaluation.evaluate import recognize_all
+from stavpr_ros.evaluation.ground_truth import GroundTruth
+from stavpr_ros.evaluation.metrics import accepted_counts, image_matches, sweep
+from stavpr_ros.evaluation.warp import select_places
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.mapping import build_map, PlaceMap
+from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.robust import THRESHOLD
+from stavpr_ros.sources import open_source
+from tqdm import tqdm
+
+SETTINGS = RecognizerSettings(THRESHOLD, mode='robust')
+LONG = 1000  # places from which a route is driven only around the removed stretch
+REMOVED, LONG_REMOVED = (40, 70, 100), (40, 100, 200)
+STEP, LONG_STEP = 10, 100  # places from one removed stretch to the next
+BEFORE, AFTER = 80, 60  # images driven around the removed stretch of a long route
+COARSER = 4  # of --quick: so many times coarser steps, every fourth pair of floors
+START_IMAGES, SMALL_MAP = 30, 40
+DAY, NIGHT, TOWER = 'gardens_point', 'walk_night', 'tower'
+WARPED = (DAY, 'walk_day', NIGHT, 'walk_night_map')
+SETS = (*WARPED, 'corridor', 'nordland', TOWER)
+CHANGES = ('same', '0.5x', 'varying', '2x', '3x', 'stop 30', 'stop 100', 'drop 0.3')
+LEVEL = 0.95  # declared probability whose precision the summary gives
+Results = dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A query and a map of one route, features extracted."""
+
+    name: str
+    places: PlaceMap
+    query: PlaceMap
+    truth: GroundTruth
+
+    @property
+    def long(self) -> bool:
+        """Whether the route is driven only around the removed stretch."""
+        return len(self.places) >= LONG
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """
+    What a drive of N images was matched with; every array has the shape (N,).
+
+    :param accepted: matched.
+    :param probabilities: declared for the matches, NaN = none.
+    :param correct: the match is right.
+    :param has_match: the place is in the map.
+    :param unseen: the place was removed from the map.
+    """
+
+    accepted: np.ndarray
+    probabilities: np.ndarray
+    correct: np.ndarray
+    has_match: np.ndarray
+    unseen: np.ndarray
+
+    @classmethod
+    def pooled(cls, outcomes: Sequence['Outcome']) -> 'Outcome':
+        """Return the images of several drives as one."""
+        names = cls.__dataclass_fields__
+        return cls(*(np.concatenate([getattr(each, name) for each in outcomes]) for name in names))
+
+    def numbers(self) -> dict[str, Any]:
+        """Return counts, precision and recall at the default threshold, best F1."""
+        counts = accepted_counts(self.accepted, self.correct, self.has_match)
+        curve = sweep(
+            np.where(np.isfinite(self.probabilities), 1 - self.probabilities, np.inf),
+            self.correct,
+            self.has_match,
+        )
+        return {
+            'images': len(self.accepted),
+            'matched': counts.accepted,
+            'wrong': counts.false_positives,
+            'precision': counts.precision,
+            'recall': counts.recall,
+            'f1': max(each.f1 for each in curve),
+            'recall_at_100_precision': max(each.recall for each in curve if each.precision == 1),
+            'unseen': int(np.count_nonzero(self.unseen)),
+            'unseen_matched': int(np.count_nonzero(self.unseen & self.accepted)),
+        }
+
+    def calibration(self) -> dict[str, Any]:
+        """Return declared probabilities beside the share of right matches."""
+        found = calibrate(self.probabilities, self.correct, self.has_match)
+        if found is None:
+            return {'images': 0, 'bins': [], 'levels': []}
+        document = found.to_json()
+        return document | {'bins': [row for row in document['bins'] if row['images']]}
+
+
+def matches_of(
+    place_map: PlaceMap, features: LocalFeatures, settings: RecognizerSettings
+) -> list[Match]:
+    """Return the matches of a drive, one an image, by a recognizer of its own."""
+    return recognize_all(PlaceRecognizer(place_map, settings), features)
+
+
+def outcome(
+    place_map: PlaceMap,
+    features: LocalFeatures,
+    truth: GroundTruth,
+    unseen: np.ndarray | None = None,
+) -> Outcome:
+    """
+    Drive a query on a map.
+
+    :param features: of N images.
+    :param truth: of the same images.
+    :param unseen: images whose place was removed; None = none was.
+    """
+    found = image_matches(matches_of(place_map, features, SETTINGS), SETTINGS.sequence.length)
+    return Outcome(
+        found.accepted,
+        found.probabilities,
+        truth.accepts(found.places),
+        truth.has_match,
+        np.zeros(len(features), bool) if unseen is None else unseen,
+    )
+
+
+def changed(pair: Pair, changes: DriveChanges, images: slice = slice(None)) -> Outcome:
+    """
+    Drive the query of a pair otherwise than it was recorded.
+
+    :param images: of the changed drive that are shown.
+    """
+    drive = changes.apply(pair.truth)
+    shown = np.arange(len(drive.images))[images]
+    unseen = np.any([np.zeros(len(drive.images), bool), *drive.unseen()], axis=0)
+    return outcome(
+        select_places(pair.places, drive.places) if changes.removed else pair.places,
+        pair.query.features[drive.images[shown]],
+        drive.truth.select(shown),
+        unseen[shown],
+    )
+
+
+def detours(pair: Pair, coarser: int = 1) -> Iterator[tuple[str, list[Outcome]]]:
+    """Yield the outcomes of all positions of a removed stretch, for each length of it."""
+    n = len(pair.places)
+    step = (LONG_STEP if pair.long else STEP) * coarser
+    for removed in LONG_REMOVED if pair.long else REMOVED:
+        found = []
+        firsts = range(0, n - removed + 1, step) if 2 * removed <= n else range(0)
+        for first in firsts:
+            last = first + removed
+            shown = slice(max(0, first - BEFORE), last + AFTER) if pair.long else slice(None)
+            found.append(changed(pair, DriveChanges(removed=((first, last),)), shown))
+        if found:
+            yield f'{pair.name}/{removed}', found
+
+
+def change_of(name: str, n: int) -> DriveChanges:
+    """Return the changes of a query of n images by the name of a row."""
+    kind, _, value = name.partition(' ')
+    if kind == 'stop':
+        return DriveChanges(stops=((n // 2, int(value)),))
+    if kind == 'drop':
+        return DriveChanges(drop=float(value))
+    if kind == 'varying':
+        return DriveChanges(speed='varying')
+    return DriveChanges(speed=1.0 if kind == 'same' else float(kind.rstrip('x')))
+
+
+def drives(pair: Pair) -> Iterator[tuple[str, Outcome]]:
+    """Yield the outcome of each change of a query: all for day and night, few for the others."""
+    names = CHANGES if pair.name in WARPED else CHANGES[:1]
+    for name in (*names, '4.5x') if pair.long else names:
+        yield f'{pair.name}/{name}', changed(pair, change_of(name, len(pair.query)))
+
+
+def first_right(matches: Sequence[Match], truth: GroundTruth, length: int) -> int | None:
+    """
+    Return how many images it took until a match was right; None = none was.
+
+    :param truth: of the images.
+    """
+    for count, match in enumerate(matches, 1):
+        image = count - length + (length - 1) // 2  # the middle of the window
+        if match.accepted and match.sequence is not None and image >= 0:
+            places = np.full(truth.N, -1)
+            places[image] = match.sequence.middle
+            if truth.accepts(places)[image]:
+                return count
+    return None
+
+
+def starts(pair: Pair, coarser: int = 1) -> Iterator[tuple[str, list[int | None]]]:
+    """Yield the images until the first right match, for starts on the map and on a small one."""
+    n, step = len(pair.query), (LONG_STEP if pair.long else STEP) * coarser
+    whole: list[int | None] = []
+    small: list[int | None] = []
+    for start in range(STEP, n - START_IMAGES, step):
+        images = np.arange(start, start + START_IMAGES)
+        first = min(max(0, start - 5), len(pair.places) - SMALL_MAP)
+        for found, stretch in (
+            (whole, (0, len(pair.places))),
+            (small, (first, first + SMALL_MAP)),
+        ):
+            kept = np.arange(*stretch)
+            truth = pair.truth.select(images).on_places(kept)
+            if not truth.has_match.any():
+                continue
+            place_map = select_places(pair.places, kept)
+            matches = matches_of(place_map, pair.query.features[images], SETTINGS)
+            found.append(first_right(matches, truth, SETTINGS.sequence.length))
+    yield f'{pair.name}/whole map', whole
+    yield f'{pair.name}/map of {SMALL_MAP} places', small
+
+
+def start_numbers(counts: Sequence[int | None]) -> dict[str, Any]:
+    """Return the numbers of a row from the images that each start took."""
+    right = [count for count in counts if count is not None]
+    return {
+        'starts': len(counts),
+        'right': len(right),
+        'median': float(np.median(right)) if right else None,
+        'longest': max(right) if right else None,
+    }
+
+
+@dataclass
+class Measurement:
+    """
+    Rows of the table of one kind of features, and the outcomes that are pooled.
+
+    :param coarser: factor on all steps.
+    """
+
+    feature: str
+    coarser: int = 1
+    rows: Results = field(default_factory=dict)
+    driven: list[Outcome] = field(default_factory=list)
+    left: list[Outcome] = field(default_factory=list)
+
+    def add(self, section: str, name: str, values: dict[str, Any]) -> None:
+        """Add a row."""
+        self.rows[f'{section}/{self.feature}/{name}'] = values
+
+    def pair(self, pair: Pair, bar: Callable[[str], object] = str) -> None:
+        """
+        Add the rows of a pair.
+
+        :param bar: called with the name of each part.
+        """
+        bar(f'{pair.name} drives')
+        found = dict(drives(pair))
+        for name, each in found.items():
+            self.add('drives', name, each.numbers())
+        if len(found) > 1:
+            pooled = Outcome.pooled(list(found.values()))
+            self.add('drives', f'{pair.name}/all', pooled.numbers())
+        self.driven += found.values()
+        bar(f'{pair.name} in reverse order')
+        if not pair.long:
+            self.add('reverse', pair.name, changed(pair, DriveChanges(reverse=True)).numbers())
+        bar(f'{pair.name} detours')
+        for name, outcomes in detours(pair, self.coarser):
+            each = [one.numbers() for one in outcomes]
+            shares = [one['unseen_matched'] / one['unseen'] for one in each if one['unseen']]
+            values = Outcome.pooled(outcomes).numbers() | {'positions': len(each)}
+            values |= {'worst': max(shares, default=0.0)}
+            self.add('detours', name, values)
+            self.left += outcomes
+        bar(f'{pair.name} starts')
+        for name, counts in starts(pair, self.coarser):
+            self.add('start', name, start_numbers(counts))
+
+    def floors(self, floors: dict[str, PlaceMap]) -> None:
+        """Add the row of floors on maps of other floors: each match is wrong."""
+        pairs = [(a, b) for a in floors for b in floors if a != b][:: self.coarser]
+        shares, found = {}, []
+        for map_name, query_name in tqdm(pairs, desc='floors', leave=False):
+            place_map, query = floors[map_name], floors[query_name]
+            nothing = GroundTruth(len(query), len(place_map), np.zeros(0, np.int64))
+            one = outcome(place_map, query.features, nothing)
+            shares[f'{query_name} on {map_name}'] = float(one.accepted.mean())
+            found.append(one)
+        pooled = Outcome.pooled(found)
+        worst = max(shares, key=shares.__getitem__)
+        matched = int(np.count_nonzero(pooled.accepted))
+        values = {'images': len(pooled.accepted), 'matched': matched, 'pairs': len(pairs)}
+        self.add('floors', TOWER, values | {'worst_pair': worst, 'worst': shares[worst]})
+        self.left += found
+
+    def finish(self) -> Results:
+        """Add the pooled rows, and return all."""
+        if self.driven:
+            pooled = Outcome.pooled(self.driven)
+            self.add('calibration', 'drives', pooled.calibration())
+        if self.left:
+            pooled = Outcome.pooled(self.driven + self.left)
+            self.add('calibration', 'with detours and floors', pooled.calibration())
+        return self.rows
+
+
+# ------------------------------------------------ the table
+
+
+def percent(part: float, whole: float) -> str:
+    """Return a share with the counts."""
+    return f'{part / whole:.1%} of {whole:,}' if whole else '-'
+
+
+def _rows(results: Results, section: str) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    for key, values in results.items():
+        head, feature, name = key.split('/', 2)
+        if head == section:
+            yield feature, name, values
+
+
+def summary(results: Results, feature: str) -> dict[str, tuple[str, str]]:
+    """Return value and aim of each row of the summary, for one kind of features."""
+
+    def of(section: str) -> dict[str, dict[str, Any]]:
+        return {name: v for f, name, v in _rows(results, section) if f == feature}
+
+    def total(rows: dict[str, dict[str, Any]], name: str) -> int:
+        return sum(row[name] for row in rows.values())
+
+    g = feature == 'g'
+    found: dict[str, tuple[str, str]] = {}
+    left, driven, reverse = of('detours'), of('drives'), of('reverse')
+    single = {k: v for k, v in driven.items() if not k.endswith('/all')}
+    if left:
+        text = percent(total(left, 'unseen_matched'), total(left, 'unseen'))
+        found['detours: unseen images matched'] = text, '<= 2 %' if g else '<= 3 %'
+    for row in of('floors').values():
+        text = f'{percent(row["matched"], row["images"])} (worst pair {row["worst"]:.1%})'
+        found['other floors: images matched'] = text, '<= 1 %' if g else '<= 2 %'
+
+    def best(label: str, names: Sequence[str], aim: float, value: str = 'f1') -> None:
+        values = [driven[name][value] for name in names if name in driven]
+        if values:
+            found[label] = f'{min(values):.3f}', f'>= {aim}'
+
+    best('day / night: best F1', [f'{NIGHT}/same'], 0.97 if g else 0.99)
+    slow = [f'{NIGHT}/0.5x', f'{NIGHT}/varying']
+    best('day / night at half and varying speed: lowest best F1', slow, 0.9 if g else 0.95)
+    best('three times the speed by day: best F1', [f'{DAY}/3x'], 0.95)
+    best('4.5 times the speed (Nordland): best F1', ['nordland/4.5x'], 0.95)
+    if single:
+        worst = min(single, key=lambda name: single[name]['precision'])
+        text = f'{single[worst]["precision"]:.3f} ({worst})'
+        found['lowest precision at the default'] = text, '>= 0.95'
+    if reverse:
+        text = percent(total(reverse, 'wrong'), total(reverse, 'images'))
+        found['reverse order: images matched wrongly'] = text, '<= 3 %'
+    label, value = 'recall at 100 % precision, all speeds', 'recall_at_100_precision'
+    best(f'{label}, by day', [f'{DAY}/all'], 0.9 if g else 0.95, value)
+    best(f'{label}, day / night', [f'{NIGHT}/all'], 0.7 if g else 0.9, value)
+    begun = of('start')
+    if begun:
+        right = percent(total(begun, 'right'), total(begun, 'starts'))
+        longest = max((row['longest'] or 0 for row in begun.values()), default=0)
+        text = f'{right}; at most {longest} images'
+        found['start in the middle: right within 30 images'] = text, f'{25 if g else 20} images'
+    for name, row in of('calibration').items():
+        if row['images']:
+            text = f'{row["expected_calibration_error"]:.3f}'
+            found[f'calibration: expected error, {name}'] = text, ''
+            for level in row['levels']:
+                if level['probability'] == LEVEL and level['matched']:
+                    label = f'precision where {LEVEL} or more is declared, {name}'
+                    found[label] = f'{level["precision"]:.3f}', '>= 0.93'
+    return found
+
+
+def summary_section(results: Results) -> list[str]:
+    """Return the summary: a row a question, a column a kind of features."""
+    features = sorted({key.split('/')[1] for key in results}, key=list(FEATURES).index)
+    columns = {feature: summary(results, feature) for feature in features}
+    labels = list(dict.fromkeys(label for column in columns.values() for label in column))
+    lines = []
+    for label in labels:
+        cells = [columns[feature].get(label, ('-', '')) for feature in features]
+        lines.append([label, *(text for cell in cells for text in cell)])
+    head = [title for feature in features for title in (FEATURES[feature], 'wanted')]
+    return table(['', *head], lines)
+
+
+def _drive_cells(row: dict[str, Any]) -> list[str]:
+    names = ('f1', 'precision', 'recall', 'recall_at_100_precision')
+    return [f'{row["images"]:,}', *(f'{row[name]:.3f}' for name in names)]
+
+
+def _detour_cells(row: dict[str, Any]) -> list[str]:
+    shares = [percent(row['unseen_matched'], row['unseen']), f'{row["worst"]:.1%}']
+    return [str(row['positions']), *shares, f'{row["precision"]:.3f}', f'{row["recall"]:.3f}']
+
+
+def _floor_cells(row: dict[str, Any]) -> list[str]:
+    worst = f'{row["worst"]:.1%} ({row["worst_pair"]})'
+    return [str(row['pairs']), percent(row['matched'], row['images']), worst]
+
+
+def _reverse_cells(row: dict[str, Any]) -> list[str]:
+    wrong = percent(row['wrong'], row['images'])
+    return [str(row['matched']), wrong, f'{row["precision"]:.3f}']
+
+
+def _start_cells(row: dict[str, Any]) -> list[str]:
+    counts = ['-' if row[name] is None else f'{row[name]:g}' for name in ('median', 'longest')]
+    return [str(row['starts']), str(row['right']), *counts]
+
+
+SECTIONS: tuple[tuple[str, str, str, tuple[str, ...], Callable[..., list[str]]], ...] = (
+    (
+        'detours',
+        'Detours: a stretch is missing in the map',
+        'The map is made without a stretch, which the query drives all the same; all positions of '
+        'the stretch (steps of 10 places, Nordland 100) are pooled. Unseen are images more than 5 '
+        'places from each place of the map. Precision counts all matches, recall the images '
+        'whose place the map has.',
+        (
+            'map and query / places removed',
+            'positions',
+            'unseen images matched',
+            'worst position',
+            'precision',
+            'recall',
+        ),
+        _detour_cells,
+    ),
+    (
+        'floors',
+        'Floors on maps of other floors',
+        'Eight floors of a building that look alike; every match is wrong.',
+        ('data set', 'pairs', 'images matched', 'worst pair'),
+        _floor_cells,
+    ),
+    (
+        'drives',
+        'Drives at other speeds, with stops and dropped images',
+        'Half speed shows every image twice; "stop" repeats the image in the middle so many '
+        'times; "drop" leaves images out with this probability; "all" pools the rows above it. '
+        'Best F1 is over all thresholds, P and R are those of the default.',
+        ('map and query / change', 'images', 'best F1', 'P', 'R', 'R at 100 % P'),
+        _drive_cells,
+    ),
+    (
+        'reverse',
+        'The route in reverse order',
+        'The images of the query, the last one first: places are right, the direction is not.',
+        ('map and query', 'matched', 'wrong', 'precision'),
+        _reverse_cells,
+    ),
+    (
+        'start',
+        'Start in the middle',
+        'Thirty images from a start on the route, with an empty window; images until the first '
+        'match is right (a window has 20). The small map has the places around the start.',
+        ('map and query / map', 'starts', 'with a right match', 'median images', 'most images'),
+        _start_cells,
+    ),
+)
+
+
+def calibration_section(results: Results) -> list[str]:
+    """Return the tables of declared probabilities."""
+    lines = []
+    for feature, name, values in _rows(results, 'calibration'):
+        for row in values['bins']:
+            cells = [f'{row["from"]:.1f} - {row["to"]:.1f}', f'{row["images"]:,}']
+            cells += [f'{row[key]:.3f}' for key in ('declared', 'right')]
+            lines.append([FEATURES[feature], name, *cells])
+    text = 'Probabilities that the best place of an image is right, beside the share that is.'
+    head = ('features', 'images of', 'declared', 'images', 'mean', 'right')
+    return ['## Calibration', '', text, '', *table(head, lines)]
+
+
+def markdown(about: dict[str, Any], results: Results) -> list[str]:
+    """Return the lines of the page."""
+    steps, coarse = about.get('steps', 1), []
+    if steps > 1:
+        coarse = [f'Steps between positions are {steps} times as coarse as below.', '']
+    lines = [
+        *heading('Off the map, at night, at other speeds', about),
+        'Mode robust with its defaults on all data sets, by `make off-map`. '
+        'Data sets: benchmarks/README.md; the method: [robust mode](robust_mode.md).',
+        '',
+        *coarse,
+        *summary_section(results),
+    ]
+    for section, title, text, head, cells in SECTIONS:
+        rows = [[FEATURES[f], name, *cells(row)] for f, name, row in _rows(results, section)]
+        if rows:
+            lines += [f'## {title}', '', text, '', *table(('features', *head), rows)]
+    return [*lines, *calibration_section(results)]
+
+
+def opened(
+    folder: Path, feature: str, making: FeatureExtractor, sets: Sequence[str] = SETS
+) -> Iterator[tuple[Pair | None, dict[str, PlaceMap]]]:
+    """Yield the pairs of the data sets, and at last the floors; features are extracted once."""
+    kept: dict[int, tuple[Any, PlaceMap]] = {}  # with its source, so that its id stays its own
+
+    def features(source: Any) -> PlaceMap:
+        if id(source) not in kept:
+            kept[id(source)] = source, build_map(source, making, thumbnails=False, progress=False)
+        return kept[id(source)][1]
+
+    cases = [*short_cases(folder), *long_cases(folder, feature)]
+    for case in (case for case in cases if case.name in sets):
+        places, query = features(case.places), features(case.query)
+        yield Pair(case.name, places, query, case.truth(len(query), len(places))), {}
+    kept.clear()
+    if TOWER not in sets:
+        return
+    paths = sorted(path for path in (folder / TOWER).iterdir() if path.is_dir())
+    yield None, {path.name: features(open_source(path)) for path in paths}
+
+
+def measure(
+    folder: Path, chosen: Sequence[str], sets: Sequence[str] = SETS, coarser: int = 1
+) -> Results:
+    """Return all rows; print what is left out."""
+    results: Results = {}
+    for feature in chosen:
+        try:
+            making = extractor(feature, folder)
+        except UnavailableError as error:
+            print(f'left out: {FEATURES[feature]}: {error}', file=sys.stderr)
+            continue
+        measurement = Measurement(feature, coarser)
+        with tqdm(desc=FEATURES[feature], unit='part') as bar:
+
+            def advance(name: str, bar: Any = bar) -> None:
+                bar.set_postfix_str(name)
+                bar.update()
+
+            for pair, floors in opened(folder, feature, making, sets):
+                if pair is not None:
+                    measurement.pair(pair, advance)
+                else:
+                    advance('floors')
+                    measurement.floors(floors)
+        results |= measurement.finish()
+    return results
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    add = parser.add_argument
+    add('--quick', action='store_true', help='gradient features, coarser steps; not into docs/')
+    add('--features', nargs='+', choices=tuple(FEATURES), default=tuple(FEATURES))
+    add('--sets', nargs='+', choices=SETS, default=SETS, metavar='NAME', help=', '.join(SETS))
+    add('--steps', type=int, default=1, metavar='N', help='steps N times as coarse (1)')
+    add('--commit', default='', help='name of the measured commit, outside a git checkout')
+    add('--output', type=Path, default=RESULTS, help='folder of the JSON (%(default)s)')
+    add('--page', type=Path, default=ROOT / 'docs/off_map.md', help='the page (%(default)s)')
+    options = parser.parse_args(arguments)
+    try:
+        folder = data_folder()
+    except NoDataError as error:
+        print(f'off_map: {error}', file=sys.stderr)
+        return 2
+    about, began = environment(named_commit=options.commit), time.perf_counter()
+    chosen, steps = (('g',), COARSER) if options.quick else (options.features, options.steps)
+    results = measure(folder, chosen, options.sets, steps)
+    path = options.output / f'off_map{"-quick" if options.quick else ""}.json'
+    page = path.with_suffix('.md') if options.quick else options.page
+    path.parent.mkdir(parents=True, exist_ok=True)
+    about |= {'steps': steps}
+    path.write_text(
+        json.dumps(about | {'results': results}, indent=1, allow_nan=False) + '\n',
+        encoding='utf-8',
+    )
+    page.write_text('\n'.join(markdown(about, results)).rstrip() + '\n', encoding='utf-8')
+    print(*summary_section(results), sep='\n')
+    print(f'took {time.perf_counter() - began:.0f} s\nwrote {path} and {page}')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
