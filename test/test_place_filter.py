@@ -56,7 +56,7 @@ def driven(s, sizes, seed=0):
         (FilterSettings(), [30] * 8),
         (replace(LIVELY, levels=(-2.0,), speeds=(1.33,)), [9] * 5),
         (LIVELY, [300] * 3),
-        (FEW, [2060] * 3),  # two blocks
+        (FEW, [2049] * 3),  # the second block shorter than a step
         (LIVELY, [0, 0, 4, 5]),
         (LIVELY, [6, 7, 9, 9, 4, 4, 5, 8]),  # after fewer places, more again
     ],
