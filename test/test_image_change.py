@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.recognition.image_change import (
+from stavpr_ros.recognition.filter_search import (
     AHEAD,
     APART,
     change_between,

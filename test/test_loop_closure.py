@@ -13,7 +13,7 @@ from stavpr_ros.alignment.spatial import adaptive_weights
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition import RecognizerSettings, Status
-from stavpr_ros.recognition.image_change import ImageChange
+from stavpr_ros.recognition.filter_search import ImageChange
 from stavpr_ros.recognition.loop_closer import (
     choose_loop_backend,
     EVICTED,

@@ -92,6 +92,65 @@ def options_of(mode: str) -> RobustOptions:
     return ROBUST if mode == 'robust' else PAPER
 
 
+@dataclass(frozen=True)
+class FilterSettings:
+    """
+    Model of the filter; tuned on the data sets named in docs/robust_mode.md.
+
+    :param speeds: places that the query passes an image.
+    :param levels: mean z-normalized distance of right places, from bad to good conditions.
+    :param weight: alpha of an image that differs from the one before as neighboring places of the
+        map do.
+    :param most_change, least_change: limits of the change, over that of neighboring places, that
+        alpha is multiplied by.
+    :param standstill: change, over that of neighboring places, below which the camera stands.
+    :param keep_level: probability of keeping the level.
+    :param keep_speed: probability of keeping the speed.
+    :param spread: probability of one place more than the speed's, and of one less.
+    :param leave: probability of leaving the map at an image, and enter: of returning to it.
+    :param start: probability of starting on the map.
+    :param change_deviation: of the logarithm of the change at one speed.
+    """
+
+    speeds: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
+    levels: tuple[float, ...] = (-1.0, -2.0, -3.25)
+    weight: float = 0.25
+    most_change: float = 2.0
+    least_change: float = 0.2
+    standstill: float = 0.1
+    keep_level: float = 0.998
+    keep_speed: float = 0.98
+    spread: float = 0.05
+    leave: float = 0.01
+    enter: float = 0.01
+    start: float = 0.7
+    change_deviation: float = 0.5
+
+    def level_changes(self) -> np.ndarray:
+        """Return the probability of each level by the one before, (K, K), float32."""
+        K = len(self.levels)
+        changes = np.zeros((K, K), np.float32)
+        for k in range(K):
+            neighbors = [j for j in (k - 1, k + 1) if 0 <= j < K]
+            changes[k, k] = self.keep_level if neighbors else 1
+            changes[k, neighbors] = (1 - changes[k, k]) / max(len(neighbors), 1)
+        return changes
+
+    def speed_changes(self, weights: np.ndarray) -> np.ndarray:
+        """
+        Return the probabilities that the kernels take, (4, V), float32.
+
+        :param weights: relative probability of each speed for this image, (V,).
+        """
+        V = len(self.speeds)
+        near, far = (1 - self.keep_speed) * 0.4, (1 - self.keep_speed) * 0.2 / V
+        total = self.keep_speed * weights + far * weights.sum()
+        total[1:] += near * weights[:-1]
+        total[:-1] += near * weights[1:]
+        before = np.array([self.keep_speed, near, far])[:, None] / total
+        return np.concatenate([before, weights[None]]).astype(np.float32)
+
+
 class MeanCentering:
     """
     Subtracts the part of the features that all images of a traverse share.
