@@ -149,7 +149,8 @@ def run_pipeline(
     from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
 
     settings = PipelineSettings(
-        threshold=0.5, mode=mode, backend='cpu', precision=precision, features='synthetic',
+        threshold=0.5 if mode == 'paper' else None, mode=mode, backend='cpu',
+        precision=precision, features='synthetic',
         feature_settings=f'{{"d": {d}}}', max_places=max(n, 1000), thumbnail_width=0,
     )  # fmt: skip
     pipeline = Pipeline(settings, operation)

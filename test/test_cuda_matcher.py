@@ -11,8 +11,9 @@ from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.features.extractor import FeatureSettings
+from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
 from stavpr_ros.recognition.robust import ZNormalization
-from stavpr_ros.recognition.sequence_search import LmDtwSearch, SequenceBuffer
+from stavpr_ros.recognition.sequence_search import SequenceBuffer
 import torch
 
 SIMULATOR = os.environ.get('NUMBA_ENABLE_CUDASIM') == '1'

@@ -8,9 +8,8 @@ from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.filter_search import FilterSearch
 from stavpr_ros.recognition.robust import THRESHOLD
-from stavpr_ros.recognition.sequence_search import SequenceBuffer
+from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')

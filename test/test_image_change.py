@@ -4,7 +4,8 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.recognition.filter_search import (
+from stavpr_ros.recognition.place_filter import FilterSettings
+from stavpr_ros.recognition.sequence_search import (
     AHEAD,
     APART,
     change_between,
@@ -12,8 +13,8 @@ from stavpr_ros.recognition.filter_search import (
     ImageChange,
     OFFSET,
     SMOOTHED,
+    STRETCH,
 )
-from stavpr_ros.recognition.place_filter import FilterSettings
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 SETTINGS = FilterSettings()
@@ -142,7 +143,7 @@ def test_unlit_is_where_places_of_map_are_equal_or_soon_will_be():
     strips[:, 30:41] = 0  # 31..40 equal the one before
     change = learned(strips)
     dark = [change.unlit(probable_at(place, 60)) for place in range(60)]
-    assert dark == [31 - AHEAD < place <= 40 for place in range(60)]
+    assert dark == [30 + STRETCH - AHEAD < place <= 40 for place in range(60)]
     assert not change.unlit(np.zeros(60))
     change.evict(5)
     assert [change.unlit(probable_at(place, 55)) for place in range(55)] == dark[5:]

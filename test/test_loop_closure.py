@@ -13,7 +13,6 @@ from stavpr_ros.alignment.spatial import adaptive_weights
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition import RecognizerSettings, Status
-from stavpr_ros.recognition.filter_search import ImageChange
 from stavpr_ros.recognition.loop_closer import (
     choose_loop_backend,
     EVICTED,
@@ -23,6 +22,7 @@ from stavpr_ros.recognition.loop_closer import (
 from stavpr_ros.recognition.place_filter import CLOSE, FilterSettings, PlaceFilter
 from stavpr_ros.recognition.robust import MEMORY, MIN_DEVIATION, PAPER, PRIOR, ROBUST, THRESHOLD
 from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
+from stavpr_ros.recognition.sequence_search import ImageChange
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')

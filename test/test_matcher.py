@@ -20,9 +20,10 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust import ZNormalization
-from stavpr_ros.recognition.sequence_search import LmDtwSearch, SequenceBuffer
+from stavpr_ros.recognition.sequence_search import SequenceBuffer
 import torch
 
 # of a number kept in float16, relative; so also of a product of unit-norm features, at most

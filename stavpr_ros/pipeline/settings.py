@@ -79,7 +79,7 @@ class PipelineSettings:
 
     @property
     def _has_probability(self) -> bool:
-        """Matches have a probability, and distances are 1 - probability."""
+        """Whether matches have a probability; distances are 1 - probability then."""
         return options_of(self.mode).place_filter
 
     @property

@@ -12,12 +12,11 @@ from stavpr_ros.alignment.spatial import adaptive_weights
 from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.recognition.filter_search import FilterSearch
 from stavpr_ros.recognition.match import Match, Status
 from stavpr_ros.recognition.recognizer import RecognizerSettings, SequenceRecognizer
 from stavpr_ros.recognition.robust import ZNormalization
 from stavpr_ros.recognition.route_features import RouteFeatures
-from stavpr_ros.recognition.sequence_search import SequenceBuffer
+from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
 import torch
 
 EVICTED = 8  # the oldest one in so many is evicted at a time

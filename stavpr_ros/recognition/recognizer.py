@@ -12,7 +12,7 @@ from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition.filter_search import FilterSearch
+from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
 from stavpr_ros.recognition.match import (
     Candidate,
     distinct_places,
@@ -28,7 +28,7 @@ from stavpr_ros.recognition.robust import (
     ZNormalization,
 )
 from stavpr_ros.recognition.sequence_search import (
-    LmDtwSearch,
+    FilterSearch,
     Search,
     SequenceBuffer,
     WindowMatch,

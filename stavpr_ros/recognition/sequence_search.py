@@ -1,23 +1,34 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The window of the query, and the nearest sequence of the map to it."""
+"""
+The window of the query, and the search of mode robust over it.
+
+The change of two images is 1 less the mean cosine similarity of their strips, each with the one in
+the same place: 0 for equal images, about 1 for unrelated ones. How it grows with the number of
+places in between is learned from the map, so that the query's changes show how fast it moves.
+"""
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
+import numba as nb
 import numpy as np
-from stavpr_ros.alignment.lm_dtw import (
-    best_match,
-    match_padded,
-    padded_width,
-    SequenceMatch,
-    trace_sequence,
-)
+from stavpr_ros.alignment.lm_dtw import padded_width, SequenceMatch
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.checks import no_nan
-from stavpr_ros.recognition.robust import ZNormalization
+from stavpr_ros.compilation import parallel_kernel
+from stavpr_ros.recognition.place_filter import Belief, CLOSE, PlaceFilter
+from stavpr_ros.recognition.robust import FilterSettings
 import torch
+
+APART = 5  # places apart up to which the map's changes are learned
+SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
+OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
+FLOOR = 1e-3  # least relative probability of a speed
+AHEAD = 8  # places within which an unlit stretch may begin
+STRETCH = 4  # places in a row, at least, equal each to the one before: an unlit stretch
+UNLIT = 0.3  # probability of such places above which equal images do not mean standstill
 
 Sequences = tuple[np.ndarray, np.ndarray]
 
@@ -157,48 +168,254 @@ Search = Callable[[int], WindowMatch]
 """Matches a full window; the argument is the radius in places of the non-maximum suppression."""
 
 
-class LmDtwSearch:
+@parallel_kernel
+def _changes(strips, apart, out):
+    """Write the change of each place of (W, n, d) from the one ``apart`` places before, (n,)."""
+    W, n, d = strips.shape
+    for y in nb.prange(apart, n):
+        total = np.float32(0)
+        for j in range(W):
+            a, b = strips[j, y], strips[j, y - apart]
+            dot, norm = np.float32(0), np.float32(0)
+            for i in range(d):
+                dot += a[i] * b[i]
+                norm += a[i] * a[i] + b[i] * b[i]
+            total += dot if norm > 0 else np.float32(1)
+        out[y] = 1 - total / W
+
+
+class ImageChange:
     """
-    LM-DTW on the CPU (section 4 of the paper).
+    Changes of a map, and of the query that is compared with it.
+
+    :param places: places that there is room for.
+    """
+
+    def __init__(self, places: int, settings: FilterSettings) -> None:
+        self._settings = settings
+        self._speeds = np.array(settings.speeds)
+        self._sums, self._counts = np.zeros(APART + 1), np.zeros(APART + 1)
+        self._from_before = np.ones(places, np.float32)  # change of each place from the one before
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the query."""
+        self._last: np.ndarray | None = None
+        self._latest: deque[float] = deque(maxlen=SMOOTHED)
+
+    def learn(self, strips: np.ndarray) -> None:
+        """Learn from all places of a map, unit-norm strips (W, n, d), float32."""
+        changes = np.empty(strips.shape[1], np.float32)
+        for apart in range(1, min(APART, strips.shape[1] - 1) + 1):
+            _changes(strips, apart, changes)
+            self._sums[apart] = changes[apart:].sum(dtype=np.float64)
+            self._counts[apart] = len(changes) - apart
+            if apart == 1:
+                self._from_before[1:] = changes[1:]
+
+    def learn_newest(self, strips: np.ndarray) -> None:
+        """Learn from the newest place of a route, (W, n, d) of all its places."""
+        n = strips.shape[1]
+        newest = strips[:, n - 1]
+        changes = [
+            change_between(newest, strips[:, n - 1 - apart])
+            for apart in range(1, min(APART, n - 1) + 1)
+        ]
+        self._from_before[n - 1] = changes[0] if changes else 1
+        if changes and not self.is_standstill(changes[0]):
+            self._sums[1 : len(changes) + 1] += changes
+            self._counts[1 : len(changes) + 1] += 1
+
+    def grow(self, places: int) -> None:
+        """Make room for more places."""
+        more = np.ones(places - len(self._from_before), np.float32)
+        self._from_before = np.append(self._from_before, more)
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+        self._from_before = np.append(self._from_before[count:], np.ones(count, np.float32))
+
+    @property
+    def curve(self) -> np.ndarray:
+        """Mean change of places 0, 1, ... ``APART`` apart; 1 where none is known."""
+        known = self._counts > 0
+        curve = np.where(known, self._sums / np.maximum(self._counts, 1), 1)
+        curve[0] = 0
+        return curve
+
+    def next_query(self, strips: np.ndarray) -> float:
+        """Return the change of the query's next image (W, d) from the one before, 1 at first."""
+        change = 1.0 if self._last is None else change_between(strips, self._last)
+        self._last = strips
+        return change
+
+    def is_standstill(self, change: float) -> bool:
+        """Whether the query's images are equal up to noise: the camera stands, or it is dark."""
+        return bool(change < self._settings.standstill * self.curve[1])
+
+    def unlit(self, by_place: np.ndarray) -> bool:
+        """
+        Whether equal images are expected where the camera is: places of the map are equal there.
+
+        :param by_place: probability of each place, (n,).
+        """
+        n = len(by_place)
+        equal = self._from_before[:n] < 2 * self._settings.standstill * self.curve[1]
+        for _ in range(STRETCH - 1):  # equal places before, too
+            equal[1:] &= equal[:-1].copy()
+        ahead = np.zeros(n, bool)
+        for places in range(min(AHEAD, n)):
+            ahead[: n - places] |= equal[places:]
+        return bool(by_place[ahead].sum() > UNLIT * by_place.sum())
+
+    def weight(self, change: float) -> float:
+        """Return the exponent alpha of the image's likelihood."""
+        s = self._settings
+        relative = change / max(float(self.curve[1]), 1e-6)
+        return s.weight * min(s.most_change, max(s.least_change, relative))
+
+    def speed_weights(self, change: float) -> np.ndarray:
+        """Return the relative probability of each speed after another change, (V,)."""
+        self._latest.append(change)
+        seen = np.log(np.mean(self._latest) + OFFSET)
+        expected = np.log(np.interp(self._speeds, np.arange(APART + 1), self.curve) + OFFSET)
+        off = (seen - expected) / self._settings.change_deviation
+        return np.asarray(np.exp(-0.5 * off**2) + FLOOR)
+
+
+def change_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the change of two images, unit-norm strips (W, d) each; equal where both are zero."""
+    similarity = np.einsum('jd,jd->j', a, b)
+    similarity[~(a.any(axis=1) | b.any(axis=1))] = 1
+    return float(1 - similarity.mean())
+
+
+class FilterSearch:
+    """
+    A :class:`PlaceFilter` fed image by image, and read at the middle of the window.
+
+    The distance of a match is 1 less the probability that its place is right.
 
     :param buffer: the window.
-    :param znorm: applied to the distances.
     """
 
-    def __init__(self, buffer: SequenceBuffer, znorm: ZNormalization) -> None:
-        self.buffer, self._znorm = buffer, znorm
+    def __init__(self, buffer: SequenceBuffer, settings: FilterSettings | None = None) -> None:
+        self.buffer = buffer
+        settings = settings or FilterSettings()
+        self._middle = (buffer.length - 1) // 2
+        self.filter = PlaceFilter(buffer.places, buffer.length - 1 - self._middle, settings)
+        self.change = ImageChange(buffer.places, settings)
+        self._speeds = settings.speeds
+        self._images: deque[int] = deque(maxlen=buffer.length)  # the filter's image of each
+        # alpha and speed weights of each image until the window is full; None = nothing was added
+        self._first: list[tuple[float, np.ndarray] | None] = []
+
+    def reset(self) -> None:
+        """Forget the query."""
+        self.filter.reset()
+        self.change.reset()
+        self._images.clear()
+        self._first.clear()
+
+    def grow(self, places: int) -> None:
+        """Make room for more places."""
+        self.filter.grow(places)
+        self.change.grow(places)
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+        self.filter.evict(count)
+        self.change.evict(count)
+
+    def update(self, z: np.ndarray, change: float, standstill: bool) -> None:
+        """
+        Advance by an image.
+
+        An image of a camera that stands adds nothing. Where the map's own images are equal, in a
+        dark tunnel, it may move: the filter goes on at its speed, without evidence.
+
+        :param z: z-normalized distances to the places, (m,), float32.
+        :param change, standstill: of the image, from :class:`ImageChange`.
+        """
+        still = standstill and self.filter.count > 0
+        evidence: tuple[float, np.ndarray] | None = None
+        if not still:
+            evidence = self.change.weight(change), self._speed_weights(change)
+        elif self.change.unlit(self.filter.places_of_states()[: len(z)]):
+            evidence = 0.0, np.ones(len(self._speeds))
+        self._advance(z, evidence)
+        if len(self._first) < self.buffer.length:
+            self._first.append(evidence)
+
+    def start_again(self, rows: np.ndarray) -> None:
+        """
+        Repeat the first window with the z-normalization that is known at its end.
+
+        :param rows: z-normalized distances of the window, (l, n).
+        """
+        self.filter.reset()
+        self._images.clear()
+        for row, evidence in zip(rows, self._first, strict=True):
+            self._advance(row, evidence)
+
+    def _advance(self, z: np.ndarray, evidence: tuple[float, np.ndarray] | None) -> None:
+        if evidence is not None:
+            self.filter.update(z, *evidence)
+        self._images.append(self.filter.count - 1)
+
+    def _speed_weights(self, change: float) -> np.ndarray:
+        if not self.filter.count:
+            return np.ones(len(self._speeds))  # of the first image no change is known
+        return self.change.speed_weights(change)
 
     def __call__(self, nms_radius: int) -> WindowMatch:
-        buffer = self.buffer
-        n, k, first = buffer.known, buffer.k, buffer.first
-        window = buffer.rows().numpy()
-        if self._znorm.reference or n < buffer.places:
-            costs = np.full((buffer.length, padded_width(n, k)), np.inf, np.float32)
-            costs[:, :n] = self._znorm.scaled(window[:, :n])
-            window = costs
-        matches = match_padded(window, n, k)
-        nearest = best_match(matches, nms_radius)
-        path = NO_PATH
-        if nearest is not None:
-            path = trace_sequence(window[:, :n], nearest.first, k).path
-        return _renumbered(
-            nearest, path, lambda: (matches.distances, matches.middles + first), first
+        n, first = self.buffer.known, self.buffer.first
+        if not n:
+            return WindowMatch()
+        newest = self._images[-1]
+        belief = self.filter.belief(n, newest - self._images[self._middle])
+        place = int(np.argmax(belief.probabilities))
+        if not belief.probabilities[place] > 0:
+            return self._nowhere(n, first)
+        near = slice(max(0, place - CLOSE), min(n, place + CLOSE + 1))
+        weights = belief.weights[near]
+        middle = round(float(np.arange(near.start, near.stop) @ weights / weights.sum()))
+        path = self._path(belief.ways[near.start + int(np.argmax(weights))])
+        elsewhere = belief.probabilities.copy()
+        elsewhere[max(0, middle - nms_radius) : middle + nms_radius + 1] = 0
+        second = int(np.argmax(elsewhere))
+        found = float(elsewhere[second])
+        path[:, 1] += first
+        match = SequenceMatch(
+            first=int(path[0, 1]),
+            last=int(path[-1, 1]),
+            middle=middle + first,
+            distance=float(1 - belief.probabilities[place]),
+            second_best_index=second + first if found > 0 else -1,
+            second_best_distance=1 - found if found > 0 else float('nan'),
         )
+        return WindowMatch(match, path, lambda: _sequences(belief, first))
+
+    def _nowhere(self, n: int, first: int) -> WindowMatch:
+        """Return the place that is most probable now, with the distance 1."""
+        place = int(np.argmax(self.filter.places_of_states()[:n])) + first
+        match = SequenceMatch(place, place, place, 1.0, -1, float('nan'))
+        length = self.buffer.length
+        path = np.stack([np.arange(length), np.full(length, place)], axis=1).astype(np.int32)
+        return WindowMatch(match, path)
+
+    def _path(self, way: np.ndarray) -> np.ndarray:
+        """Return the place of each image of the window, (l, 2); before the middle at one speed."""
+        images = np.array(self._images)
+        back = images[-1] - images
+        lag = int(back[self._middle])
+        places = self.filter.way(way, lag)
+        slope = (places[0] - places[lag]) / lag if lag else self._speeds[way[3]]
+        earlier = np.maximum(back - lag, 0) * slope
+        path = places[np.minimum(back, lag)] - np.rint(earlier).astype(np.int32)
+        return np.stack([np.arange(len(path)), np.maximum(path, 0)], axis=1).astype(np.int32)
 
 
-def _renumbered(
-    nearest: SequenceMatch | None, path: np.ndarray, sequences: Callable[[], Sequences], first: int
-) -> WindowMatch:
-    """Return a match whose places are counted from the first place ever, evicted ones included."""
-    if nearest is None or not first:
-        return WindowMatch(nearest, path, sequences)
-    path[:, 1] += first
-    second_best = nearest.second_best_index
-    moved = replace(
-        nearest,
-        first=nearest.first + first,
-        last=nearest.last + first,
-        middle=nearest.middle + first,
-        second_best_index=second_best + first if second_best >= 0 else -1,
-    )
-    return WindowMatch(moved, path, sequences)
+def _sequences(belief: Belief, first: int) -> Sequences:
+    costs = np.where(belief.probabilities > 0, 1 - belief.probabilities, np.inf)
+    return costs.astype(np.float32), np.arange(first, first + len(costs))

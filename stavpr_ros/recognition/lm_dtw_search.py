@@ -1,0 +1,65 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The nearest sequence of the map by LM-DTW, on the CPU."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from stavpr_ros.alignment.lm_dtw import (
+    best_match,
+    match_padded,
+    padded_width,
+    SequenceMatch,
+    trace_sequence,
+)
+from stavpr_ros.alignment.path import NO_PATH
+from stavpr_ros.recognition.robust import ZNormalization
+from stavpr_ros.recognition.sequence_search import SequenceBuffer, Sequences, WindowMatch
+
+
+class LmDtwSearch:
+    """
+    LM-DTW on the CPU (section 4 of the paper).
+
+    :param buffer: the window.
+    :param znorm: applied to the distances.
+    """
+
+    def __init__(self, buffer: SequenceBuffer, znorm: ZNormalization) -> None:
+        self.buffer, self._znorm = buffer, znorm
+
+    def __call__(self, nms_radius: int) -> WindowMatch:
+        buffer = self.buffer
+        n, k, first = buffer.known, buffer.k, buffer.first
+        window = buffer.rows().numpy()
+        if self._znorm.reference or n < buffer.places:
+            costs = np.full((buffer.length, padded_width(n, k)), np.inf, np.float32)
+            costs[:, :n] = self._znorm.scaled(window[:, :n])
+            window = costs
+        matches = match_padded(window, n, k)
+        nearest = best_match(matches, nms_radius)
+        path = NO_PATH
+        if nearest is not None:
+            path = trace_sequence(window[:, :n], nearest.first, k).path
+        return _renumbered(
+            nearest, path, lambda: (matches.distances, matches.middles + first), first
+        )
+
+
+def _renumbered(
+    nearest: SequenceMatch | None, path: np.ndarray, sequences: Callable[[], Sequences], first: int
+) -> WindowMatch:
+    """Return a match whose places are counted from the first place ever, evicted ones included."""
+    if nearest is None or not first:
+        return WindowMatch(nearest, path, sequences)
+    path[:, 1] += first
+    second_best = nearest.second_best_index
+    moved = replace(
+        nearest,
+        first=nearest.first + first,
+        last=nearest.last + first,
+        middle=nearest.middle + first,
+        second_best_index=second_best + first if second_best >= 0 else -1,
+    )
+    return WindowMatch(moved, path, sequences)
