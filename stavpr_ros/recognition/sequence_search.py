@@ -18,7 +18,7 @@ from stavpr_ros.alignment.lm_dtw import padded_width, SequenceMatch
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.checks import no_nan
 from stavpr_ros.compilation import parallel_kernel
-from stavpr_ros.recognition.place_filter import Belief, CLOSE, PlaceFilter
+from stavpr_ros.recognition.place_filter import Belief, CLOSE, NEGLIGIBLE, PlaceFilter
 from stavpr_ros.recognition.robust import FilterSettings
 import torch
 
@@ -381,7 +381,8 @@ class FilterSearch:
         weights = belief.weights[near]
         middle = round(float(np.arange(near.start, near.stop) @ weights / weights.sum()))
         path = self._path(belief.ways[near.start + int(np.argmax(weights))])
-        elsewhere = belief.probabilities.copy()
+        probabilities = self._all_probabilities(belief)
+        elsewhere = probabilities.copy()
         elsewhere[max(0, middle - nms_radius) : middle + nms_radius + 1] = 0
         second = int(np.argmax(elsewhere))
         found = float(elsewhere[second])
@@ -394,15 +395,22 @@ class FilterSearch:
             second_best_index=second + first if found > 0 else -1,
             second_best_distance=1 - found if found > 0 else float('nan'),
         )
-        return WindowMatch(match, path, lambda: _sequences(belief, first))
+        return WindowMatch(match, path, lambda: _sequences(probabilities, first))
+
+    def _all_probabilities(self, belief: Belief) -> np.ndarray:
+        """Return the probabilities of places, of improbable ones by the filter's state today."""
+        n = len(belief.probabilities)
+        faint = self.filter.places_of_states()[:n] * np.float64(NEGLIGIBLE)
+        return np.where(belief.probabilities > 0, belief.probabilities, faint)
 
     def _nowhere(self, n: int, first: int) -> WindowMatch:
         """Return the place that is most probable now, with the distance 1."""
-        place = int(np.argmax(self.filter.places_of_states()[:n])) + first
+        now = self.filter.places_of_states()[:n] * np.float64(NEGLIGIBLE)
+        place = int(np.argmax(now)) + first
         match = SequenceMatch(place, place, place, 1.0, -1, float('nan'))
         length = self.buffer.length
         path = np.stack([np.arange(length), np.full(length, place)], axis=1).astype(np.int32)
-        return WindowMatch(match, path)
+        return WindowMatch(match, path, lambda: _sequences(now, first))
 
     def _path(self, way: np.ndarray) -> np.ndarray:
         """Return the place of each image of the window, (l, 2); before the middle at one speed."""
@@ -416,6 +424,6 @@ class FilterSearch:
         return np.stack([np.arange(len(path)), np.maximum(path, 0)], axis=1).astype(np.int32)
 
 
-def _sequences(belief: Belief, first: int) -> Sequences:
-    costs = np.where(belief.probabilities > 0, 1 - belief.probabilities, np.inf)
-    return costs.astype(np.float32), np.arange(first, first + len(costs))
+def _sequences(probabilities: np.ndarray, first: int) -> Sequences:
+    costs = np.where(probabilities > 0, 1 - probabilities, np.inf)
+    return costs, np.arange(first, first + len(costs))
