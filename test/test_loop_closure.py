@@ -392,7 +392,7 @@ def test_ranked_places_are_numbered_from_start_of_route(laps, robust_options):
             assert ranked[1].place == nearest.second_best_index
             assert ranked[1].distance == pytest.approx(nearest.second_best_distance, abs=1e-6)
         if i > 220:
-            offsets = [i - 2 - c.place for c in ranked[:2]]
+            offsets = [i - 2 - c.place for c in ranked[:2] if c.distance < 0.99]
             near = CLOSE if robust_options.place_filter else 0
             assert all(min(abs(o - lap) for lap in (60, 120, 180)) <= near for o in offsets)
             assert closer.first > 0
