@@ -18,7 +18,8 @@ from stavpr_ros.recognition.cpu_matcher import CACHE_LINE
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
-# Resident bytes beside the features: the heap, the window and the filter; a copy of the features takes more.
+# Resident bytes beside the features: the heap, the window and the filter; a copy of the features
+# takes more.
 ALLOWANCE = 36e6
 
 
