@@ -190,13 +190,12 @@ class SequenceRecognizer:
         self, row: np.ndarray, place_filter: FilterSearch, strips: np.ndarray, stamp: int
     ) -> None:
         """Push a row and advance the filter; images of a camera that stands are observed once."""
-        normalized = self._znorm.normalized(row)
+        normalized, was_full = self._znorm.normalized(row), self._buffer.full
+        self._buffer.push(torch.from_numpy(normalized), stamp)
         change = place_filter.change.next_query(strips)
         standstill = place_filter.change.is_standstill(change)
         if not standstill:
             self._znorm.observe(normalized)
-        was_full = self._buffer.full
-        self._buffer.push(torch.from_numpy(normalized), stamp)
         place_filter.update(self._znorm.scaled(normalized), change, standstill)
         if self._buffer.full and not was_full:
             known = self._buffer.rows()[:, : self._buffer.known].numpy()

@@ -155,8 +155,8 @@ class WindowMatch:
 
     :param nearest: with the second best; None where no sequence is possible.
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
-    :param sequences: returns the costs of all sequences, shape (n,), float32, +inf where there is
-        none, and their middle places, shape (n,); valid until the next search.
+    :param sequences: returns the costs of all sequences, shape (n,), +inf where there is none,
+        and their middle places, shape (n,); valid until the next search.
     """
 
     nearest: SequenceMatch | None = None
