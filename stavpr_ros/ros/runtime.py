@@ -22,6 +22,7 @@ from stavpr_ros.ros.input import ImageInput, InputStatus, STOP_TIMEOUT, Worker
 from stavpr_ros.ros.output import map_info_message, nanoseconds, Output
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import OdometryInput
+from stavpr_ros.ros.visualization import Visualization
 from stavpr_ros.threads import limit_threads
 from std_msgs.msg import Header
 
@@ -67,6 +68,7 @@ class Runtime:
         self._load_lock = threading.Lock()
         self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size)
+        self._views = Visualization(node, lambda: self.worker.call(self._publish_route))
         self._pipeline: Pipeline | None = None
         try:
             self._pipeline = self.worker.run(self._make_pipeline)
@@ -110,6 +112,7 @@ class Runtime:
             if not self.worker.stop():
                 self._node.left_behind = True
             self._output.close()
+            self._views.close()
 
     def save_at_end(self) -> None:
         """Save a recorded map, unless the worker stays busy."""
@@ -274,12 +277,10 @@ class Runtime:
         header = item.message.header
         stamp = nanoseconds(header.stamp)
         odometry = self.odometry  # another thread may unsubscribe
-        pose, frame = None, self.settings.map_frame
-        if odometry is not None:
-            pose = odometry.trajectory.at(stamp)
-            if self.pipeline.operation != 'localization':  # places have the poses of the odometry
-                frame = odometry.frame
-        self.pipeline.list_candidates = self._output.candidates_requested
+        pose = None if odometry is None else odometry.trajectory.at(stamp)
+        self.pipeline.list_candidates = (
+            self._output.candidates_requested or self._views.needs_candidates
+        )
         try:
             match = self.pipeline.process(item.message, stamp, pose)
         except Exception as error:
@@ -290,10 +291,21 @@ class Runtime:
             match = Match(Status.INVALID_IMAGE, reason, cause='internal error')
         if match.status is Status.NOT_READY and self.loading:
             match = replace(match, reason=f'map {self.loading} is being loaded')
-        self._publish(header, match, frame, waited)
+        self._publish(header, match, waited)
 
-    def _publish(self, header: Header, match: Match, frame: str, waited: float) -> None:
-        began = time.monotonic()
+    @property
+    def _frame(self) -> str:
+        """Return the frame of the places: places of a growing route have poses of the odometry."""
+        odometry = self.odometry  # another thread may unsubscribe
+        growing = self.pipeline.operation != 'localization'
+        return odometry.frame if growing and odometry is not None else self.settings.map_frame
+
+    def _publish_route(self) -> None:
+        self._views.publish_route(self.pipeline.places, self._frame)
+
+    def _publish(self, header: Header, match: Match, waited: float) -> None:
+        began, frame = time.monotonic(), self._frame
+        self._views.publish(header, match, self.pipeline, frame)
         message = self._output.publish(header, match, self.pipeline.places, frame)
         stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
         if match.cause:
