@@ -12,13 +12,14 @@ import socket
 from socketserver import TCPServer
 import threading
 from typing import Any
+from urllib.parse import urlsplit
 
 from stavpr_ros.errors import StavprError, UnavailableError
 from stavpr_ros.ros.monitor import History
 
 EVENT_SECONDS = 5.0  # most time between two events, so that a closed browser is noticed
 MAX_REQUEST = 10_000  # bytes
-NAMES = {'localhost', socket.gethostname()}
+NAMES = {'localhost', socket.gethostname().lower()}
 
 
 class MonitorServer(ThreadingHTTPServer):
@@ -115,15 +116,15 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _is_allowed(self) -> bool:
         """Refuse foreign names of this host: pages of other sites may use them (rebinding)."""
-        name = (self.headers.get('Host') or '').rpartition(':')[0].strip('[]')
+        given = self.headers.get('Host', '')
         try:
-            ipaddress.ip_address(name)
-            allowed = True
+            name = urlsplit(f'//{given}').hostname or ''
+            allowed = name in NAMES or bool(ipaddress.ip_address(name))
         except ValueError:
-            allowed = name in NAMES
+            allowed = False
         if not allowed:
             self.close_connection = True
-            text = f'unknown host {name!r}: use the address of this machine'
+            text = f'unknown host {given!r}: use the address of this machine'
             self._send(HTTPStatus.FORBIDDEN, 'text/plain', text.encode())
         return allowed
 
