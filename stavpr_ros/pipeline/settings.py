@@ -186,6 +186,8 @@ class NodeSettings:
     odometry_timeout: float
     save_path: str
     map_frame: str
+    publish_tf: bool
+    publish_initialpose: bool
     diagnostics_period: float
     verbosity: str
     threads: int
@@ -196,8 +198,9 @@ class NodeSettings:
 
     @property
     def needs_odometry(self) -> bool:
-        """Whether poses are used, for keyframes or for the places of a growing map."""
-        return self.pipeline.keyframes.needs_poses or self.operation != 'localization'
+        """Whether poses are used: for keyframes, places of a growing map, or the transform."""
+        used = self.pipeline.keyframes.needs_poses or self.publish_tf
+        return used or self.operation != 'localization'
 
 
 def node_settings(values: Mapping[str, Any]) -> NodeSettings:

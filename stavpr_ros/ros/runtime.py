@@ -19,6 +19,7 @@ from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import ImageInput, InputStatus, STOP_TIMEOUT, Worker
+from stavpr_ros.ros.navigation import Navigation
 from stavpr_ros.ros.output import map_info_message, nanoseconds, Output
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import OdometryInput
@@ -66,6 +67,7 @@ class Runtime:
         self.last_header = Header()  # of the last image in the window
         self.loading = self.problem = ''
         self._load_lock = threading.Lock()
+        self._navigation = Navigation(node, settings)
         self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size)
         self._views = Visualization(node, lambda: self.worker.call(self._publish_route))
@@ -113,6 +115,7 @@ class Runtime:
                 self._node.left_behind = True
             self._output.close()
             self._views.close()
+            self._navigation.close()
 
     def save_at_end(self) -> None:
         """Save a recorded map, unless the worker stays busy."""
@@ -172,6 +175,7 @@ class Runtime:
         with self._loading(path):
             loaded = read_map(path, self.settings.pipeline)
             self.worker.run(lambda: self.pipeline.change(loaded=loaded))
+            self.worker.call(self._publish_route)
         places = loaded.places
         self._node.get_logger().info(
             f'map {path}: {len(places)} places, features {places.settings.kind}, '
@@ -291,6 +295,8 @@ class Runtime:
             match = Match(Status.INVALID_IMAGE, reason, cause='internal error')
         if match.status is Status.NOT_READY and self.loading:
             match = replace(match, reason=f'map {self.loading} is being loaded')
+        odometry_frame = '' if odometry is None else odometry.frame
+        self._navigation.publish(header, match, self.pipeline.places, pose, odometry_frame)
         self._publish(header, match, waited)
 
     @property
@@ -301,7 +307,8 @@ class Runtime:
         return odometry.frame if growing and odometry is not None else self.settings.map_frame
 
     def _publish_route(self) -> None:
-        self._views.publish_route(self.pipeline.places, self._frame)
+        if self._pipeline is not None:  # a subscriber may come first
+            self._views.publish_route(self.pipeline.places, self._frame)
 
     def _publish(self, header: Header, match: Match, waited: float) -> None:
         began, frame = time.monotonic(), self._frame
