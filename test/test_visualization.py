@@ -3,8 +3,12 @@
 """The topics for viewers: by a stand-in for the publishers, and of the node."""
 
 from itertools import pairwise
+import json
+from pathlib import Path as Pathname
+import re
 from types import SimpleNamespace
 
+from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Time
 import cv2
 from nav_msgs.msg import Path
@@ -19,6 +23,7 @@ from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.visualization import color, GROWTH, Visualization
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
+import yaml
 
 TOPICS = {'map_path', 'matched_path', 'markers', 'match_image/compressed', 'window_image'}
 TOPICS |= {'distances'}
@@ -201,6 +206,41 @@ def test_draw_window_shows_the_path_over_its_places(places):
     if places <= 40:
         assert drawn.shape == without.shape
         assert (drawn != without).any()
+
+
+DISPLAYS = {
+    'Path': 'nav_msgs/msg/Path',
+    'MarkerArray': 'visualization_msgs/msg/MarkerArray',
+    'PoseWithCovariance': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'Image': 'sensor_msgs/msg/Image',
+}
+
+
+def test_node_publishes_the_topics_of_the_layouts(robot, start):
+    start()
+    config = Pathname(get_package_share_directory('stavpr_ros')) / 'config'
+    rviz = yaml.safe_load((config / 'stavpr.rviz').read_text())['Visualization Manager']
+    named = {
+        (display['Topic']['Value'], DISPLAYS[display['Class'].partition('/')[2]])
+        for display in rviz['Displays']
+        if 'Topic' in display
+    }
+    assert len(named) >= 6
+    foxglove = json.loads((config / 'foxglove.json').read_text())
+    topics = set(re.findall(r'"(/stavpr/[a-z_/]+)', json.dumps(foxglove)))
+    assert len(topics) >= 7
+
+    def published():
+        return dict(robot.node.get_publisher_names_and_types_by_node('stavpr', '/'))
+
+    robot.until(lambda: topics <= published().keys(), f'publishers of {sorted(topics)}')
+    for topic, kind in named:
+        assert published()[topic] == [kind]
+
+    def panels(part):
+        return {part} if isinstance(part, str) else panels(part['first']) | panels(part['second'])
+
+    assert panels(foxglove['layout']) == set(foxglove['configById'])
 
 
 def test_node_publishes_the_route_for_a_late_subscriber_without_an_image(robot, start):

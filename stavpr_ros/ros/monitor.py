@@ -18,6 +18,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Path
 import numpy as np
 from rclpy.client import Client
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
@@ -145,7 +146,8 @@ class Monitor:
         self._reset = node.create_client(Trigger, f'{name}/reset')
         history.set('node', self._full_name)
         history.set('state', 'not found')
-        node.create_timer(POLL_SECONDS, self._poll)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # also without /clock
+        node.create_timer(POLL_SECONDS, self._poll, clock=steady)
 
     # commands, on threads of the server
 
