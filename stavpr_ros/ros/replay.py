@@ -191,8 +191,11 @@ class Replayer:
         self._poll = lambda: None
 
     def _send(self, record: ImageRecord | MessageRecord) -> None:
+        is_image = isinstance(record, ImageRecord)
+        if is_image:
+            self._spin_once(0.0)  # also while late: pause is served
         self._wait_until_due(record.time_ns)
-        self.playback.passed(record.time_ns, isinstance(record, ImageRecord))
+        self.playback.passed(record.time_ns, is_image)
         self._publish_clock()
         if isinstance(record, MessageRecord):
             self._others[record.topic].publish(record.content)
@@ -266,7 +269,6 @@ class Replayer:
         return found
 
     def _wait_until_due(self, time_ns: int) -> None:
-        self._spin_once(0.0)  # also while late: pause is served
         notified = False
         while (left := self.playback.seconds_until(time_ns)) > 0:
             if 10 < left < math.inf and not notified:
