@@ -16,7 +16,7 @@ from stavpr_ros.recognition import Match
 from stavpr_ros.ros.output import matched_pose_message, pose_message
 from std_msgs.msg import Header
 
-# (0.5 m)^2 and (15 degrees)^2, as RViz's 2D Pose Estimate: the place does not tell the lateral
+# (0.5 m)^2 and (15 degrees)^2, as RViz's 2D Pose Estimate: a place does not determine the lateral
 # offset from the mapped route
 MIN_VARIANCE_XY, MIN_VARIANCE_YAW = 0.25, 0.0685
 TF_DEPTH = 100  # that of tf2_ros

@@ -144,7 +144,7 @@ class Replayer:
 
     @property
     def topics(self) -> Collection[str]:
-        """The topics of the bag that are published beside the images."""
+        """Return the topics of the bag that are published beside the images."""
         return self._others.keys()
 
     def wait_for_subscribers(self) -> None:
