@@ -164,6 +164,15 @@ def test_server_on_a_port_in_use_is_rejected(served, history):
         MonitorServer('127.0.0.1', port, history, None)
 
 
+def test_server_prints_no_error_of_a_browser_that_has_gone(served, capsys):
+    for error, is_printed in ((ConnectionResetError(), False), (KeyError('defect'), True)):
+        try:
+            raise error
+        except Exception:
+            served.server.handle_error(None, ('127.0.0.1', 1))
+        assert ('Traceback' in capsys.readouterr().err) == is_printed
+
+
 # the node
 
 

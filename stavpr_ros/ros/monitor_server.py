@@ -10,6 +10,7 @@ import ipaddress
 import json
 import socket
 from socketserver import TCPServer
+import sys
 import threading
 from typing import Any
 from urllib.parse import urlsplit
@@ -55,6 +56,11 @@ class MonitorServer(ThreadingHTTPServer):
         TCPServer.server_bind(self)
         host, self.server_port = self.server_address[:2]
         self.server_name = str(host)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print the error of a request, unless the browser has just gone."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
 
     def start(self) -> None:
         """Serve from now on."""

@@ -25,7 +25,7 @@ from stavpr_ros.ros.output import image_message, LATCHED, pose_message
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-KEPT = 500  # matched poses and loop closures that are shown
+KEPT = 200  # matched poses and loop closures that are shown
 COLUMNS = 512  # of ~/distances, at most
 GROWTH = 1.05  # a growing route is published again when it has grown by this factor
 QUALITY = 80  # of JPEG
