@@ -186,11 +186,11 @@ class NodeSettings:
     odometry_timeout: float
     save_path: str
     map_frame: str
-    publish_tf: bool
-    publish_initialpose: bool
     diagnostics_period: float
     verbosity: str
     threads: int
+    publish_tf: bool
+    publish_initialpose: bool
     pipeline: PipelineSettings
 
     def __post_init__(self) -> None:

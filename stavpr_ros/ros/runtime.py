@@ -281,10 +281,13 @@ class Runtime:
         header = item.message.header
         stamp = nanoseconds(header.stamp)
         odometry = self.odometry  # another thread may unsubscribe
-        pose = None if odometry is None else odometry.trajectory.at(stamp)
-        self.pipeline.list_candidates = (
-            self._output.candidates_requested or self._views.needs_candidates
-        )
+        pose, frame = None, self.settings.map_frame
+        if odometry is not None:
+            pose = odometry.trajectory.at(stamp)
+            if self.pipeline.operation != 'localization':  # places have the poses of the odometry
+                frame = odometry.frame
+        self.pipeline.list_candidates = self._output.candidates_requested
+        self.pipeline.list_candidates |= self._views.needs_candidates
         try:
             match = self.pipeline.process(item.message, stamp, pose)
         except Exception as error:
@@ -293,25 +296,14 @@ class Runtime:
             )
             reason = f'internal error: {type(error).__name__}: {error}'
             match = Match(Status.INVALID_IMAGE, reason, cause='internal error')
-        if match.status is Status.NOT_READY and self.loading:
-            match = replace(match, reason=f'map {self.loading} is being loaded')
         odometry_frame = '' if odometry is None else odometry.frame
         self._navigation.publish(header, match, self.pipeline.places, pose, odometry_frame)
-        self._publish(header, match, waited)
+        if match.status is Status.NOT_READY and self.loading:
+            match = replace(match, reason=f'map {self.loading} is being loaded')
+        self._publish(header, match, frame, waited)
 
-    @property
-    def _frame(self) -> str:
-        """Return the frame of the places: places of a growing route have poses of the odometry."""
-        odometry = self.odometry  # another thread may unsubscribe
-        growing = self.pipeline.operation != 'localization'
-        return odometry.frame if growing and odometry is not None else self.settings.map_frame
-
-    def _publish_route(self) -> None:
-        if self._pipeline is not None:  # a subscriber may come first
-            self._views.publish_route(self.pipeline.places, self._frame)
-
-    def _publish(self, header: Header, match: Match, waited: float) -> None:
-        began, frame = time.monotonic(), self._frame
+    def _publish(self, header: Header, match: Match, frame: str, waited: float) -> None:
+        began = time.monotonic()
         self._views.publish(header, match, self.pipeline, frame)
         message = self._output.publish(header, match, self.pipeline.places, frame)
         stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
@@ -322,6 +314,13 @@ class Runtime:
         self.last_header = header
         place = message.newest_index if match.status is Status.MAPPED else message.place_index
         self._statistics.answered(match.status.name, match.reason, place, message.distance, stages)
+
+    def _publish_route(self) -> None:
+        """Publish the route for a new subscriber, in the frame of the last image if it grows."""
+        if self._pipeline is not None:  # a subscriber may come first
+            in_map = self.pipeline.operation == 'localization'
+            frame = self.settings.map_frame if in_map else self._views.frame
+            self._views.publish_route(self.pipeline.places, frame)
 
     def _log_cause(self, match: Match) -> None:
         """Log why an image is in no window: an invalid one once for each cause."""

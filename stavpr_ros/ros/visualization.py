@@ -39,6 +39,8 @@ class Visualization:
 
     :param on_subscriber: called on another thread when the route has a new subscriber; it calls
         :meth:`publish_route` on the worker.
+
+    ``frame`` is that of the last image.
     """
 
     def __init__(self, node: Node, on_subscriber: Callable[[], object]) -> None:
@@ -50,7 +52,7 @@ class Visualization:
         self._window = node.create_publisher(Image, '~/window_image', 1)
         self._distances = node.create_publisher(Image, '~/distances', 10)
         self._published: tuple[Places, int, str] = (None, 0, '')
-        self._frame = ''
+        self.frame = ''
         self._poses: deque[PoseStamped] = deque(maxlen=KEPT)
         self._closures: deque[tuple[Point, Point, ColorRGBA]] = deque(maxlen=KEPT)
 
@@ -98,8 +100,8 @@ class Visualization:
 
     def _publish(self, header: Header, match: Match, pipeline: Pipeline, frame: str) -> None:
         places = pipeline.places
-        if frame != self._frame:
-            self._frame = frame
+        if frame != self.frame:
+            self.frame = frame
             self._poses.clear()
             self._closures.clear()
         self.publish_route(places, frame)
@@ -137,7 +139,7 @@ class Visualization:
             return
         pose = places.place(match.newest_index).pose
         if pose is not None:
-            stamped = Header(stamp=header.stamp, frame_id=self._frame)
+            stamped = Header(stamp=header.stamp, frame_id=self.frame)
             self._poses.append(PoseStamped(header=stamped, pose=pose_message(pose)))
         if match.image_index >= 0:
             query = places.place(match.image_index).pose
@@ -146,7 +148,7 @@ class Visualization:
 
     def _markers_message(self, header: Header, match: Match, places: Places) -> MarkerArray:
         """Return the closures, the matched place with its text, and the candidates."""
-        own = Header(stamp=header.stamp, frame_id=self._frame)
+        own = Header(stamp=header.stamp, frame_id=self.frame)
         markers = [Marker(header=own, action=Marker.DELETEALL)]
 
         def add(kind: int, **fields: Any) -> Marker:
