@@ -70,8 +70,8 @@ class Runtime:
         self._navigation = Navigation(node, settings)
         self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size)
-        self._views = Visualization(node, lambda: self.worker.call(self._publish_route))
         self._pipeline: Pipeline | None = None
+        self._views = Visualization(node, lambda: self.worker.call(self._publish_route))
         try:
             self._pipeline = self.worker.run(self._make_pipeline)
             if settings.map_path:
