@@ -69,7 +69,8 @@ class Navigation:
                 raise
 
     def close(self) -> None:
-        """Destroy the publishers."""
+        """Destroy the publishers, and release the map."""
+        self._places = None
         for publisher in (self._tf, self._initial_pose):
             if publisher is not None:
                 self._node.destroy_publisher(publisher)

@@ -44,8 +44,8 @@ class Visualization:
     """
 
     def __init__(self, node: Node, on_subscriber: Callable[[], object]) -> None:
-        self._node = node
-        self._route = self._latched(Path, '~/map_path', on_subscriber)
+        self._node, self._on_subscriber = node, on_subscriber
+        self._route = self._latched(Path, '~/map_path')
         self._matched = node.create_publisher(Path, '~/matched_path', 1)
         self._markers = node.create_publisher(MarkerArray, '~/markers', 1)
         self._image = node.create_publisher(CompressedImage, '~/match_image/compressed', 1)
@@ -91,7 +91,8 @@ class Visualization:
         self._route.publish(message)
 
     def close(self) -> None:
-        """Destroy the publishers."""
+        """Destroy the publishers, and release the map: the executor may keep them for a while."""
+        self._on_subscriber, self._published = lambda: None, (None, 0, '')
         for publisher in (
             *(self._route, self._matched, self._markers),
             *(self._image, self._window, self._distances),
@@ -182,10 +183,10 @@ class Visualization:
                     text.text += f', p {match.probability:.2f}'
         return MarkerArray(markers=markers)
 
-    def _latched(self, kind: type, topic: str, on_subscriber: Callable[[], object]) -> Publisher:
+    def _latched(self, kind: type, topic: str) -> Publisher:
         def on_matched(event: Any) -> None:
             if event.current_count_change > 0:
-                on_subscriber()
+                self._on_subscriber()
 
         events = PublisherEventCallbacks(matched=on_matched)
         try:
