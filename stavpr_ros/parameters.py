@@ -289,6 +289,12 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         ),
     ),
     'Output': (
+        NodeParameter(
+            'robot_id',
+            '',
+            'Name of the robot, copied into the messages and the diagnostics, for systems of '
+            'several robots.',
+        ),
         NodeParameter('map_frame', 'map', 'Frame of the poses of the map, for ~/pose.'),
         NodeParameter(
             'diagnostics_period', 1.0, 'Period of the diagnostics.', 's', 'start', (0.1, 60.0)

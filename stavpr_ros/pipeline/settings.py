@@ -186,6 +186,7 @@ class NodeSettings:
     odometry_timeout: float
     save_path: str
     map_frame: str
+    robot_id: str
     diagnostics_period: float
     verbosity: str
     threads: int

@@ -313,7 +313,8 @@ class PlaceRecognitionNode(ManagedNode):
         def describe() -> MapInfo | None:
             runtime = self._runtime
             if state:
-                return MapInfo(operation=self.settings.operation, state=state, path=path)
+                operation, robot_id = self.settings.operation, self.settings.robot_id
+                return MapInfo(operation=operation, state=state, path=path, robot_id=robot_id)
             return None if runtime is None else runtime.map_info()
 
         self._map_info.publish(describe)

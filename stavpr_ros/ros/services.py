@@ -10,9 +10,11 @@ from rclpy.node import Node
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
 from stavpr_ros.pipeline.saving import write_map
+from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.output import candidates_message, match_message
 from stavpr_ros.ros.rclpy_workarounds import repeat_responses
 from stavpr_ros.ros.runtime import Runtime
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 
@@ -56,12 +58,16 @@ class Services:
             try:
                 response.message = serve(self._runtime(), request, response)
                 response.success = True
+                return response
             except StavprError as error:
-                response.success, response.message = False, str(error)
+                response.message = str(error)
                 self._logger.warning(f'{name} failed: {error}')
             except Exception as error:  # a defect: the client must get a response all the same
-                response.success, response.message = False, f'{type(error).__name__}: {error}'
+                response.message = f'{type(error).__name__}: {error}'
                 self._logger.error(f'{name} failed: {response.message}')
+            response.success = False
+            if name == 'relocalize':  # indices of -1, where the default 0 would be a place
+                response.match = match_message(Header(), Match(Status.NOT_READY, response.message))
             return response
 
         return callback
@@ -95,7 +101,8 @@ class Services:
             # call
             pipeline, header = runtime.pipeline, runtime.last_header
             match = pipeline.relocalize(count)
-            response.match = match_message(header, match, pipeline.places)
+            robot_id = runtime.settings.robot_id
+            response.match = match_message(header, match, pipeline.places, robot_id)
             candidates = candidates_message(header, match, pipeline.places)
             response.candidates = candidates.candidates if candidates is not None else []
 

@@ -85,14 +85,14 @@ class OdometryInput:
 
     :param timeout: seconds for which the newest pose is valid.
 
-    ``frame`` is the frame of the poses.
+    ``frame`` is the frame of the poses, ``child_frame`` the one whose poses they are.
     """
 
     def __init__(self, node: Node, timeout: float) -> None:
         self.trajectory = Trajectory(timeout)
         self._node, self._timeout = node, timeout
         self._arrived: float | None = None
-        self.frame = ''
+        self.frame = self.child_frame = ''
         self._subscription = subscribe(node, Odometry, 'odom', self._on_odometry, 50)
 
     def freshness(self) -> str:
@@ -113,4 +113,5 @@ class OdometryInput:
                 f'odometry rejected: {error}', throttle_duration_sec=10.0
             )
             return
-        self._arrived, self.frame = time.monotonic(), message.header.frame_id
+        self._arrived = time.monotonic()
+        self.frame, self.child_frame = message.header.frame_id, message.child_frame_id
