@@ -40,6 +40,7 @@ COUNTS = ImageCounts(
 SETTINGS = {row.name: row.default for row in PARAMETERS} | {'backend': 'cpu'}
 HEALTH = Health(
     state='active',
+    hardware_id='r2 /camera',
     settings=node_settings(SETTINGS),
     counts=COUNTS,
     map_info=MapInfo(path='route.map', state='loaded', places=1000, features='gradient'),
@@ -92,7 +93,7 @@ def test_array_is_stamped_named_and_serializable():
     array = diagnostic_array(HEALTH, '/robot/stavpr', Time(sec=7, nanosec=8))
     assert (array.header.stamp.sec, array.header.stamp.nanosec) == (7, 8)
     assert [s.name for s in array.status] == [f'robot/stavpr: {part}' for part in PARTS]
-    assert {s.hardware_id for s in array.status} == {'CPU'}
+    assert {s.hardware_id for s in array.status} == {'r2 /camera'}
     assert deserialize_message(serialize_message(array), DiagnosticArray) == array
 
 
@@ -200,12 +201,13 @@ CASES = {
         (
             WARN,
             f'odometry, required by a parameter, was never received: {ODOMETRY}',
-            {'odometry': 'never'},
+            {'odometry': 'never', 'keyframe_distance': 1.0},
         ),
+        (OK, STEADY, {'odometry': 'never', 'operation': 'mapping'}),
         (
             WARN,
             f'odometry, required by a parameter, has stopped: {ODOMETRY}',
-            {'odometry': 'stale'},
+            {'odometry': 'stale', 'keyframe_distance': 1.0},
         ),
         (OK, STEADY, {'odometry': 'fresh'}),
         (
@@ -313,7 +315,8 @@ def test_input_without_a_valid_image_is_an_error(other):
 
 def test_input_with_several_faults_lists_the_worst_first():
     drops = {'lost in transport': 1, 'invalid: size': 2}
-    found, _ = status('input', recent_drops=drops, recent_statuses={}, odometry='stale')
+    changes = {'odometry': 'stale', 'keyframe_distance': 1.0}
+    found, _ = status('input', recent_drops=drops, recent_statuses={}, **changes)
     assert found.level == ERROR
     assert [text.split()[0] for text in found.message.split('; ')] == ['all', '1', 'odometry,']
 
@@ -322,6 +325,18 @@ def test_recognition_counts_only_matches_and_rejections():
     statuses = {'match': 1, 'no match': 1, 'skipped': 90, 'warming up': 8}
     found, _ = status('recognition', recent_statuses=statuses)
     assert found.message.startswith('1 of 2 images matched')
+
+
+@pytest.mark.parametrize(
+    ('changes', 'value'),
+    [
+        ({}, 'not needed'),
+        ({'odometry': 'fresh', 'operation': 'mapping'}, 'fresh, optional'),
+        ({'odometry': 'stale', 'keyframe_angle': 1.0}, 'stale'),
+    ],
+)
+def test_value_of_odometry_states_whether_it_is_used(changes, value):
+    assert values('input', **changes)['odometry'] == value
 
 
 def test_values_of_input_are_complete():

@@ -35,13 +35,15 @@ class Health:
     :param problem: cause of the last failed transition or load; empty = none failed.
     :param loading: path of the map that is being loaded by a service; empty = none.
     :param input: topic and publishers of the images; empty while the node is not active.
-    :param odometry: fresh, stale or never; empty = no parameter needs it.
+    :param hardware_id: robot and camera; tells the statuses of several cameras apart.
+    :param odometry: fresh, stale or never; empty = it is not subscribed to.
     :param queue: waiting images; ``window``: images in the window.
     :param missing: prerequisite of a match that is missing; empty = none.
     """
 
     state: str
     problem: str = ''
+    hardware_id: str = ''
     settings: NodeSettings
     counts: ImageCounts
     map_info: MapInfo
@@ -56,6 +58,11 @@ class Health:
     def map_path(self) -> str:
         """Return the file of the map that is loaded or in use; empty = none."""
         return self.loading or self.map_info.path
+
+    @property
+    def odometry_required(self) -> bool:
+        """Whether images without a pose are skipped; places of recorded maps can do without."""
+        return self.settings.pipeline.keyframes.needs_poses
 
     @property
     def backend(self) -> str:
@@ -78,7 +85,11 @@ def input_findings(health: Health) -> list[Finding]:
     findings = []
     if age > SILENCE:
         findings.append(_silence(health, age))
-    elif health.input.incompatible and health.input.publishers > 1 and counts.received:
+    elif (
+        health.input.incompatible
+        and health.input.publishers > 1
+        and counts.received_age is not None
+    ):
         # a single publisher is not the refused one: images arrive
         refused = f'{_of(health.input.incompatible, "publisher")} refused for QoS'
         findings.append((WARN, f'{refused}, while images of others arrive: {_qos_remedy(health)}'))
@@ -86,7 +97,7 @@ def input_findings(health: Health) -> list[Finding]:
     if lost := counts.recent_drops.get('lost in transport', 0):
         remedy = 'give the publisher more shared memory (docs/troubleshooting.md, images are lost)'
         findings.append((WARN, f'{_of(lost, "image")} lost in transport {recent}: {remedy}'))
-    if health.odometry in ('stale', 'never'):
+    if health.odometry_required and health.odometry in ('stale', 'never'):
         state = 'was never received' if health.odometry == 'never' else 'has stopped'
         remedy = 'start it, compare its topic and its stamps'
         findings.append((WARN, f'odometry, required by a parameter, {state}: {remedy}'))

@@ -182,7 +182,7 @@ class PlaceRecognitionNode(ManagedNode):
         gc.freeze()
 
     def _activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self.statistics.reset()
+        self.statistics.restart()
         self.runtime.activate()
         return TransitionCallbackReturn.SUCCESS
 
@@ -297,9 +297,11 @@ class PlaceRecognitionNode(ManagedNode):
 
     def _health(self) -> Health:
         self._publish_map_info()
+        camera = self.resolve_topic_name('image')
         health = Health(
             state=self.state,
             problem=self.problem,
+            hardware_id=f'{self.settings.robot_id} {camera}'.lstrip(),
             settings=self.settings,
             counts=self.statistics.counts(),
             map_info=self._map_info.last or MapInfo(state='none'),

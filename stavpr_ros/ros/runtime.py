@@ -224,13 +224,12 @@ class Runtime:
     def complete(self, health: Health) -> Health:
         """Return the health of the node with the queue, the window and the subscriptions."""
         pipeline, images, odometry = self.pipeline, self.images, self.odometry
-        needs_poses = pipeline.settings.keyframes.needs_poses  # otherwise poses are optional
         return replace(
             health,
             problem=health.problem or self.problem,
             loading=self.loading,
             input=InputStatus() if images is None else images.status(),
-            odometry=odometry.freshness() if odometry is not None and needs_poses else '',
+            odometry='' if odometry is None else odometry.freshness(),
             queue=self.worker.waiting,
             window=pipeline.window_fill,
             missing=pipeline.missing,
