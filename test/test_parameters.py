@@ -130,6 +130,26 @@ def test_invalid_values_are_rejected_by_name(values, words, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ('values', 'missing'),
+    [
+        ({}, 'model and layer missing'),
+        ({'feature_settings': '{"layer": "relu"}'}, 'model missing'),
+        ({'model_path': 'net.onnx'}, 'layer missing'),
+    ],
+)
+def test_network_without_its_settings_is_rejected_by_name(values, missing):
+    with pytest.raises(SettingsError, match=f'features onnx are invalid .{missing}.*model_path'):
+        PipelineSettings(features='onnx', **values).extractor()
+
+
+def test_network_of_feature_settings_and_model_path_is_accepted():
+    settings = PipelineSettings(
+        features='onnx', feature_settings='{"layer": "relu"}', model_path='/nowhere/net.onnx'
+    )
+    assert settings.model_path == '/nowhere/net.onnx'
+
+
+@pytest.mark.parametrize(
     ('mode', 'operation', 'backend', 'available', 'stages'),
     [
         ('robust', 'localization', 'auto', 'cuda', ('cuda', 'cuda', 'cpu')),

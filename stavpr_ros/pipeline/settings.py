@@ -74,7 +74,7 @@ class PipelineSettings:
             )
         settings_class(self.features)  # rejects an unknown kind
         if self.feature_settings:
-            settings_from_json(self.features, self.feature_settings)
+            settings_from_json(self.features, self.feature_settings, self.model_path)
         self.recognition()
 
     @property
@@ -160,11 +160,9 @@ class PipelineSettings:
 
         :raises StavprError: invalid settings of the features, or a missing model file.
         """
-        backbone = None
-        if self.feature_settings or self.model_path:
-            backbone = settings_from_json(
-                self.features, self.feature_settings or '{}', self.model_path
-            )
+        backbone = settings_from_json(
+            self.features, self.feature_settings or '{}', self.model_path
+        )
         return FeatureExtractor(self.features, backbone, device=choose_backend(self.backend))
 
 

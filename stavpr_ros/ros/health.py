@@ -35,7 +35,7 @@ class Health:
     :param problem: cause of the last failed transition or load; empty = none failed.
     :param loading: path of the map that is being loaded by a service; empty = none.
     :param input: topic and publishers of the images; empty while the node is not active.
-    :param hardware_id: robot and camera; tells the statuses of several cameras apart.
+    :param hardware_id: robot and camera of the statuses.
     :param odometry: fresh, stale or never; empty = it is not subscribed to.
     :param queue: waiting images; ``window``: images in the window.
     :param missing: prerequisite of a match that is missing; empty = none.

@@ -36,6 +36,7 @@ class Services:
     ) -> None:
         self._logger = node.get_logger()
         self._runtime, self._load, self._operate = runtime, load_map, set_operation
+        self._faults: dict[str, str] = {}  # last fault of a service, until it succeeds
         group = MutuallyExclusiveCallbackGroup()
         for kind, name, serve in (
             (LoadMap, 'load_map', self._load_map),
@@ -52,19 +53,25 @@ class Services:
     def _callback(
         self, name: str, serve: Callable[[Runtime, Any, Any], str]
     ) -> Callable[[Any, Any], Any]:
-        """Return a service callback that fills ``success`` and ``message``, and logs errors."""
+        """
+        Return a service callback that fills ``success`` and ``message``.
+
+        An error that is repeated, as by a client that polls, is logged once.
+        """
 
         def callback(request: Any, response: Any) -> Any:
             try:
                 response.message = serve(self._runtime(), request, response)
                 response.success = True
+                self._faults.pop(name, None)
                 return response
             except StavprError as error:
-                response.message = str(error)
-                self._logger.warning(f'{name} failed: {error}')
+                log, response.message = self._logger.warning, str(error)
             except Exception as error:  # a defect: the client must get a response all the same
-                response.message = f'{type(error).__name__}: {error}'
-                self._logger.error(f'{name} failed: {response.message}')
+                log, response.message = self._logger.error, f'{type(error).__name__}: {error}'
+            if self._faults.get(name) != response.message:
+                log(f'{name} failed: {response.message} (logged once while it is repeated)')
+            self._faults[name] = response.message
             response.success = False
             if name == 'relocalize':  # indices of -1, where the default 0 would be a place
                 response.match = match_message(Header(), Match(Status.NOT_READY, response.message))
