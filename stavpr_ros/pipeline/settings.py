@@ -4,6 +4,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+import os
 from typing import Any
 
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
@@ -199,6 +200,15 @@ class NodeSettings:
         return self.pipeline.keyframes.needs_poses or self.operation != 'localization'
 
 
+def absolute_path(path: str) -> str:
+    """
+    Return the absolute path of a file, '' of none; launch files leave ``~`` as it is.
+
+    :param path: may begin with ``~``; a relative one is relative to the working directory.
+    """
+    return os.path.abspath(os.path.expanduser(path)) if path else ''
+
+
 def node_settings(values: Mapping[str, Any]) -> NodeSettings:
     """
     Build the settings from the values of all parameters.
@@ -211,6 +221,8 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
         if choices and value not in choices:
             raise SettingsError(f'{name} = {value!r} is unknown: take one of {", ".join(choices)}')
     values = {**values, 'threshold': None if values['threshold'] < 0 else values['threshold']}
+    values |= {name: absolute_path(values[name]) for name in ('map_path', 'save_path')}
+    values['model_path'] = os.path.expanduser(values['model_path'])  # or a word: cached, download
     method = values['geometric_check']
     pipeline = PipelineSettings(
         spatial=SpatialSettings(
