@@ -66,9 +66,9 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'map_path',
             '',
-            'Map file made by build_map or save_map; ~ is the home folder, a relative path is in the '
-            'working directory. Without one, localization waits for the service ~/load_map, and '
-            'mapping starts a new map.',
+            'Map file made by build_map or save_map; ~ is the home folder, a relative path is in '
+            'the working directory. Without one, localization waits for the service '
+            '~/load_map, and mapping starts a new map.',
         ),
         NodeParameter(
             'save_path',

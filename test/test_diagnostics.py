@@ -339,6 +339,62 @@ def test_value_of_odometry_states_whether_it_is_used(changes, value):
     assert values('input', **changes)['odometry'] == value
 
 
+@pytest.mark.parametrize(
+    ('part', 'changes', 'message'),
+    [
+        ('input', {'contrast': 1.25}, 'the images show nothing (standard deviation 1.2 of 255): '),
+        (
+            'input',
+            {'odometry': 'never', 'operation': 'mapping', 'odometry_fault': 'remap odom'},
+            'odometry, for poses of the map, was never received: remap odom',
+        ),
+        (
+            'input',
+            {'odometry': 'stale', 'keyframe_distance': 1.0, 'odometry_fault': 'remap odom'},
+            'odometry, required by a parameter, has stopped: remap odom',
+        ),
+        ('recognition', {'places': 19}, 'the map has fewer places (19) than a window has images '),
+        (
+            'recognition',
+            {'statuses': {'no match': 100}, 'nearest': 0.75},
+            'none of 100 images was ever matched, the best had probability 0.250: compare the '
+            'route, the direction and the keyframe rules with those of the map, or lower '
+            'min_probability (0.5)',
+        ),
+        (
+            'recognition',
+            {'mode': 'paper', 'threshold': 0.125, 'nearest': 0.5, 'statuses': {'no match': 100}},
+            'none of 100 images was ever matched, the best had distance 0.500: compare the '
+            'route, the direction and the keyframe rules with those of the map, or raise '
+            'threshold (0.125)',
+        ),
+        (
+            'recognition',
+            {'statuses': {'no match': 100}, 'nearest': 0.25},
+            'none of 100 images was ever matched: the geometric check rejects all, ',
+        ),
+    ],
+)
+def test_faults_of_the_setup_are_warnings_with_a_remedy(part, changes, message):
+    found, others = status(part, **changes)
+    assert (found.level, found.message[: len(message)]) == (WARN, message)
+    assert set(others.values()) == {OK}
+
+
+@pytest.mark.parametrize(
+    ('part', 'changes'),
+    [
+        ('input', {'contrast': 3.0}),
+        ('input', {'contrast': 1.0, 'rate_in': 0.0}),
+        ('recognition', {'places': 20}),
+        ('recognition', {'statuses': {'no match': 99}}),
+        ('recognition', {'statuses': {'no match': 1000}, 'operation': 'loop_closure'}),
+    ],
+)
+def test_setups_that_may_work_are_no_fault(part, changes):
+    assert status(part, **changes)[0].level == OK
+
+
 def test_values_of_input_are_complete():
     drops = {'invalid: cut off': 3, 'lost in transport': 4, 'no odometry': 5, 'max_rate': 6}
     assert values(

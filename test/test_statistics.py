@@ -149,7 +149,12 @@ def test_restart_keeps_totals_and_nothing_recent(clock, statistics):
     clock.now += 5
     statistics.restart()
     totals = {'received': 1, 'answered': 1, 'gaps': 1, 'longest_gap': 2, 'jumps_back': 1}
-    totals |= {'longest_jump_back': 3, 'drops': {'queue full': 1}, 'statuses': {'no match': 1}}
+    totals |= {
+        'nearest': 0.1,
+        'longest_jump_back': 3,
+        'drops': {'queue full': 1},
+        'statuses': {'no match': 1},
+    }
     expected = dataclasses.replace(fresh, **totals)
     assert str(statistics.counts()) == str(expected)  # as text, in which NaN equals NaN
 

@@ -51,6 +51,7 @@ class ImageCounts:
         recent ones.
     :param status: of the last result, with its reason, place (-1 = none) and distance (NaN =
         none).
+    :param nearest: smallest distance of all results, +inf = none had one.
     :param stages: recent times by stage.
     :param total: recent times of all stages together, None = no measurement; ``work``: without
         waiting.
@@ -73,6 +74,7 @@ class ImageCounts:
     reason: str = ''
     place: int = -1
     distance: float = math.nan
+    nearest: float = math.inf
     stages: Mapping[str, StageTime] = field(default_factory=dict)
     total: StageTime | None = None
     work: StageTime | None = None
@@ -167,6 +169,7 @@ class Statistics:
                 reason=reason,
                 place=place,
                 distance=distance,
+                nearest=min(self._counts.nearest, distance),  # NaN is not less
             )
 
     def dropped(self, cause: str, count: int = 1) -> None:

@@ -233,6 +233,8 @@ class Runtime:
             queue=self.worker.waiting,
             window=pipeline.window_fill,
             missing=pipeline.missing,
+            odometry_fault='' if odometry is None else odometry.fault(),
+            contrast=pipeline.contrast,
         )
 
     # images
