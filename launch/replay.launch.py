@@ -77,5 +77,4 @@ def generate_launch_description() -> LaunchDescription:
             for name, description in SWITCHES.items()
         ),
     ]
-    described = node_launch(OpaqueFunction(function=_replay))
-    return LaunchDescription([*own, *described.entities])
+    return node_launch(*own, OpaqueFunction(function=_replay))
