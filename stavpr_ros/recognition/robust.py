@@ -36,7 +36,7 @@ class RobustOptions:
         running mean of the query from the query's: the part shared by all images distinguishes no
         places.
     :param whitening: shrink the directions in which the map's places vary most
-        (:class:`Whitening`): what many places share tells few of them apart.
+        (:class:`Whitening`): what many places share distinguishes few of them.
     :param query_znorm: z-normalize the distances of an image to all places: some images are far
         from all.
     :param reference_znorm: z-normalize the distances of a place to the latest images, against
