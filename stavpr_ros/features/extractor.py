@@ -25,14 +25,21 @@ class FeatureSettings:
     :param backbone: the settings of that kind, its frozen dataclass.
     :param strips: number of vertical strips W.
     :param projection: identity of the random projection, None without one.
+    :param feature_version: version of the computation: another one gives other features.
     """
 
     kind: str
     backbone: Any
     strips: int = 7
     projection: str | None = None
+    feature_version: int = 1
 
     def __post_init__(self) -> None:
+        if self.feature_version != 1:
+            raise SettingsError(
+                f'features {self.kind} of version {self.feature_version} are unknown, expected '
+                '1: update this program'
+            )
         if self.strips < 1:
             raise SettingsError(f'strips W = {self.strips} must be at least 1')
 
