@@ -10,8 +10,8 @@ from stavpr_ros.mapping.keyframes import (
     KeyframeSettings,
     small_gray,
 )
-from stavpr_ros.mapping.map_file import load_map, open_map, save_map
-from stavpr_ros.mapping.place_map import encode_thumbnail, Place, PlaceMap
+from stavpr_ros.mapping.map_file import is_map, load_map, open_map, save_map, verify_map
+from stavpr_ros.mapping.place_map import encode_thumbnail, Place, PlaceMap, Session
 from stavpr_ros.mapping.trajectory import distance, rotation, Trajectory
 
 __all__ = [
@@ -20,15 +20,18 @@ __all__ = [
     'KeyframeSettings',
     'Place',
     'PlaceMap',
+    'Session',
     'Trajectory',
     'build_map',
     'distance',
     'encode_thumbnail',
     'extract_features',
     'image_change',
+    'is_map',
     'load_map',
     'open_map',
     'rotation',
     'save_map',
     'small_gray',
+    'verify_map',
 ]

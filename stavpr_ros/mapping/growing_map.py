@@ -65,14 +65,14 @@ class GrowingMap:
             raise InputError(
                 f'a map of {n} places does not fit into a limit of {limit}: raise the limit'
             )
-        features = place_map.features.to('cpu')
+        features = place_map.features
         growing = cls(place_map.settings, place_map.projection, limit, features.cells)
         growing.dimension = features.dimension
         growing._make_room(max(n, min(ROOM, limit)))
-        growing._strips[:, :n], growing._weights[:, :n] = (
-            features.strips.numpy(),
-            features.weights.numpy(),
-        )
+        for low in range(0, n, ROOM):  # they may be in the map's file
+            places = slice(low, min(low + ROOM, n))
+            growing._strips[:, places] = features[places].strips.cpu().numpy()
+        growing._weights[:, :n] = features.weights.cpu().numpy()
         growing._stamps[:n] = place_map.stamps
         growing._poses[:n] = np.nan if place_map.poses is None else place_map.poses
         growing.ids = list(place_map.ids)

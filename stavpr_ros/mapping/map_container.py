@@ -89,7 +89,7 @@ class MapFile:
         while len(view):
             count = os.preadv(self._file.fileno(), [view], start)
             if not count:
-                raise self.damaged(f'ends at byte {start}: it is truncated')
+                raise self.damaged(f'is truncated: byte {start} is missing')
             view, start = view[count:], start + count
 
     def bytes_at(self, start: int, count: int) -> bytes:

@@ -23,7 +23,7 @@ from stavpr_ros.mapping.jpeg import is_thumbnail, jpeg_pixels, MOST_PIXELS
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
 from stavpr_ros.mapping.map_schema import identity_fields, Object
 from stavpr_ros.mapping.map_version1 import read_version1
-from stavpr_ros.mapping.map_version2 import NewPart, read_version2, write_version2
+from stavpr_ros.mapping.map_version2 import MOST_HEADER, NewPart, read_version2, write_version2
 from stavpr_ros.mapping.place_map import PlaceMap, Session
 from stavpr_ros.regular_file import open_regular
 import torch
@@ -211,6 +211,17 @@ def verify_map(place_map: PlaceMap) -> None:
     if isinstance(features, StoredFeatures):
         with errors_of(features.file.path):
             features.file.verify()
+
+
+def is_map(path: str | Path) -> bool:
+    """Return whether a file begins as maps do; False for one that cannot be read."""
+    try:
+        with open_regular(path) as file:
+            start = file.read(9)
+    except OSError:
+        return False
+    short = int.from_bytes(start[:8], 'little') <= MOST_HEADER
+    return start[:4] == b'PK\x03\x04' or (short and start[8:] == b'{')
 
 
 def _place_map(file: MapFile) -> PlaceMap:

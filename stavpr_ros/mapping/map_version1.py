@@ -7,6 +7,7 @@ The manifest is turned into one of version 2, and the position of each array is 
 nothing else of this program depends on the version.
 """
 
+from dataclasses import fields
 import hashlib
 import io
 import re
@@ -125,7 +126,7 @@ def _settings(text: str) -> dict[str, Any]:
     settings = read_json(text.encode(), 'settings')
     if isinstance(settings, dict) and isinstance(settings.get('backbone'), dict):
         kind = settings.get('kind')
-        rows = settings_class(kind).__dataclass_fields__ if isinstance(kind, str) else {}
+        rows = {row.name: row for row in fields(settings_class(str(kind)))}
         for name in list(settings['backbone']):
             if name in rows and not rows[name].compare:
                 del settings['backbone'][name]

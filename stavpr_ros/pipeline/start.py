@@ -32,7 +32,9 @@ def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
     :raises StavprError: an invalid file, or a missing model.
     """
     place_map = open_map(path)
-    extractor = place_map.extractor(choose_backend(settings.backend), settings.model_path)
+    extractor = place_map.extractor(
+        choose_backend(settings.backend), settings.model_path, settings.allow_torchscript
+    )
     return LoadedMap(path, place_map, extractor)
 
 

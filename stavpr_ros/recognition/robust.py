@@ -7,7 +7,7 @@ Everything is causal: only images that have arrived count. The probability of a 
 and successive ones are correlated.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ MODES = ('paper', 'robust')
 MIN_PROBABILITY = 0.5  # above which mode robust matches a window
 THRESHOLD = 1 - MIN_PROBABILITY  # of the distance, 1 less the probability
 PRIOR = 20  # images that the statistics of the map count for in those of the query
-PIECE = 8192  # images centered at a time
+PIECE = 256  # images read or centered at a time
 MEMORY = 150  # rows after which old ones fade
 MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
 
@@ -161,7 +161,11 @@ class MeanCentering:
     """
 
     def __init__(self, features: LocalFeatures) -> None:
-        self._mean = features.strips.sum(dim=1) / max(len(features), 1)  # (W, d)
+        total = torch.zeros((len(features.weights), features.dimension), dtype=torch.float64)
+        total = total.to(features.weights.device)
+        for _, some in blocks(features):
+            total += some.strips.sum(dim=1)
+        self._mean = (total / max(len(features), 1)).float()  # (W, d)
         self.reset()
 
     def reset(self) -> None:
@@ -169,9 +173,11 @@ class MeanCentering:
         # float64: in float32, the images of a long traverse would be rounded away
         self._sum, self._count = self._mean.double() * PRIOR, PRIOR
 
-    def places(self, features: LocalFeatures) -> LocalFeatures:
+    def places(
+        self, features: LocalFeatures, dtype: torch.dtype = torch.float32
+    ) -> LocalFeatures:
         """Return features of the map, or of single images, less the map's mean."""
-        return replace(features, strips=without_mean(features.strips, self._mean))
+        return converted(features, lambda strips: without_mean(strips, self._mean), dtype)
 
     def next_query(self, strips: torch.Tensor) -> torch.Tensor:
         """
@@ -183,6 +189,26 @@ class MeanCentering:
         self._sum = self._sum + strips
         self._count += 1
         return without_mean(strips[:, None], (self._sum / self._count).float())[:, 0]
+
+
+def blocks(features: LocalFeatures) -> Iterator[tuple[slice, LocalFeatures]]:
+    """Yield features some places at a time: those of a map may be in its file."""
+    for low in range(0, len(features), PIECE):
+        places = slice(low, min(low + PIECE, len(features)))
+        yield places, features[places]
+
+
+def converted(
+    features: LocalFeatures,
+    convert: Callable[[torch.Tensor], torch.Tensor],
+    dtype: torch.dtype,
+) -> LocalFeatures:
+    """Return new features of another type: those of one block after the other, converted."""
+    shape = (*features.weights.shape, features.dimension)
+    strips = torch.empty(shape, dtype=dtype, device=features.weights.device)
+    for places, some in blocks(features):
+        strips[:, places] = convert(some.strips)
+    return LocalFeatures(strips, features.weights, features.settings, features.cells)
 
 
 def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
