@@ -11,6 +11,7 @@ from stavpr_ros.mapping.keyframes import (
     small_gray,
 )
 from stavpr_ros.mapping.map_file import is_map, load_map, open_map, save_map, verify_map
+from stavpr_ros.mapping.merging import merge_maps, select_session
 from stavpr_ros.mapping.place_map import encode_thumbnail, Place, PlaceMap, Session
 from stavpr_ros.mapping.trajectory import distance, rotation, Trajectory
 
@@ -29,9 +30,11 @@ __all__ = [
     'image_change',
     'is_map',
     'load_map',
+    'merge_maps',
     'open_map',
     'rotation',
     'save_map',
+    'select_session',
     'small_gray',
     'verify_map',
 ]

@@ -8,7 +8,7 @@ explains it; :mod:`stavpr_ros.mapping.map_version1` reads the former one. Nothin
 executed.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import fields, replace
 import os
 from pathlib import Path
@@ -227,7 +227,7 @@ def is_map(path: str | Path) -> bool:
 def _place_map(file: MapFile) -> PlaceMap:
     manifest = file.manifest
     settings = _settings(manifest['settings'])
-    sizes = _require_shapes(file.parts, settings)
+    sizes = _require_shapes(file.parts, settings, manifest['sections'])
     arrays = {
         name: file.read(name) for name in file.parts if name in PARTS and name not in LARGE
     }
@@ -274,7 +274,9 @@ def _settings(record: dict[str, Any]) -> FeatureSettings:
     return FeatureSettings(**{**record, 'backbone': backbone})
 
 
-def _require_shapes(parts: dict[str, Part], settings: FeatureSettings) -> dict[str, int]:
+def _require_shapes(
+    parts: dict[str, Part], settings: FeatureSettings, sections: Collection[str]
+) -> dict[str, int]:
     """Check which parts there are, their types and shapes; return the sizes W, n, d and D."""
     for name in ('strips', 'weights', 'stamps'):
         if name not in parts:
@@ -285,7 +287,10 @@ def _require_shapes(parts: dict[str, Part], settings: FeatureSettings) -> dict[s
     sizes: dict[str, int] = {'W': settings.strips}
     for name, part in parts.items():
         if name not in PARTS:
-            if '/' in name:  # of a section
+            section, slash, _ = name.partition('/')
+            if slash and section not in sections:
+                raise ValueError(f'part {name[:80]} is of no section')
+            if slash:
                 continue
             raise ValueError(f'part {name[:80]} is unknown')
         types, shape = PARTS[name]
