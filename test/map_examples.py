@@ -22,8 +22,7 @@ def example_map(projection: int | None = None) -> PlaceMap:
         'gradient', GradientSettings(32, cell=8, orientations=4), 2, projection
     )
     frames = [
-        Frame(image, (i + 1) * 10**9, f'place {i}')
-        for i, image in enumerate(route_images(PLACES))
+        Frame(image, (i + 1) * 10**9, f'place {i}') for i, image in enumerate(route_images(PLACES))
     ]
     poses = np.zeros((PLACES, 7))
     poses[:, 0], poses[:, 6] = np.arange(PLACES), 1

@@ -23,9 +23,9 @@ from stavpr_ros.mapping import load_map, open_map, PlaceMap, verify_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
 VALUES = (
-    None, True, False, -1, 0, 1, 2, 7, 2**31, 2**63, 2**64, 10**400, 0.5, -0.0, 1e308, float('nan'),
-    float('inf'), '', 'x', 'gradient', '\ud800', '\0', 'x' * 10_000, '{}', [], [[]], {}, {'a': 1},
-    ['x'], [1, 2], [1] * 5000,
+    None, True, False, -1, 0, 1, 2, 7, 2**31, 2**63, 2**64, 10**400, 0.5, -0.0, 1e308,
+    float('nan'), float('inf'), '', 'x', 'gradient', '\ud800', '\0', 'x' * 10_000, '{}',
+    [], [[]], {}, {'a': 1}, ['x'], [1, 2], [1] * 5000,
 )  # fmt: skip
 
 
@@ -55,7 +55,7 @@ def rejected_or_works(path: Path, thorough: bool = True) -> bool:
         if thorough:
             use(load_map(path))
     except MapFileError as error:
-        assert str(path) in str(error)
+        assert str(path) in str(error)  # noqa: PT017
         return False
     return True
 

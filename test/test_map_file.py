@@ -3,7 +3,6 @@
 """Map files: the format, atomic saving, and files that are damaged, foreign or hostile."""
 
 import dataclasses
-import hashlib
 import json
 import os
 from pathlib import Path
@@ -16,14 +15,14 @@ import zipfile
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from map_examples import example_files, example_map, VERSION1
-from map_files import array_of, members_of, parts_of, tensor, version1, version2
+from map_files import members_of, parts_of, tensor, version1, version2
 from map_fuzz import hand_made, mutated, rejected_or_works, use
 import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 from stavpr_ros.errors import InputError, MapFileError, SettingsError
 from stavpr_ros.mapping import is_map, load_map, open_map, PlaceMap, save_map, Session, verify_map
-from stavpr_ros.mapping.map_file import StoredFeatures
+from stavpr_ros.mapping.stored_features import StoredFeatures
 import torch
 
 VERSION2 = Path(__file__).parent / 'data' / 'version2'
@@ -118,7 +117,7 @@ def test_reader_written_from_the_documentation_finds_the_same(example, saved):
 
 @pytest.mark.parametrize('name', ['float32', 'float16'])
 def test_kept_file_of_version2_loads(name, example):
-    """These files were written when the format was fixed, from :func:`map_examples.example_map`."""
+    """These files were written when the format was fixed, from ``example_map``."""
     kept = load_map(VERSION2 / f'{name}.stavpr')
     assert (kept.ids, kept.sessions, len(kept)) == (example.ids, example.sessions, 24)
     torch.testing.assert_close(kept.features.strips, example.features.strips, rtol=0, atol=1e-3)
@@ -139,10 +138,9 @@ def changed(content: bytes, change=lambda manifest: None, **parts) -> bytes:
     manifest, tensors = parts_of(content)
     del manifest['parts']
     for name, array in parts.items():
-        name = name.replace('__', '/')
         tensors.pop(name, None)
         if array is not None:
-            tensors[name] = tensor(array)
+            tensors[name.replace('__', '/')] = tensor(array)
     result = change(manifest)
     return version2(manifest if result is None else result, tensors)
 
@@ -240,7 +238,6 @@ def test_load_map_takes_regular_files_only(tmp_path, saved):
 
 @pytest.mark.parametrize('size', [2**33, 2**50])
 def test_sparse_file_is_rejected_before_memory_is_taken(saved, size):
-    manifest, tensors = parts_of(saved.read_bytes())
     content = saved.read_bytes()
     with saved.open('wb') as file:
         file.write(content)
@@ -313,9 +310,7 @@ def test_damage_of_a_large_part_is_named_to_four_megabytes(tmp_path):
     strips[:, :, 0] = 1
     kind = FeatureSettings('gradient', GradientSettings(60, cell=4, orientations=4), 1)
     features = LocalFeatures(strips, torch.ones(1, 2500), kind)
-    save_map(
-        PlaceMap(features, None, np.zeros(2500, np.int64), ('',) * 2500), tmp_path / 'map'
-    )
+    save_map(PlaceMap(features, None, np.zeros(2500, np.int64), ('',) * 2500), tmp_path / 'map')
     with (tmp_path / 'map').open('r+b') as file:
         file.seek(5 * 2**20)
         file.write(b'x')
@@ -441,7 +436,7 @@ def test_hand_made_file_is_rejected_by_name(saved, parts, change, text):
 def test_map_of_another_version_is_rejected(saved, version):
     manifest, tensors = parts_of(saved.read_bytes())
     saved.write_bytes(version2(manifest, tensors, {'version': version}))
-    with pytest.raises(MapFileError, match='version|no map'):
+    with pytest.raises(MapFileError, match=r'version|no map'):
         load_map(saved)
 
 

@@ -83,7 +83,13 @@ def file(request, net, tmp_path_factory):
 
 
 def settings(path, **changes):
-    options = {'allow': True, 'size': 16, 'scale': 1.0, 'mean': (0, 0, 0), 'std': (1, 1, 1)} | changes
+    options = {
+        'allow': True,
+        'size': 16,
+        'scale': 1.0,
+        'mean': (0, 0, 0),
+        'std': (1, 1, 1),
+    } | changes
     return settings_class('torchscript')(model=str(path), **options)
 
 

@@ -151,9 +151,7 @@ def test_download_is_complete_and_checked(server, cache, content):
         ({'status': 302}, 'http://elsewhere/ is not https'),
     ],
 )
-def test_download_that_fails_leaves_no_file(
-    server, cache, content, changes, message, monkeypatch
-):
+def test_download_that_fails_leaves_no_file(server, cache, content, changes, message, monkeypatch):
     for name, value in changes.items():
         setattr(server, name, value)
     if changes.get('status') == 302:  # from an allowed address to another one

@@ -4,7 +4,6 @@
 
 import argparse
 from dataclasses import dataclass, field, replace
-import os
 from pathlib import Path
 import time
 

@@ -45,9 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     add('info', 'Show what a map holds.', 'map')
     action = add('verify', 'Compare all of a map with its hashes, and check every value.')
     action.add_argument('maps', nargs='+', metavar='MAP')
-    action = add(
-        'convert', 'Write a map in the present format.', 'map', 'output', output=True
-    )
+    action = add('convert', 'Write a map in the present format.', 'map', 'output', output=True)
     _add_storage(action)
     add('export', 'Write the arrays of a map for NumPy.', 'map', 'output', output=True)
     action = add('merge', 'Make one map of several: each is a session of it.', output=True)
@@ -81,7 +79,7 @@ def _info(arguments: argparse.Namespace) -> None:
 def describe(place_map: 'PlaceMap', path: Path) -> str:
     """Return what an opened map holds, a line each."""
     import numpy as np
-    from stavpr_ros.mapping.map_file import StoredFeatures
+    from stavpr_ros.mapping.stored_features import StoredFeatures
 
     features, settings, n = place_map.features, place_map.settings, len(place_map)
     assert isinstance(features, StoredFeatures)
@@ -183,7 +181,8 @@ def _export(arguments: argparse.Namespace) -> None:
         'settings': np.array(place_map.settings.to_json()),
     }
     with open(arguments.output, 'wb') as file:
-        np.savez(file, **{name: array for name, array in arrays.items() if array is not None})
+        found = {name: array for name, array in arrays.items() if array is not None}
+        np.savez(file, **found)  # type: ignore[arg-type]
     print(f'{arguments.output}: {len(place_map)} places; numpy.load reads it')
 
 

@@ -119,7 +119,7 @@ def _hash_file(path: Path) -> Path:
     return path.with_name(path.name + '.sha256')
 
 
-def open_model(path: Path) -> BinaryIO:
+def open_model(path: Path) -> io.BufferedReader:
     """
     Open the file of a model.
 

@@ -14,8 +14,8 @@ from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping.keyframes import KeyframeSelector, KeyframeSettings
 from stavpr_ros.mapping.place_map import (
     encode_thumbnail,
-    plain_text,
     PlaceMap,
+    plain_text,
     THUMBNAIL_WIDTH,
 )
 from stavpr_ros.mapping.trajectory import checked_pose, Trajectory

@@ -85,7 +85,7 @@ class MapFile:
 
         :raises MapFileError: the file has become shorter.
         """
-        view = memoryview(array).cast('B') if array.size else memoryview(b'')
+        view = array.reshape(-1).view(np.uint8).data if array.size else memoryview(b'')
         while len(view):
             count = os.preadv(self._file.fileno(), [view], start)
             if not count:
@@ -93,7 +93,7 @@ class MapFile:
             view, start = view[count:], start + count
 
     def bytes_at(self, start: int, count: int) -> bytes:
-        """Read some bytes; they must be within the file, so that no memory is taken in vain."""
+        """Read some bytes; they must be within the file, checked before memory is taken."""
         if start < 0 or count < 0 or start + count > self.size:
             raise self.damaged(
                 f'has {self.size} bytes, {count} from byte {start} on are missing: it is truncated'
@@ -129,7 +129,7 @@ class MapFile:
         for at in range(start, end, AT_ONCE):
             piece = content[: min(AT_ONCE, end - at)]
             self.fill(piece, at)
-            digest.update(piece)
+            digest.update(piece.data)
         return digest.hexdigest()
 
     def require_whole(self) -> None:

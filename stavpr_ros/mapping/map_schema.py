@@ -182,9 +182,7 @@ def identity_fields(kind: str) -> dict[str, Any]:
     The location of a model is not among them, nor what is without effect on the features.
     """
     return {
-        row.name: _SETTING_TYPES[row.type]
-        for row in fields(settings_class(kind))
-        if row.compare
+        row.name: _SETTING_TYPES[row.type] for row in fields(settings_class(kind)) if row.compare
     }
 
 

@@ -29,7 +29,7 @@ _LOCAL = struct.Struct('<4s5H3I2H')  # header before each member
 _NPY = struct.Struct('<8sH')  # magic and version, length of the header
 _HEADER = re.compile(
     r"\{'descr': '([<|]\w\d)', 'fortran_order': False, 'shape': \(((?:\d{1,12}, ?)*(?:\d{1,12})?)"
-    r"\), \} *\n"
+    r'\), \} *\n'
 )
 _TYPES = {'<f4': 'F32', '<f8': 'F64', '<i8': 'I64', '|u1': 'U8'}
 _SCHEMA = {
@@ -54,9 +54,6 @@ class _SmallReads(io.RawIOBase):
 
     def readable(self) -> bool:
         return True
-
-    def tell(self) -> int:
-        return self._at
 
     def seek(self, offset: int, whence: int = 0) -> int:
         base = {0: 0, 1: self._at, 2: self._file.size}[whence]
@@ -83,7 +80,7 @@ def read_version1(file: MapFile) -> None:
     :raises ValueError: anything else that is wrong with it.
     """
     try:
-        with zipfile.ZipFile(_SmallReads(file)) as archive:  # type: ignore[arg-type]
+        with zipfile.ZipFile(_SmallReads(file)) as archive:
             members = archive.infolist()
     except (zipfile.BadZipFile, OSError) as error:
         raise file.foreign(str(error)) from error
@@ -163,9 +160,7 @@ def _part(file: MapFile, member: zipfile.ZipInfo, sha256: str) -> Part:
     if found is None or found[1] not in _TYPES:
         raise ValueError(f'{name}, byte {start}: no array of numbers')
     shape = tuple(int(text) for text in found[2].split(',') if text.strip())
-    part = Part(
-        _TYPES[found[1]], shape, start + _NPY.size + length, (Piece(start, end, sha256),)
-    )
+    part = Part(_TYPES[found[1]], shape, start + _NPY.size + length, (Piece(start, end, sha256),))
     if part.start + part.size != end:
         raise ValueError(f'{name} has {end - part.start} bytes, {part.size} by its shape {shape}')
     return part

@@ -143,7 +143,7 @@ def write_version2(file: IO[bytes], manifest: dict[str, Any], parts: dict[str, N
         hasher = _PieceHasher()
         for array in parts[name].content:
             if array.size:
-                view = memoryview(np.ascontiguousarray(array)).cast('B')
+                view = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
                 hasher.update(view)
                 file.write(view)
         hashes[name] = hasher.hashes()

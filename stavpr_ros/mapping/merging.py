@@ -59,11 +59,11 @@ def select_session(place_map: PlaceMap, session_id: str, keep: bool = True) -> P
     left = [i for i in range(len(ids)) if (i == number) == keep]
     renumbered = np.full(len(ids), -1, np.int32)
     renumbered[left] = np.arange(len(left))
-    places = np.flatnonzero(chosen)
+    places = np.flatnonzero(chosen).tolist()
     thumbnails = tuple(place_map.thumbnails[i] for i in places) if place_map.thumbnails else ()
     return replace(
         place_map,
-        features=place_map.features[places],
+        features=place_map.features[np.array(places)],
         stamps=place_map.stamps[places],
         ids=tuple(place_map.ids[i] for i in places),
         poses=None if place_map.poses is None else place_map.poses[places],

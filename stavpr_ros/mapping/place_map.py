@@ -9,7 +9,7 @@ import math
 
 import cv2
 import numpy as np
-from stavpr_ros.errors import InputError
+from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.jpeg import is_thumbnail, MOST_PIXELS
 
@@ -98,9 +98,13 @@ class PlaceMap:
             raise InputError(
                 f'{len(self.thumbnails)} thumbnails for {n} places: expected all or none'
             )
-        if n and not -MOST_SECONDS <= self.stamps.min() // 10**9 <= (
-            self.stamps.max() // 10**9
-        ) < MOST_SECONDS:
+        if (
+            n
+            and not -MOST_SECONDS
+            <= self.stamps.min() // 10**9
+            <= (self.stamps.max() // 10**9)
+            < MOST_SECONDS
+        ):
             raise InputError('a stamp is out of range: expected ns of at most 2**31 seconds')
         _require_texts(self.ids)
         _require_sessions(self.sessions, self.session_index, n)
@@ -155,7 +159,10 @@ class PlaceMap:
 
     def thumbnail(self, place: int) -> np.ndarray | None:
         """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None."""
-        return decode_thumbnail(self.thumbnails[place]) if self.thumbnails else None
+        try:
+            return decode_thumbnail(self.thumbnails[place]) if len(self.thumbnails) else None
+        except MapFileError:  # the file has become shorter since it was opened
+            return None
 
 
 def require_projection(projection: Projection | None, settings: FeatureSettings) -> None:
@@ -192,7 +199,7 @@ def _require_texts(ids: tuple[str, ...]) -> None:
     for place, identifier in enumerate(ids):
         if identifier and (len(identifier) > LONGEST_ID or identifier != plain_text(identifier)):
             raise InputError(
-                f'the identifier of place {place} is {ascii(identifier[:80])}: expected at most '
+                f'the identifier of place {place} is {identifier[:80]!a}: expected at most '
                 f'{LONGEST_ID} characters, without NUL and lone surrogates'
             )
 
@@ -202,14 +209,14 @@ def plain_text(text: str) -> str:
     return text.replace('\0', '?').encode(errors='replace').decode()
 
 
-def _require_sessions(
-    sessions: tuple[Session, ...], index: np.ndarray | None, n: int
-) -> None:
+def _require_sessions(sessions: tuple[Session, ...], index: np.ndarray | None, n: int) -> None:
     if not sessions and index is None:
         return
     if index is None or index.dtype != np.int32 or index.shape != (n,):
         found = 'none' if index is None else f'{index.dtype} {index.shape}'
-        raise InputError(f'session index of {len(sessions)} sessions: {found}, expected int32 ({n},)')
+        raise InputError(
+            f'session index of {len(sessions)} sessions: {found}, expected int32 ({n},)'
+        )
     if n and not 0 <= index.min() <= index.max() < len(sessions):
         raise InputError(f'the session index is not between 0 and {len(sessions) - 1}')
     ids = [session.id for session in sessions]

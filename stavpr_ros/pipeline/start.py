@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, open_map, PlaceMap
+from stavpr_ros.mapping import GrowingMap, open_map, PlaceMap, verify_map
 from stavpr_ros.pipeline.operations import Localization, LoopClosing, Mapping, Operation
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.recognition import PlaceRecognizer
@@ -66,6 +66,8 @@ def start_operation(
     extractor = extractor or settings.extractor()
     if name == 'mapping':
         extractor.extract([BLANK])
+        if place_map is not None:
+            verify_map(place_map)  # damage would be saved again, with correct hashes
         growing = (
             GrowingMap(extractor.settings, extractor.projection, settings.max_places)
             if place_map is None

@@ -8,7 +8,7 @@ and successive ones are correlated.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from stavpr_ros.errors import SettingsError
@@ -173,9 +173,7 @@ class MeanCentering:
         # float64: in float32, the images of a long traverse would be rounded away
         self._sum, self._count = self._mean.double() * PRIOR, PRIOR
 
-    def places(
-        self, features: LocalFeatures, dtype: torch.dtype = torch.float32
-    ) -> LocalFeatures:
+    def places(self, features: LocalFeatures, dtype: torch.dtype = torch.float32) -> LocalFeatures:
         """Return features of the map, or of single images, less the map's mean."""
         return converted(features, lambda strips: without_mean(strips, self._mean), dtype)
 

@@ -28,7 +28,7 @@ from stavpr_msgs.msg import (
 )
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap
-from stavpr_ros.mapping.map_file import VERSION
+from stavpr_ros.mapping.map_version2 import VERSION
 from stavpr_ros.pipeline.overlay import draw_match
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
