@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 from stavpr_ros.commands.map import main
 from stavpr_ros.errors import FeatureMismatchError, InputError
-from stavpr_ros.mapping import load_map, merge_maps, open_map, save_map, select_session
+from stavpr_ros.mapping import (
+    GrowingMap,
+    load_map,
+    merge_maps,
+    open_map,
+    save_map,
+    select_session,
+)
 import torch
 
 
@@ -121,6 +128,16 @@ def test_merged_drives_are_sessions_that_can_be_taken_out_again(folder, drive):
     assert torch.equal(days.features[24:].strips, drive.features.strips)
     assert merge_maps([days, night], ['', '']).session(70).id == 'night'
     assert main(['sessions', 'both.stavpr', 'x', '--keep', 'dusk']) == 1
+
+
+def test_recording_behind_a_map_with_sessions_is_another_session(drive):
+    growing = GrowingMap.from_map(merge_maps([drive, drive], ['day', 'recorded-1']), 100)
+    assert [session.id for session in growing.snapshot().sessions] == ['day', 'recorded-1']
+    for i in range(3):
+        growing.add(drive.features[i : i + 1], stamp=7 * 10**9)
+    snapshot = growing.snapshot()
+    assert [session.id for session in snapshot.sessions] == ['day', 'recorded-1', 'recorded-2']
+    assert (snapshot.session(50).id, snapshot.session(50).start) == ('recorded-2', 7 * 10**9)
 
 
 def test_maps_that_do_not_fit_are_not_merged(drive):

@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 TIMEOUT = 30  # seconds without a byte
 PIECE = 1 << 20  # bytes
+HASH_FILE = 4096  # bytes read of NAME.sha256
 SCHEMES = ('https',)  # of downloads
 COUNTER = '.num_batches_tracked'  # for training only; missing in files from before torch 0.4
 
@@ -107,7 +108,8 @@ def expected_hash(path: Path, published: PublishedFile | None = None) -> str:
     if published is not None and published.sha256 and path.name == published.name:
         return published.sha256
     try:
-        words = _hash_file(path).read_text().split()
+        with open_regular(_hash_file(path)) as file:
+            words = file.read(HASH_FILE).decode().split()
     except FileNotFoundError:
         return ''
     except (OSError, ValueError) as error:

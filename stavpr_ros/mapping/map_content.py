@@ -7,6 +7,7 @@ from dataclasses import fields
 from typing import Any
 
 import numpy as np
+from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureSettings, Projection
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping.jpeg import jpeg_pixels, MOST_PIXELS
@@ -158,21 +159,22 @@ def _thumbnails(file: MapFile, ends: np.ndarray | None) -> 'StoredThumbnails | t
         last = max(first + 1, int(np.searchsorted(ends, start + THUMBNAILS_AT_ONCE, 'right')))
         content = np.empty(int(ends[last - 1]) - start, np.uint8)
         file.fill(content, part.start + start)
-        _require_jpegs(content, ends[first:last] - start, first)
+        require_jpegs(content, ends[first:last] - start, first)
         first = last
     return StoredThumbnails(file, ends)
 
 
-def _require_jpegs(content: np.ndarray, ends: np.ndarray, first: int = 0) -> None:
+def require_jpegs(content: np.ndarray, ends: np.ndarray, first: int = 0) -> None:
     """
     Reject anything but JPEG images of a limited size; an empty one is none.
 
     :param content, ends: see :func:`stavpr_ros.mapping.jpeg.jpeg_pixels`.
     :param first: number of the first place.
+    :raises InputError: names the place.
     """
     pixels = jpeg_pixels(content, ends)
     bad = np.flatnonzero((pixels < 0) | (pixels > MOST_PIXELS))
     if len(bad):
         found = pixels[bad[0]]
         what = f'has {found} pixels, at most {MOST_PIXELS}' if found > 0 else 'is no JPEG image'
-        raise ValueError(f'the thumbnail of place {first + bad[0]} {what}')
+        raise InputError(f'the thumbnail of place {first + bad[0]} {what}')

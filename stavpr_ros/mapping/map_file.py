@@ -16,11 +16,10 @@ import tempfile
 from typing import Any
 
 import numpy as np
-from stavpr_ros.errors import InputError, MapFileError, SettingsError
+from stavpr_ros.errors import MapFileError, SettingsError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping.jpeg import is_thumbnail
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile
-from stavpr_ros.mapping.map_content import map_content, PARTS
+from stavpr_ros.mapping.map_content import map_content, PARTS, require_jpegs
 from stavpr_ros.mapping.map_schema import identity_fields
 from stavpr_ros.mapping.map_version1 import read_version1
 from stavpr_ros.mapping.map_version2 import MOST_HEADER, NewPart, read_version2, write_version2
@@ -28,6 +27,7 @@ from stavpr_ros.mapping.place_map import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.regular_file import open_regular
 
+THUMBNAILS_AT_ONCE = 1000
 STORAGE = {'float32': 'F32', 'float16': 'F16'}
 # ---------------------------------------------------------------------------------------- saving
 
@@ -132,9 +132,10 @@ def _require_thumbnails(thumbnails: Sequence[bytes]) -> None:
 
     :raises InputError: names the place.
     """
-    for place, content in enumerate(thumbnails):
-        if content and not is_thumbnail(content):
-            raise InputError(f'the thumbnail of place {place} is no JPEG image of a small size')
+    for first in range(0, len(thumbnails), THUMBNAILS_AT_ONCE):
+        some = thumbnails[first : first + THUMBNAILS_AT_ONCE]
+        ends = np.cumsum([len(content) for content in some])
+        require_jpegs(np.frombuffer(b''.join(some), np.uint8), ends, first)
 
 
 def _strips(features: LocalFeatures, dtype: np.dtype) -> Iterator[np.ndarray]:
