@@ -38,6 +38,8 @@ class GrowingMap:
     :raises InputError: the projection is not that of the settings.
     """
 
+    map_id = ''  # that of a PlaceMap is of its file
+
     def __init__(
         self,
         settings: FeatureSettings,
@@ -57,7 +59,7 @@ class GrowingMap:
         self._weights = np.empty((settings.strips, 0), np.float32)
         self._stamps = np.empty(0, np.int64)
         self._poses = np.empty((0, 7))
-        self._sessions: tuple[Session, ...] = ()  # of the map that is continued
+        self.sessions: tuple[Session, ...] = ()  # of the map that is continued
         self._session_index: np.ndarray | None = None
         self.ids: list[str] = []  # '' = none
         self.thumbnails: list[bytes] = []  # small JPEGs, an empty one = none
@@ -84,7 +86,7 @@ class GrowingMap:
         growing._weights[:, :n] = features.weights.cpu().numpy()
         growing._stamps[:n] = place_map.stamps
         growing._poses[:n] = np.nan if place_map.poses is None else place_map.poses
-        growing._sessions, growing._session_index = place_map.sessions, place_map.session_index
+        growing.sessions, growing._session_index = place_map.sessions, place_map.session_index
         growing.ids = list(place_map.ids)
         growing.thumbnails = list(place_map.thumbnails) or [b''] * n
         growing._count = n
@@ -214,13 +216,13 @@ class GrowingMap:
         """Return the sessions of a continued map that has some, and one of the places added."""
         index = self._session_index
         if index is None or len(index) == self._count:
-            return self._sessions, index
-        taken = {session.id for session in self._sessions}
+            return self.sessions, index
+        taken = {session.id for session in self.sessions}
         names = (f'recorded-{number}' for number in itertools.count(1))
         name = next(name for name in names if name not in taken)
         recorded = Session(name, start=max(int(self.stamps[len(index)]), 0))
-        added = np.full(self._count - len(index), len(self._sessions), np.int32)
-        return (*self._sessions, recorded), np.concatenate([index, added])
+        added = np.full(self._count - len(index), len(self.sessions), np.int32)
+        return (*self.sessions, recorded), np.concatenate([index, added])
 
     def _checked(self, features: LocalFeatures) -> tuple[np.ndarray, np.ndarray]:
         """Return the strips (W, d) and weights (W,) of an image that fits."""

@@ -38,16 +38,18 @@ class Session:
 @dataclass(frozen=True)
 class Place:
     """
-    Stamp, identifier and pose of a place.
+    What is known of a place beside its features.
 
     :param stamp: ns, 0 = unknown.
     :param identifier: external identifier, '' = none.
     :param pose: x y z (meters) and quaternion x y z w, shape (7,), or None.
+    :param session: id of its session, '' = unknown.
     """
 
     stamp: int = 0
     identifier: str = ''
     pose: np.ndarray | None = None
+    session: str = ''
 
 
 @dataclass(frozen=True)
@@ -135,8 +137,14 @@ class PlaceMap:
         return self.poses[place]
 
     def place(self, index: int) -> Place:
-        """Return stamp, identifier and pose of a place."""
-        return Place(int(self.stamps[index]), self.ids[index], self.pose(index))
+        """Return stamp, identifier, pose and session of a place."""
+        session = self.session(index)
+        return Place(
+            int(self.stamps[index]),
+            self.ids[index],
+            self.pose(index),
+            session.id if session is not None else '',
+        )
 
     def session(self, place: int) -> Session | None:
         """Return the session that a place is of, None without sessions."""
