@@ -19,7 +19,7 @@ PLACES = 24
 def example_map(projection: int | None = None) -> PlaceMap:
     """Return a map of 24 places in two sessions, 32 dimensions or those of a projection."""
     extractor = FeatureExtractor(
-        'gradient', GradientSettings(32, cell=8, orientations=4), 2, projection
+        'gradient', GradientSettings(32, cell=8, orientations=4, logarithm=False), 2, projection
     )
     frames = [
         Frame(image, (i + 1) * 10**9, f'place {i}') for i, image in enumerate(route_images(PLACES))

@@ -108,6 +108,7 @@ def test_reader_written_from_the_documentation_finds_the_same(example, saved):
     np.testing.assert_array_equal(arrays['stamps'], example.stamps)
     assert manifest['settings']['backbone'] == {
         'size': 32, 'cell': 8, 'orientations': 4, 'resize': 'area', 'signed': True,
+        'logarithm': False,
     }  # fmt: skip
     assert arrays['ids'] == list(example.ids)
     assert arrays['thumbnails'] == list(example.thumbnails)
@@ -117,7 +118,7 @@ def test_reader_written_from_the_documentation_finds_the_same(example, saved):
 
 @pytest.mark.parametrize('name', ['float32', 'float16'])
 def test_kept_file_of_version2_loads(name, example):
-    """These files were written when the format was fixed, from ``example_map``."""
+    """These files were written from ``example_map`` before the setting ``logarithm``."""
     kept = load_map(VERSION2 / f'{name}.stavpr')
     assert (kept.ids, kept.sessions, len(kept)) == (example.ids, example.sessions, 24)
     torch.testing.assert_close(kept.features.strips, example.features.strips, rtol=0, atol=1e-3)

@@ -79,8 +79,10 @@ def map_content(file: MapFile) -> PlaceMap:
 
 def _settings(record: dict[str, Any]) -> FeatureSettings:
     """Build the settings of the features; the location of a model is unknown to a map."""
-    kind, values = record['kind'], record['backbone']
+    kind = record['kind']
     rows = identity_fields(kind)
+    # settings that there were none of when the map was made
+    values = getattr(settings_class(kind), 'BEFORE', {}) | record['backbone']
     Object(rows).check(values, f'settings of features {kind}')
     if 'sha256' in rows and not values['sha256']:
         raise ValueError(f'settings of features {kind} lack the sha256 of the model')

@@ -124,6 +124,7 @@ def _settings(text: str) -> dict[str, Any]:
     if isinstance(settings, dict) and isinstance(settings.get('backbone'), dict):
         kind = settings.get('kind')
         rows = {row.name: row for row in fields(settings_class(str(kind)))}
+        before = getattr(settings_class(str(kind)), 'BEFORE', {})
         for name in list(settings['backbone']):
             if name in rows and not rows[name].compare:
                 del settings['backbone'][name]
@@ -132,7 +133,7 @@ def _settings(text: str) -> dict[str, Any]:
             for name, row in rows.items()
             if row.compare and isinstance(row.default, (bool, int, float, str, tuple))
         }
-        settings['backbone'] = defaults | settings['backbone']
+        settings['backbone'] = defaults | before | settings['backbone']
     return {'projection': None, 'feature_version': 1} | settings
 
 

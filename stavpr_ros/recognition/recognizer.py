@@ -24,6 +24,7 @@ from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust import (
     blocks,
     converted,
+    evenly,
     MeanCentering,
     options_of,
     RobustOptions,
@@ -258,7 +259,9 @@ class PlaceRecognizer(SequenceRecognizer):
         for _, some in blocks(features):
             require_finite(some, 'the map')
         self._dimension = features.dimension
-        self._centering = MeanCentering(features) if options.mean_centering else None
+        self._centering = None
+        if options.mean_centering or options.whitening:
+            self._centering = MeanCentering(features, options.mean_centering, options.whitening)
         # cells are made of float32 strips
         half = precision == 'float16' and not settings.spatial.vertical
         held = self._held(features, torch.float16 if half else torch.float32)
@@ -285,7 +288,7 @@ class PlaceRecognizer(SequenceRecognizer):
     def _distances_to_itself(self, features: LocalFeatures) -> np.ndarray:
         """Return the distances of some places to all, shape (m, n); NaN to their neighbors."""
         n, radius = len(features), self._settings.nms_radius
-        some = np.unique(np.linspace(0, max(n - 1, 0), min(n, PLACES_TO_START_FROM)).astype(int))
+        some = evenly(n, PLACES_TO_START_FROM)
         chosen = features[some]
         if self._centering is not None:
             chosen = self._centering.places(chosen)
