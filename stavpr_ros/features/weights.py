@@ -195,9 +195,9 @@ def download(address: str, path: Path, sha256: str) -> None:
 class _Redirects(urllib.request.HTTPRedirectHandler):
     """Follows redirects to the allowed schemes only."""
 
-    def redirect_request(self, req, fp, code, msg, headers, newurl):  # type: ignore[no-untyped-def]
-        _require_scheme(newurl)
-        return super().redirect_request(req, fp, code, msg, headers, newurl)
+    def redirect_request(self, *request: Any) -> urllib.request.Request | None:
+        _require_scheme(request[-1])  # the new address
+        return super().redirect_request(*request)
 
 
 def _require_scheme(address: str) -> None:
