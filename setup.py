@@ -19,6 +19,8 @@ NAME = 'stavpr_ros'
 EXECUTABLES = (
     'node',
     'build_map',
+    'map',
+    'weights',
     'replay',
     'demo',
     'record',
@@ -29,7 +31,7 @@ EXECUTABLES = (
 
 # The command `evaluate` is part of every installation.
 EVALUATION = ['jinja2>=3.1', 'scikit-learn>=1.4']
-TEST = ['hypothesis>=6.98', 'pytest>=7.4', 'PyYAML>=6.0']
+TEST = ['hypothesis>=6.98', 'pytest>=7.4', 'PyYAML>=6.0', 'safetensors>=0.4']
 LINT = [
     'flake8>=7.0',
     'flake8-builtins>=2.1',

@@ -19,6 +19,7 @@ import sys
 import tempfile
 from types import SimpleNamespace
 from typing import Any, TYPE_CHECKING
+from unittest.mock import patch
 
 import numpy as np
 
@@ -124,13 +125,16 @@ def _save_map(path: Path, n: int, d: int) -> None:
 
     from data import make_features
     from stavpr_ros.features import FeatureSettings
+    from stavpr_ros.features.registry import KINDS
     from stavpr_ros.mapping import PlaceMap, save_map
 
     features = make_features(n, d, STRIPS, 'cpu', seed=0)
     features = replace(
         features, settings=FeatureSettings('synthetic', SyntheticSettings(d)), cells=(1, 1)
     )
-    save_map(PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n), path)
+    place_map = PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
+    with patch.dict(KINDS, synthetic=(SyntheticSettings, 'synthetic:Synthetic')):
+        save_map(place_map, path)
 
 
 def resident_bytes() -> int:

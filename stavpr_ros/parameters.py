@@ -271,7 +271,15 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'model_path',
             '',
-            'File of the network, for maps of a network, if it is not where the map was built.',
+            'File of the network, for features of a network. For a map also a folder with it; '
+            'empty: the folder $STAVPR_MODELS, by default ~/.local/share/stavpr_ros/models.',
+        ),
+        NodeParameter(
+            'allow_torchscript',
+            False,
+            'Permit features torchscript to run their file: it is a program, and may read and '
+            'write files.',
+            when='start',
         ),
         NodeParameter(
             'max_places',

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 import signal
 import subprocess
+import sys
 
 from ament_index_python.packages import get_package_prefix
 
@@ -33,7 +34,7 @@ class Process:
         self.log = log
         with log.open('w') as output:
             self.popen = subprocess.Popen(
-                [executable(name), *arguments],
+                [*command(name), *arguments],
                 env=environment(),
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -61,7 +62,13 @@ class Process:
         print(self.output())  # which pytest shows when the test has failed
 
 
-def node_process(log: Path, *options: str, **parameters: object) -> Process:
-    """Start the node with options of ROS and parameters."""
+def command(name: str) -> list[str]:
+    """Return the command of an executable, or of the slow node beside this file."""
+    slow = Path(__file__).with_name(f'{name}.py')
+    return [sys.executable, str(slow)] if name == 'slow_node' else [executable(name)]
+
+
+def node_process(log: Path, *options: str, slow: bool = False, **parameters: object) -> Process:
+    """Start the node, or the slow one, with options of ROS and parameters."""
     values = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
-    return Process(log, 'node', '--ros-args', *options, *values)
+    return Process(log, 'slow_node' if slow else 'node', '--ros-args', *options, *values)

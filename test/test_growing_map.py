@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import growing_map, GrowingMap, load_map, save_map
+from stavpr_ros.features.gradient import GradientSettings
+from stavpr_ros.mapping import encode_thumbnail, growing_map, GrowingMap, load_map, save_map
 import torch
 
-EXTRACTOR = FeatureExtractor()
-W, D = 7, 5
+# 7 x 7 cells, one column a strip
+EXTRACTOR = FeatureExtractor('gradient', GradientSettings(28, cell=4, orientations=2))
+W, D = 7, 14
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +27,7 @@ def little_room(monkeypatch):
 
 def features(i, d=D, settings=EXTRACTOR.settings, count=1):
     strips = torch.arange(W * count * d, dtype=torch.float32).reshape(W, count, d) + 1000 * i
-    return LocalFeatures(strips, torch.full((W, count), float(i)), settings, (5, 1))
+    return LocalFeatures(strips / 2**20, torch.full((W, count), i / 128), settings, (7, 1))
 
 
 def where(i):
@@ -42,7 +44,11 @@ def grown(count, limit=100):
 
 def add(made, i):
     pose = where(i) if i % 3 else None
-    return made.add(features(i), i * 10, f'place {i}', pose, b'' if i % 2 else bytes([i]))
+    return made.add(features(i), i * 10, f'place {i}', pose, b'' if i % 2 else thumbnail(i))
+
+
+def thumbnail(i):
+    return encode_thumbnail(np.full((8, 8, 3), i, np.uint8))
 
 
 def assert_holds(made, numbers):
@@ -55,10 +61,10 @@ def assert_holds(made, numbers):
         torch.testing.assert_close(
             made.features.strips[:, place], features(i).strips[:, 0], rtol=0, atol=0
         )
-        assert made.features.weights[:, place].tolist() == [i] * W
+        assert made.features.weights[:, place].tolist() == [i / 128] * W
         known = where(i) if i % 3 else np.full(7, np.nan)
         np.testing.assert_allclose(made.poses[place], known)
-        assert made.thumbnails[place] == (b'' if i % 2 else bytes([i]))
+        assert made.thumbnails[place] == (b'' if i % 2 else thumbnail(i))
 
 
 def test_growing_map_memory_doubles_up_to_limit():
@@ -67,13 +73,16 @@ def test_growing_map_memory_doubles_up_to_limit():
         rooms.append(made.memory)
         assert add(made, i) == i
     place = W * (D + 1) * 4 + 8 + 7 * 8
-    texts = [sum(len(f'place {j}') + (j % 2 == 0) for j in range(i)) for i in range(18)]
+    texts = [
+        sum(len(f'place {j}') + len(thumbnail(j)) * (j % 2 == 0) for j in range(i))
+        for i in range(18)
+    ]
     places = [(room - text) / place for room, text in zip(rooms, texts, strict=True)]
     assert places == [0, *[4] * 4, *[8] * 4, *[16] * 8, 18]
     with pytest.raises(InputError, match=r'full, it has 18 places: raise its limit, evict'):
         add(made, 18)
     assert_holds(made, range(18))
-    assert made.features.cells == (5, 1)
+    assert made.features.cells == (7, 1)
 
 
 def test_snapshot_is_independent_of_map():
@@ -187,7 +196,7 @@ def test_add_with_error_changes_nothing(count, arguments, error, words):
 
 def test_add_of_other_dimension_is_rejected():
     made = grown(2)
-    with pytest.raises(InputError, match='6 dimensions: the map has 5'):
+    with pytest.raises(InputError, match='6 dimensions: the map has 14'):
         made.add(features(2, d=6))
     assert_holds(made, range(2))
 

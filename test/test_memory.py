@@ -3,6 +3,7 @@
 """Features are in memory once: the owner is the matcher, or the loop closer."""
 
 from dataclasses import replace
+import os
 from pathlib import Path
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.mapping import GrowingMap, load_map, open_map, PlaceMap, save_map
+from stavpr_ros.mapping import GrowingMap, load_map, open_map, PlaceMap, save_map, verify_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CACHE_LINE
 import torch
@@ -82,12 +83,15 @@ def test_opened_map_outlives_its_name(path, small_map, change):
     assert torch.equal(opened.features.strips, small_map.features.strips)
 
 
-def test_opened_map_that_is_overwritten_is_an_error(path, small_map):
+def test_opened_map_whose_file_changes_is_an_error(path, small_map):
     opened = open_map(path)
-    path.write_bytes(
-        path.read_bytes().replace(small_map.features.strips.numpy().tobytes()[:64], bytes(64))
-    )
-    with pytest.raises(MapFileError, match='damaged'):
+    verify_map(opened)
+    features = small_map.features.strips.numpy().tobytes()
+    path.write_bytes(path.read_bytes().replace(features[:64], bytes(64)))
+    with pytest.raises(MapFileError, match='of part strips, do not match their hash'):
+        verify_map(opened)
+    os.truncate(path, 1000)
+    with pytest.raises(MapFileError, match=r'is truncated: byte \d+ is missing'):
         _ = opened.features.strips
 
 
@@ -157,7 +161,8 @@ def random_map(path, places, dimension):
     strips = rng.standard_normal((7, places, dimension), np.float32)
     strips /= np.linalg.norm(strips, axis=2, keepdims=True)
     weights = torch.full((7, places), 7**-0.5)
-    settings = FeatureSettings('gradient', GradientSettings())
+    # 8 x 8 cells, one column a strip
+    settings = FeatureSettings('gradient', GradientSettings(128, orientations=dimension // 8))
     features = LocalFeatures(torch.from_numpy(strips), weights, settings)
     save_map(PlaceMap(features, None, np.zeros(places, np.int64), ('',) * places), path)
     return str(path)

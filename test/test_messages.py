@@ -15,7 +15,7 @@ from sensor_msgs.msg import Image
 from stavpr_msgs.msg import LoopClosure, PlaceMatch
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import encode_thumbnail, GrowingMap
+from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Session
 from stavpr_ros.pipeline import overlay
 from stavpr_ros.recognition import Candidate, Match, Status
 from stavpr_ros.ros.output import (
@@ -289,12 +289,25 @@ def test_map_info_message_of_a_map(small_map):
         3,
     )
     assert (info.places, info.features, info.strips, info.dimension, info.format_version) == (
-        60, 'gradient', 7, 64, 1
+        60, 'gradient', 7, 64, 2
     )  # fmt: skip
+    assert (info.feature_version, info.sessions) == (1, [])
     assert info.settings == small_map.settings.to_json()
     assert all(
         (info.projected, info.has_stamps, info.has_ids, info.has_poses, info.has_thumbnails)
     )
+
+
+def test_messages_name_the_session_of_the_place(small_map):
+    index = np.repeat(np.array([0, 1], np.int32), 30)
+    both = replace(small_map, sessions=(Session('day'), Session('night')), session_index=index)
+    assert match_message(HEADER, accepted(), both).session == 'night'
+    assert match_message(HEADER, rejected(), both).session == ''
+    match = rejected(candidates=(Candidate(29, 0.25), Candidate(30, 0.5)))
+    candidates = candidates_message(HEADER, match, both).candidates
+    assert [candidate.session for candidate in candidates] == ['day', 'night']
+    info = map_info_message('localization', 'loaded', 'a', both, None, Time())
+    assert info.sessions == ['day', 'night']
 
 
 def test_map_info_message_of_a_growing_map_and_of_none(extractor, features):

@@ -4,7 +4,9 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
-import os
+from pathlib import Path
+import threading
+from unittest.mock import patch
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -14,6 +16,7 @@ from robot import image_message, LENGTH, SECOND
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.ros import runtime
 from std_srvs.srv import Trigger
 import torch
 
@@ -22,17 +25,25 @@ PAPER = {'mode': 'paper', 'threshold': 0.2}  # certain after one window
 
 @contextmanager
 def while_loading(robot, path):
-    """Load a pipe: reading it takes until the end of the block, and then it is no map."""
-    os.mkfifo(path)
-    futures = []
+    """Load a file that is no map; reading it takes until the end of the block."""
+    path.write_bytes(b'no map')
+    futures, proceed, read = [], threading.Event(), runtime.read_map
+
+    def slow(*arguments):
+        proceed.wait()
+        return read(*arguments)
 
     def loading():
         return bool(robot.infos) and robot.infos[-1].state == 'loading'
 
-    with robot.request(futures, LoadMap, 'load_map', loading, path=str(path)):
-        yield path
-        os.close(os.open(path, os.O_WRONLY))  # waits for the reader
-        robot.until(futures[0].done, 'the response of load_map')
+    with patch.object(runtime, 'read_map', slow):
+        try:
+            with robot.request(futures, LoadMap, 'load_map', loading, path=str(path)):
+                yield path
+                proceed.set()
+                robot.until(futures[0].done, 'the response of load_map')
+        finally:
+            proceed.set()
     assert not futures[0].result().success
     assert path.name in futures[0].result().message
 
@@ -63,6 +74,20 @@ def test_services_without_a_map_return_the_reason(robot, start, route, map_file,
     assert list(tmp_path.iterdir()) == []
     assert robot.does(LoadMap, 'load_map', path=map_file).map.places == 60
     assert robot.drive(route[:LENGTH])[-1].newest_index == LENGTH - 1
+
+
+def test_damage_of_the_map_in_use_is_reported_after_the_first_match(
+    robot, start, route, map_file, tmp_path
+):
+    content, damaged = bytearray(Path(map_file).read_bytes()), tmp_path / 'damaged.stavpr'
+    strips = load_map(map_file).features.strips.numpy().tobytes()
+    content[content.index(strips[:64]) + 1] ^= 1  # too little for a check of the values
+    damaged.write_bytes(content)
+    start(map_path=str(damaged))
+    robot.until_logged('the map in use is not reliable: ')
+    robot.until_diagnosed('map', DiagnosticStatus.WARN, 'is damaged')
+    assert robot.drive(route[:LENGTH])[-1].newest_index == LENGTH - 1
+    assert 'is damaged' in robot.refuses(SetOperation, 'set_operation', operation='mapping')
 
 
 def test_images_while_the_first_map_is_loaded_are_not_ready(robot, start, route, tmp_path):

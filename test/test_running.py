@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node as a process: signals in every state, options of ROS."""
 
-import os
 import shutil
 import signal
 
@@ -106,29 +105,27 @@ def test_node_after_a_signal_during_compilation_ends(robot, run, map_file, tmp_p
     ],
 )
 def test_node_after_a_signal_while_a_map_is_read_ends(robot, run, map_file, tmp_path, how):
-    """The file is a pipe without a writer: reading it does not end."""
-    pipe = tmp_path / 'pipe.stavpr'
-    os.mkfifo(pipe)
-    if how == 'load_map again':  # the map in use, whose file has changed
-        pipe.unlink()
-        shutil.copy(map_file, pipe)
-    process = run(map_path=map_file if how == 'load_map' else pipe)
+    """The file is on a disk that does not respond: reading it does not end."""
+    path, slow = tmp_path / 'slow.stavpr', tmp_path / 'slow.stavpr.slow'
+    shutil.copy(map_file, path)
+    if how == 'configure':
+        slow.touch()
+    process = run(slow=True, map_path=map_file if how == 'load_map' else path)
     if how != 'configure':
         robot.wait_for_node()
-        pipe.unlink()
-        os.mkfifo(pipe)
+        slow.touch()
         futures = []
 
         def loading():
-            return f'loading {pipe}' in robot.diagnostics['map'].message
+            return f'loading {path}' in robot.diagnostics['map'].message
 
-        with robot.request(futures, LoadMap, 'load_map', loading, path=str(pipe)):
+        with robot.request(futures, LoadMap, 'load_map', loading, path=str(path)):
             assert not any(future.done() for future in futures)
         answer = robot.ask(image_message(np.zeros((96, 128, 3), np.uint8), 1))  # meanwhile
         assert answer.status == PlaceMatch.WARMING_UP
     else:
         robot.until_diagnosed('processing', DiagnosticStatus.OK, 'configuring')
-        robot.until_diagnosed('map', DiagnosticStatus.OK, f'loading {pipe}')
+        robot.until_diagnosed('map', DiagnosticStatus.OK, f'loading {path}')
         assert robot.state() == 'configuring'  # during the transition
         assert not robot.transition('cleanup')
         assert 'another is under way' in process.output()

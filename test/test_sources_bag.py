@@ -3,6 +3,7 @@
 """Bags of every kind: written and read back, real, damaged."""
 
 import hashlib
+import os
 import shutil
 import sqlite3
 
@@ -13,6 +14,7 @@ import pytest
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import BagSource, COMPRESSED, RAW
+from stavpr_ros.sources.bag_file import open_bag
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 
@@ -241,3 +243,16 @@ def test_bag_of_ros1_is_read(data_folder):
         assert [frame.image.shape for frame in frames] == [(800, 848, 3)] * 3
         assert [round(gap / 1e6) for gap in np.diff([frame.stamp for frame in frames])] == [33, 33]
         assert all(np.ptp(frame.image) > 100 for frame in frames)
+
+
+@pytest.mark.parametrize('name', ['bag.bag', 'bag.db3', 'folder'])
+def test_open_bag_takes_regular_files_only(tmp_path, name):
+    """Reading a pipe would not end."""
+    path = tmp_path / name
+    if name == 'folder':
+        path.mkdir()
+        os.mkfifo(path / 'bag.db3')
+    else:
+        os.mkfifo(path)
+    with pytest.raises(SourceError, match=r'pipe|director'), open_bag(path):
+        pass

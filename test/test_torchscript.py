@@ -2,11 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Features of TorchScript files: outputs and inner modules, traced and scripted, errors."""
 
+from dataclasses import replace
+import json
+
 import numpy as np
 import pytest
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class, settings_class
+from stavpr_ros.parameters import BY_NAME
+from stavpr_ros.pipeline import PipelineSettings
 import torch
 from torch import nn
 
@@ -83,7 +88,13 @@ def file(request, net, tmp_path_factory):
 
 
 def settings(path, **changes):
-    options = {'size': 16, 'scale': 1.0, 'mean': (0, 0, 0), 'std': (1, 1, 1)} | changes
+    options = {
+        'allow': True,
+        'size': 16,
+        'scale': 1.0,
+        'mean': (0, 0, 0),
+        'std': (1, 1, 1),
+    } | changes
     return settings_class('torchscript')(model=str(path), **options)
 
 
@@ -203,3 +214,26 @@ def test_torchscript_in_half_precision_on_gpu_is_close(file, net):
     torch.testing.assert_close(
         maps.float().cpu(), expected(net, 'body.last', batch), rtol=1e-2, atol=1e-2
     )
+
+
+def test_torchscript_runs_with_permission_only(file):
+    """Neither a map nor settings give it, and without it the file is not even opened."""
+    with pytest.raises(SettingsError, match='set parameter allow_torchscript'):
+        FeatureExtractor('torchscript', settings('/nowhere', allow=False))
+    text = json.dumps({'model': str(file), 'allow': True, 'size': 16})
+    made = PipelineSettings(features='torchscript', feature_settings=text)
+    with pytest.raises(SettingsError, match='set parameter allow_torchscript'):
+        made.extractor()
+    allowed = replace(made, allow_torchscript=True)
+    assert allowed.extractor().settings.backbone.sha256
+    assert BY_NAME['allow_torchscript'].when == 'start'
+
+
+def test_torchscript_of_another_hash_is_not_run(file, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.jit, 'load', lambda *_, **__: pytest.fail('it was run'))
+    with pytest.raises(FeatureMismatchError, match='sha256'):
+        FeatureExtractor('torchscript', settings(file, sha256='0' * 64))
+    (tmp_path / 'copy.pt').write_bytes(file.read_bytes())
+    (tmp_path / 'copy.pt.sha256').write_text('0' * 64)
+    with pytest.raises(UnavailableError, match='it is damaged or another file'):
+        FeatureExtractor('torchscript', settings(tmp_path / 'copy.pt'))

@@ -5,6 +5,8 @@
 import hashlib
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import io
+import os
+from pathlib import Path
 import pickle
 import socket
 import threading
@@ -13,13 +15,16 @@ from checkpoints import Call, Global, OldPickle
 import numpy as np
 import pytest
 from stavpr_ros.errors import FeatureMismatchError, UnavailableError
+from stavpr_ros.features import weights
 from stavpr_ros.features.paper_networks import PublishedNetwork
 from stavpr_ros.features.registry import PublishedSettings
 from stavpr_ros.features.weights import (
     cache_folder,
     download,
+    find_model,
     PublishedFile,
     read_checkpoint,
+    read_model,
 )
 import torch
 from torch import nn
@@ -67,6 +72,8 @@ class Server:
             def do_GET(self):
                 outer.requests += 1
                 self.send_response(outer.status)
+                if outer.status == 302:
+                    self.send_header('Location', 'http://elsewhere/')
                 self.send_header('Content-Length', str(outer.announced or len(outer.body)))
                 self.end_headers()
                 self.wfile.write(outer.body)
@@ -86,6 +93,7 @@ def server(content, monkeypatch):
     thread = threading.Thread(target=server.http.serve_forever, kwargs={'poll_interval': 0.01})
     thread.start()
     monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address), raising=False)
+    monkeypatch.setattr(weights, 'SCHEMES', ('http',))
     yield server
     server.http.shutdown()
     thread.join()
@@ -107,27 +115,30 @@ def test_cache_folder_follows_xdg(monkeypatch, tmp_path):
     assert cache_folder() == tmp_path / '.cache' / 'stavpr_ros'
 
 
-def test_network_by_default_downloads_nothing(server, cache):
+def fetch(server, cache, content) -> str:
+    """Download the file; return its hash."""
+    digest = hashlib.sha256(content).hexdigest()
+    download(server.address, cache / 'tiny.pth', digest)
+    return digest
+
+
+def test_network_without_its_file_downloads_nothing(server, cache):
     with pytest.raises(
-        UnavailableError, match=rf"{cache}/tiny\.pth.*'download'.*{server.address}"
+        UnavailableError, match=rf'{cache}/tiny\.pth: `stavpr weights`.*{server.address}'
     ):
         Tiny(PublishedSettings())
+    with pytest.raises(UnavailableError, match="'download' cannot be read"):
+        Tiny(PublishedSettings(model='download'))
     assert server.requests == 0
     assert not cache.exists()
 
 
-def test_download_happens_once(server, cache, content, capsys):
-    first = tiny(model='download')
-    digest = hashlib.sha256(content).hexdigest()
-    assert first.settings.sha256 == digest
-    assert first.settings.model == 'cached'  # recorded in maps: no download elsewhere
+def test_download_is_complete_and_checked(server, cache, content):
+    digest = fetch(server, cache, content)
     assert sorted(path.name for path in cache.iterdir()) == ['tiny.pth', 'tiny.pth.sha256']
     assert (cache / 'tiny.pth.sha256').read_text() == f'{digest}  tiny.pth\n'
-    assert digest in (printed := capsys.readouterr().err)
-    assert 'trusted now' in printed
-    server.http.shutdown()
-    for model in ('download', 'cached', str(cache / 'tiny.pth')):
-        assert tiny(model=model).settings == first.settings
+    for model in ('cached', str(cache / 'tiny.pth')):
+        assert tiny(model=model).settings.sha256 == digest
     assert server.requests == 1
 
 
@@ -136,16 +147,39 @@ def test_download_happens_once(server, cache, content, capsys):
     [
         ({'status': 404}, 'HTTP Error 404'),
         ({'announced': 10**6}, 'of 1000000 bytes received'),
-        ({'body': b''}, 'cannot be read as a file of weights'),
+        ({'body': b''}, 'it was changed or damaged on its way'),
+        ({'status': 302}, 'http://elsewhere/ is not https'),
     ],
 )
-def test_download_that_fails_leaves_no_partial_file(server, cache, changes, message):
+def test_download_that_fails_leaves_no_file(server, cache, content, changes, message, monkeypatch):
     for name, value in changes.items():
         setattr(server, name, value)
+    if changes.get('status') == 302:  # from an allowed address to another one
+        monkeypatch.setattr(weights, '_require_scheme', Once(weights._require_scheme))
+        monkeypatch.setattr(weights, 'SCHEMES', ('https',))
     with pytest.raises(UnavailableError, match=message):
-        Tiny(PublishedSettings(model='download'))
-    left = {path.name for path in cache.iterdir()}
-    assert left == ({'tiny.pth', 'tiny.pth.sha256'} if 'body' in changes else set())
+        fetch(server, cache, content)
+    assert list(cache.iterdir()) == []
+
+
+class Once:
+    """Lets the first call pass."""
+
+    def __init__(self, function) -> None:
+        self.function, self.called = function, False
+
+    def __call__(self, address):
+        if self.called:
+            self.function(address)
+        self.called = True
+
+
+def test_download_takes_https_only(server, cache, monkeypatch):
+    monkeypatch.setattr(weights, 'SCHEMES', ('https',))
+    for address in (server.address, 'file:///etc/passwd', 'ftp://a/b'):
+        with pytest.raises(UnavailableError, match='is not https'):
+            download(address, cache / 'tiny.pth', '0' * 64)
+    assert server.requests == 0
 
 
 def test_download_without_network_fails_with_advice(cache, monkeypatch):
@@ -153,61 +187,83 @@ def test_download_without_network_fails_with_advice(cache, monkeypatch):
         free.bind(('127.0.0.1', 0))
         address = f'http://127.0.0.1:{free.getsockname()[1]}/tiny.pth'
     monkeypatch.setenv('no_proxy', '*')
+    monkeypatch.setattr(weights, 'SCHEMES', ('http',))
     with pytest.raises(UnavailableError, match=rf'{address} cannot be downloaded.*give its path'):
-        download(address, cache / 'tiny.pth')
+        download(address, cache / 'tiny.pth', '0' * 64)
     assert list(cache.iterdir()) == []
 
 
-def test_download_to_unwritable_cache_fails(server, tmp_path, monkeypatch):
+def test_download_to_unwritable_cache_fails(server, tmp_path, content):
     (tmp_path / 'file').touch()
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'file'))
     with pytest.raises(UnavailableError, match='cannot be'):
-        Tiny(PublishedSettings(model='download'))
+        fetch(server, tmp_path / 'file', content)
 
 
-def test_download_with_other_published_hash_is_rejected(
-    server, cache, content, monkeypatch, capsys
-):
-    monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address, sha256='0123abcd'))
-    with pytest.raises(UnavailableError, match=r'expected 0123abcd: it was changed or damaged'):
-        Tiny(PublishedSettings(model='download'))
-    with pytest.raises(UnavailableError, match='expected 0000'):  # that of a map
-        Tiny(PublishedSettings(model='download', sha256='0' * 64))
-    assert list(cache.iterdir()) == []
+def test_published_hash_is_checked_in_full(server, cache, content, monkeypatch):
+    digest = hashlib.sha256(content).hexdigest()
+    other = digest[:16] + '0' * 48
+    monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address, sha256=other))
+    fetch(server, cache, content)
+    with pytest.raises(UnavailableError, match='it is damaged or another file; delete it'):
+        Tiny(PublishedSettings())
     (cache / 'mine.pth').write_bytes(content)
     tiny(model=str(cache / 'mine.pth'))  # another name than the published file's
+
+
+def test_command_weights_needs_a_full_hash(cache, capsys, monkeypatch):
+    from stavpr_ros.commands.weights import main
+
+    fetched = []
+    monkeypatch.setattr(weights, 'download', lambda *arguments: fetched.append(arguments))
+    assert main(['vgg16', '--sha256', 'abc']) == 2
+    assert main(['densenet161_places365']) == 2
+    assert 'publish no hash' in capsys.readouterr().err
+    assert main(['vgg16']) == main(['densenet161_places365', '--sha256', '0' * 64]) == 0
+    assert [(path.parent, sha256[:8]) for _, path, sha256 in fetched] == [
+        (cache, '397923af'),
+        (cache, '0' * 8),
+    ]
+
+
+def test_model_is_found_by_its_hash(tmp_path, cache, content, monkeypatch):
+    monkeypatch.setenv('STAVPR_MODELS', str(tmp_path / 'models'))
     digest = hashlib.sha256(content).hexdigest()
-    monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address, sha256=digest[:8]))
-    tiny(model='download')
-    assert 'as published' in capsys.readouterr().err
+    with pytest.raises(UnavailableError, match=f'{digest} is not in {tmp_path}/models or {cache}'):
+        find_model(digest, '')
+    for folder in (tmp_path / 'models', cache, tmp_path / 'given'):
+        folder.mkdir(parents=True)
+    (tmp_path / 'models' / 'other.pth').write_bytes(b'other')
+    os.mkfifo(tmp_path / 'models' / 'pipe')
+    (cache / 'any.name').write_bytes(content)
+    assert find_model(digest, '') == cache / 'any.name'
+    (tmp_path / 'models' / 'mine').write_bytes(content)
+    assert find_model(digest, '') == tmp_path / 'models' / 'mine'
+    assert find_model(digest, '/some/file') == Path('/some/file')  # its hash is checked later
+    with pytest.raises(UnavailableError, match='given'):
+        find_model(digest, str(tmp_path / 'given'))
 
 
-def test_download_unlike_first_is_rejected(server, cache, content):
-    """A file that was deleted and downloaded again must equal the first one."""
-    tiny(model='download')
-    (cache / 'tiny.pth').unlink()
-    server.body = content + b'\x00'
-    with pytest.raises(UnavailableError, match='changed or damaged'):
-        Tiny(PublishedSettings(model='download'))
-    assert not (cache / 'tiny.pth').exists()
-    server.body = content
-    tiny(model='download')
-
-
-def test_weights_that_cannot_be_read_are_rejected(tmp_path, server):
-    for path in (tmp_path, tmp_path / 'gone.pth'):
-        with pytest.raises(UnavailableError, match='cannot be read'):
-            Tiny(PublishedSettings(model=str(path)))
+@pytest.mark.parametrize('name', ['/dev/zero', 'pipe'])
+def test_model_that_is_no_regular_file_is_rejected(tmp_path, name):
+    os.mkfifo(tmp_path / 'pipe')
+    with pytest.raises(UnavailableError, match='expected a regular file'):
+        read_model(tmp_path / name)
 
 
 def test_weights_changed_since_download_are_rejected(server, cache, content):
-    tiny(model='download')
+    fetch(server, cache, content)
     (cache / 'tiny.pth').write_bytes(content[:-1] + b'\x01')
     with pytest.raises(UnavailableError, match='it is damaged or another file; delete it'):
         Tiny(PublishedSettings())
     (cache / 'tiny.pth.sha256').write_bytes(b'\xff')
     with pytest.raises(UnavailableError, match='sha256 cannot be read'):
         Tiny(PublishedSettings())
+
+
+def test_weights_that_cannot_be_read_are_rejected(tmp_path, server):
+    for path in (tmp_path, tmp_path / 'gone.pth'):
+        with pytest.raises(UnavailableError, match='cannot be read'):
+            Tiny(PublishedSettings(model=str(path)))
 
 
 def test_weights_saved_in_training_load_as_float32(server, tmp_path):

@@ -4,10 +4,8 @@
 
 import argparse
 from dataclasses import dataclass, field, replace
-import os
 from pathlib import Path
 import time
-import zipfile
 
 import numpy as np
 from stavpr_ros.commands.feature_options import kind_options, make_extractor
@@ -25,7 +23,7 @@ from stavpr_ros.evaluation.warp import (
     warp_changes,
 )
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map, load_map, PlaceMap
+from stavpr_ros.mapping import build_map, is_map, load_map, PlaceMap
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag_file import is_bag
 from stavpr_ros.sources.folder import text_of
@@ -82,7 +80,7 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
 
 def is_saved_map(path: str | None) -> bool:
     """Return whether a path is a map file, by its content; False for an unreadable path."""
-    return path is not None and os.path.isfile(path) and zipfile.is_zipfile(path)
+    return path is not None and Path(path).is_file() and is_map(path)
 
 
 class _Loader:
@@ -141,10 +139,10 @@ class _Loader:
                 raise SettingsError(
                     f'--{name} {requested}: the map {path} was made with {present}; leave it out'
                 )
-        model = f'--{found.settings.kind}-model'  # the file may have moved
+        model = f'--{found.settings.kind}-model'  # a map does not state where it is
         options = {'--projection': given.projection, '--seed': given.seed, **kind_options(given)}
         for option, value in options.items():
-            if value is not None and option != model:
+            if value is not None and option not in (model, '--torchscript-allow'):
                 raise SettingsError(f'{option}: the map {path} has its own or none; leave it out')
         self._saved = found
         return found
@@ -154,7 +152,9 @@ class _Loader:
             given = self._arguments
             if self._saved is not None:
                 model = getattr(given, f'{self._saved.settings.kind}_model', None)
-                self._extractor = self._saved.extractor(choose_device(given.device), model or '')
+                self._extractor = self._saved.extractor(
+                    choose_device(given.device), model or '', bool(given.torchscript_allow)
+                )
             else:
                 options = argparse.Namespace(**vars(given))
                 for name, default in DEFAULTS.items():

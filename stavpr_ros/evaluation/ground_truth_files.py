@@ -10,6 +10,7 @@ import zipfile
 import cv2
 import numpy as np
 from stavpr_ros.errors import InputError, SourceError
+from stavpr_ros.regular_file import require_regular
 from stavpr_ros.sources.folder import SUFFIXES
 
 TEXT, ARRAYS = ('.csv', '.tsv', '.txt'), ('.npy', '.npz')
@@ -54,6 +55,7 @@ def read_poses(path: Path) -> tuple[np.ndarray, bool]:
     :raises SourceError: the file cannot be read.
     """
     try:
+        require_regular(path)
         with path.open(newline='') as file:
             lines = [row for row in csv.reader(file) if row and row[0][:1] != '#']
             rows = [[float(value) for value in row] for row in lines]
@@ -110,6 +112,7 @@ def _columns(names: list[str] | None, width: int, path: Path) -> tuple[int | Non
 
 def _from_text(path: Path, N: int) -> Pairs:
     try:
+        require_regular(path)
         lines = path.read_text(encoding='utf-8-sig').splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise SourceError(f'ground truth {path} cannot be read: {error}') from error
@@ -158,6 +161,7 @@ def _whole(cells: list[str], column: int, number: int, path: Path) -> int:
 
 def _load(path: Path) -> np.ndarray:
     try:
+        require_regular(path)
         loaded = np.load(path, allow_pickle=False)
         if isinstance(loaded, np.ndarray):
             return loaded

@@ -25,38 +25,27 @@ class FeatureSettings:
     :param backbone: the settings of that kind, its frozen dataclass.
     :param strips: number of vertical strips W.
     :param projection: identity of the random projection, None without one.
+    :param feature_version: version of the computation: another one gives other features.
     """
 
     kind: str
     backbone: Any
     strips: int = 7
     projection: str | None = None
+    feature_version: int = 1
 
     def __post_init__(self) -> None:
+        if self.feature_version != 1:
+            raise SettingsError(
+                f'features {self.kind} of version {self.feature_version} are unknown, expected '
+                '1: update this program'
+            )
         if self.strips < 1:
             raise SettingsError(f'strips W = {self.strips} must be at least 1')
 
     def to_json(self) -> str:
-        """Return the settings as one line of JSON; map files keep it, so its keys are fixed."""
+        """Return the settings as one line of JSON."""
         return json.dumps(dataclasses.asdict(self), sort_keys=True)
-
-    @classmethod
-    def from_json(cls, text: str) -> 'FeatureSettings':
-        """
-        Read the settings from the JSON of :meth:`to_json`.
-
-        :raises SettingsError: no such kind, or no such setting of that kind.
-        """
-        try:
-            fields = json.loads(text)
-            kind = settings_class(fields['kind'])
-            before = getattr(kind, 'BEFORE', {})
-            fields['backbone'] = kind(**(before | fields['backbone']))
-            return cls(**fields)
-        except (ValueError, TypeError, KeyError) as error:
-            raise SettingsError(
-                f'feature settings cannot be read ({error}): {text[:200]}'
-            ) from error
 
 
 @dataclass(frozen=True)
@@ -162,11 +151,18 @@ class FeatureExtractor:
         """
         Make the extractor with the settings of a map.
 
-        :param changes: settings of the backbone to replace, such as the path of a model file.
+        :param changes: settings of the backbone to replace: ``model``, the file of the model or a
+            folder with it, see :func:`stavpr_ros.features.weights.find_model`; ``allow``.
         :raises FeatureMismatchError: the projection or a change gives other features.
+        :raises UnavailableError: the model is not found.
         """
         known = {field.name for field in dataclasses.fields(settings.backbone)}
         changes = {name: value for name, value in changes.items() if value and name in known}
+        if 'model' in known and settings.backbone.sha256:
+            from stavpr_ros.features.weights import find_model
+
+            stated = changes.get('model', settings.backbone.model)
+            changes['model'] = str(find_model(settings.backbone.sha256, stated))
         backbone = dataclasses.replace(settings.backbone, **changes)
         extractor = cls(settings.kind, backbone, settings.strips, projection, device=device)
         if extractor.settings != settings:

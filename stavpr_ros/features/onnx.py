@@ -16,7 +16,7 @@ import numpy as np
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.extractor import resize_square
 from stavpr_ros.features.registry import OnnxSettings
-from stavpr_ros.features.weights import open_weights
+from stavpr_ros.features.weights import read_model
 import torch
 
 
@@ -37,7 +37,7 @@ class Onnx:
 
     def __init__(self, settings: OnnxSettings, device: str = 'cpu') -> None:
         onnx, onnxruntime = _import_extra()
-        file, digest = open_weights(Path(settings.model), required=settings.sha256)
+        file, digest = read_model(Path(settings.model), required=settings.sha256)
         with file:
             content = file.read()
         self.settings = replace(settings, sha256=digest)

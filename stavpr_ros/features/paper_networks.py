@@ -19,14 +19,14 @@ from typing import ClassVar
 import numpy as np
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features.preprocessing import BatchMaker
-from stavpr_ros.features.registry import CACHED, DOWNLOAD, PublishedSettings
+from stavpr_ros.features.registry import PublishedSettings
 from stavpr_ros.features.weights import (
     expected_hash,
-    find_weights,
     load_parameters,
-    open_weights,
+    published_path,
     PublishedFile,
     read_checkpoint,
+    read_model,
 )
 import torch
 from torch import nn
@@ -58,13 +58,11 @@ class PublishedNetwork:
 
     def __init__(self, settings: PublishedSettings, device: str = 'cpu') -> None:
         self._device = torch.device(device)
-        path = find_weights(settings.model, self.published, settings.sha256)
-        file, digest = open_weights(path, expected_hash(path, self.published), settings.sha256)
+        path = published_path(settings.model, self.published)
+        file, digest = read_model(path, expected_hash(path, self.published), settings.sha256)
         with file:
             parameters = read_checkpoint(file, str(path))
-        # Recorded in maps: a query elsewhere finds the file in its cache, but downloads nothing.
-        model = CACHED if settings.model == DOWNLOAD else settings.model
-        self.settings = replace(settings, model=model, sha256=digest)
+        self.settings = replace(settings, sha256=digest)
         with torch.device('meta'):
             network = self.whole_network()
         load_parameters(network, self.current_names(parameters), str(path))
@@ -136,7 +134,8 @@ class VGG16Pool4(PublishedNetwork):
 
     whole_network = VGG16
     published = PublishedFile(
-        'https://download.pytorch.org/models/vgg16-397923af.pth', sha256='397923af'
+        'https://download.pytorch.org/models/vgg16-397923af.pth',
+        sha256='397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0',
     )
 
     @staticmethod
@@ -236,7 +235,7 @@ class DenseNet161Places365(PublishedNetwork):
 
     whole_network = DenseNet161
     published = PublishedFile(
-        'http://places2.csail.mit.edu/models_places365/densenet161_places365.pth.tar'
+        'https://places2.csail.mit.edu/models_places365/densenet161_places365.pth.tar'
     )
 
     @staticmethod

@@ -19,10 +19,11 @@ if TYPE_CHECKING:
     import numpy as np
     import torch
 
+MOST_PIXELS = 4096  # on a side of the resized image
 RESIZE_METHODS = ('bilinear', 'area')
 IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of R, G, B in 0..1: torchvision's networks are trained so
 IMAGENET_STD = (0.229, 0.224, 0.225)
-CACHED, DOWNLOAD = 'cached', 'download'  # stand for a published file instead of a path
+CACHED = 'cached'  # stands for a published file instead of a path
 _RESIZE_HELP = 'how images are resized: bilinear, or area (averages, no aliasing)'
 _HALF_HELP = 'float16 on a GPU: faster, nearly the same features; no effect on a CPU'
 
@@ -42,7 +43,9 @@ def setting(
     return dataclasses.field(default=default, metadata={'help': help}, compare=identity)
 
 
-def _check_resize(method: str) -> None:
+def _check_resize(method: str, size: int) -> None:
+    if size > MOST_PIXELS:
+        raise SettingsError(f'size = {size} must be at most {MOST_PIXELS} pixels')
     if method not in RESIZE_METHODS:
         raise SettingsError(f'resize = {method!r} must be one of {", ".join(RESIZE_METHODS)}')
 
@@ -64,14 +67,14 @@ class GradientSettings:
     )
 
     def __post_init__(self) -> None:
-        _check_resize(self.resize)
+        _check_resize(self.resize, self.size)
         if self.cell < 2 or self.size < 2 * self.cell or self.size % self.cell:
             raise SettingsError(
                 f'size {self.size} and cell {self.cell}: size must be a multiple of cell, at '
                 'least twice it'
             )
-        if self.orientations < 2:
-            raise SettingsError(f'orientations = {self.orientations} must be at least 2')
+        if not 2 <= self.orientations <= 360:
+            raise SettingsError(f'orientations = {self.orientations} must be 2 to 360')
 
     @property
     def cells(self) -> int:
@@ -91,7 +94,7 @@ class NetworkSettings:
     sha256: str = setting('', help='expected hash of the file; empty: not checked')
 
     def __post_init__(self) -> None:
-        _check_resize(self.resize)
+        _check_resize(self.resize, self.size)
         if self.sha256 and (len(self.sha256) != 64 or set(self.sha256) - set('0123456789abcdef')):
             raise SettingsError(f'sha256 = {self.sha256!r} must be empty or 64 digits 0-9 a-f')
         if self.size < self.LEAST_SIZE:
@@ -134,6 +137,9 @@ class TorchScriptSettings(OnnxSettings):
         "the network's output",
     )
     half: bool = setting(False, help=_HALF_HELP, identity=False)
+    allow: bool = setting(
+        False, help='permit to run this file: TorchScript is a program', identity=False
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,8 +150,7 @@ class PublishedSettings(NetworkSettings):
 
     model: str = setting(
         CACHED,
-        help="file of the weights; 'download': the published file, downloaded unless it is in the "
-        "cache; 'cached': the published file from the cache",
+        help="file of the weights; 'cached': the published file, as `stavpr weights` downloads it",
         identity=False,
     )
     half: bool = setting(False, help=_HALF_HELP, identity=False)

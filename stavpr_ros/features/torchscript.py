@@ -4,8 +4,7 @@
 Features of any convolutional network in a TorchScript file: its output or that of an inner layer.
 
 A TorchScript file is a program that torch interprets. It holds no Python, but a malicious one may
-reach files through torch's operators: take such files only from a source that you trust as you
-would trust a program.
+reach files through torch's operators: it runs only with permission, after its hash was checked.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +17,7 @@ import numpy as np
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.preprocessing import BatchMaker
 from stavpr_ros.features.registry import TorchScriptSettings
-from stavpr_ros.features.weights import expected_hash, last_line, open_weights
+from stavpr_ros.features.weights import expected_hash, last_line, read_model
 import torch
 
 
@@ -28,7 +27,12 @@ class TorchScript:
     def __init__(self, settings: TorchScriptSettings, device: str = 'cpu') -> None:
         self._device = torch.device(device)
         path = Path(settings.model)
-        file, digest = open_weights(path, expected_hash(path), settings.sha256)
+        if not settings.allow:
+            raise SettingsError(
+                f'the TorchScript file {path} is a program, which may read and write files: set '
+                'parameter allow_torchscript (--torchscript-allow true) if you trust its source'
+            )
+        file, digest = read_model(path, expected_hash(path), settings.sha256)
         with file:
             try:
                 network = torch.jit.load(file, map_location=self._device).eval()

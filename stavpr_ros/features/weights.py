@@ -1,28 +1,31 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of weights: paths, downloads, hashes; and checkpoints into networks."""
+"""Files of models: paths, downloads, hashes; and checkpoints into networks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 import hashlib
 import http.client
+import io
 import os
 from pathlib import Path
 import re
-import sys
 import tempfile
 from typing import Any, BinaryIO, IO
 import urllib.request
 
 import numpy as np
 from stavpr_ros.errors import FeatureMismatchError, UnavailableError
-from stavpr_ros.features.registry import CACHED, DOWNLOAD
+from stavpr_ros.features.registry import CACHED
+from stavpr_ros.regular_file import open_regular
 import torch
 from torch import nn
 from tqdm import tqdm
 
 TIMEOUT = 30  # seconds without a byte
 PIECE = 1 << 20  # bytes
+HASH_FILE = 4096  # bytes read of NAME.sha256
+SCHEMES = ('https',)  # of downloads
 COUNTER = '.num_batches_tracked'  # for training only; missing in files from before torch 0.4
 
 
@@ -31,7 +34,7 @@ class PublishedFile:
     """
     A file of weights on the server of its authors.
 
-    :param sha256: the first digits of its hash as published by the authors, '' if unpublished.
+    :param sha256: '' if unpublished: whoever downloads it must state it.
     """
 
     address: str
@@ -48,32 +51,56 @@ def cache_folder() -> Path:
     return Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'stavpr_ros'
 
 
-def find_weights(model: str, published: PublishedFile, sha256: str = '') -> Path:
+def models_folder() -> Path:
+    """Return the folder of the user's models: ``$STAVPR_MODELS``, or below ``~/.local/share``."""
+    share = os.environ.get('XDG_DATA_HOME') or Path.home() / '.local' / 'share'
+    return Path(os.environ.get('STAVPR_MODELS') or Path(share) / 'stavpr_ros' / 'models')
+
+
+def find_model(sha256: str, stated: str) -> Path:
+    """
+    Find the model of a map, which is known by its hash only.
+
+    :param stated: a file, which is returned; or a folder to look in; '' = the models folder and
+        the cache of downloads.
+    :raises UnavailableError: none of the files there has this hash.
+    """
+    if stated and not Path(stated).is_dir():
+        return Path(stated)
+    folders = [Path(stated)] if stated else [models_folder(), cache_folder()]
+    files = [file for folder in folders if folder.is_dir() for file in sorted(folder.iterdir())]
+    for file in sorted(files, key=lambda file: sha256[:8] not in file.name):
+        if file.is_file() and os.access(file, os.R_OK):
+            with open_model(file) as content:
+                if hashlib.file_digest(content, 'sha256').hexdigest() == sha256:
+                    return file
+    raise UnavailableError(
+        f'the model with sha256 {sha256} is not in {" or ".join(map(str, folders))}: copy the '
+        'file that the map was built with there, or give its path as model_path'
+    )
+
+
+def published_path(model: str, published: PublishedFile) -> Path:
     """
     Turn a setting into the path of a file.
 
-    :param model: a path; or ``cached``, the published file in the cache; or ``download``, the
-        same, downloaded now if it is missing.
-    :param sha256: the required hash of a download, '' if unknown.
-    :raises UnavailableError: the published file is missing, or cannot be downloaded.
+    :param model: a path; or ``cached``, the published file in the cache.
+    :raises UnavailableError: the published file is not there.
     """
-    if model not in (CACHED, DOWNLOAD):
+    if model != CACHED:
         return Path(model)
     path = cache_folder() / published.name
-    if path.exists():
-        return path
-    if model == CACHED:
+    if not path.exists():
         raise UnavailableError(
-            f"there is no {path}: give 'download' to get it from {published.address}, or the "
-            "file's path"
+            f'there is no {path}: `stavpr weights` downloads it from {published.address}; or give '
+            "the file's path"
         )
-    download(published.address, path, sha256 or expected_hash(path, published))
     return path
 
 
 def expected_hash(path: Path, published: PublishedFile | None = None) -> str:
     """
-    Return the expected hash of a file, its first digits or all, '' if unknown.
+    Return the expected hash of a file, '' if unknown.
 
     It is the hash published by the authors, else that in ``NAME.sha256`` beside the file, in the
     format of sha256sum: a download writes it, so that later changes are detected.
@@ -81,7 +108,8 @@ def expected_hash(path: Path, published: PublishedFile | None = None) -> str:
     if published is not None and published.sha256 and path.name == published.name:
         return published.sha256
     try:
-        words = _hash_file(path).read_text().split()
+        with open_regular(_hash_file(path)) as file:
+            words = file.read(HASH_FILE).decode().split()
     except FileNotFoundError:
         return ''
     except (OSError, ValueError) as error:
@@ -93,50 +121,52 @@ def _hash_file(path: Path) -> Path:
     return path.with_name(path.name + '.sha256')
 
 
-def open_weights(path: Path, expected: str = '', required: str = '') -> tuple[BinaryIO, str]:
+def open_model(path: Path) -> io.BufferedReader:
     """
-    Open a file of weights and check its hash.
+    Open the file of a model.
 
-    :param expected: the first digits of its hash, see :func:`expected_hash`.
-    :param required: the hash of the file of a map, '' for any.
-    :returns: the open file, at its beginning, and its sha256.
+    :raises UnavailableError: it cannot be read, or is no regular file.
+    """
+    try:
+        return io.BufferedReader(open_regular(path))
+    except OSError as error:
+        raise UnavailableError(f'model {str(path)!r} cannot be read: {error}') from error
+
+
+def read_model(path: Path, expected: str = '', required: str = '') -> tuple[BinaryIO, str]:
+    """
+    Read a model into memory and check its hash: what is checked is what is used.
+
+    :param expected: its hash, see :func:`expected_hash`, '' for any.
+    :param required: the hash that a map states, '' for any.
+    :returns: its content, as a file, and its sha256.
     :raises UnavailableError: it cannot be read, or is damaged.
     :raises FeatureMismatchError: it is another file than the required one.
     """
     try:
-        file = path.open('rb')
+        with open_model(path) as file:
+            content = file.read()
     except OSError as error:
-        raise UnavailableError(f'weights {str(path)!r} cannot be read: {error}') from error
-    try:
-        digest = hashlib.file_digest(file, 'sha256').hexdigest()
-        if not digest.startswith(expected):
-            raise UnavailableError(
-                f'{path} has sha256 {digest[:16]}, expected {expected[:16]}: it is damaged or '
-                'another file; delete it and get it again'
-            )
-        if required and digest != required:
-            raise FeatureMismatchError(
-                f'weights {path} have sha256 {digest[:16]}, the settings require {required[:16]}: '
-                'give the file that the map was built with'
-            )
-        file.seek(0)
-    except OSError as error:
-        file.close()
-        raise UnavailableError(f'weights {str(path)!r} cannot be read: {error}') from error
-    except BaseException:
-        file.close()
-        raise
-    return file, digest
+        raise UnavailableError(f'model {str(path)!r} cannot be read: {error}') from error
+    digest = hashlib.sha256(content).hexdigest()
+    if expected and digest != expected:
+        raise UnavailableError(
+            f'{path} has sha256 {digest[:16]}, expected {expected[:16]}: it is damaged or '
+            'another file; delete it and get it again'
+        )
+    if required and digest != required:
+        raise FeatureMismatchError(
+            f'model {path} has sha256 {digest[:16]}, the settings require {required[:16]}: '
+            'give the file that the map was built with'
+        )
+    return io.BytesIO(content), digest
 
 
-def download(address: str, path: Path, expected: str = '') -> None:
+def download(address: str, path: Path, sha256: str) -> None:
     """
     Download a file; it appears under its name complete and checked, or not at all.
 
-    Its hash is written beside it: where no hash is published, the first download is trusted, and
-    later ones are compared with it.
-
-    :param expected: the first digits of its required hash, '' for any.
+    :param sha256: its required hash, all 64 digits.
     :raises UnavailableError: the download fails, is incomplete or has another hash.
     """
     advice = f'download it by other means and give its path, or copy it to {path}'
@@ -148,10 +178,10 @@ def download(address: str, path: Path, expected: str = '') -> None:
         ) as file:
             partial = Path(file.name)
             digest = _fetch(address, file, path.name)
-        if not digest.startswith(expected):
+        if digest != sha256:
             raise UnavailableError(
-                f'the file from {address} has sha256 {digest[:16]}, expected {expected[:16]}: it '
-                f'was changed or damaged on its way; try again, or {advice}'
+                f'the file from {address} has sha256 {digest}, expected {sha256}: it was changed '
+                f'or damaged on its way; try again, or {advice}'
             )
         _hash_file(path).write_text(f'{digest}  {path.name}\n')
         partial.replace(path)
@@ -160,14 +190,26 @@ def download(address: str, path: Path, expected: str = '') -> None:
     finally:
         if partial is not None:
             partial.unlink(missing_ok=True)
-    known = 'as published' if expected else 'unpublished: trusted now, kept to detect changes'
-    tqdm.write(f'{path}: sha256 {digest} ({known})', file=sys.stderr)
+
+
+class _Redirects(urllib.request.HTTPRedirectHandler):
+    """Follows redirects to the allowed schemes only."""
+
+    def redirect_request(self, *request: Any) -> urllib.request.Request | None:
+        _require_scheme(request[-1])  # the new address
+        return super().redirect_request(*request)
+
+
+def _require_scheme(address: str) -> None:
+    if address.partition(':')[0] not in SCHEMES:
+        raise OSError(f'{address} is not {" or ".join(SCHEMES)}')
 
 
 def _fetch(address: str, file: IO[bytes], name: str) -> str:
     """Copy the content of an address into a file and return its sha256."""
     digest, received = hashlib.sha256(), 0
-    with urllib.request.urlopen(address, timeout=TIMEOUT) as response:
+    _require_scheme(address)
+    with urllib.request.build_opener(_Redirects).open(address, timeout=TIMEOUT) as response:
         length = response.headers.get('Content-Length')
         total = int(length) if length and length.isdigit() else None
         with tqdm(total=total, unit='B', unit_scale=True, desc=name, disable=None) as bar:

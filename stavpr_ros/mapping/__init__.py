@@ -10,8 +10,9 @@ from stavpr_ros.mapping.keyframes import (
     KeyframeSettings,
     small_gray,
 )
-from stavpr_ros.mapping.map_file import load_map, open_map, save_map
-from stavpr_ros.mapping.place_map import encode_thumbnail, Place, PlaceMap
+from stavpr_ros.mapping.map_file import is_map, load_map, open_map, save_map, verify_map
+from stavpr_ros.mapping.merging import merge_maps, select_session
+from stavpr_ros.mapping.place_map import encode_thumbnail, Place, PlaceMap, Session
 from stavpr_ros.mapping.trajectory import distance, rotation, Trajectory
 
 __all__ = [
@@ -20,15 +21,20 @@ __all__ = [
     'KeyframeSettings',
     'Place',
     'PlaceMap',
+    'Session',
     'Trajectory',
     'build_map',
     'distance',
     'encode_thumbnail',
     'extract_features',
     'image_change',
+    'is_map',
     'load_map',
+    'merge_maps',
     'open_map',
     'rotation',
     'save_map',
+    'select_session',
     'small_gray',
+    'verify_map',
 ]

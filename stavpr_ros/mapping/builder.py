@@ -12,7 +12,12 @@ import numpy as np
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping.keyframes import KeyframeSelector, KeyframeSettings
-from stavpr_ros.mapping.place_map import encode_thumbnail, PlaceMap, THUMBNAIL_WIDTH
+from stavpr_ros.mapping.place_map import (
+    encode_thumbnail,
+    PlaceMap,
+    plain_text,
+    THUMBNAIL_WIDTH,
+)
 from stavpr_ros.mapping.trajectory import checked_pose, Trajectory
 from stavpr_ros.sources.frame import Frame
 from tqdm import tqdm
@@ -86,7 +91,7 @@ def build_map(
             features.append(extractor.extract([place.frame.image for place in batch]))
             for _, frame, pose in batch:
                 thumbnail = encode_thumbnail(frame.image, thumbnail_width) if thumbnails else b''
-                found.append((frame.stamp, frame.identifier, pose, thumbnail))
+                found.append((frame.stamp, plain_text(frame.identifier), pose, thumbnail))
             bar.update(batch[-1].number + 1 - bar.n)
     stamps, ids, known, encoded = zip(*found, strict=True)
     return PlaceMap(

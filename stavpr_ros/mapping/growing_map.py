@@ -4,11 +4,18 @@
 
 from collections.abc import Callable
 import dataclasses
+import itertools
 
 import numpy as np
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures, Projection
-from stavpr_ros.mapping.place_map import decode_thumbnail, Place, PlaceMap, require_projection
+from stavpr_ros.mapping.place_map import (
+    decode_thumbnail,
+    Place,
+    PlaceMap,
+    require_projection,
+    Session,
+)
 from stavpr_ros.mapping.trajectory import checked_pose
 import torch
 
@@ -52,6 +59,8 @@ class GrowingMap:
         self._weights = np.empty((settings.strips, 0), np.float32)
         self._stamps = np.empty(0, np.int64)
         self._poses = np.empty((0, 7))
+        self.sessions: tuple[Session, ...] = ()  # of the map that is continued
+        self._session_index: np.ndarray | None = None
         self.ids: list[str] = []  # '' = none
         self.thumbnails: list[bytes] = []  # small JPEGs, an empty one = none
 
@@ -67,16 +76,17 @@ class GrowingMap:
             raise InputError(
                 f'a map of {n} places does not fit into a limit of {limit}: raise the limit'
             )
-        features = place_map.features.to('cpu')
+        features = place_map.features
         growing = cls(place_map.settings, place_map.projection, limit, features.cells)
         growing.dimension = features.dimension
         growing._make_room(max(n, min(ROOM, limit)))
-        growing._strips[:, :n], growing._weights[:, :n] = (
-            features.strips.numpy(),
-            features.weights.numpy(),
-        )
+        for low in range(0, n, ROOM):  # they may be in the map's file
+            places = slice(low, min(low + ROOM, n))
+            growing._strips[:, places] = features[places].strips.cpu().numpy()
+        growing._weights[:, :n] = features.weights.cpu().numpy()
         growing._stamps[:n] = place_map.stamps
         growing._poses[:n] = np.nan if place_map.poses is None else place_map.poses
+        growing.sessions, growing._session_index = place_map.sessions, place_map.session_index
         growing.ids = list(place_map.ids)
         growing.thumbnails = list(place_map.thumbnails) or [b''] * n
         growing._count = n
@@ -190,7 +200,10 @@ class GrowingMap:
         if self._held_features is None:
             strips, weights = features.strips.clone(), features.weights.clone()
             features = dataclasses.replace(features, strips=strips, weights=weights)
+        sessions, session_index = self._with_session()
         return PlaceMap(
+            sessions=sessions,
+            session_index=session_index,
             features=features,
             projection=self.projection,
             stamps=self.stamps.copy(),
@@ -198,6 +211,18 @@ class GrowingMap:
             poses=None if np.isnan(self.poses).all() else self.poses.copy(),
             thumbnails=tuple(self.thumbnails) if any(self.thumbnails) else (),
         )
+
+    def _with_session(self) -> tuple[tuple[Session, ...], np.ndarray | None]:
+        """Return the sessions of a continued map that has some, and one of the places added."""
+        index = self._session_index
+        if index is None or len(index) == self._count:
+            return self.sessions, index
+        taken = {session.id for session in self.sessions}
+        names = (f'recorded-{number}' for number in itertools.count(1))
+        name = next(name for name in names if name not in taken)
+        recorded = Session(name, start=max(int(self.stamps[len(index)]), 0))
+        added = np.full(self._count - len(index), len(self.sessions), np.int32)
+        return (*self.sessions, recorded), np.concatenate([index, added])
 
     def _checked(self, features: LocalFeatures) -> tuple[np.ndarray, np.ndarray]:
         """Return the strips (W, d) and weights (W,) of an image that fits."""

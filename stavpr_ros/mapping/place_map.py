@@ -2,30 +2,54 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference map: local features, stamps, identifiers, poses, thumbnails of places."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+import math
 
 import cv2
 import numpy as np
-from stavpr_ros.errors import InputError
+from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
+from stavpr_ros.mapping.jpeg import is_thumbnail, MOST_PIXELS
 
 THUMBNAIL_WIDTH = 192  # pixels
+MOST_SECONDS = 2**31  # of a stamp, since 1970: those of ROS messages
+LONGEST_ID = 4096  # characters
+
+
+@dataclass(frozen=True)
+class Session:
+    """
+    One drive of several in a map.
+
+    :param id: unique in the map.
+    :param name: for people, '' = none.
+    :param robot: id of the robot, '' = unknown.
+    :param start: time of its first image, ns, 0 = unknown.
+    """
+
+    id: str
+    name: str = ''
+    robot: str = ''
+    start: int = 0
 
 
 @dataclass(frozen=True)
 class Place:
     """
-    Stamp, identifier and pose of a place.
+    What is known of a place beside its features.
 
     :param stamp: ns, 0 = unknown.
     :param identifier: external identifier, '' = none.
     :param pose: x y z (meters) and quaternion x y z w, shape (7,), or None.
+    :param session: id of its session, '' = unknown.
     """
 
     stamp: int = 0
     identifier: str = ''
     pose: np.ndarray | None = None
+    session: str = ''
 
 
 @dataclass(frozen=True)
@@ -42,8 +66,10 @@ class PlaceMap:
         of NaN = unknown for that place; None = unknown for all.
     :param thumbnails: a small JPEG of each place, n byte strings, an empty one = none of that
         place; empty = none kept.
-    :param map_id: first 16 hexadecimal digits of the hash of the content of its file, '' = it was
-        not read from a file.
+    :param sessions: the drives that the places are of; empty = one drive, nothing known of it.
+    :param session_index: number of each place's session, shape (n,), int32; None without sessions.
+    :param map_id: first 16 hexadecimal digits of the hash of its file's content, '' = it was not
+        read from a file.
     """
 
     features: LocalFeatures
@@ -51,11 +77,17 @@ class PlaceMap:
     stamps: np.ndarray
     ids: tuple[str, ...]
     poses: np.ndarray | None = None
-    thumbnails: tuple[bytes, ...] = field(default=(), repr=False)
+    thumbnails: Sequence[bytes] = field(default=(), repr=False)
+    sessions: tuple[Session, ...] = ()
+    session_index: np.ndarray | None = None
     map_id: str = ''
 
     def __post_init__(self) -> None:
         n = len(self.features)
+        if self.stamps.ndim != 1 or self.stamps.dtype != np.int64:
+            raise InputError(
+                f'stamps are {self.stamps.dtype} {self.stamps.shape}: expected int64 ({n},)'
+            )
         if n != len(self.stamps) or n != len(self.ids):
             raise InputError(
                 f'{n} places, {len(self.stamps)} stamps, {len(self.ids)} ids: expected one a place'
@@ -68,6 +100,16 @@ class PlaceMap:
             raise InputError(
                 f'{len(self.thumbnails)} thumbnails for {n} places: expected all or none'
             )
+        if (
+            n
+            and not -MOST_SECONDS
+            <= self.stamps.min() // 10**9
+            <= (self.stamps.max() // 10**9)
+            < MOST_SECONDS
+        ):
+            raise InputError('a stamp is out of range: expected ns of at most 2**31 seconds')
+        _require_texts(self.ids)
+        _require_sessions(self.sessions, self.session_index, n)
         require_projection(self.projection, self.settings)
 
     def __len__(self) -> int:
@@ -95,21 +137,40 @@ class PlaceMap:
         return self.poses[place]
 
     def place(self, index: int) -> Place:
-        """Return stamp, identifier and pose of a place."""
-        return Place(int(self.stamps[index]), self.ids[index], self.pose(index))
+        """Return stamp, identifier, pose and session of a place."""
+        session = self.session(index)
+        return Place(
+            int(self.stamps[index]),
+            self.ids[index],
+            self.pose(index),
+            session.id if session is not None else '',
+        )
 
-    def extractor(self, device: str = 'cpu', model: str = '') -> FeatureExtractor:
+    def session(self, place: int) -> Session | None:
+        """Return the session that a place is of, None without sessions."""
+        return None if self.session_index is None else self.sessions[self.session_index[place]]
+
+    def extractor(
+        self, device: str = 'cpu', model: str = '', allow_torchscript: bool = False
+    ) -> FeatureExtractor:
         """
         Make the extractor for queries, with the settings of this map.
 
-        :param model: path of the network's file, if it has moved.
+        :param model: the network's file, or a folder with it; '' = in the models folder.
+        :param allow_torchscript: permit to run a network that is a TorchScript program.
         :raises FeatureMismatchError: the file is not the map's.
+        :raises UnavailableError: the file is not there.
         """
-        return FeatureExtractor.from_settings(self.settings, self.projection, device, model=model)
+        return FeatureExtractor.from_settings(
+            self.settings, self.projection, device, model=model, allow=allow_torchscript
+        )
 
     def thumbnail(self, place: int) -> np.ndarray | None:
         """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None."""
-        return decode_thumbnail(self.thumbnails[place]) if self.thumbnails else None
+        try:
+            return decode_thumbnail(self.thumbnails[place]) if len(self.thumbnails) else None
+        except MapFileError:  # the file has become shorter since it was opened
+            return None
 
 
 def require_projection(projection: Projection | None, settings: FeatureSettings) -> None:
@@ -134,6 +195,41 @@ def _require_whole_rows(poses: np.ndarray) -> None:
             'expected 7 '
             'finite numbers, or 7 times NaN where it is unknown'
         )
+    bad = np.flatnonzero(abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) > 0.01)
+    if len(bad):
+        raise InputError(
+            f'the quaternion of place {bad[0]} is {poses[bad[0], 3:].tolist()}: expected norm 1'
+        )
+
+
+def _require_texts(ids: tuple[str, ...]) -> None:
+    """Reject identifiers that cannot be published."""
+    for place, identifier in enumerate(ids):
+        if identifier and (len(identifier) > LONGEST_ID or identifier != plain_text(identifier)):
+            raise InputError(
+                f'the identifier of place {place} is {identifier[:80]!a}: expected at most '
+                f'{LONGEST_ID} characters, without NUL and lone surrogates'
+            )
+
+
+def plain_text(text: str) -> str:
+    """Replace what cannot be published in a text: NUL, and bytes of a name that is not UTF-8."""
+    return text.replace('\0', '?').encode(errors='replace').decode()
+
+
+def _require_sessions(sessions: tuple[Session, ...], index: np.ndarray | None, n: int) -> None:
+    if not sessions and index is None:
+        return
+    if index is None or index.dtype != np.int32 or index.shape != (n,):
+        found = 'none' if index is None else f'{index.dtype} {index.shape}'
+        raise InputError(
+            f'session index of {len(sessions)} sessions: {found}, expected int32 ({n},)'
+        )
+    if n and not 0 <= index.min() <= index.max() < len(sessions):
+        raise InputError(f'the session index is not between 0 and {len(sessions) - 1}')
+    ids = [session.id for session in sessions]
+    if not all(ids) or len(set(ids)) < len(ids):
+        raise InputError(f'sessions have the ids {ids[:8]}: expected different ones, none empty')
 
 
 def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
@@ -143,7 +239,8 @@ def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
     :param image: RGB (h, w, 3) uint8.
     :param width: pixels; narrower images keep their size.
     """
-    scale = min(1.0, width / image.shape[1])
+    most = math.sqrt(MOST_PIXELS / 2 / (image.shape[0] * image.shape[1]))
+    scale = min(1.0, width / image.shape[1], most)
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     done, encoded = cv2.imencode(
@@ -156,5 +253,7 @@ def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
 
 def decode_thumbnail(content: bytes) -> np.ndarray | None:
     """Return the image of a thumbnail, RGB (h, w, 3) uint8; None of an empty or damaged one."""
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
+    if not is_thumbnail(content):
+        return None
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

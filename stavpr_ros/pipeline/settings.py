@@ -3,7 +3,7 @@
 """Settings of the pipeline and of the node, built from the values of the parameters."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import os
 from typing import Any
 
@@ -48,6 +48,7 @@ class PipelineSettings:
     backend: str = 'auto'
     precision: str = 'float32'
     model_path: str = ''
+    allow_torchscript: bool = False
     features: str = 'gradient'
     feature_settings: str = ''
     exclude_places: int = 50
@@ -164,6 +165,8 @@ class PipelineSettings:
         backbone = settings_from_json(
             self.features, self.feature_settings or '{}', self.model_path
         )
+        if self.features == 'torchscript':
+            backbone = replace(backbone, allow=self.allow_torchscript)
         return FeatureExtractor(self.features, backbone, device=choose_backend(self.backend))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, open_map, PlaceMap
+from stavpr_ros.mapping import GrowingMap, open_map, PlaceMap, verify_map
 from stavpr_ros.pipeline.operations import Localization, LoopClosing, Mapping, Operation
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.recognition import PlaceRecognizer
@@ -39,7 +39,9 @@ def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
         remedy = f'name one of its maps: {maps}' if maps else 'build a map of its images'
         raise MapFileError(f'{path} is a folder, not a map: {remedy} (build_map makes map files)')
     place_map = open_map(path)
-    extractor = place_map.extractor(choose_backend(settings.backend), settings.model_path)
+    extractor = place_map.extractor(
+        choose_backend(settings.backend), settings.model_path, settings.allow_torchscript
+    )
     return LoadedMap(path, place_map, extractor)
 
 
@@ -71,6 +73,8 @@ def start_operation(
     extractor = extractor or settings.extractor()
     if name == 'mapping':
         extractor.extract([BLANK])
+        if place_map is not None:
+            verify_map(place_map)  # damage would be saved again, with correct hashes
         growing = (
             GrowingMap(extractor.settings, extractor.projection, settings.max_places)
             if place_map is None

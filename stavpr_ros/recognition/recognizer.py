@@ -9,7 +9,7 @@ import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.devices import choose_backend
-from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
@@ -22,6 +22,8 @@ from stavpr_ros.recognition.match import (
 )
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust import (
+    blocks,
+    converted,
     evenly,
     MeanCentering,
     options_of,
@@ -264,30 +266,44 @@ class PlaceRecognizer(SequenceRecognizer):
         precision: str = 'float32',
     ) -> None:
         super().__init__(settings, place_map.settings, len(place_map))
-        features, options = place_map.features[:], settings.applied_options
-        require_finite(features, 'the map')
+        features, options = place_map.features, settings.applied_options
+        for _, some in blocks(features):
+            require_finite(some, 'the map')
+        self._dimension = features.dimension
         self._centering = None
         if options.mean_centering or options.whitening:
             self._centering = MeanCentering(features, options.mean_centering, options.whitening)
-        if self._centering is not None:
-            features = self._centering.places(features)
+        # cells are made of float32 strips
+        half = precision == 'float16' and not settings.spatial.vertical
+        held = self._held(features, torch.float16 if half else torch.float32)
         backend = choose_backend(backend)
-        self._matcher = make_matcher(features, settings.spatial, backend, precision)
+        self._matcher = make_matcher(held, settings.spatial, backend, precision)
         if options.reference_znorm:
             self._znorm.start_from(self._distances_to_itself(features))
         if self._filter is not None:
-            self._filter.change.learn(features.strips.cpu().numpy())
+            self._filter.change.learn(held.strips)
         if backend == 'cuda' and not options.any:
             from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
             search = CudaLmDtwSearch(len(place_map), settings.sequence)
             self._search, self._buffer = search, search.buffer
 
+    def _held(self, features: LocalFeatures, dtype: torch.dtype) -> LocalFeatures:
+        """Return the features for the matcher, in memory once; those of a map are not copied."""
+        if self._centering is not None:
+            return self._centering.places(features, dtype)
+        if dtype == torch.float32:
+            return features[:]
+        return converted(features, lambda strips: strips, dtype)
+
     def _distances_to_itself(self, features: LocalFeatures) -> np.ndarray:
         """Return the distances of some places to all, shape (m, n); NaN to their neighbors."""
         n, radius = len(features), self._settings.nms_radius
         some = evenly(n, PLACES_TO_START_FROM)
-        matrix = self._matcher.distance_matrix(features.strips[:, some], features.weights[:, some])
+        chosen = features[some]
+        if self._centering is not None:
+            chosen = self._centering.places(chosen)
+        matrix = self._matcher.distance_matrix(chosen.strips, chosen.weights)
         rows = matrix.cpu().numpy()
         for row, place in zip(rows, some.tolist(), strict=True):
             row[max(0, place - radius) : place + radius + 1] = np.nan
@@ -315,10 +331,19 @@ class PlaceRecognizer(SequenceRecognizer):
         :raises InputError: features that are not finite.
         """
         features.require_same_settings(self._feature_settings, 'the map')
+        self._require_dimension(features)
         require_finite(features, 'the image')
         if self._centering is not None:
             features = self._centering.places(features)
         return self._matcher.distance_matrix(features.strips, features.weights).cpu().numpy()
+
+    def _require_dimension(self, features: LocalFeatures) -> None:
+        """Reject what a map states wrongly about its network; the kernels trust it."""
+        if features.dimension != self._dimension:
+            raise FeatureMismatchError(
+                f'strips of {features.dimension} dimensions, the map has {self._dimension}: it '
+                'was not made with this network; build it again'
+            )
 
     def update(self, features: LocalFeatures, stamp: int = 0) -> Match:
         """
@@ -332,6 +357,7 @@ class PlaceRecognizer(SequenceRecognizer):
         :raises InputError: not one image, or features that are not finite.
         """
         self._require_one_image(features, 'the map')
+        self._require_dimension(features)
         strips = features.strips[:, 0]
         if self._centering is not None:
             strips = self._centering.next_query(strips)

@@ -7,8 +7,8 @@ Everything is causal: only images that have arrived count. The probability of a 
 and successive ones are correlated.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
 
 import numpy as np
 from stavpr_ros.errors import SettingsError
@@ -19,7 +19,7 @@ MODES = ('paper', 'robust')
 MIN_PROBABILITY = 0.5  # above which mode robust matches a window
 THRESHOLD = 1 - MIN_PROBABILITY  # of the distance, 1 less the probability
 PRIOR = 20  # images that the statistics of the map count for in those of the query
-PIECE = 8192  # images centered at a time
+PIECE = 256  # images read or centered at a time
 MEMORY = 150  # rows after which old ones fade
 RANK = 64  # directions that whitening shrinks, at most
 SAMPLE = 256  # places that whitening is learned from
@@ -217,9 +217,11 @@ class MeanCentering:
         self, features: LocalFeatures, centering: bool = True, whitening: bool = True
     ) -> None:
         self._centering = centering
-        self._mean = features.strips.sum(dim=1) / max(len(features), 1)  # (W, d)
-        if not centering:
-            self._mean.zero_()
+        total = torch.zeros((len(features.weights), features.dimension), dtype=torch.float64)
+        total = total.to(features.weights.device)
+        for _, piece in blocks(features) if centering else ():
+            total += piece.strips.sum(dim=1)
+        self._mean = (total / max(len(features), 1)).float()  # (W, d)
         self._whitening: Whitening | None = None
         if whitening and len(features):
             some = evenly(len(features), SAMPLE)
@@ -232,13 +234,13 @@ class MeanCentering:
         # float64: in float32, the images of a long traverse would be rounded away
         self._sum, self._count = self._mean.double() * PRIOR, PRIOR
 
-    def places(self, features: LocalFeatures) -> LocalFeatures:
+    def places(self, features: LocalFeatures, dtype: torch.dtype = torch.float32) -> LocalFeatures:
         """Return features of the map, or of single images, less the map's mean, whitened."""
-        strips = without_mean(features.strips, self._mean)
-        if self._whitening is not None:
-            for piece in strips.split(PIECE, dim=1):
-                piece.copy_(unit_norm(self._whitening(piece)))
-        return replace(features, strips=strips)
+        return converted(features, self._converted, dtype)
+
+    def _converted(self, strips: torch.Tensor) -> torch.Tensor:
+        centered = without_mean(strips, self._mean)
+        return centered if self._whitening is None else unit_norm(self._whitening(centered))
 
     def next_query(self, strips: torch.Tensor) -> torch.Tensor:
         """
@@ -264,6 +266,26 @@ def evenly(n: int, count: int) -> np.ndarray:
 def unit_norm(strips: torch.Tensor) -> torch.Tensor:
     """Return features (..., d) with unit norm; zero ones stay zero."""
     return strips / strips.norm(dim=-1, keepdim=True).clamp_(min=1e-12)
+
+
+def blocks(features: LocalFeatures) -> Iterator[tuple[slice, LocalFeatures]]:
+    """Yield features some places at a time: those of a map may be in its file."""
+    for low in range(0, len(features), PIECE):
+        places = slice(low, min(low + PIECE, len(features)))
+        yield places, features[places]
+
+
+def converted(
+    features: LocalFeatures,
+    convert: Callable[[torch.Tensor], torch.Tensor],
+    dtype: torch.dtype,
+) -> LocalFeatures:
+    """Return new features of another type: those of one block after the other, converted."""
+    shape = (*features.weights.shape, features.dimension)
+    strips = torch.empty(shape, dtype=dtype, device=features.weights.device)
+    for places, some in blocks(features):
+        strips[:, places] = convert(some.strips)
+    return LocalFeatures(strips, features.weights, features.settings, features.cells)
 
 
 def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:

@@ -22,6 +22,7 @@ from stavpr_ros.recognition.place_filter import Belief, CLOSE, NEGLIGIBLE, Place
 from stavpr_ros.recognition.robust import FilterSettings
 import torch
 
+LEARNED_AT_ONCE = 256  # places
 APART = 5  # places apart up to which the map's changes are learned
 SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
 OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
@@ -203,15 +204,21 @@ class ImageChange:
         self._last: np.ndarray | None = None
         self._latest: deque[float] = deque(maxlen=SMOOTHED)
 
-    def learn(self, strips: np.ndarray) -> None:
-        """Learn from all places of a map, unit-norm strips (W, n, d), float32."""
-        changes = np.empty(strips.shape[1], np.float32)
-        for apart in range(1, min(APART, strips.shape[1] - 1) + 1):
-            _changes(strips, apart, changes)
-            self._sums[apart] = changes[apart:].sum(dtype=np.float64)
-            self._counts[apart] = len(changes) - apart
-            if apart == 1:
-                self._from_before[1:] = changes[1:]
+    def learn(self, strips: torch.Tensor | np.ndarray) -> None:
+        """Learn from all places of a map, unit-norm strips (W, n, d), float32 or float16."""
+        n = strips.shape[1]
+        changes = np.empty((APART + 1, n), np.float32)
+        for low in range(0, n, LEARNED_AT_ONCE):
+            first, high = max(0, low - APART), min(low + LEARNED_AT_ONCE, n)
+            block = torch.as_tensor(strips[:, first:high]).float().contiguous().cpu().numpy()
+            out = np.empty(high - first, np.float32)
+            for apart in range(1, min(APART, n - 1) + 1):
+                _changes(block, apart, out)
+                changes[apart, low:high] = out[low - first :]
+        for apart in range(1, min(APART, n - 1) + 1):
+            self._sums[apart] = changes[apart, apart:].sum(dtype=np.float64)
+            self._counts[apart] = n - apart
+        self._from_before[1:] = changes[1, 1:]
 
     def learn_newest(self, strips: np.ndarray) -> None:
         """Learn from the newest place of a route, (W, n, d) of all its places."""

@@ -29,7 +29,7 @@ from stavpr_msgs.msg import (
 )
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap
-from stavpr_ros.mapping.map_file import VERSION
+from stavpr_ros.mapping.map_version2 import VERSION
 from stavpr_ros.pipeline.overlay import draw_match
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
@@ -128,6 +128,7 @@ def match_message(
     if match.accepted and places is not None:
         place, newest = places.place(match.place_index), places.place(match.newest_index)
         message.place_stamp, message.place_id = time_message(place.stamp), place.identifier
+        message.session = place.session
         message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
     return message
 
@@ -150,6 +151,7 @@ def candidates_message(
                 probability=1 - candidate.distance if match.relative else math.nan,
                 place_stamp=time_message(place.stamp),
                 place_id=place.identifier,
+                session=place.session,
             )
         )
     return message
@@ -262,10 +264,12 @@ def map_info_message(
     if extractor is not None:
         settings = extractor.settings
         message.features, message.settings = settings.kind, settings.to_json()
+        message.feature_version = settings.feature_version
         message.strips = settings.strips
         message.projected = settings.projection is not None
     if places is not None:
         message.places = len(places)
+        message.sessions = [session.id for session in places.sessions]
         if len(places):
             message.dimension = places.dimension
         message.has_stamps, message.has_ids = bool(np.any(places.stamps)), any(places.ids)

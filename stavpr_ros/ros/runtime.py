@@ -12,7 +12,8 @@ import traceback
 from typing import Any
 
 from stavpr_msgs.msg import MapInfo
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import MapFileError, SettingsError
+from stavpr_ros.mapping import PlaceMap, verify_map
 from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.saving import save_recorded_map
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
@@ -181,6 +182,19 @@ class Runtime:
             f'map {path}: {len(places)} places, features {places.settings.kind}, '
             f'{places.settings.strips} strips of {places.dimension} dimensions'
         )
+        # reads all of the file, for seconds: the map is in use meanwhile
+        threading.Thread(target=self._verify, args=(path, places), daemon=True).start()
+
+    def _verify(self, path: str, places: PlaceMap) -> None:
+        """Compare the file of the map in use with its hashes; log damage, and keep it."""
+        try:
+            verify_map(places)
+            self._node.get_logger().info(f'map {path} is verified')
+        except MapFileError as error:
+            if self.pipeline.places is places:
+                self.problem = f'the map in use is not reliable: {error}'
+                self._node.get_logger().error(self.problem)
+                self.on_map_change()
 
     @contextmanager
     def _loading(self, path: str) -> Iterator[None]:

@@ -17,6 +17,7 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import SourceError, StavprError
+from stavpr_ros.regular_file import require_regular
 
 METADATA = 'metadata.yaml'
 SECOND = 1_000_000_000
@@ -156,6 +157,7 @@ def _only_storage_file(folder: Path) -> Path:
 
 
 def _stage_file(file: Path, target: Path) -> Path:
+    require_regular(file)  # a pipe would never end
     if target.is_dir():
         target /= f'bag{file.suffix}'
     logs = [

@@ -1,0 +1,218 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 run stavpr_ros map``: show, check, convert, export and merge maps."""
+
+import argparse
+from datetime import datetime, UTC
+from pathlib import Path
+import sys
+from typing import TYPE_CHECKING
+
+from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.errors import MapFileError, SettingsError
+from stavpr_ros.output_file import require_room
+
+if TYPE_CHECKING:
+    from stavpr_ros.mapping import PlaceMap
+
+EPILOG = """
+examples:
+  map info route.stavpr
+  map verify *.stavpr
+  map convert old.stavpr new.stavpr --storage float16
+  map export route.stavpr arrays.npz
+  map merge both.stavpr day.stavpr night.stavpr
+  map sessions both.stavpr day.stavpr --keep day
+
+exit codes: 0 done, or all maps are sound; 1 not (the reason is printed); 2 usage
+"""
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = make_parser('map', 'Show, check, convert, export and merge maps.', EPILOG)
+    actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
+
+    def add(name: str, text: str, *files: str, output: bool = False) -> argparse.ArgumentParser:
+        action = actions.add_parser(name, help=text, description=text)
+        for file in files:
+            action.add_argument(file, metavar=file.upper())
+        if output:
+            action.add_argument(
+                '--force', action='store_true', help='replace an existing output file'
+            )
+        return action
+
+    add('info', 'Show what a map holds.', 'map')
+    action = add('verify', 'Compare all of a map with its hashes, and check every value.')
+    action.add_argument('maps', nargs='+', metavar='MAP')
+    action = add('convert', 'Write a map in the present format.', 'map', 'output', output=True)
+    _add_storage(action)
+    add('export', 'Write the arrays of a map for NumPy.', 'map', 'output', output=True)
+    action = add('merge', 'Make one map of several: each is a session of it.', output=True)
+    action.add_argument('output', metavar='OUTPUT')
+    action.add_argument('maps', nargs='+', metavar='MAP')
+    _add_storage(action)
+    action = add(
+        'sessions', 'Write some sessions of a map to another map.', 'map', 'output', output=True
+    )
+    chosen = action.add_mutually_exclusive_group(required=True)
+    chosen.add_argument('--keep', metavar='ID', help='only the places of this session')
+    chosen.add_argument('--remove', metavar='ID', help='all places but those of this session')
+    return parser
+
+
+def _add_storage(action: argparse.ArgumentParser) -> None:
+    action.add_argument(
+        '--storage',
+        choices=('float32', 'float16'),
+        default='',
+        help='of the features; float16 halves the file (as it is; float32 for a merged map)',
+    )
+
+
+def _info(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.mapping import open_map
+
+    print(describe(open_map(arguments.map), Path(arguments.map)))
+
+
+def describe(place_map: 'PlaceMap', path: Path) -> str:
+    """Return what an opened map holds, a line each."""
+    import numpy as np
+    from stavpr_ros.mapping.stored_features import StoredFeatures
+
+    features, settings, n = place_map.features, place_map.settings, len(place_map)
+    assert isinstance(features, StoredFeatures)
+    posed = sum(place_map.pose(place) is not None for place in range(n))
+    known = place_map.stamps[place_map.stamps != 0]
+    rows = {
+        'file': f'{path}, {path.stat().st_size / 1e6:.1f} MB, format version '
+        f'{features.file.version}',
+        'id': place_map.map_id,
+        'places': f'{n}, {posed} with a pose, {sum(map(bool, place_map.ids))} with an identifier, '
+        f'{"with" if len(place_map.thumbnails) else "without"} thumbnails',
+        'features': f'{settings.kind}, version {settings.feature_version}: {settings.strips} '
+        f'strips of {place_map.dimension} dimensions, {features.storage}',
+        'settings': settings.to_json(),
+        'projection': place_map.projection.identity if place_map.projection else 'none',
+        'stamps': f'{_time(int(known.min()))} to {_time(int(known.max()))}'
+        if len(known)
+        else 'unknown',
+    }
+    if posed and place_map.poses is not None:
+        positions = place_map.poses[~np.isnan(place_map.poses[:, 0]), :3]
+        length = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
+        rows['poses'] = f'a route of {length:.0f} m'
+    lines = [f'{name:<11}{value}' for name, value in rows.items()]
+    for number, session in enumerate(place_map.sessions):
+        assert place_map.session_index is not None
+        places = np.count_nonzero(place_map.session_index == number)
+        named = ''.join(f', {text}' for text in (session.name, session.robot) if text)
+        start = f', {_time(session.start)}' if session.start else ''
+        lines.append(f'session    {session.id}{named}: {places} places{start}')
+    return '\n'.join(lines)
+
+
+def _time(stamp: int) -> str:
+    return datetime.fromtimestamp(stamp // 10**9, UTC).strftime('%Y-%m-%d %H:%M:%S UTC')
+
+
+def _verify(arguments: argparse.Namespace) -> int:
+    from stavpr_ros.mapping import load_map
+
+    bad = 0
+    for path in arguments.maps:
+        try:
+            place_map = load_map(path)
+            print(f'{path}: sound, {len(place_map)} places, id {place_map.map_id}')
+        except MapFileError as error:
+            bad += 1
+            print(f'map: {error}', file=sys.stderr)
+    return 1 if bad else 0
+
+
+def _convert(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.mapping import open_map, verify_map
+
+    place_map = open_map(arguments.map)
+    verify_map(place_map)
+    _write(place_map, arguments)
+
+
+def _merge(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.mapping import merge_maps, open_map, verify_map
+
+    maps = [open_map(path) for path in arguments.maps]
+    for place_map in maps:
+        verify_map(place_map)
+    _write(merge_maps(maps, [Path(path).stem for path in arguments.maps]), arguments)
+
+
+def _sessions(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.mapping import open_map, select_session, verify_map
+
+    place_map, keep = open_map(arguments.map), arguments.keep is not None
+    verify_map(place_map)
+    _write(select_session(place_map, arguments.keep or arguments.remove, keep), arguments)
+
+
+def _write(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
+    from stavpr_ros.mapping import save_map
+
+    map_id = save_map(place_map, arguments.output, getattr(arguments, 'storage', ''))
+    size = Path(arguments.output).stat().st_size / 1e6
+    print(f'{arguments.output}: {len(place_map)} places, {size:.1f} MB, id {map_id}')
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    import numpy as np
+    from stavpr_ros.mapping import load_map
+
+    place_map = load_map(arguments.map)
+    arrays = {
+        'strips': place_map.features.strips.numpy(),
+        'weights': place_map.features.weights.numpy(),
+        'stamps': place_map.stamps,
+        'ids': np.array(place_map.ids),
+        'poses': place_map.poses,
+        'session_index': place_map.session_index,
+        'session_ids': np.array([session.id for session in place_map.sessions]),
+        'projection': place_map.projection.matrix if place_map.projection else None,
+        'settings': np.array(place_map.settings.to_json()),
+    }
+    with open(arguments.output, 'wb') as file:
+        found = {name: array for name, array in arrays.items() if array is not None}
+        np.savez(file, **found)  # type: ignore[arg-type]
+    print(f'{arguments.output}: {len(place_map)} places; numpy.load reads it')
+
+
+def _check_output(arguments: argparse.Namespace) -> None:
+    """Reject an output that exists, or that is one of the inputs."""
+    if 'output' not in arguments:
+        return
+    require_room(arguments.output)
+    output = Path(arguments.output)
+    inputs = [arguments.map] if 'map' in arguments else arguments.maps
+    if output.exists() and not arguments.force:
+        raise SettingsError(f'{output} exists: give --force to replace it, or another name')
+    if output.exists() and any(Path(path).exists() and output.samefile(path) for path in inputs):
+        raise SettingsError(f'{output} is also an input: give another name')
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command."""
+
+    def work() -> int | None:
+        arguments = _parser().parse_args(args)
+        _check_output(arguments)
+        actions = {
+            'info': _info, 'verify': _verify, 'convert': _convert, 'export': _export,
+            'merge': _merge, 'sessions': _sessions,
+        }  # fmt: skip
+        return actions[arguments.action](arguments)
+
+    return run_program('map', work)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,49 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 run stavpr_ros weights``: download the published weights of a network."""
+
+import sys
+
+from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.features.registry import backbone_class, KINDS, PublishedSettings
+
+EPILOG = """
+Nothing else in this package goes online. The file is downloaded over https, compared with its
+SHA-256, and then lies where the features of this kind look for it.
+
+exit codes: 0 it is there; 1 it is not (the reason is printed); 2 usage
+"""
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command."""
+
+    def work() -> None:
+        parser = make_parser('weights', 'Download the published weights of a network.', EPILOG)
+        kinds = [kind for kind, (settings, _) in KINDS.items() if settings is PublishedSettings]
+        parser.add_argument('features', choices=kinds, help='kind of features')
+        parser.add_argument(
+            '--sha256', default='', help='hash of the file, 64 digits; known for vgg16'
+        )
+        arguments = parser.parse_args(args)
+        from stavpr_ros.features import weights
+
+        published = backbone_class(arguments.features).published
+        sha256 = arguments.sha256.lower() or published.sha256
+        if not sha256:
+            raise SettingsError(
+                f'the authors of {published.name} publish no hash: give --sha256, that of a file '
+                'which you trust'
+            )
+        if len(sha256) != 64 or set(sha256) - set('0123456789abcdef'):
+            raise SettingsError(f'--sha256 {sha256}: expected 64 digits 0-9 a-f')
+        path = weights.cache_folder() / published.name
+        weights.download(published.address, path, sha256)
+        print(f'{path}: sha256 {sha256}')
+
+    return run_program('weights', work)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,48 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Sizes of JPEG images from their headers, of many images at once, before any is decoded."""
+
+import numpy as np
+
+MOST_PIXELS = 2**24  # of a thumbnail: 50 MB when it is decoded
+MOST_SEGMENTS = 64  # before the frame header
+FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive
+FRAME_BYTES = 10  # marker, length, precision, height, width, components
+END_OF_IMAGE = b'\xff\xd9'
+
+
+def jpeg_pixels(content: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """
+    Return the number of pixels of each image; -1 = not a JPEG, 0 = an empty image.
+
+    :param content: the images one after the other, shape (bytes,), uint8.
+    :param ends: end of each image in ``content``, not decreasing, shape (n,), int64.
+    """
+    starts = np.concatenate([[0], ends[:-1]]).astype(np.int64)
+    pixels = np.where(ends > starts, -1, 0)
+    padded = np.append(content, np.zeros(FRAME_BYTES, np.uint8))
+    # of the images whose header is not found yet: number, and position of the next marker
+    left = np.flatnonzero(ends - starts >= 2 + FRAME_BYTES)
+    left = left[(padded[starts[left]] == 0xFF) & (padded[starts[left] + 1] == 0xD8)]
+    at = starts[left] + 2
+    for _ in range(MOST_SEGMENTS):
+        inside = at + FRAME_BYTES <= ends[left]
+        left, at = left[inside], at[inside]
+        if not len(left):
+            break
+        header = padded[at[:, None] + np.arange(FRAME_BYTES)].astype(np.int64)
+        frame = np.isin(header[:, 1], FRAME_HEADERS) & (header[:, 0] == 0xFF)
+        sizes = (header[:, 5] * 256 + header[:, 6]) * (header[:, 7] * 256 + header[:, 8])
+        pixels[left[frame]] = np.where(sizes[frame] > 0, sizes[frame], -1)
+        length = header[:, 2] * 256 + header[:, 3]
+        # no frame header after the scan starts (0xDA) or the image ends (0xD9)
+        go_on = (header[:, 0] == 0xFF) & (header[:, 1] >= 0xC0) & ~frame & (length >= 2)
+        go_on &= (header[:, 1] != 0xDA) & (header[:, 1] != 0xD9)
+        left, at = left[go_on], (at + 2 + length)[go_on]
+    return pixels
+
+
+def is_thumbnail(content: bytes) -> bool:
+    """Whether this is a JPEG of 1 to :data:`MOST_PIXELS` pixels, by its header."""
+    data = np.frombuffer(content, np.uint8)
+    return 0 < jpeg_pixels(data, np.array([len(data)]))[0] <= MOST_PIXELS

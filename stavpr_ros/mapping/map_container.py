@@ -1,0 +1,208 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+An open map file of any version: manifest, and parts that are read by their position.
+
+Nothing is mapped into memory: a mapped file that another program shortens ends the process.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+import hashlib
+import io
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+import weakref
+
+import numpy as np
+from stavpr_ros.errors import MapFileError
+import torch
+
+# Name of a type in safetensors files: its NumPy type; BF16 is only passed on.
+DTYPES = {
+    'F64': np.float64, 'I64': np.int64, 'U64': np.uint64, 'F32': np.float32, 'I32': np.int32,
+    'U32': np.uint32, 'F16': np.float16, 'BF16': np.uint16, 'I16': np.int16, 'U16': np.uint16,
+    'I8': np.int8, 'U8': np.uint8, 'BOOL': np.bool_,
+}  # fmt: skip
+AT_ONCE = 2**20  # bytes hashed at a time
+BUILD_AGAIN = 'get it from a backup, or build it again'
+
+
+class Piece(NamedTuple):
+    """Bytes of the file that are hashed together."""
+
+    start: int
+    end: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Part:
+    """
+    An array in the file.
+
+    :param dtype: key of :data:`DTYPES`.
+    :param start: its first byte in the file.
+    :param pieces: all its bytes, in their order.
+    """
+
+    dtype: str
+    shape: tuple[int, ...]
+    start: int
+    pieces: tuple[Piece, ...]
+
+    @property
+    def size(self) -> int:
+        """Return the number of bytes."""
+        return math.prod(self.shape) * np.dtype(DTYPES[self.dtype]).itemsize
+
+
+class MapFile:
+    """
+    An open map file; it may be replaced or deleted meanwhile. Thread-safe.
+
+    :param file: closed with this object.
+    :param size: bytes of the file when it was opened.
+    """
+
+    def __init__(self, file: io.FileIO, path: Path) -> None:
+        self.path, self._file = path, file
+        self.size = os.fstat(file.fileno()).st_size
+        self.version = 0
+        self.map_id = ''
+        self.manifest: dict[str, Any] = {}
+        self.ids: list[str] | None = None  # of version 1, which has them in the manifest
+        self.parts: dict[str, Part] = {}
+        weakref.finalize(self, file.close)
+
+    def fill(self, array: np.ndarray, start: int) -> None:
+        """
+        Read bytes from a position on into a contiguous array.
+
+        :raises MapFileError: the file has become shorter.
+        """
+        view = array.reshape(-1).view(np.uint8).data if array.size else memoryview(b'')
+        while len(view):
+            count = os.preadv(self._file.fileno(), [view], start)
+            if not count:
+                raise self.damaged(f'is truncated: byte {start} is missing')
+            view, start = view[count:], start + count
+
+    def bytes_at(self, start: int, count: int) -> bytes:
+        """Read some bytes; they must be within the file, checked before memory is taken."""
+        if start < 0 or count < 0 or start + count > self.size:
+            raise self.damaged(
+                f'has {self.size} bytes, {count} from byte {start} on are missing: it is truncated'
+            )
+        content = np.empty(count, np.uint8)
+        self.fill(content, start)
+        return content.tobytes()
+
+    def read(self, name: str) -> np.ndarray:
+        """Read a part whole, checked, into memory that begins with a cache line."""
+        part = self.parts[name]
+        self.verify(name)
+        content = torch.empty(part.size, dtype=torch.uint8).numpy()
+        self.fill(content, part.start)
+        return content.view(DTYPES[part.dtype]).reshape(part.shape)
+
+    def verify(self, *names: str) -> None:
+        """
+        Compare parts with their hashes, all without names.
+
+        :raises MapFileError: names the damaged part and where it is in the file.
+        """
+        for name in names or self.parts:
+            for start, end, sha256 in self.parts[name].pieces:
+                if self._hash(start, end) != sha256:
+                    raise self.damaged(
+                        f'is damaged: bytes {start} to {end}, of part {name}, do not match their '
+                        'hash'
+                    )
+
+    def _hash(self, start: int, end: int) -> str:
+        digest, content = hashlib.sha256(), np.empty(min(AT_ONCE, end - start), np.uint8)
+        for at in range(start, end, AT_ONCE):
+            piece = content[: min(AT_ONCE, end - at)]
+            self.fill(piece, at)
+            digest.update(piece.data)
+        return digest.hexdigest()
+
+    def require_whole(self) -> None:
+        """
+        Reject a file with holes: it claims more than there is.
+
+        :raises MapFileError: names the first hole.
+        """
+        try:
+            hole = os.lseek(self._file.fileno(), 0, os.SEEK_HOLE)
+        except (AttributeError, OSError):  # unknown to the operating or the file system
+            return
+        if hole < self.size:
+            raise MapFileError(
+                f'map {self.path} has a hole at byte {hole} (a sparse file): copy it with '
+                f'cp --sparse=never, {BUILD_AGAIN}'
+            )
+
+    def damaged(self, what: str) -> MapFileError:
+        """Return the error for this file."""
+        return MapFileError(f'map {self.path} {what}: {BUILD_AGAIN}')
+
+    def foreign(self, why: str) -> MapFileError:
+        """Return the error for a file of something else."""
+        return MapFileError(
+            f'{self.path} is no map of this program ({why}), or damaged or truncated: build one '
+            'with build_map'
+        )
+
+
+@contextmanager
+def errors_of(path: Path) -> Iterator[None]:
+    """
+    Turn every error in the block into one that names the map file and a remedy.
+
+    :raises MapFileError: nothing else leaves the block, whatever the file holds.
+    """
+    try:
+        yield
+    except MapFileError:
+        raise
+    except FileNotFoundError as error:
+        raise MapFileError(f'map {path} does not exist: make one with build_map') from error
+    except OSError as error:
+        raise MapFileError(
+            f'map {path} cannot be read ({error.strerror}): name a map file'
+        ) from error
+    except Exception as error:
+        raise MapFileError(
+            f'map {path} is damaged or was not written by this program '
+            f'({type(error).__name__}: {error}): {BUILD_AGAIN}'
+        ) from error
+
+
+def read_json(text: bytes, what: str) -> Any:
+    """
+    Parse JSON as strictly as it is written: UTF-8, no key twice, no NaN.
+
+    :raises ValueError: names what it is.
+    """
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) < len(pairs):
+            raise ValueError('a key is there twice')
+        return found
+
+    def constant(name: str) -> None:
+        raise ValueError(f'{name} is no number')
+
+    try:
+        return json.loads(text.decode(), object_pairs_hook=once, parse_constant=constant)
+    except RecursionError:
+        raise ValueError(f'{what} is nested too deeply') from None
+    except ValueError as error:
+        raise ValueError(f'{what} is no JSON: {error}') from error

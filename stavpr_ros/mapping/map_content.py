@@ -1,0 +1,182 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of a map file, checked against each other and the manifest, as a map."""
+
+from collections.abc import Collection
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from stavpr_ros.errors import InputError
+from stavpr_ros.features import FeatureSettings, Projection
+from stavpr_ros.features.registry import settings_class
+from stavpr_ros.mapping.jpeg import jpeg_pixels, MOST_PIXELS
+from stavpr_ros.mapping.map_container import MapFile, Part
+from stavpr_ros.mapping.map_schema import identity_fields, Object
+from stavpr_ros.mapping.place_map import PlaceMap, Session
+from stavpr_ros.mapping.stored_features import LONGEST, StoredFeatures, StoredThumbnails
+import torch
+
+LARGE = ('strips', 'thumbnails')  # parts that are read, and compared with their hashes, later
+THUMBNAILS_AT_ONCE = 2**24  # bytes
+# Types and shape of each part; W, n, d are known from the others, a letter alone is any number.
+PARTS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
+    'strips': (('F32', 'F16'), ('W', 'n', 'd')),
+    'weights': (('F32',), ('W', 'n')),
+    'stamps': (('I64',), ('n',)),
+    'poses': (('F64',), ('n', 7)),
+    'projection': (('F32',), ('D', 'd')),
+    'ids': (('U8',), ('bytes',)),
+    'id_ends': (('I64',), ('n',)),
+    'thumbnails': (('U8',), ('bytes',)),
+    'thumbnail_ends': (('I64',), ('n',)),
+    'session': (('I32',), ('n',)),
+}
+_TOGETHER = (('ids', 'id_ends'), ('thumbnails', 'thumbnail_ends'))
+
+
+def map_content(file: MapFile) -> PlaceMap:
+    """
+    Return the map in a file; the large parts stay there.
+
+    :raises ValueError: names what is wrong with it, and the part.
+    :raises StavprError: likewise.
+    """
+    manifest = file.manifest
+    settings = _settings(manifest['settings'])
+    sizes = _require_shapes(file.parts, settings, manifest['sections'])
+    arrays = {name: file.read(name) for name in file.parts if name in PARTS and name not in LARGE}
+    if (manifest['projection'] is None) is ('projection' in arrays):
+        raise ValueError('the manifest and the parts disagree on whether there is a projection')
+    projection = None
+    if manifest['projection'] is not None:
+        projection = Projection(arrays['projection'], manifest['projection'])
+        if not np.isfinite(projection.matrix).all():
+            raise ValueError('part projection is not finite')
+    cells = None if manifest['cells'] is None else (manifest['cells'][0], manifest['cells'][1])
+    _require_dimension(settings, sizes.get('D', sizes['d']), cells, projection is None)
+    weights = arrays['weights']
+    if weights.size and not (weights.min() >= 0 and weights.max() <= LONGEST):
+        raise ValueError('part weights is not between 0 and 1')
+    n = sizes['n']
+    ids = file.ids or [''] * n
+    if 'ids' in arrays:
+        ends = _ends(arrays['id_ends'], len(arrays['ids']), 'id_ends')
+        content = arrays['ids'].tobytes()
+        ids = [content[a:b].decode() for a, b in zip([0, *ends], ends, strict=False)]
+    return PlaceMap(
+        features=StoredFeatures(file, torch.from_numpy(weights), settings, cells),
+        projection=projection,
+        stamps=arrays['stamps'],
+        ids=tuple(ids),
+        poses=arrays.get('poses'),
+        thumbnails=_thumbnails(file, arrays.get('thumbnail_ends')),
+        sessions=tuple(Session(**session) for session in manifest['sessions']),
+        session_index=arrays.get('session'),
+        map_id=file.map_id,
+    )
+
+
+def _settings(record: dict[str, Any]) -> FeatureSettings:
+    """Build the settings of the features; the location of a model is unknown to a map."""
+    kind = record['kind']
+    rows = identity_fields(kind)
+    # settings that there were none of when the map was made
+    values = getattr(settings_class(kind), 'BEFORE', {}) | record['backbone']
+    Object(rows).check(values, f'settings of features {kind}')
+    if 'sha256' in rows and not values['sha256']:
+        raise ValueError(f'settings of features {kind} lack the sha256 of the model')
+    located = {row.name for row in fields(settings_class(kind))} & {'model'}
+    backbone = settings_class(kind)(**values, **dict.fromkeys(located, ''))
+    return FeatureSettings(**{**record, 'backbone': backbone})
+
+
+def _require_shapes(
+    parts: dict[str, Part], settings: FeatureSettings, sections: Collection[str]
+) -> dict[str, int]:
+    """Check which parts there are, their types and shapes; return the sizes W, n, d and D."""
+    for name in ('strips', 'weights', 'stamps'):
+        if name not in parts:
+            raise ValueError(f'part {name} is missing')
+    for one, other in _TOGETHER:
+        if (one in parts) is not (other in parts):
+            raise ValueError(f'of the parts {one} and {other}, one is missing')
+    sizes: dict[str, int] = {'W': settings.strips}
+    for name in parts.keys() - PARTS.keys():
+        section, slash, _ = name.partition('/')
+        if section not in sections:
+            raise ValueError(f'part {name[:80]} is {"of no section" if slash else "unknown"}')
+    for name, (types, axes) in PARTS.items():
+        if name not in parts:
+            continue
+        dtype, shape = parts[name].dtype, parts[name].shape
+        if dtype not in types or len(shape) != len(axes):
+            raise ValueError(
+                f'part {name} is {dtype} {shape}: expected {" or ".join(types)} {axes}'
+            )
+        for axis, size in zip(axes, shape, strict=True):
+            known = axis if isinstance(axis, int) else sizes.setdefault(axis, size)
+            if axis != 'bytes' and size != known:
+                raise ValueError(f'part {name} has shape {shape}: expected {known} for {axis}')
+    if sizes['d'] < 1:
+        raise ValueError('the strips have no dimensions')
+    return sizes
+
+
+def _require_dimension(
+    settings: FeatureSettings, dimension: int, cells: tuple[int, int] | None, plain: bool
+) -> None:
+    """Check the dimensions of a strip before its projection."""
+    if cells is not None and not plain:
+        raise ValueError(f'cells {cells} of strips with a projection')
+    if cells is not None and dimension % (cells[0] * cells[1]):
+        raise ValueError(f'cells {cells} of strips of {dimension} dimensions')
+    if settings.kind == 'gradient':
+        side = settings.backbone.cells
+        columns = side // settings.strips
+        expected = settings.backbone.orientations * side * columns
+        if dimension != expected or cells not in (None, (side, columns)):
+            raise ValueError(
+                f'strips of {dimension} dimensions, cells {cells}: expected {expected} and '
+                f'{(side, columns)} by the settings of the features'
+            )
+
+
+def _ends(ends: np.ndarray, size: int, name: str) -> list[int]:
+    """Return the ends of consecutive pieces that fill ``size`` bytes."""
+    if (np.diff(ends, prepend=0) < 0).any() or (ends[-1] if len(ends) else 0) != size:
+        raise ValueError(f'part {name} does not increase from 0 to {size}')
+    return ends.tolist()
+
+
+def _thumbnails(file: MapFile, ends: np.ndarray | None) -> 'StoredThumbnails | tuple[()]':
+    """Check the headers of all thumbnails, some megabytes at a time."""
+    if ends is None:
+        return ()
+    part = file.parts['thumbnails']
+    _ends(ends, part.size, 'thumbnail_ends')
+    first = 0
+    while first < len(ends):
+        start = int(ends[first - 1]) if first else 0
+        last = max(first + 1, int(np.searchsorted(ends, start + THUMBNAILS_AT_ONCE, 'right')))
+        content = np.empty(int(ends[last - 1]) - start, np.uint8)
+        file.fill(content, part.start + start)
+        require_jpegs(content, ends[first:last] - start, first)
+        first = last
+    return StoredThumbnails(file, ends)
+
+
+def require_jpegs(content: np.ndarray, ends: np.ndarray, first: int = 0) -> None:
+    """
+    Reject anything but JPEG images of a limited size; an empty one is none.
+
+    :param content, ends: see :func:`stavpr_ros.mapping.jpeg.jpeg_pixels`.
+    :param first: number of the first place.
+    :raises InputError: names the place.
+    """
+    pixels = jpeg_pixels(content, ends)
+    bad = np.flatnonzero((pixels < 0) | (pixels > MOST_PIXELS))
+    if len(bad):
+        found = pixels[bad[0]]
+        what = f'has {found} pixels, at most {MOST_PIXELS}' if found > 0 else 'is no JPEG image'
+        raise InputError(f'the thumbnail of place {first + bad[0]} {what}')

@@ -1,0 +1,102 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Several maps in one: each drive is a session of it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import count
+
+import numpy as np
+from stavpr_ros.errors import FeatureMismatchError, InputError
+from stavpr_ros.features import LocalFeatures
+from stavpr_ros.mapping.place_map import PlaceMap, Session
+
+
+def merge_maps(maps: Sequence[PlaceMap], names: Sequence[str]) -> PlaceMap:
+    """
+    Return one map with the places of all, in their order.
+
+    :param names: id and name of the session that a map without sessions becomes; one each.
+    :raises FeatureMismatchError: features of different settings.
+    :raises InputError: no map.
+    """
+    if not maps:
+        raise InputError('no maps to merge: give at least one')
+    sessions: list[Session] = []
+    index = []
+    for place_map, name in zip(maps, names, strict=True):
+        place_map.features.require_same_settings(maps[0].settings, 'the first map')
+        if place_map.dimension != maps[0].dimension:
+            raise FeatureMismatchError(
+                f'strips of {place_map.dimension} dimensions, the first map has '
+                f'{maps[0].dimension}'
+            )
+        start = int(place_map.stamps[0]) if len(place_map) else 0
+        own = place_map.sessions or (Session(name[:64], name[:128], start=max(start, 0)),)
+        numbers = place_map.session_index
+        if numbers is None:
+            numbers = np.zeros(len(place_map), np.int32)
+        index.append(numbers + np.int32(len(sessions)))
+        for session in own:
+            sessions.append(replace(session, id=_free_id(session.id, sessions)))
+    return _joined(maps, tuple(sessions), np.concatenate(index))
+
+
+def select_session(place_map: PlaceMap, session_id: str, keep: bool = True) -> PlaceMap:
+    """
+    Return the places of one session only, or those of all others.
+
+    :raises InputError: no such session, or nothing is left.
+    """
+    ids = [session.id for session in place_map.sessions]
+    if session_id not in ids:
+        raise InputError(f'session {session_id!r} is not in the map: it has {ids}')
+    number = ids.index(session_id)
+    assert place_map.session_index is not None
+    chosen = (place_map.session_index == number) == keep
+    if not chosen.any():
+        raise InputError(f'without session {session_id!r} no place is left')
+    left = [i for i in range(len(ids)) if (i == number) == keep]
+    renumbered = np.full(len(ids), -1, np.int32)
+    renumbered[left] = np.arange(len(left))
+    places = np.flatnonzero(chosen).tolist()
+    thumbnails = tuple(place_map.thumbnails[i] for i in places) if place_map.thumbnails else ()
+    return replace(
+        place_map,
+        features=place_map.features[np.array(places)],
+        stamps=place_map.stamps[places],
+        ids=tuple(place_map.ids[i] for i in places),
+        poses=None if place_map.poses is None else place_map.poses[places],
+        thumbnails=thumbnails,
+        sessions=tuple(place_map.sessions[i] for i in left),
+        session_index=renumbered[place_map.session_index[places]],
+        map_id='',
+    )
+
+
+def _free_id(wanted: str, sessions: list[Session]) -> str:
+    """Return the id, or the first numbered one that no other session has."""
+    taken = {session.id for session in sessions}
+    names = (wanted if number == 1 else f'{wanted[:60]}-{number}' for number in count(1))
+    return next(name for name in names if name not in taken)
+
+
+def _joined(
+    maps: Sequence[PlaceMap], sessions: tuple[Session, ...], index: np.ndarray
+) -> PlaceMap:
+    poses = [
+        np.full((len(each), 7), np.nan) if each.poses is None else each.poses for each in maps
+    ]
+    thumbnails = [list(each.thumbnails) or [b''] * len(each) for each in maps]
+    return PlaceMap(
+        features=LocalFeatures.concatenate([each.features for each in maps]),
+        projection=maps[0].projection,
+        stamps=np.concatenate([each.stamps for each in maps]),
+        ids=tuple(identifier for each in maps for identifier in each.ids),
+        poses=np.concatenate(poses) if any(each.has_poses for each in maps) else None,
+        thumbnails=tuple(content for each in thumbnails for content in each)
+        if any(len(each.thumbnails) for each in maps)
+        else (),
+        sessions=sessions,
+        session_index=index,
+    )

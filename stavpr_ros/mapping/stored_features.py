@@ -1,0 +1,137 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Features and thumbnails of a map that stay in its file, and are read by position on use."""
+
+from collections.abc import Sequence
+from typing import Any, overload
+
+import numpy as np
+from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile
+import torch
+
+LONGEST = 1.01  # norm of a strip; float16 rounds it
+PLACES_AT_ONCE = 512  # of one strip: they stay in the cache while they are checked
+
+
+class StoredThumbnails(Sequence[bytes]):
+    """Thumbnails that stay in the map's file; thread-safe."""
+
+    def __init__(self, file: MapFile, ends: np.ndarray) -> None:
+        self._file, self._ends = file, ends
+
+    def __len__(self) -> int:
+        return len(self._ends)
+
+    @overload
+    def __getitem__(self, place: int) -> bytes: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> tuple[bytes, ...]: ...
+
+    def __getitem__(self, place: int | slice) -> bytes | tuple[bytes, ...]:
+        if isinstance(place, slice):
+            return tuple(self[i] for i in range(len(self))[place])
+        i = range(len(self))[place]
+        start = int(self._ends[i - 1]) if i else 0
+        with errors_of(self._file.path):
+            return self._file.bytes_at(
+                self._file.parts['thumbnails'].start + start, int(self._ends[i]) - start
+            )
+
+
+class StoredFeatures(LocalFeatures):
+    """
+    Features of a map that stay in its file, without a copy in memory.
+
+    Every access to ``strips`` reads them all, ``features[places]`` some of them. The file stays
+    open, so that it may be replaced or deleted. Thread-safe.
+
+    :param weights: see :class:`LocalFeatures`; in memory.
+    """
+
+    def __init__(
+        self,
+        file: MapFile,
+        weights: torch.Tensor,
+        settings: FeatureSettings,
+        cells: tuple[int, int] | None,
+    ) -> None:
+        self.file, self._part = file, file.parts['strips']
+        for name, value in (('weights', weights), ('settings', settings), ('cells', cells)):
+            object.__setattr__(self, name, value)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return self._part.shape[1]
+
+    def __repr__(self) -> str:
+        return f'StoredFeatures({str(self.file.path)!r}, {self._part.shape}, {self.settings})'
+
+    def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
+        strips = self._read(np.arange(len(self))[images])
+        return LocalFeatures(strips, self.weights[:, images], self.settings, self.cells)
+
+    @property
+    def dimension(self) -> int:
+        """Return the number d of dimensions of a strip."""
+        return self._part.shape[2]
+
+    @property
+    def storage(self) -> str:
+        """Return the type in the file, ``float32`` or ``float16``."""
+        return np.dtype(DTYPES[self._part.dtype]).name
+
+    @property
+    def strips(self) -> torch.Tensor:
+        """Return the features, read from the file; shape (W, n, d), float32."""
+        return self._read(np.arange(len(self)))
+
+    def to(self, device: str | torch.device) -> LocalFeatures:
+        """Read the features to a device."""
+        return self[:].to(device)
+
+    def stored_strip(self, j: int) -> np.ndarray:
+        """Return the features of one strip in the type of the file, shape (n, d)."""
+        _, n, d = self._part.shape
+        strip: np.ndarray = np.empty((n, d), DTYPES[self._part.dtype])
+        with errors_of(self.file.path):
+            self.file.fill(strip, self._part.start + j * strip.nbytes)
+            self._require_normalized(torch.from_numpy(strip), j, 0)
+        return strip
+
+    def _read(self, places: np.ndarray) -> torch.Tensor:
+        """Return the features of some places, shape (W, len(places), d), float32."""
+        W, n, d = self._part.shape
+        row = d * np.dtype(DTYPES[self._part.dtype]).itemsize
+        # runs of neighbors, each read at once
+        ends = np.append(np.flatnonzero(np.diff(places) != 1) + 1, len(places))
+        runs = [(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True) if a < b]
+        pieces = [
+            (c, min(c + PLACES_AT_ONCE, b)) for a, b in runs for c in range(a, b, PLACES_AT_ONCE)
+        ]
+        out = torch.empty((W, len(places), d))
+        with errors_of(self.file.path):
+            for j in range(W):
+                for a, b in pieces:
+                    target = out[j, a:b]
+                    start = self._part.start + (j * n + int(places[a])) * row
+                    if self.storage == 'float32':
+                        self.file.fill(target.numpy(), start)
+                    else:
+                        half = torch.empty((b - a, d), dtype=torch.float16)
+                        self.file.fill(half.numpy(), start)
+                        target.copy_(half)
+                    self._require_normalized(target, j, int(places[a]))
+        return out
+
+    def _require_normalized(self, strips: torch.Tensor, j: int, place: int) -> None:
+        for low in range(0, len(strips), PLACES_AT_ONCE):
+            norms = strips[low : low + PLACES_AT_ONCE].float().norm(dim=1)
+            if not bool((norms <= LONGEST).all()):  # NaN included
+                raise ValueError(
+                    f'part strips, strip {j}, from place {place + low} on: features are not '
+                    'finite, or longer than 1'
+                )

@@ -1,0 +1,46 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Small maps with everything that a map may hold."""
+
+import dataclasses
+from pathlib import Path
+
+from conftest import route_images
+import numpy as np
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.features.gradient import GradientSettings
+from stavpr_ros.mapping import build_map, PlaceMap, save_map, Session
+from stavpr_ros.sources.frame import Frame
+
+VERSION1 = Path(__file__).parent / 'data' / 'version1'
+PLACES = 24
+
+
+def example_map(projection: int | None = None) -> PlaceMap:
+    """Return a map of 24 places in two sessions, 32 dimensions or those of a projection."""
+    extractor = FeatureExtractor(
+        'gradient', GradientSettings(32, cell=8, orientations=4, logarithm=False), 2, projection
+    )
+    frames = [
+        Frame(image, (i + 1) * 10**9, f'place {i}') for i, image in enumerate(route_images(PLACES))
+    ]
+    poses = np.zeros((PLACES, 7))
+    poses[:, 0], poses[:, 6] = np.arange(PLACES), 1
+    place_map = build_map(frames, extractor, poses, progress=False, thumbnail_width=32)
+    poses[3] = np.nan
+    return dataclasses.replace(
+        place_map,
+        poses=poses,
+        thumbnails=(b'', *place_map.thumbnails[1:]),
+        sessions=(Session('a', 'morning', 'robot 1', 10**9), Session('b')),
+        session_index=np.repeat(np.arange(2, dtype=np.int32), PLACES // 2),
+    )
+
+
+def example_files(folder: Path) -> list[bytes]:
+    """Return the content of map files of both versions and both storages."""
+    save_map(example_map(), folder / 'float32')
+    save_map(example_map(projection=16), folder / 'projected', 'float16')
+    version1 = VERSION1 / 'gradient.stavpr', VERSION1 / 'gradient_projected.stavpr'
+    files = [folder / 'float32', folder / 'projected', *version1]
+    return [file.read_bytes() for file in files]

@@ -1,0 +1,100 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Map files of both versions, taken apart and put together again with correct hashes."""
+
+import hashlib
+import io
+import json
+import zipfile
+
+import numpy as np
+
+PIECE = 2**22
+
+
+def parts_of(content: bytes) -> tuple[dict, dict[str, tuple[str, list[int], bytes]]]:
+    """Return the manifest of a file of version 2, and type, shape and bytes of its tensors."""
+    length = int.from_bytes(content[:8], 'little')
+    header = json.loads(content[8 : 8 + length])
+    manifest = json.loads(header.pop('__metadata__')['manifest'])
+    tensors = {}
+    for name, tensor in header.items():
+        first, last = (8 + length + offset for offset in tensor['data_offsets'])
+        tensors[name] = tensor['dtype'], tensor['shape'], content[first:last]
+    return manifest, tensors
+
+
+def hashes(content: bytes) -> list[str]:
+    pieces = [content[at : at + PIECE] for at in range(0, len(content), PIECE)]
+    return [hashlib.sha256(piece).hexdigest() for piece in pieces]
+
+
+def version2(manifest: dict, tensors: dict, metadata: dict | None = None) -> bytes:
+    """Put a file together; metadata replaces that of the header."""
+    listed = {
+        name: {'dtype': dtype, 'shape': shape, 'sha256': hashes(content)}
+        for name, (dtype, shape, content) in tensors.items()
+    }
+    text = json.dumps({'parts': listed} | manifest)
+    header: dict = {
+        '__metadata__': {
+            'format': 'stavpr-map',
+            'version': '2',
+            'manifest': text,
+            'sha256': hashlib.sha256(text.encode('utf-8', 'surrogatepass')).hexdigest(),
+        }
+        | (metadata or {})
+    }
+    end = 0
+    for name, (dtype, shape, content) in tensors.items():
+        start, end = end, end + len(content)
+        header[name] = {'dtype': dtype, 'shape': shape, 'data_offsets': [start, end]}
+    encoded = json.dumps(header).encode()
+    return (
+        len(encoded).to_bytes(8, 'little')
+        + encoded
+        + b''.join(content for _, _, content in tensors.values())
+    )
+
+
+def tensor(array: np.ndarray) -> tuple[str, list[int], bytes]:
+    """Return type, shape and bytes of an array."""
+    names = {'f': 'F', 'i': 'I', 'u': 'U'}
+    return (
+        f'{names[array.dtype.kind]}{array.itemsize * 8}',
+        list(array.shape),
+        np.ascontiguousarray(array).tobytes(),
+    )
+
+
+def array_of(part: tuple[str, list[int], bytes]) -> np.ndarray:
+    """Return the array of a tensor."""
+    dtype = part[0].lower().replace('f', 'float').replace('i', 'int').replace('u', 'uint')
+    return np.frombuffer(part[2], dtype).reshape(part[1]).copy()
+
+
+def members_of(content: bytes) -> tuple[dict, dict[str, np.ndarray]]:
+    """Return the manifest of a file of version 1, and its arrays."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        manifest = json.loads(archive.read('manifest.json'))
+        arrays = {name: np.load(archive.open(f'{name}.npy')) for name in manifest['members']}
+    return manifest, arrays
+
+
+def version1(manifest: dict, arrays: dict, compression: int = zipfile.ZIP_STORED) -> bytes:
+    """Put a file of version 1 together; arrays may be bytes of a member."""
+    members = {}
+    for name, array in arrays.items():
+        stream = io.BytesIO()
+        if isinstance(array, bytes):
+            stream.write(array)
+        else:
+            np.lib.format.write_array(stream, np.asarray(array))
+        members[name] = stream.getvalue()
+    listed = {name: hashlib.sha256(content).hexdigest() for name, content in members.items()}
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, 'w', compression) as archive:
+        archive.writestr('manifest.json', json.dumps(manifest | {'members': listed}))
+        for name, content in members.items():
+            archive.writestr(f'{name}.npy', content)
+    return stream.getvalue()

@@ -1,0 +1,182 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Damaged and hand-made map files: each is rejected by our own error, or loads and works.
+
+A few hundred are part of the tests; ``python3 test/map_fuzz.py MUTATED HAND_MADE`` tries many,
+and prints the longest time and the most memory that one took.
+"""
+
+from collections.abc import Callable, Iterator
+import copy
+from pathlib import Path
+import random
+import resource
+import sys
+import tempfile
+import time
+
+from map_files import array_of, members_of, parts_of, tensor, version1, version2
+import numpy as np
+from stavpr_ros.errors import MapFileError
+from stavpr_ros.mapping import load_map, open_map, PlaceMap, verify_map
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+
+VALUES = (
+    None, True, False, -1, 0, 1, 2, 7, 2**31, 2**63, 2**64, 10**400, 0.5, -0.0, 1e308,
+    float('nan'), float('inf'), '', 'x', 'gradient', '\ud800', '\0', 'x' * 10_000, '{}',
+    [], [[]], {}, {'a': 1}, ['x'], [1, 2], [1] * 5000,
+)  # fmt: skip
+
+
+def use(place_map: PlaceMap) -> None:
+    """Use everything that is in a map, as the node does."""
+    n = len(place_map)
+    for i in range(n):
+        place = place_map.place(i)
+        assert -(2**31) <= place.stamp // 10**9 < 2**31
+        place.identifier.encode()
+        assert '\0' not in place.identifier
+        assert place.pose is None or 0.98 < np.linalg.norm(place.pose[3:]) < 1.02
+        place_map.session(i)
+        place_map.thumbnail(i)
+    for mode in ('paper', 'robust') if n else ():
+        recognizer = PlaceRecognizer(place_map, RecognizerSettings(0.5, mode=mode))
+        for i in range(22):
+            match = recognizer.update(place_map.features[[i % n]])
+        assert np.isfinite(match.distance) or mode == 'paper'
+
+
+def rejected_or_works(path: Path, thorough: bool = True) -> bool:
+    """Return whether a file loads; anything but MapFileError leaves this function."""
+    try:
+        place_map = open_map(path)
+        verify_map(place_map)
+        if thorough:
+            use(load_map(path))
+    except MapFileError as error:
+        assert str(path) in str(error)  # noqa: PT017
+        return False
+    return True
+
+
+def mutated(content: bytes, rng: random.Random) -> bytes:
+    """Return a file with some damage."""
+    data = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 5))):
+        at = int(len(data) * rng.random() ** rng.choice((1, 8)))
+        kind = rng.randrange(6)
+        if kind == 0:
+            data[at : at + 1] = bytes([rng.randrange(256)])
+        elif kind == 1:
+            del data[at:]
+        elif kind == 2:
+            data[at:at] = rng.randbytes(rng.randrange(1, 40))
+        elif kind == 3:
+            del data[at : at + rng.randrange(1, 40)]
+        elif kind == 4:
+            data[at : at + 8] = rng.choice((bytes(8), b'\xff' * 8, (2**62).to_bytes(8, 'little')))
+        else:
+            other = rng.randrange(len(data) + 1)
+            data[at : at + 64] = data[other : other + 64]
+    return bytes(data)
+
+
+def _places_of(value: object, at: tuple = ()) -> Iterator[tuple]:
+    """Yield the ways to all values in a manifest."""
+    pairs = value.items() if isinstance(value, dict) else enumerate(value)  # type: ignore
+    for key, item in pairs:
+        yield (*at, key)
+        if isinstance(item, (dict, list)) and len(at) < 4:
+            yield from _places_of(item, (*at, key))
+
+
+def _change_manifest(manifest: dict, rng: random.Random) -> None:
+    way = rng.choice(list(_places_of(manifest)))
+    for key in way[:-1]:
+        manifest = manifest[key]
+    kind = rng.randrange(5)
+    if kind == 0:
+        del manifest[way[-1]]
+    elif kind == 1 and isinstance(manifest, dict):
+        manifest[str(rng.choice(VALUES))[:100]] = rng.choice(VALUES)
+    else:
+        manifest[way[-1]] = copy.deepcopy(rng.choice(VALUES))
+
+
+def _changed_array(array: np.ndarray, rng: random.Random) -> np.ndarray:
+    kind = rng.randrange(6)
+    if kind == 0:
+        return array.reshape(-1)
+    if kind == 1:
+        return array[..., None] if rng.random() < 0.5 else array[:-1]
+    if kind == 2:
+        return array.astype(rng.choice((np.float16, np.float32, np.float64, np.int64, np.uint8)))
+    if kind == 3:
+        return np.concatenate([array, array])
+    array, values = array.copy(), (0, -1, 255, 2**31, 2**62, np.nan, np.inf, -np.inf, 1e-30, 3)
+    with np.errstate(all='ignore'):
+        value = np.array(rng.choice(values)).astype(array.dtype)
+    if array.size:
+        array.reshape(-1)[rng.randrange(array.size) if kind == 4 else slice(None)] = value
+    return array
+
+
+def hand_made(content: bytes, rng: random.Random) -> bytes:
+    """Return a file with correct hashes and something else wrong, as a rule."""
+    manifest, parts = (members_of if content[:2] == b'PK' else parts_of)(content)
+    for _ in range(rng.choice((1, 1, 2))):
+        name = rng.choice(sorted(parts))
+        kind = rng.randrange(5)
+        if kind < 2:
+            manifest.pop('parts', None)
+            _change_manifest(manifest, rng)
+        elif kind == 2:
+            del parts[name]
+        elif content[:2] == b'PK':
+            parts[name] = _changed_array(parts[name], rng)
+        else:
+            parts[name] = tensor(_changed_array(array_of(parts[name]), rng))
+        if not parts:
+            break
+    if content[:2] == b'PK':
+        return version1(manifest, parts)
+    if rng.random() < 0.8:
+        manifest.pop('parts', None)
+    return version2(manifest, parts)
+
+
+def main(arguments: list[str]) -> None:
+    """Try many files."""
+    from map_examples import example_files
+
+    rng = random.Random(int(arguments[2]) if len(arguments) > 2 else 0)
+    with tempfile.TemporaryDirectory() as folder:
+        originals = example_files(Path(folder))
+        for content in originals:
+            Path(folder, 'warm').write_bytes(content)
+            assert rejected_or_works(Path(folder, 'warm'))
+        makers: tuple[Callable[[bytes, random.Random], bytes], ...] = (mutated, hand_made)
+        for make, count in zip(makers, map(int, arguments), strict=False):
+            slowest, loads, before = 0.0, 0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            for i in range(count):
+                path = Path(folder, f'{i}.stavpr')
+                path.write_bytes(make(originals[i % len(originals)], rng))
+                began = time.process_time()
+                try:
+                    loads += rejected_or_works(path)
+                except Exception:
+                    print(f'{make.__name__} {i}: kept as {path.name}')
+                    Path(path.name).write_bytes(path.read_bytes())
+                    raise
+                slowest = max(slowest, time.process_time() - began)
+                path.unlink()
+            grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+            print(
+                f'{make.__name__}: {count} files, {loads} load and work, the others are rejected; '
+                f'the slowest took {slowest:.2f} s, peak memory grew by {grown / 1024:.0f} MB'
+            )
+
+
+if __name__ == '__main__':
+    main(sys.argv[1:])

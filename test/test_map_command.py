@@ -1,0 +1,158 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command map, and merging maps into sessions."""
+
+from dataclasses import replace
+import shutil
+
+from map_examples import example_map, VERSION1
+import numpy as np
+import pytest
+from stavpr_ros.commands.map import main
+from stavpr_ros.errors import FeatureMismatchError, InputError
+from stavpr_ros.mapping import (
+    GrowingMap,
+    load_map,
+    merge_maps,
+    open_map,
+    save_map,
+    select_session,
+)
+import torch
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """Return a map of one drive, without sessions."""
+    return replace(example_map(), sessions=(), session_index=None)
+
+
+@pytest.fixture
+def folder(drive, tmp_path, monkeypatch):
+    """Change into a folder with maps of two drives."""
+    save_map(drive, tmp_path / 'day.stavpr')
+    night = replace(drive, poses=None, thumbnails=(), ids=('',) * len(drive))
+    save_map(night, tmp_path / 'night.stavpr')
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_map_info_shows_what_a_map_holds(folder, capsys):
+    save_map(example_map(), 'both.stavpr')
+    shutil.copy(VERSION1 / 'gradient.stavpr', 'old.stavpr')
+    assert main(['info', 'both.stavpr']) == main(['info', 'old.stavpr']) == 0
+    shown = capsys.readouterr().out
+    for text in (
+        'format version 2', 'format version 1', '24, 23 with a pose, 24 with an identifier',
+        'gradient, version 1: 2 strips of 32 dimensions, float32',
+        open_map('both.stavpr').map_id, 'session    a, morning, robot 1: 12 places, 1970-01-01',
+        'a route of 23 m', '1970-01-01 00:00:24 UTC',
+    ):  # fmt: skip
+        assert text in shown
+
+
+def test_map_verify_names_the_damaged_ones(folder, capsys):
+    assert main(['verify', 'day.stavpr', 'night.stavpr']) == 0
+    content = bytearray((folder / 'night.stavpr').read_bytes())
+    content[-1] ^= 1
+    (folder / 'night.stavpr').write_bytes(content)
+    assert main(['verify', 'day.stavpr', 'night.stavpr', 'missing']) == 1
+    shown = capsys.readouterr()
+    assert 'day.stavpr: sound, 24 places' in shown.out
+    assert 'night.stavpr is damaged: bytes' in shown.err
+    assert 'missing does not exist' in shown.err
+
+
+def test_map_convert_writes_the_present_format(folder, capsys):
+    for name in ('gradient', 'gradient_projected', 'vgg16'):
+        old = load_map(VERSION1 / f'{name}.stavpr')
+        assert main(['convert', str(VERSION1 / f'{name}.stavpr'), name]) == 0
+        assert open_map(name).features.file.version == 2
+        new = load_map(name)
+        assert (new.settings, new.ids, tuple(new.thumbnails)) == (
+            old.settings, old.ids, tuple(old.thumbnails),
+        )  # fmt: skip
+        assert torch.equal(new.features.strips, old.features.strips)
+        np.testing.assert_array_equal(new.stamps, old.stamps)
+    assert main(['convert', 'day.stavpr', 'half', '--storage', 'float16']) == 0
+    assert open_map('half').features.storage == 'float16'
+
+
+def test_map_replaces_nothing_unasked(folder, capsys):
+    before = (folder / 'night.stavpr').read_bytes()
+    assert main(['convert', 'day.stavpr', 'night.stavpr']) == 2
+    assert 'night.stavpr exists: give --force' in capsys.readouterr().err
+    assert main(['merge', 'day.stavpr', 'day.stavpr', 'night.stavpr', '--force']) == 2
+    assert 'is also an input' in capsys.readouterr().err
+    assert (folder / 'night.stavpr').read_bytes() == before
+    assert main(['convert', 'day.stavpr', 'night.stavpr', '--force']) == 0
+    assert main(['convert', 'missing', 'new']) == 1
+    assert not (folder / 'new').exists()
+
+
+def test_damaged_map_is_not_converted(folder, drive, capsys):
+    content = (folder / 'day.stavpr').read_bytes()
+    first = drive.features.strips.numpy().tobytes()[:64]
+    (folder / 'day.stavpr').write_bytes(content.replace(first, first[:-1] + b'\0'))
+    for action in (['convert', 'day.stavpr', 'new'], ['merge', 'new', 'day.stavpr']):
+        assert main(action) == 1
+        assert 'do not match their hash' in capsys.readouterr().err
+    assert not (folder / 'new').exists()
+
+
+def test_map_export_is_read_by_numpy(folder, drive):
+    assert main(['export', 'day.stavpr', 'arrays.npz']) == 0
+    with np.load('arrays.npz', allow_pickle=False) as arrays:
+        np.testing.assert_array_equal(arrays['strips'], drive.features.strips.numpy())
+        assert arrays['ids'].tolist() == list(drive.ids)
+        assert sorted(arrays) == [
+            'ids', 'poses', 'session_ids', 'settings', 'stamps', 'strips', 'weights',
+        ]  # fmt: skip
+
+
+def test_merged_drives_are_sessions_that_can_be_taken_out_again(folder, drive):
+    assert main(['merge', 'both.stavpr', 'day.stavpr', 'night.stavpr', 'day.stavpr']) == 0
+    both = load_map('both.stavpr')
+    assert [session.id for session in both.sessions] == ['day', 'night', 'day-2']
+    assert both.sessions[0].start == drive.stamps[0]
+    assert both.session_index.tolist() == [0] * 24 + [1] * 24 + [2] * 24
+    assert torch.equal(both.features[24:48].strips, drive.features.strips)
+    assert (both.pose(5) is not None, both.pose(30)) == (True, None)
+    assert (both.thumbnail(30), both.ids[30], both.ids[50]) == (None, '', 'place 2')
+    assert main(['sessions', 'both.stavpr', 'night', '--keep', 'night']) == 0
+    assert main(['sessions', 'both.stavpr', 'days', '--remove', 'night']) == 0
+    night, days = load_map('night'), load_map('days')
+    assert [session.id for session in night.sessions] == ['night']
+    assert [session.id for session in days.sessions] == ['day', 'day-2']
+    assert days.session_index.tolist() == [0] * 24 + [1] * 24
+    assert torch.equal(days.features[24:].strips, drive.features.strips)
+    assert merge_maps([days, night], ['', '']).session(70).id == 'night'
+    assert main(['sessions', 'both.stavpr', 'x', '--keep', 'dusk']) == 1
+
+
+def test_recording_behind_a_map_with_sessions_is_another_session(drive):
+    growing = GrowingMap.from_map(merge_maps([drive, drive], ['day', 'recorded-1']), 100)
+    assert [session.id for session in growing.snapshot().sessions] == ['day', 'recorded-1']
+    for i in range(3):
+        growing.add(drive.features[i : i + 1], stamp=7 * 10**9)
+    snapshot = growing.snapshot()
+    assert [session.id for session in snapshot.sessions] == ['day', 'recorded-1', 'recorded-2']
+    assert (snapshot.session(50).id, snapshot.session(50).start) == ('recorded-2', 7 * 10**9)
+
+
+def test_maps_that_do_not_fit_are_not_merged(drive):
+    other = load_map(VERSION1 / 'gradient_projected.stavpr')
+    with pytest.raises(FeatureMismatchError, match='the first map'):
+        merge_maps([drive, other], ['a', 'b'])
+    with pytest.raises(InputError, match='no maps'):
+        merge_maps([], [])
+    with pytest.raises(InputError, match='no place is left'):
+        select_session(merge_maps([drive], ['a']), 'a', keep=False)
+
+
+@pytest.mark.parametrize('action', ['info', 'verify', 'convert', 'export', 'merge', 'sessions'])
+def test_every_action_has_help(action, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main([action, '--help'])
+    assert caught.value.code == 0
+    assert 'usage: map' in capsys.readouterr().out
