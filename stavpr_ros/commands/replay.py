@@ -33,7 +33,7 @@ examples:
         a folder of images, 5 per second, on another topic
 
 exit codes:
-  0    all images were published, and arrived where that can be known
+  0    all images were published; the last line names how many of them the node received
   1    the bag or folder cannot be read, or none of its images
   2    wrong usage
   3    no subscriber within --wait seconds
@@ -108,6 +108,8 @@ def _replay(
     )
     if replayer.lossless:
         summary += f', {replayer.resent} sent again, {replayer.dropped} dropped'
+    elif report := replayer.receipts.report():
+        summary += f', {report}'
     return summary
 
 

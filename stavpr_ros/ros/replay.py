@@ -16,6 +16,7 @@ from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError
 from stavpr_ros.ros.process import Discovery
+from stavpr_ros.ros.receipts import Receipts
 from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord
 from std_msgs.msg import Header
@@ -78,6 +79,7 @@ class Replayer:
         self.lossless = lossless
         self.published = self.resent = self.dropped = 0
         self.publisher = node.create_publisher(Image, 'image', RELIABLE)
+        self.receipts = Receipts(node)
         self._match_topic = node.resolve_topic_name('stavpr/match')
         if lossless:
             node.create_subscription(PlaceMatch, 'stavpr/match', self._on_match, RELIABLE)
@@ -122,6 +124,7 @@ class Replayer:
             self._send_until_answered(message)
         else:
             self._wait_until_due(record.time_ns)
+            self.receipts.sent(message.header)
             self.publisher.publish(message)
         self.published += 1
 
@@ -139,6 +142,7 @@ class Replayer:
             )
         # best-effort subscribers acknowledge nothing: a response to a later request proves it
         self._wait_for_discovery()
+        self._spin_until(self.receipts.settled, None)
 
     def close(self) -> None:
         """Release the node; the caller destroys it."""
