@@ -29,7 +29,7 @@ REORDERING_SECONDS = 0.1
 INTERVALS = 40
 """Pauses between images from which the period of a camera is taken; it needs half of them."""
 REGULAR = 0.75
-"""Share of them near a multiple of the period, from which on a camera has one; by chance half."""
+"""Share of them near a multiple of the period, from which on a camera has one."""
 LONGEST_LOSS = 10
 """Longer pauses than so many periods are pauses of the camera, not losses."""
 

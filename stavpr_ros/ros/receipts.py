@@ -11,7 +11,7 @@ from stavpr_msgs.msg import PlaceMatch
 from std_msgs.msg import Header
 
 RESULTS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-PATIENCE = 2.0  # seconds after the last result: then outstanding images count as lost
+QUIET = 2.0  # seconds after the last result: then outstanding images count as lost
 
 
 class Receipts:
@@ -40,7 +40,7 @@ class Receipts:
         """Return whether no more results are expected."""
         if self._received == self._sent or not self._node.count_publishers(self._topic):
             return True
-        return time.monotonic() - self._last > PATIENCE
+        return time.monotonic() - self._last > QUIET
 
     def report(self) -> str:
         """Return how many images were received; empty without a node that publishes results."""
