@@ -60,11 +60,11 @@ def reduce(image: np.ndarray, least: tuple[int, int] | None) -> np.ndarray:
     :param image: uint8, shape (height, width, channels).
     :returns: the same image if it is not large.
     """
-    divisor = reduction(*image.shape[:2], least)
+    height, width = image.shape[:2]
+    divisor = reduction(height, width, least)
     while divisor > 1:
-        size = image.shape[1] // 2, image.shape[0] // 2
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)  # its fast case
-        divisor //= 2
+        height, width, divisor = height // 2, width // 2, divisor // 2
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)  # its fast case
     return image
 
 
