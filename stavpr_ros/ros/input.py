@@ -20,8 +20,9 @@ from stavpr_ros.pipeline.statistics import PeriodWatch, StampWatch, Statistics
 from stavpr_ros.ros.output import nanoseconds
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import AdaptiveSubscription, qos_remedy
+from stavpr_ros.signals import time_left
 
-STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end: `ros2 launch` kills after 5
+STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end
 
 QUEUE = 10  # images in the middleware while the executor is busy
 
@@ -253,7 +254,7 @@ class Worker:
             self._stopping = True
             self._changed.notify()
         if threading.current_thread() is not self._thread:
-            self._thread.join(STOP_TIMEOUT)
+            self._thread.join(time_left(STOP_TIMEOUT))
         for future, _ in self._calls:
             future.cancel()
         if self._thread.is_alive() and self._running is not None and not self._running.done():

@@ -22,6 +22,7 @@ from stavpr_ros.ros.input import ImageInput, InputStatus, STOP_TIMEOUT, Worker
 from stavpr_ros.ros.output import map_info_message, nanoseconds, Output
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import OdometryInput
+from stavpr_ros.signals import time_left
 from stavpr_ros.threads import limit_threads
 from std_msgs.msg import Header
 
@@ -113,7 +114,7 @@ class Runtime:
 
     def save_at_end(self) -> None:
         """Save a recorded map, unless the worker stays busy."""
-        self._save(lambda function: self.worker.call(function).result(STOP_TIMEOUT))
+        self._save(lambda function: self.worker.call(function).result(time_left(STOP_TIMEOUT, 1)))
 
     def _save(self, on_worker: Callable[[Callable[[], Any]], Any]) -> None:
         if self._pipeline is not None:
