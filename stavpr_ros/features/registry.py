@@ -51,11 +51,17 @@ def _check_resize(method: str) -> None:
 class GradientSettings:
     """Settings of the oriented-gradient features."""
 
+    # of maps that do not hold these settings, since they were made before there were any
+    BEFORE: ClassVar[dict[str, Any]] = {'logarithm': False}
+
     size: int = setting(224, help='images are resized to size x size pixels first')
     resize: str = setting('area', help=_RESIZE_HELP)
     cell: int = setting(16, help='side of a cell in pixels; size must be a multiple of it')
     orientations: int = setting(8, help='number of orientation bins')
     signed: bool = setting(True, help='distinguish dark-to-bright from bright-to-dark')
+    logarithm: bool = setting(
+        True, help='gradients of the logarithm of the intensity, as strong in shadow as in light'
+    )
 
     def __post_init__(self) -> None:
         _check_resize(self.resize)
@@ -199,16 +205,20 @@ def settings_from_json(kind: str, text: str, model: str = '') -> Any:
     :raises SettingsError: no such kind, no such setting, a missing one, or no JSON object.
     """
     cls = settings_class(kind)
-    names = [field.name for field in dataclasses.fields(cls)]
+    fields = dataclasses.fields(cls)
+    names = [field.name for field in fields]
+    required = [field.name for field in fields if field.default is dataclasses.MISSING]
     try:
         values = json.loads(text)
         if not isinstance(values, dict):
             raise TypeError('expected an object, {"name": value}')
         if model and 'model' in names:
             values['model'] = model
+        if missing := [name for name in required if name not in values]:
+            raise TypeError(f'{" and ".join(missing)} missing')
         return cls(**values)
     except (ValueError, TypeError) as error:
         raise SettingsError(
             f'settings {text!r} of features {kind} are invalid ({error}): expected a JSON object '
-            f'with {", ".join(names)}'
+            f'with {", ".join(names)} (parameter feature_settings; model also as model_path)'
         ) from error
