@@ -14,11 +14,13 @@ from run import Peer, Run
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.extractor import cut_strips, normalize
 from stavpr_ros.features.gradient import feature_maps_by_torch, GradientSettings
+from stavpr_ros.mapping import small_gray
 from stavpr_ros.sources.encodings import decode_message
 from timing import timed
 import torch
 
 WIDTH, HEIGHT, BATCH = 640, 480, 16
+FULL_HD, FULL_HD_IMAGES = (1080, 1920), 8
 IMAGES = 64  # more memory than a cache holds, as a camera's
 
 
@@ -60,3 +62,41 @@ def extraction_stages(run: Run, seed: int) -> None:
 
     measure_batches(1)
     measure_batches(BATCH)
+    for kind in ('raw', 'JPEG'):
+        full_hd_stage(run, images, extractor, kind)
+
+
+def full_hd_stage(
+    run: Run, images: list[np.ndarray], extractor: FeatureExtractor, kind: str
+) -> None:
+    """Measure an image of 1920x1080 from the message to its features, beside a whole one."""
+    height, width = FULL_HD
+    large = [
+        cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC)
+        for image in images[:FULL_HD_IMAGES]
+    ]
+    if kind == 'raw':
+        messages = [
+            SimpleNamespace(
+                height=height, width=width, encoding='rgb8', is_bigendian=False, step=3 * width,
+                data=image.reshape(-1),
+            )
+            for image in large
+        ]  # fmt: skip
+    else:
+        messages = [
+            SimpleNamespace(format='jpeg', data=cv2.imencode('.jpg', image)[1]) for image in large
+        ]
+    size = extractor.settings.backbone.size
+
+    def features(least: tuple[int, int] | None, turn: Any) -> Any:
+        image = decode_message(next(turn), least)
+        small_gray(image)  # of the keyframes
+        return extractor.extract([image])
+
+    ours, theirs = cycle(messages), cycle(messages)
+    peer = Peer('whole image', timed(lambda: features(None, theirs)))
+    call = partial(features, (size, size), ours)
+    run.measure(
+        f'1080p {kind} to features', (1, 0), call, [Work(messages[0].data.nbytes, 0)], [peer]
+    )

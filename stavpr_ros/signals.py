@@ -4,17 +4,26 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+import os
 import signal
+import sys
+import time
 from types import FrameType
+from typing import NoReturn
+
+END_SECONDS = 3.5  # for all waits after a signal: `ros2 launch` escalates after 5
 
 
 class _State:
     received = False
     deferred = False
+    time = 0.0  # of the first one
 
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
     first, _State.received = not _State.received, True
+    if first:
+        _State.time = time.monotonic()
     if first and not _State.deferred:
         raise KeyboardInterrupt
 
@@ -33,6 +42,24 @@ def obey_signals() -> None:
 def interrupted() -> bool:
     """Return whether a signal was received."""
     return _State.received
+
+
+def time_left(most: float, least: float = 0.1) -> float:
+    """Return how long to wait for something at the end: all waits share the time of a signal."""
+    if not _State.received:
+        return most
+    return min(most, max(least, _State.time + END_SECONDS - time.monotonic()))
+
+
+def end_process(code: int) -> NoReturn:
+    """
+    End the process now: Python would wait for its threads, and free torch and numba.
+
+    Measured on a busy machine: 5 to 13 seconds.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 @contextmanager

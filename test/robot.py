@@ -42,7 +42,6 @@ PARAMETERS = {
     'threads': 1,
     'keyframe_change': 0.0,
     'diagnostics_period': 0.1,
-    'qos_overrides./image.subscription.reliability': 'reliable',
     'qos_overrides./image.subscription.depth': 1000,
 }
 

@@ -268,8 +268,7 @@ def test_node_with_another_name_and_namespace_uses_them_everywhere(robot, start,
     names = ('-r', '__ns:=/robot', '-r', '__node:=places', '-r', 'image:=front/camera')
     matches = robot.listen(PlaceMatch, '/robot/places/match')
     publisher = robot.node.create_publisher(Image, '/robot/front/camera', RELIABLE)
-    reliably = {'qos_overrides./robot/front/camera.subscription.reliability': 'reliable'}
-    start(*names, wait=False, sequence_lenght=5, **reliably)
+    start(*names, wait=False, sequence_lenght=5)
     robot.until(lambda: publisher.get_subscription_count() > 0, 'the subscription')
 
     def answered():

@@ -44,7 +44,12 @@ HEALTH = Health(
     settings=node_settings(SETTINGS),
     counts=COUNTS,
     map_info=MapInfo(path='route.map', state='loaded', places=1000, features='gradient'),
-    input=InputStatus(topic='/camera/image', publishers=1),
+    input=InputStatus(
+        topic='/camera/image',
+        publishers=1,
+        loss_remedy='make the camera driver reliable',
+        reliability='reliable, every publisher offers it',
+    ),
     window=20,
 )
 
@@ -127,8 +132,12 @@ MISSING_PUBLISHER = (
 SILENT = 'there, but silent; check for a paused bag or a camera that is off'
 INFO = "compare 'ros2 topic info --verbose /camera/image'"
 LOST = (
-    '1 image lost in transport in the last 10 s: give the publisher more shared memory '
+    '1 image lost in transport in the last 10 s: make the camera driver reliable '
     '(docs/troubleshooting.md, images are lost)'
+)
+MISSING = (
+    'about 16 images missing by their stamps in the last 10 s; none was lost in transport: check '
+    'the camera driver, its cable and its exposure'
 )
 ODOMETRY = 'start it, compare its topic and its stamps'
 REFUSED = {'incompatible': 1, 'remedy': 'set reliability'}
@@ -193,6 +202,9 @@ CASES = {
         ),
         (WARN, LOST, {'recent_drops': {'lost in transport': 1}}),
         (OK, STEADY, {'drops': {'lost in transport': 9}}),
+        (OK, STEADY, {'recent_missing': 15}),
+        (WARN, MISSING, {'recent_missing': 16}),
+        (WARN, LOST, {'recent_missing': 16, 'recent_drops': {'lost in transport': 1}}),
         (
             WARN,
             '3 images in the last 10 s were invalid (size 2, encoding 1): see the log',
@@ -404,7 +416,10 @@ def test_values_of_input_are_complete():
         'transport': 'raw',
         'publishers': '1',
         'publishers_refused': '0',
+        'reliability': 'reliable, every publisher offers it',
         'received': '3000',
+        'missing_by_stamps_estimate': '0',
+        'missing_by_stamps_estimate_10s': '0',
         'rate_in_hz': '30.000',
         'last_image_age_s': '0.020',
         'gaps': '2',

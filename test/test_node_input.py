@@ -138,10 +138,10 @@ def test_compressed_images_on_a_remapped_topic_are_recognized(robot, start, publ
 
 def test_incompatible_publishers_are_reported(robot, start, publish, route):
     """Alone, beside a compatible one, and no longer when they are gone."""
-    start(wait=False)  # subscribes reliably
+    start(wait=False, **{RELIABILITY: 'reliable'})
     unreliable = publish(Image, 'image')
     robot.node.destroy_publisher(robot.publisher)
-    remedy = f'set {RELIABILITY} to best_effort, or make the publisher reliable'
+    remedy = f'remove {RELIABILITY}, or make the publisher reliable'
     offers = f'a publisher of /image offers another reliability: {remedy}'
     robot.until_diagnosed('input', ERROR, f'1 publisher refused for QoS: {offers}')
     robot.until_logged(f'images are not received: {offers}')
@@ -161,8 +161,20 @@ def test_incompatible_publishers_are_reported(robot, start, publish, route):
     assert robot.counts('input')['publishers_refused'] == '0'
 
 
-def test_qos_overrides_apply_to_one_topic_and_after_a_pause(robot, start):
+def test_best_effort_camera_is_received_and_reported(robot, start, publish, route):
     start()
+    robot.until_logged('subscription to /image: reliable, every publisher offers it')
+    robot.node.destroy_publisher(robot.publisher)
+    camera = publish(Image, 'image')
+    robot.until_logged('subscription to /image: best effort, 1 of 1 publishers are best effort')
+    robot.wait_for_node(camera)
+    assert robot.show(image_message(route[0]), publisher=camera).status == WARMING_UP
+    assert robot.counts('input')['reliability'].startswith('best effort, 1 of 1')
+    robot.publisher = robot.node.create_publisher(Image, 'image', RELIABLE)
+
+
+def test_qos_overrides_apply_to_one_topic_and_after_a_pause(robot, start):
+    start(**{RELIABILITY: 'best_effort'})
 
     def offered(topic):
         infos = robot.node.get_subscriptions_info_by_topic(topic)
@@ -171,7 +183,7 @@ def test_qos_overrides_apply_to_one_topic_and_after_a_pause(robot, start):
     assert robot.transition('deactivate')
     assert robot.transition('activate')
     robot.wait_for_node()
-    robot.until(lambda: offered('/image') == [ReliabilityPolicy.RELIABLE], 'the subscription')
+    robot.until(lambda: offered('/image') == [ReliabilityPolicy.BEST_EFFORT], 'the subscription')
     robot.set(keyframe_distance=1.0)
     robot.until(lambda: bool(offered('/odom')), 'the subscriber of odometry')
     assert offered('/odom') == [ReliabilityPolicy.BEST_EFFORT]

@@ -115,11 +115,20 @@ def test_replay_of_a_bag_publishes_its_images_and_headers(tmp_path, subscribe):
     subscriber = subscribe()
     code, output, _ = replay(bag)
     assert (code, output[:30]) == (0, '20 images published on /image ')
+    assert ', 20 of 20 received by the node, 0 skipped' in output
     assert subscriber.data() == data
     first = subscriber.images[0]
     assert (first.header.frame_id, first.header.stamp.sec) == ('cam', 10**9)
     assert (first.height, first.width, first.encoding, first.step) == (6, 8, 'rgb8', 24)
     assert subscriber.milliseconds() == list(range(0, 400, 20))
+
+
+def test_replay_reports_the_images_that_got_no_result_as_lost(tmp_path, subscribe):
+    bag, _ = make_bag(tmp_path / 'bag', stamped=False)  # equal headers are counted
+    subscribe(answers=lambda images: len(images) not in (3, 5))
+    code, output, _ = replay(bag)
+    assert code == 0
+    assert ', 18 of 20 received by the node, 2 lost: see docs/troubleshooting.md' in output
 
 
 def test_replay_with_a_rate_publishes_at_that_pace(tmp_path, subscribe):

@@ -88,7 +88,7 @@ def test_node_after_a_signal_during_compilation_ends(robot, run, map_file, tmp_p
     configure, futures = Transition(label='configure'), []
 
     def begun():
-        return 'backend cpu' in process.output()
+        return 'image distances on cpu' in process.output()
 
     with robot.request(futures, ChangeState, 'change_state', begun, transition=configure):
         assert not any(future.done() for future in futures)

@@ -6,7 +6,7 @@ import sys
 
 from stavpr_ros.errors import StavprError
 from stavpr_ros.parameters import PARAMETERS
-from stavpr_ros.signals import interrupted, obey_signals
+from stavpr_ros.signals import end_process, interrupted, obey_signals
 from stavpr_ros.threads import wait_passively
 
 HELP = """usage: node [--ros-args -p map_path:=FILE [-p NAME:=VALUE ...] [-r image:=TOPIC]]
@@ -49,10 +49,10 @@ def main(args: list[str] | None = None) -> int:
     try:
         return _run(args)
     except KeyboardInterrupt:
-        return 0
+        end_process(0)
     except Exception:  # an interrupt inside a foreign library may be raised as another exception
         if interrupted():
-            return 0
+            end_process(0)
         raise
 
 

@@ -49,7 +49,7 @@ On a terminal, space pauses and resumes, s or the right arrow publishes the next
 services ~/pause, ~/resume, ~/toggle_paused and ~/play_next (std_srvs/Trigger) do the same.
 
 exit codes:
-  0    all images were published, and arrived where that can be known
+  0    all images were published; the last line names how many of them the node received
   1    the bag or folder cannot be read, or none of its images
   2    wrong usage
   3    no subscriber within --wait seconds
@@ -187,6 +187,8 @@ def _replay(
     )
     if options.lossless:
         summary += f', {replayer.resent} sent again, {replayer.dropped} dropped'
+    elif report := replayer.receipts.report():
+        summary += f', {report}'
     return summary
 
 

@@ -227,7 +227,7 @@ class Pipeline:
         pose: np.ndarray | None,
     ) -> Match:
         with _timed(stages, 'decoding'):
-            image = decode_message(message)
+            image = decode_message(message, self._needed_size(operation))
             self.contrast = _contrast(image)
             if reason := self._keyframes.too_alike(image):
                 return Match(Status.SKIPPED, reason, image=image, cause=NOT_A_KEYFRAME)
@@ -249,6 +249,14 @@ class Pipeline:
             match = replace(match, candidates=candidates)
         self._last = replace(match, image=image)
         return self._last
+
+    def _needed_size(self, operation: Operation) -> tuple[int, int] | None:
+        """Return the rows and columns of an image that have an effect; None = all."""
+        backbone = operation.extractor.settings.backbone
+        if backbone.resize != 'area':  # bilinear features are of single pixels
+            return None
+        check = self._verifier.settings.width if self._verifier else 0
+        return backbone.size, max(backbone.size, check, self.settings.thumbnail_width)
 
     def _verified(self, match: Match, image: np.ndarray, places: PlaceMap | GrowingMap) -> Match:
         """Verify a match against the thumbnail of its place; reject too few inliers."""

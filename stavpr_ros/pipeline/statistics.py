@@ -6,6 +6,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 import math
+from statistics import median
 import threading
 import time
 from typing import Generic, TypeVar
@@ -24,6 +25,13 @@ WAITING = 'waiting'
 NANOSECONDS = 1_000_000_000
 REORDERING_SECONDS = 0.1
 """Images less than this out of order were reordered on the way, as on best-effort links."""
+
+INTERVALS = 40
+"""Pauses between images from which the period of a camera is taken; it needs half of them."""
+REGULAR = 0.75
+"""Share of them near a multiple of the period, from which on a camera has one."""
+LONGEST_LOSS = 10
+"""Longer pauses than so many periods are pauses of the camera, not losses."""
 
 Value = TypeVar('Value')
 
@@ -55,6 +63,8 @@ class ImageCounts:
     :param stages: recent times by stage.
     :param total: recent times of all stages together, None = no measurement; ``work``: without
         waiting.
+    :param missing: images that the stamps lack at the rate of the camera, an estimate;
+        ``recent_missing``: the recent ones.
     :param gaps: pauses in the stamps, the longest of ``longest_gap`` seconds.
     :param jumps_back: jumps back of the stamps, by at most ``longest_jump_back`` seconds.
     """
@@ -78,6 +88,8 @@ class ImageCounts:
     stages: Mapping[str, StageTime] = field(default_factory=dict)
     total: StageTime | None = None
     work: StageTime | None = None
+    missing: int = 0
+    recent_missing: int = 0
     gaps: int = 0
     longest_gap: float = 0.0
     jumps_back: int = 0
@@ -140,6 +152,7 @@ class Statistics:
             self._received: _Recent[None] = _Recent()
             self._results: _Recent[tuple[str, Mapping[str, float]]] = _Recent()
             self._dropped: _Recent[tuple[str, int]] = _Recent()
+            self._missing: _Recent[int] = _Recent()
 
     def received(self) -> None:
         """Count a received image."""
@@ -178,6 +191,12 @@ class Statistics:
             self._dropped.add(self._clock(), (cause, count))
             self._drops[cause] += count
 
+    def missing(self, count: int) -> None:
+        """Count images that the stamps lack."""
+        with self._lock:
+            self._missing.add(self._clock(), count)
+            self._count(missing=self._counts.missing + count)
+
     def gap(self, seconds: float) -> None:
         """Count a pause in the stamps."""
         with self._lock:
@@ -210,6 +229,7 @@ class Statistics:
                 recent_drops=_sum(self._dropped.values(now)),
                 statuses=dict(self._statuses),
                 recent_statuses=dict(Counter(status for status, _ in results)),
+                recent_missing=sum(self._missing.values(now)),
                 stages=_by_stage(measured),
                 total=_time(sum(stages.values()) for stages in measured),
                 work=_time(sum(stages.values()) - stages.get(WAITING, 0.0) for stages in measured),
@@ -250,6 +270,46 @@ class StampWatch:
         if ahead < 0:
             self._newest = newest
         return ahead if 0 < self.gap < ahead else 0.0
+
+
+class PeriodWatch:
+    """Estimates from stamps how many images of a camera of steady rate are missing."""
+
+    def __init__(self) -> None:
+        self._intervals: deque[float] = deque(maxlen=INTERVALS)
+        self._newest = 0
+
+    def see(self, stamp: int) -> int:
+        """
+        Take the next stamp; return the number of images missing before it.
+
+        It is 0 while the rate is unknown or unsteady, and after a pause. Jitter of a tenth of the
+        period and the loss of half of the images do no harm; a change of the rate is detected
+        after ``INTERVALS`` images.
+
+        :param stamp: nanoseconds; 0 = unknown, ignored.
+        """
+        before, self._newest = self._newest, stamp or self._newest
+        interval = (stamp - before) / NANOSECONDS
+        if before == 0 or interval <= 0:  # the first, unknown, or out of order
+            return 0
+        self._intervals.append(interval)
+        period = self._period()
+        if period is None or interval > LONGEST_LOSS * period:
+            return 0
+        return max(round(interval / period) - 1, 0)
+
+    def _period(self) -> float | None:
+        """Return the period, seconds, of which most intervals are multiples; None without one."""
+        ordered = sorted(self._intervals)
+        if len(ordered) < INTERVALS // 2:
+            return None
+        # a short interval, since long ones have losses, but not the shortest: it has most jitter
+        guess = ordered[len(ordered) // 5]
+        period = median(interval / max(round(interval / guess), 1) for interval in ordered)
+        multiples = [interval / period for interval in ordered]
+        near = sum(abs(multiple - max(round(multiple), 1)) < 0.25 for multiple in multiples)
+        return period if near >= REGULAR * len(multiples) else None
 
 
 def _sum(counted: Iterable[tuple[str, int]]) -> dict[str, int]:

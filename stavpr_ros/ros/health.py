@@ -20,6 +20,9 @@ SILENCE = 2.0
 BUSY = 0.8
 """Share of its time that the worker is busy; below it, a full queue is due to a burst."""
 
+MISSING = 0.05
+"""Share of the received images; from this estimate of missing ones on it is reported."""
+
 DECIDED = ('match', 'no match')
 NOT_DECODED = ('invalid image', 'dropped', 'not ready', 'skipped')
 NEXT_TRANSITION = {'unconfigured': 'configure', 'inactive': 'activate'}
@@ -99,9 +102,7 @@ def input_findings(health: Health) -> list[Finding]:
         refused = f'{_of(health.input.incompatible, "publisher")} refused for QoS'
         findings.append((WARN, f'{refused}, while images of others arrive: {_qos_remedy(health)}'))
     findings += _invalid(counts)
-    if lost := counts.recent_drops.get('lost in transport', 0):
-        remedy = 'give the publisher more shared memory (docs/troubleshooting.md, images are lost)'
-        findings.append((WARN, f'{_of(lost, "image")} lost in transport {recent}: {remedy}'))
+    findings += _lost(health)
     if health.odometry in ('stale', 'never') and (
         health.odometry_required or health.odometry_fault
     ):
@@ -158,6 +159,21 @@ def _invalid(counts: ImageCounts) -> list[Finding]:
     if valid or 'not a keyframe' in counts.recent_drops:
         return [(WARN, f'{_of(sum(invalid.values()), "image")} {text}')]
     return [(ERROR, f'all images {text}, and docs/node.md for the supported encodings')]
+
+
+def _lost(health: Health) -> list[Finding]:
+    """Return the finding on images lost on the way, or before that, if there are any."""
+    counts = health.counts
+    recent = f'in the last {RECENT} s'
+    lost = counts.recent_drops.get('lost in transport', 0)
+    if lost:
+        remedy = f'{health.input.loss_remedy} (docs/troubleshooting.md, images are lost)'
+        return [(WARN, f'{_of(lost, "image")} lost in transport {recent}: {remedy}')]
+    if counts.recent_missing > MISSING * RECENT * counts.rate_in:
+        text = f'about {_of(counts.recent_missing, "image")} missing by their stamps {recent}'
+        remedy = 'none was lost in transport: check the camera driver, its cable and its exposure'
+        return [(WARN, f'{text}; {remedy}')]
+    return []
 
 
 def map_finding(health: Health) -> Finding:

@@ -11,19 +11,20 @@ import time
 import traceback
 from typing import Any, TypeVar
 
-from rclpy.event_handler import UnsupportedEventTypeError
 from rclpy.logging import get_logger
-from rclpy.node import Node
-from rclpy.qos import qos_check_compatible, qos_policy_name_from_kind, QoSCompatibility
-from rclpy.subscription import Subscription
+from rclpy.qos import qos_check_compatible, QoSCompatibility
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_ros.errors import StavprError
 from stavpr_ros.pipeline import NodeSettings
-from stavpr_ros.pipeline.statistics import StampWatch, Statistics
+from stavpr_ros.pipeline.statistics import PeriodWatch, StampWatch, Statistics
 from stavpr_ros.ros.output import nanoseconds
-from stavpr_ros.ros.subscriptions import qos_remedy, subscribe
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode
+from stavpr_ros.ros.subscriptions import AdaptiveSubscription, qos_remedy
+from stavpr_ros.signals import time_left
 
-STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end: `ros2 launch` kills after 5
+STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end
+
+QUEUE = 10  # images in the middleware while the executor is busy
 
 END_POLL = 0.2  # seconds until a waiting caller detects the end of the node
 
@@ -39,7 +40,8 @@ class InputStatus:
     :param publishers: of the topic, of any QoS and type; ``incompatible``: those that are not
         received because of their QoS.
     :param mistyped: other message types on the topic; empty = none.
-    :param remedy: for the incompatible publishers.
+    :param remedy: for the incompatible publishers; ``loss_remedy``: for lost images.
+    :param reliability: of the subscription, with the reason.
     """
 
     topic: str = ''
@@ -47,6 +49,8 @@ class InputStatus:
     incompatible: int = 0
     mistyped: str = ''
     remedy: str = ''
+    loss_remedy: str = ''
+    reliability: str = ''
 
 
 class ImageInput:
@@ -65,7 +69,7 @@ class ImageInput:
 
     def __init__(
         self,
-        node: Node,
+        node: ManagedNode,
         settings: NodeSettings,
         statistics: Statistics,
         enqueue: Callable[[Any, float], None],
@@ -75,6 +79,7 @@ class ImageInput:
         self._node, self._statistics = node, statistics
         self._enqueue, self._reject, self._restart = enqueue, reject, restart
         self.stamps = StampWatch(settings.max_stamp_gap)
+        self._period = PeriodWatch()
         self.max_rate = settings.max_rate
         self.remedy = ''
         self._last: float | None = None  # seconds, of the last image within the rate
@@ -86,12 +91,16 @@ class ImageInput:
         message_type, name = kinds[settings.image_transport]
         self._type = f'sensor_msgs/msg/{message_type.__name__}'
         self.topic = node.resolve_topic_name(name)  # before events, which come on another thread
-        self._subscription = self._subscribe(message_type, name)
+        self._subscription = AdaptiveSubscription(
+            node, message_type, name, QUEUE, self.on_image, self._on_lost, self._on_refused
+        )
 
     def status(self) -> InputStatus:
         """Return the topic and its publishers, for the diagnostics."""
+        subscription = self._subscription
+        subscription.follow()
         infos = self._node.get_publishers_info_by_topic(self.topic)
-        requested = self._subscription.qos_profile
+        requested = subscription.qos
         incompatible = sum(
             qos_check_compatible(info.qos_profile, requested)[0] == QoSCompatibility.ERROR
             for info in infos
@@ -99,28 +108,28 @@ class ImageInput:
         )
         # the middleware does not report other types
         mistyped = ', '.join(sorted({info.topic_type for info in infos} - {self._type}))
-        return InputStatus(self.topic, len(infos), incompatible, mistyped, self.remedy)
+        return InputStatus(
+            self.topic,
+            len(infos),
+            incompatible,
+            mistyped,
+            self.remedy,
+            subscription.loss_remedy,
+            subscription.choice,
+        )
 
     def close(self) -> None:
         """Unsubscribe from images, including one that another thread has just taken."""
         with self._lock:
             self._closed = True
-        self._node.destroy_subscription(self._subscription)
+        self._subscription.close()
 
-    def _subscribe(self, message_type: type, topic: str) -> Subscription:
-        events = {'incompatible_qos': self._on_incompatible, 'message_lost': self._on_lost}
-        try:
-            return subscribe(self._node, message_type, topic, self.on_image, 5, **events)
-        except UnsupportedEventTypeError:  # not every middleware reports lost messages
-            del events['message_lost']
-            return subscribe(self._node, message_type, topic, self.on_image, 5, **events)
-
-    def _on_incompatible(self, event: Any) -> None:
-        self.remedy = qos_remedy(self.topic, qos_policy_name_from_kind(event.last_policy_kind))
+    def _on_refused(self, policy: str) -> None:
+        self.remedy = qos_remedy(self.topic, policy)
         self._node.get_logger().error(f'images are not received: {self.remedy}')
 
-    def _on_lost(self, event: Any) -> None:
-        self._statistics.dropped('lost in transport', event.total_count_change)
+    def _on_lost(self, count: int) -> None:
+        self._statistics.dropped('lost in transport', count)
 
     def on_image(self, message: Any) -> None:
         """Enqueue an image, or reject it for its rate; the callback of the subscription."""
@@ -137,11 +146,14 @@ class ImageInput:
                 self._enqueue(message, arrival)
 
     def _check_stamp(self, stamp: int) -> None:
-        """Count gaps of the stamps; restart after a jump back."""
+        """Count gaps of the stamps and missing images; restart after a jump back."""
+        if missing := self._period.see(stamp):
+            self._statistics.missing(missing)
         ahead = self.stamps.see(stamp)
         if ahead > 0:
             self._statistics.gap(ahead)
         elif ahead < 0:
+            self._period = PeriodWatch()
             self._statistics.jump_back(-ahead)
             self._last = None
             self._restart(f'the stamps of the images jumped back by {-ahead:.3f} s')
@@ -242,7 +254,7 @@ class Worker:
             self._stopping = True
             self._changed.notify()
         if threading.current_thread() is not self._thread:
-            self._thread.join(STOP_TIMEOUT)
+            self._thread.join(time_left(STOP_TIMEOUT))
         for future, _ in self._calls:
             future.cancel()
         if self._thread.is_alive() and self._running is not None and not self._running.done():

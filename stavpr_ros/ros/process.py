@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 import os
 from pathlib import Path
-import sys
 import time
 from typing import Any, TypeVar
 
@@ -22,10 +21,10 @@ from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.ros.rclpy_workarounds import PromptExecutor
-from stavpr_ros.signals import interrupted, signals_deferred
+from stavpr_ros.signals import end_process, interrupted, signals_deferred, time_left
 
 SPIN_SECONDS = 0.2  # until a signal is noticed
-END_SECONDS = 4.0  # for running callbacks at the end; the node's worker takes 3 of them
+CALLBACK_SECONDS = 2.0  # for running callbacks at the end
 SERVICE_SECONDS = 2.0
 """Time in which a node shows its parameter service; some tools have none."""
 
@@ -107,10 +106,8 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
             left_behind = getattr(node, 'left_behind', False)
     finally:
         rclpy.try_shutdown()
-        if left_behind and interrupted():  # Python would wait for its threads without limit
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(0)
+        if left_behind and interrupted():
+            end_process(0)
 
 
 def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: int = 1) -> None:
@@ -139,7 +136,7 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
             node.ending.set()
         if isinstance(executor, PromptExecutor):
             # shutdown takes the entities from under running callbacks
-            executor.finish(END_SECONDS)
+            executor.finish(time_left(CALLBACK_SECONDS))
         executor.shutdown()
 
 

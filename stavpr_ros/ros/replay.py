@@ -24,6 +24,7 @@ from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError, UnavailableError
 from stavpr_ros.ros.playback import keyboard, Playback
 from stavpr_ros.ros.process import Discovery
+from stavpr_ros.ros.receipts import Receipts
 from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
 from std_msgs.msg import Header
@@ -125,6 +126,7 @@ class Replayer:
         self.node, self.notify, self.options = node, notify, options
         self.published = self.resent = self.dropped = 0
         self.publisher = node.create_publisher(Image, 'image', RELIABLE)
+        self.receipts = Receipts(node)
         self._others = {topic.name: self._publish_on(topic, to) for topic, to in topics.items()}
         self._match_topic = node.resolve_topic_name('stavpr/match')
         if options.lossless:
@@ -204,6 +206,7 @@ class Replayer:
         if self.options.lossless:
             self._send_until_answered(message)
         else:
+            self.receipts.sent(message.header)
             self.publisher.publish(message)
         self.published += 1
 
@@ -223,6 +226,7 @@ class Replayer:
             )
         # best-effort subscribers acknowledge nothing: a response to a later request proves it
         self._wait_for_discovery()
+        self._spin_until(self.receipts.settled, None)
 
     def close(self) -> None:
         """Release the node; the caller destroys it."""

@@ -25,6 +25,7 @@ from stavpr_ros.ros.output import map_info_message, nanoseconds, Output, PoseFra
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import OdometryInput
 from stavpr_ros.ros.visualization import Visualization
+from stavpr_ros.signals import time_left
 from stavpr_ros.threads import limit_threads
 from std_msgs.msg import Header
 
@@ -120,7 +121,7 @@ class Runtime:
 
     def save_at_end(self) -> None:
         """Save a recorded map, unless the worker stays busy."""
-        self._save(lambda function: self.worker.call(function).result(STOP_TIMEOUT))
+        self._save(lambda function: self.worker.call(function).result(time_left(STOP_TIMEOUT, 1)))
 
     def _save(self, on_worker: Callable[[Callable[[], Any]], Any]) -> None:
         if self._pipeline is not None:

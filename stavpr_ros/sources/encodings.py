@@ -37,7 +37,7 @@ class Encoding:
     :param channels: values per pixel.
     :param value_bytes: bytes per value, 1 or 2; of two only the more significant one is used.
     :param to_rgb: takes uint8 (rows, width, channels), a view of the message unless the values had
-        two bytes; gives a new RGB array (height, width, 3), C-contiguous.
+        two bytes; gives an RGB array (height, width, 3), new or the same.
     :param block: (rows, columns) of the pixels that share a color: the size is a multiple of it.
     :param chroma_rows: rows of ``step`` bytes with color below the image, per row of the image.
     """
@@ -66,7 +66,7 @@ def copy(pixels: np.ndarray) -> np.ndarray:
 
 
 def keep(pixels: np.ndarray) -> np.ndarray:
-    """Leave RGB pixels alone that are a copy already."""
+    """Return RGB pixels as they are."""
     return pixels
 
 
@@ -124,7 +124,7 @@ _FROM_UYVY = partial(convert, cv2.COLOR_YUV2RGB_UYVY)
 _FROM_YUYV = partial(convert, cv2.COLOR_YUV2RGB_YUYV)
 
 ENCODINGS: dict[str, Encoding] = {
-    'rgb8': Encoding(3, 1, copy),
+    'rgb8': Encoding(3, 1, keep),
     'bgr8': Encoding(3, 1, _FROM_BGR),
     'rgba8': Encoding(4, 1, _FROM_RGBA),
     'bgra8': Encoding(4, 1, _FROM_BGRA),
@@ -172,6 +172,7 @@ def decode_image(
     is_bigendian: bool,
     step: int,
     data: Any,
+    least: tuple[int, int] | None = None,
 ) -> np.ndarray:
     """
     Decode the fields of a raw ``sensor_msgs/Image``.
@@ -186,6 +187,8 @@ def decode_image(
     :param step: bytes from one row to the next; rows may be padded.
     :param data: the bytes: anything with the buffer protocol. The last row's padding may be
         missing.
+    :param least: rows and columns that are needed of a large image, which is reduced then, see
+        :func:`stavpr_ros.sources.files.reduce`; None = all.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous, own memory.
     :raises ImageError: header and data contradict each other, the encoding is unsupported, or the
         image has more than :data:`stavpr_ros.sources.files.MAX_PIXELS` pixels.
@@ -208,26 +211,29 @@ def decode_image(
     values = width * layout.channels
     if layout.value_bytes == 1:
         strides = (step, layout.channels, 1)
-        return layout.to_rgb(
-            np.ndarray((rows, width, layout.channels), np.uint8, flat, 0, strides)
-        )
+        pixels: np.ndarray = np.ndarray((rows, width, layout.channels), np.uint8, flat, 0, strides)
+        image = files.reduce(layout.to_rgb(pixels), least)
+        return copy(image) if image is pixels else image
     # the more significant byte lies first if big-endian
     pairs: np.ndarray = np.ndarray((rows, values, 2), np.uint8, flat, 0, (step, 2, 1))
     high = cv2.extractChannel(pairs, 0 if is_bigendian else 1)
-    return layout.to_rgb(np.asarray(high).reshape(rows, width, layout.channels))
+    pixels = np.asarray(high).reshape(rows, width, layout.channels)
+    return files.reduce(layout.to_rgb(pixels), least)
 
 
-def decode_message(message: Any) -> np.ndarray:
+def decode_message(message: Any, least: tuple[int, int] | None = None) -> np.ndarray:
     """
     Decode an image message, raw or compressed, of rclpy or rosbags, or any object with its fields.
 
     :param message: a ``sensor_msgs/CompressedImage`` if it has a ``format``, else a
         ``sensor_msgs/Image``.
+    :param least: rows and columns that are needed of a large image, which is reduced then; None =
+        all.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous, own memory.
     :raises ImageError: see :func:`decode_image` and :func:`decode_compressed_message`.
     """
     if hasattr(message, 'format'):
-        return decode_compressed_message(message)
+        return decode_compressed_message(message, least)
     return decode_image(
         message.height,
         message.width,
@@ -235,6 +241,7 @@ def decode_message(message: Any) -> np.ndarray:
         bool(message.is_bigendian),
         message.step,
         message.data,
+        least,
     )
 
 
@@ -253,7 +260,7 @@ def decode_compressed(data: Any) -> np.ndarray:
     return files.decode_file(flat_bytes(data))
 
 
-def decode_compressed_message(message: Any) -> np.ndarray:
+def decode_compressed_message(message: Any, least: tuple[int, int] | None = None) -> np.ndarray:
     """
     Decode a ``sensor_msgs/CompressedImage``.
 
@@ -261,6 +268,7 @@ def decode_compressed_message(message: Any) -> np.ndarray:
     images, and to detect Bayer mosaics, which image_transport stores as gray files.
 
     :param message: anything with ``format`` and ``data``.
+    :param least: see :func:`decode_message`.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
     :raises ImageError: a depth image, or see :func:`decode_compressed`.
     """
@@ -272,7 +280,7 @@ def decode_compressed_message(message: Any) -> np.ndarray:
             kind='depth',
         )
     try:
-        return files.decode_file(flat_bytes(message.data), _demosaic_of(message.format))
+        return files.decode_file(flat_bytes(message.data), _demosaic_of(message.format), least)
     except ImageError as error:
         raise ImageError(f'format {message.format!r}: {error}', kind=error.kind) from error
 

@@ -18,12 +18,60 @@ JPEG_MARKER = re.compile(rb'\xff[\xc0-\xcf\xd9-\xfe]')
 """Markers before a segment (length and bytes), and the end; never within compressed pixels."""
 END_OF_JPEG = b'\xff\xd9'
 
+JPEG_FORMATS = ('JPEG', 'MPO')  # MPO: several images, the first is read
+
+LARGE_PIXELS, ENOUGH_PIXELS = 1024 * 768, 640 * 480
+"""Images of more pixels than the first are reduced, until they have at most the second."""
+
+REDUCED_JPEG = {
+    1: cv2.IMREAD_COLOR,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+    8: cv2.IMREAD_REDUCED_COLOR_8,
+}
+"""Decoders of a JPEG at a fraction of its size; they skip most of the work."""
+
 COMPRESSED_FORMATS = ('JPEG', 'PNG', 'BMP', 'TIFF', 'PPM', 'WEBP')
 """The supported files, in Pillow's names."""
 
 
+def reduction(height: int, width: int, least: tuple[int, int] | None) -> int:
+    """
+    Return the divisor of the sides of a large image, a power of two, 1 of a small one.
+
+    :param least: rows and columns that must remain; None = all.
+    """
+    divisor = 1
+    if least is None or height * width <= LARGE_PIXELS:
+        return divisor
+    while (
+        height * width > ENOUGH_PIXELS
+        and not (height % 2 or width % 2)
+        and (height // 2 >= least[0] and width // 2 >= least[1])
+    ):
+        height, width, divisor = height // 2, width // 2, 2 * divisor
+    return divisor
+
+
+def reduce(image: np.ndarray, least: tuple[int, int] | None) -> np.ndarray:
+    """
+    Reduce an image by :func:`reduction`: blocks of 2 x 2 pixels are averaged, again and again.
+
+    :param image: uint8, shape (height, width, channels).
+    :returns: the same image if it is not large.
+    """
+    height, width = image.shape[:2]
+    divisor = reduction(height, width, least)
+    while divisor > 1:
+        height, width, divisor = height // 2, width // 2, divisor // 2
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)  # its fast case
+    return image
+
+
 def decode_file(
-    flat: np.ndarray, demosaic: Callable[[np.ndarray], np.ndarray] | None = None
+    flat: np.ndarray,
+    demosaic: Callable[[np.ndarray], np.ndarray] | None = None,
+    least: tuple[int, int] | None = None,
 ) -> np.ndarray:
     """
     Decode a file.
@@ -31,16 +79,21 @@ def decode_file(
     :param flat: the file's bytes, shape (size,), uint8.
     :param demosaic: converts a gray image (height, width), a Bayer mosaic, to RGB; not called if
         the file has color.
+    :param least: rows and columns that are needed of a large image, which is reduced then; None =
+        all.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
     :raises ImageError: not such a file, damaged, cut off, or of more than :data:`MAX_PIXELS`
         pixels.
     """
-    mode = _check_file(flat)
+    header = _check_file(flat)
+    mode, flag = header.mode, cv2.IMREAD_COLOR
+    if header.format in JPEG_FORMATS:
+        flag = REDUCED_JPEG[min(8, reduction(header.height, header.width, least))]
     try:
         # Pillow's modes of one channel: L of 8 bits, I or I;16 of more
         if demosaic is not None and (mode == 'L' or mode.startswith('I')):
-            return demosaic(_unpack(flat, cv2.IMREAD_GRAYSCALE))
-        return np.asarray(cv2.cvtColor(_unpack(flat, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))
+            return reduce(demosaic(_unpack(flat, cv2.IMREAD_GRAYSCALE)), least)
+        return np.asarray(cv2.cvtColor(reduce(_unpack(flat, flag), least), cv2.COLOR_BGR2RGB))
     except cv2.error as error:
         raise ImageError(
             f'compressed image of {flat.size} bytes is damaged: {error}', kind='damaged'
@@ -58,12 +111,11 @@ def _unpack(flat: np.ndarray, mode: int) -> np.ndarray:
     return np.asarray(image)
 
 
-def _check_file(flat: np.ndarray) -> str:
-    """Check the header and return Pillow's mode, before the decoder allocates the image."""
+def _check_file(flat: np.ndarray) -> Image.Image:
+    """Check the header and return it, closed, before the decoder allocates the image."""
     try:
         with Image.open(BytesIO(flat.data), formats=COMPRESSED_FORMATS) as header:
             width, height = header.size
-            mode, kind = header.mode, header.format
     except Image.DecompressionBombError as error:
         raise ImageError(
             f'{error}: expected at most {MAX_PIXELS}; scale it down', kind='too large'
@@ -76,9 +128,9 @@ def _check_file(flat: np.ndarray) -> str:
         ) from error
     if width * height > MAX_PIXELS:
         raise too_large(width, height)
-    if kind in ('JPEG', 'MPO'):  # MPO: several images, the first is read
+    if header.format in JPEG_FORMATS:
         _check_end_of_jpeg(flat.tobytes())
-    return mode
+    return header
 
 
 def _check_end_of_jpeg(data: bytes) -> None:

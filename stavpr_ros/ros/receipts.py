@@ -1,0 +1,62 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Counts how many of the published images a node has received, by its results."""
+
+from collections import Counter
+import time
+
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from stavpr_msgs.msg import PlaceMatch
+from std_msgs.msg import Header
+
+RESULTS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+QUIET = 2.0  # seconds after the last result: then outstanding images count as lost
+
+
+class Receipts:
+    """
+    Compares the headers of published images with those of the results on ``stavpr/match``.
+
+    The recognition node publishes one result for each image that it receives, processed or not.
+
+    :param node: for the subscription; the caller spins it.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node, self._topic = node, node.resolve_topic_name('stavpr/match')
+        self._outstanding: Counter[tuple[int, int, str]] = Counter()
+        self._sent = self._received = 0
+        self._last = time.monotonic()  # event
+        node.create_subscription(PlaceMatch, 'stavpr/match', self._on_match, RESULTS)
+
+    def sent(self, header: Header) -> None:
+        """Count an image; to be called before it is published."""
+        self._sent += 1
+        self._outstanding[_key(header)] += 1
+        self._last = time.monotonic()
+
+    def settled(self) -> bool:
+        """Return whether no more results are expected."""
+        if self._received == self._sent or not self._node.count_publishers(self._topic):
+            return True
+        return time.monotonic() - self._last > QUIET
+
+    def report(self) -> str:
+        """Return how many images were received; empty without a node that publishes results."""
+        if not self._received and not self._node.count_publishers(self._topic):
+            return ''
+        text = f'{self._received} of {self._sent} received by the node'
+        lost = self._sent - self._received
+        return text + (f', {lost} lost: see docs/troubleshooting.md' if lost else '')
+
+    def _on_match(self, match: PlaceMatch) -> None:
+        key = _key(match.header)
+        if self._outstanding[key] > 0:
+            self._outstanding[key] -= 1
+            self._received += 1
+            self._last = time.monotonic()
+
+
+def _key(header: Header) -> tuple[int, int, str]:
+    return header.stamp.sec, header.stamp.nanosec, header.frame_id

@@ -1,0 +1,163 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Large images are reduced while they are decoded; results stay those of whole images."""
+
+from itertools import islice
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+from pipelines import settings_of
+import pytest
+from stavpr_ros.errors import ImageError
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import build_map
+from stavpr_ros.pipeline import LoadedMap, Pipeline
+from stavpr_ros.recognition.verification import GeometricSettings
+from stavpr_ros.sources import open_source
+from stavpr_ros.sources.encodings import decode_image, decode_message
+from stavpr_ros.sources.files import reduction
+from stavpr_ros.sources.frame import Frame
+
+LEAST = (224, 224)
+
+
+def as_nv12(rgb):
+    height, width = rgb.shape[:2]
+    planar = cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV_I420)
+    u, v = planar[height:].reshape(2, height // 2, width // 2)
+    return np.vstack([planar[:height], np.dstack([u, v]).reshape(height // 2, width)])
+
+
+ENCODERS = {
+    'rgb8': lambda rgb: rgb,
+    'bgr8': lambda rgb: rgb[..., ::-1],
+    'rgba8': lambda rgb: cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA),
+    'rgb16': lambda rgb: rgb.astype('<u2') << 8,
+    'nv12': as_nv12,
+}
+
+
+@pytest.fixture(scope='module')
+def image():
+    """Return a smooth image of 1920x1080 pixels, in color."""
+    coarse = np.random.default_rng(0).integers(0, 256, (18, 32, 3), np.uint8)
+    return cv2.resize(coarse, (1920, 1080), interpolation=cv2.INTER_CUBIC)
+
+
+def block_means(image, divisor):
+    height, width = image.shape[0] // divisor, image.shape[1] // divisor
+    return image.reshape(height, divisor, width, divisor, 3).mean((1, 3))
+
+
+def raw(image, encoding='rgb8', padding=0):
+    """Return the message of an image with padded rows."""
+    rows = np.ascontiguousarray(ENCODERS[encoding](image))
+    rows = rows.reshape(len(rows), -1).view(np.uint8)
+    rows = np.pad(rows, ((0, 0), (0, padding)))
+    height, width = image.shape[:2]
+    fields = {'height': height, 'width': width, 'encoding': encoding, 'is_bigendian': 0}
+    return SimpleNamespace(**fields, step=rows.shape[1], data=rows.reshape(-1))
+
+
+def compressed(image, suffix):
+    data = cv2.imencode(suffix, image[..., ::-1])[1].reshape(-1)
+    return SimpleNamespace(format='rgb8; jpeg compressed bgr8', data=data)
+
+
+@pytest.mark.parametrize(
+    ('size', 'least', 'divisor'),
+    [
+        ((480, 640), LEAST, 1),
+        ((768, 1024), LEAST, 1),  # not large
+        ((960, 1280), LEAST, 2),
+        ((720, 1280), LEAST, 2),
+        ((1080, 1920), LEAST, 4),
+        ((1080, 1920), (224, 480), 4),
+        ((1080, 1920), (224, 481), 2),
+        ((1080, 1920), (271, 271), 2),
+        ((1080, 1920), None, 1),
+        ((1081, 1920), LEAST, 1),
+        ((1080, 1918), LEAST, 2),
+        ((2160, 3840), LEAST, 8),
+    ],
+)
+def test_reduction_keeps_needed_size_and_whole_pixels(size, least, divisor):
+    assert reduction(*size, least) == divisor
+
+
+@pytest.mark.parametrize('encoding', ENCODERS)
+@pytest.mark.parametrize('padding', [0, 7])
+def test_decode_of_large_raw_image_averages_blocks(image, encoding, padding):
+    reduced = decode_message(raw(image, encoding, padding), LEAST)
+    whole = decode_message(raw(image, encoding, padding))
+    assert (whole.shape, reduced.shape) == ((1080, 1920, 3), (270, 480, 3))
+    assert np.abs(reduced - block_means(whole, 4)).max() <= 1  # rounded twice
+    assert reduced.flags.c_contiguous
+
+
+@pytest.mark.parametrize(('suffix', 'tolerance'), [('.png', 1), ('.jpg', 4)])
+def test_decode_of_large_compressed_image_averages_blocks(image, suffix, tolerance):
+    reduced = decode_message(compressed(image, suffix), LEAST)
+    whole = decode_message(compressed(image, suffix))
+    assert reduced.shape == (270, 480, 3)
+    assert np.abs(reduced - block_means(whole, 4)).max() <= tolerance
+
+
+def test_decode_of_small_image_is_unchanged(image):
+    small = image[:768, :1024]
+    for message in (raw(small), compressed(small, '.jpg')):
+        np.testing.assert_array_equal(decode_message(message, LEAST), decode_message(message))
+    assert not np.shares_memory(decode_message(raw(small), LEAST), small)
+
+
+def test_decode_of_large_image_cut_off_is_rejected(image):
+    message = raw(image)
+    with pytest.raises(ImageError, match='cut off'):
+        decode_image(1080, 1920, 'rgb8', False, 5760, message.data[:-1], LEAST)
+    message = compressed(image, '.jpg')
+    message.data = message.data[:-30]
+    with pytest.raises(ImageError, match='cut off'):
+        decode_message(message, LEAST)
+
+
+@pytest.mark.parametrize(
+    ('resize', 'changes', 'rows'),
+    [
+        ('area', {}, 270),
+        ('area', {'geometric': GeometricSettings(width=500)}, 540),
+        ('area', {'thumbnail_width': 960}, 540),
+        ('bilinear', {}, 1080),  # its features are of single pixels
+    ],
+)
+def test_pipeline_reduces_large_images_to_what_is_needed(image, resize, changes, rows):
+    settings = settings_of(feature_settings=f'{{"resize": "{resize}"}}', **changes)
+    pipeline = Pipeline(settings, 'mapping')
+    assert pipeline.process(raw(image), 1).image.shape[0] == rows
+
+
+def test_pipeline_on_large_real_images_matches_as_on_whole_ones(data_folder, monkeypatch):
+    """Gardens Point at 1920x1080: equal statuses, places at most one apart."""
+
+    def traverse(name):
+        for frame in islice(open_source(data_folder / 'gardens_point' / name), 40):
+            large = cv2.resize(frame.image, (1920, 1080), interpolation=cv2.INTER_CUBIC)
+            yield Frame(large, frame.stamp, frame.identifier)
+
+    extractor = FeatureExtractor()
+    places = build_map(traverse('day_left'), extractor, progress=False)
+    query = [frame.image for frame in traverse('day_right')]
+
+    def matches(make):
+        pipeline = Pipeline(settings_of())
+        pipeline.change(loaded=LoadedMap('', places, extractor))
+        return [pipeline.process(make(image), (i + 1) * 10**9) for i, image in enumerate(query)]
+
+    reduced = matches(raw), matches(lambda image: compressed(image, '.jpg'))
+    monkeypatch.setattr(Pipeline, '_needed_size', lambda *_: None)
+    whole = matches(raw)
+    assert sum(match.accepted for match in whole) > 20
+    for matched in reduced:
+        assert [match.status for match in matched] == [match.status for match in whole]
+        places_of = np.array([[m.newest_index for m in found] for found in (matched, whole)])
+        assert np.abs(places_of[0] - places_of[1]).max() <= 1
