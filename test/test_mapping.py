@@ -21,6 +21,7 @@ from stavpr_ros.errors import (
     ImageError,
     InputError,
     MapFileError,
+    OutputError,
     SettingsError,
 )
 from stavpr_ros.features import FeatureExtractor
@@ -237,14 +238,14 @@ def test_save_map_that_fails_keeps_old_file(partial_map, saved, monkeypatch):
         raise OSError(28, 'No space left on device')
 
     monkeypatch.setattr(os, 'fsync', full_disk)
-    with pytest.raises(MapFileError, match='untouched'):
-        save_map(partial_map, saved)
+    with pytest.raises(OutputError, match='untouched'):
+        save_map(partial_map, saved, force=True)
     assert saved.read_bytes() == before
     assert [path.name for path in saved.parent.iterdir()] == [saved.name]
 
 
 def test_map_file_at_invalid_path_fails(small_map, tmp_path):
-    with pytest.raises(MapFileError, match='cannot be written'):
+    with pytest.raises(OutputError, match='does not exist: make it'):
         save_map(small_map, tmp_path / 'missing' / 'map.stavpr')
     with pytest.raises(MapFileError, match='name a map file'):
         load_map(tmp_path)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
-from stavpr_ros.output_file import require_room
+from stavpr_ros.output_file import MAP, require_replaceable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -44,6 +44,7 @@ def _parser() -> argparse.ArgumentParser:
         '--input', required=True, metavar='FOLDER|BAG', help='images, or a ROS 1 or ROS 2 bag'
     )
     parser.add_argument('--output', required=True, metavar='MAP', help='the file to write')
+    parser.add_argument('--force', action='store_true', help='replace an existing map')
     parser.add_argument('--topic', help='image topic of the bag, if it has several')
     parser.add_argument(
         '--every', type=int, default=1, metavar='N', help='take every N-th image (%(default)s)'
@@ -136,7 +137,7 @@ def _check(arguments: argparse.Namespace) -> None:
         )
     if arguments.thumbnail_width is not None and arguments.no_thumbnails:
         raise SettingsError('--thumbnail-width and --no-thumbnails: give one')
-    require_room(arguments.output)
+    require_replaceable(arguments.output, MAP, arguments.force)
 
 
 def _keyframes(arguments: argparse.Namespace) -> 'KeyframeSettings':
@@ -242,7 +243,7 @@ def main(args: list[str] | None = None) -> int:
         from stavpr_ros.mapping import save_map
 
         place_map = _build(arguments)
-        save_map(place_map, arguments.output)
+        save_map(place_map, arguments.output, arguments.force)
         state = f'{arguments.output} is written, without a suggested threshold'
         _report(place_map, arguments.output)
 

@@ -15,9 +15,7 @@ from dataclasses import replace
 import hashlib
 import io
 import json
-import os
 from pathlib import Path
-import tempfile
 from threading import Lock
 from typing import Any, IO
 import weakref
@@ -27,6 +25,7 @@ import numpy as np
 from stavpr_ros.errors import InputError, MapFileError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.place_map import PlaceMap
+from stavpr_ros.output_file import atomic_output, Force, MAP
 import torch
 
 FORMAT = 'stavpr-map'
@@ -63,13 +62,13 @@ def _arrays(place_map: PlaceMap) -> dict[str, np.ndarray]:
     return {name: np.ascontiguousarray(array, _TYPES[name]) for name, array in arrays.items()}
 
 
-def save_map(place_map: PlaceMap, path: str | Path) -> None:
+def save_map(place_map: PlaceMap, path: str | Path, force: Force = False) -> None:
     """
-    Write a map to a file atomically: an existing file is replaced by the complete new one.
+    Write a map to a file, all of it or nothing.
 
-    :raises MapFileError: the file cannot be written.
+    :param force: replace an existing map, see :func:`stavpr_ros.output_file.atomic_output`.
+    :raises OutputError: the file is there already, or cannot be written.
     """
-    path = Path(path)
     members = {}
     for name, array in _arrays(place_map).items():
         buffer = io.BytesIO()
@@ -86,33 +85,13 @@ def save_map(place_map: PlaceMap, path: str | Path) -> None:
             name: hashlib.sha256(content).hexdigest() for name, content in members.items()
         },
     }
-    temporary = None
-    try:
-        with tempfile.NamedTemporaryFile(
-            dir=path.parent, prefix=f'.{path.name}.', delete=False
-        ) as file:
-            temporary = file.name
-            with zipfile.ZipFile(file, 'w', zipfile.ZIP_STORED) as archive:
-                archive.writestr(MANIFEST, json.dumps(manifest))
-                for name, content in members.items():
-                    archive.writestr(f'{name}.npy', content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise MapFileError(
-            f'map {path} cannot be written ({error}); an existing file is untouched'
-        ) from error
-    finally:
-        if temporary is not None and os.path.exists(temporary):
-            os.unlink(temporary)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    with (
+        atomic_output(path, MAP, force) as file,
+        zipfile.ZipFile(file, 'w', zipfile.ZIP_STORED) as archive,
+    ):
+        archive.writestr(MANIFEST, json.dumps(manifest))
+        for name, content in members.items():
+            archive.writestr(f'{name}.npy', content)
 
 
 def load_map(path: str | Path) -> PlaceMap:

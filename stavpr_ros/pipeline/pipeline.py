@@ -6,13 +6,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 import math
-import os
-from pathlib import Path
 import time
 from typing import Any
 
 import numpy as np
-from stavpr_ros.errors import ImageError, InputError, MapFileError, StavprError
+from stavpr_ros.errors import ImageError, InputError, StavprError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.keyframes import KeyframeSelector
@@ -141,20 +139,15 @@ class Pipeline:
         self._keyframes.settings = settings.keyframes
         self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
 
-    def snapshot(self, path: str, overwrite: bool) -> MapSnapshot:
+    def snapshot(self) -> MapSnapshot:
         """
         Return the map, or the recorded route, to be written to a file.
 
-        :raises MapFileError: an existing file, or a missing folder.
         :raises InputError: there are no places.
         """
         place_map = self._places_as_map()
         if place_map is None:
             raise InputError(f'there is nothing to save yet: {self.missing or "no places"}')
-        if os.path.exists(path) and not overwrite:
-            raise MapFileError(f'{path} exists already: set overwrite, or choose another name')
-        if not Path(path).absolute().parent.is_dir():
-            raise MapFileError(f'the folder of {path} does not exist: make it first')
         state = self._map_save_state if place_map is self._map else self.save_state
         return MapSnapshot(place_map, state, state.recorded)
 

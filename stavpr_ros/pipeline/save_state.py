@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import os
 
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.output_file import FileVersion, Force
 
 
 @dataclass
@@ -21,20 +22,24 @@ class SaveState:
     path: str = ''
     recorded: int = 0
     saved: int = 0
-    _files: set[str] = field(default_factory=set)
+    _files: dict[str, FileVersion | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.path:
-            self._files.add(os.path.abspath(self.path))
+            self.own(self.path)
 
     @property
     def unsaved(self) -> int:
         """Return the number of recorded places that are in no file."""
         return self.recorded - self.saved
 
-    def owns(self, path: str) -> bool:
-        """Return whether a file holds, or held, this map, and may be overwritten."""
-        return os.path.abspath(path) in self._files
+    def own(self, path: str) -> None:
+        """Remember a file that holds this map now."""
+        self._files[os.path.abspath(path)] = FileVersion.of(path)
+
+    def owned(self, path: str) -> Force:
+        """Return the version of a file that holds, or held, this map and may be replaced."""
+        return self._files.get(os.path.abspath(path)) or False
 
 
 @dataclass(frozen=True)
@@ -49,4 +54,4 @@ class MapSnapshot:
         """Update the state after writing; later places, or another map in use, are unaffected."""
         state = self.state
         state.path, state.saved = path, max(state.saved, self.recorded)
-        state._files.add(os.path.abspath(path))
+        state.own(path)

@@ -5,27 +5,27 @@
 from collections.abc import Callable
 import itertools
 from logging import Logger
-import os
 from pathlib import Path
 from typing import Any
 
-from stavpr_ros.errors import StavprError
+from stavpr_ros.errors import OutputTakenError, StavprError
 from stavpr_ros.mapping import save_map
+from stavpr_ros.output_file import Force, MAP, require_replaceable
 from stavpr_ros.pipeline.pipeline import Pipeline
-from stavpr_ros.pipeline.save_state import SaveState
 
 OnWorker = Callable[[Callable[[], Any]], Any]
 
 
-def write_map(pipeline: Pipeline, on_worker: OnWorker, path: str, overwrite: bool) -> int:
+def write_map(pipeline: Pipeline, on_worker: OnWorker, path: str, overwrite: Force) -> int:
     """
     Write the map of the pipeline to a file, on this thread; return its number of places.
 
     :param on_worker: calls a function on the thread of the pipeline.
     :raises StavprError: no places, an existing file, or a file that cannot be written.
     """
-    snapshot = on_worker(lambda: pipeline.snapshot(path, overwrite))
-    save_map(snapshot.places, path)
+    require_replaceable(path, MAP, overwrite)  # before places are copied
+    snapshot = on_worker(pipeline.snapshot)
+    save_map(snapshot.places, path, overwrite)
     on_worker(lambda: snapshot.mark_saved(path))
     return len(snapshot.places)
 
@@ -43,9 +43,8 @@ def save_recorded_map(
     try:
         unsaved = on_worker(lambda: pipeline.unsaved)  # includes the image being processed
         if unsaved and path:
-            target = _free_name(path, pipeline.save_state)
-            log.info(f'writing the map to {target}')
-            places = write_map(pipeline, on_worker, target, overwrite=True)
+            log.info(f'writing the map to {path}')
+            places, target = _write_beside(pipeline, on_worker, path)
             log.info(f'{places} places written to {target}')
         elif unsaved and pipeline.operation != 'loop_closure':
             log.warning(f'{unsaved} recorded places are lost: set save_path, or call ~/save_map')
@@ -57,12 +56,14 @@ def save_recorded_map(
         log.error(f'the map is not saved: {cause}')
 
 
-def _free_name(path: str, state: SaveState) -> str:
-    """Return the path, or the first numbered name that is free or holds this map."""
+def _write_beside(pipeline: Pipeline, on_worker: OnWorker, path: str) -> tuple[int, str]:
+    """Write the map to the path, or the first numbered name that is free or holds this map."""
     there = Path(path)
-    numbered = (
-        str(there.with_name(f'{there.stem}-{number}{there.suffix}'))
-        for number in itertools.count(2)
-    )
-    names = itertools.chain([path], numbered)
-    return next(name for name in names if state.owns(name) or not os.path.exists(name))
+    for number in itertools.count(1):
+        name = path if number == 1 else str(there.with_stem(f'{there.stem}-{number}'))
+        try:
+            overwrite = pipeline.save_state.owned(name)
+            return write_map(pipeline, on_worker, name, overwrite), name
+        except OutputTakenError:
+            continue
+    raise AssertionError

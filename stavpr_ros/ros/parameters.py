@@ -8,7 +8,7 @@ from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
-from stavpr_ros.errors import SettingsError, SourceError
+from stavpr_ros.errors import OutputError, SettingsError
 from stavpr_ros.output_file import require_room
 from stavpr_ros.parameters import BY_NAME, NodeParameter, PARAMETERS
 
@@ -86,5 +86,5 @@ def require_writable(save_path: str) -> None:
     try:
         if save_path:
             require_room(save_path)
-    except SourceError as error:
+    except OutputError as error:
         raise SettingsError(f'save_path: {error}') from error
