@@ -98,7 +98,7 @@ def machine_problems() -> list:
 
 def clean_environment() -> dict:
     """Copy the environment variables, with the ROS of ``.venv`` as the only one in them."""
-    venv = ROOT / '.venv'
+    venv = (ROOT / '.venv').resolve()
     overlays = [os.environ.get(name, '') for name in ('AMENT_PREFIX_PATH', 'COLCON_PREFIX_PATH')]
     prefixes = [entry for entry in ':'.join(['/opt/ros', *overlays]).split(':') if entry]
     # The wheels add their own libraries to LD_LIBRARY_PATH of every Python that they start in.
@@ -202,7 +202,7 @@ def install(extras: list, torch_index: str) -> None:
     :param extras: names of :data:`EXTRAS`.
     :param torch_index: package index to take torch from; empty for the default one.
     """
-    venv = ROOT / '.venv'
+    venv = (ROOT / '.venv').resolve()
     stamp = venv / 'setup.json'
     before = read_stamp(stamp)
     place = {
