@@ -4,15 +4,19 @@
 
 from collections.abc import Iterable, Mapping
 import difflib
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from stavpr_ros.errors import OutputError, SettingsError
 from stavpr_ros.output_file import require_room
 from stavpr_ros.parameters import BY_NAME, NodeParameter, PARAMETERS
+from stavpr_ros.pipeline.maps_folder import inside
 
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+_FILES = ('map_path', 'save_path', 'model_path')
 _CHANGED_BY_SERVICE = {'map_path': 'load_map', 'operation': 'set_operation'}
 
 
@@ -73,6 +77,46 @@ def require_changeable(changes: Mapping[str, Any], state: str) -> None:
         raise SettingsError(
             f'{", ".join(fixed)} can be set only while the node is unconfigured, it is {state}: '
             'clean it up first (`ros2 lifecycle set NODE deactivate`, then cleanup)'
+        )
+
+
+def inside_maps_folder(parameters: list[Parameter], node: Node, folder: Path) -> list[Parameter]:
+    """
+    Return parameters that are set after the start, with absolute paths of the files they name.
+
+    A name that leads out of the folder stays as it is, for :func:`require_inside` to reject.
+    """
+    return [_with_path(parameter, node, folder) for parameter in parameters]
+
+
+def _with_path(parameter: Parameter, node: Node, folder: Path) -> Parameter:
+    name, value = parameter.name, parameter.value
+    known = name in _FILES and isinstance(value, str) and value
+    if not known or value == node.get_parameter(name).value:
+        return parameter
+    try:
+        return Parameter(name, value=inside(folder, value))
+    except SettingsError:
+        return parameter
+
+
+def require_inside(changes: Mapping[str, Any], folder: Path) -> None:
+    """
+    Reject files outside the maps folder: anyone on the ROS graph may set parameters.
+
+    :param changes: name to value, those that differ from the current values.
+    :raises SettingsError: names the parameter.
+    """
+    for name in _FILES:
+        if changes.get(name):
+            try:
+                inside(folder, changes[name])
+            except SettingsError as error:
+                raise SettingsError(f'{name}: {error}') from error
+    if '"model"' in changes.get('feature_settings', ''):
+        raise SettingsError(
+            'feature_settings: the file of a network is not set after the start by "model", but '
+            'by parameter model_path'
         )
 
 

@@ -3,7 +3,8 @@
 """The configured node: the pipeline on its worker, the subscriptions and the publishers."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import wait
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 import math
 import threading
@@ -12,19 +13,21 @@ import traceback
 from typing import Any
 
 from stavpr_msgs.msg import MapInfo
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.saving import save_recorded_map
+from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.health import Health
-from stavpr_ros.ros.input import ImageInput, InputStatus, STOP_TIMEOUT, Worker
+from stavpr_ros.ros.input import END_POLL, ImageInput, InputStatus, STOP_TIMEOUT, Worker
 from stavpr_ros.ros.output import map_info_message, nanoseconds, Output
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import OdometryInput
-from stavpr_ros.threads import limit_threads
+from stavpr_ros.threads import call_on_thread, limit_threads
 from std_msgs.msg import Header
 
+LOAD_TIMEOUT = 120.0  # seconds to read a map
 REPORT_PERIOD = 10.0  # seconds between repeated warnings
 
 
@@ -160,20 +163,36 @@ class Runtime:
                 self.problem = str(error)
                 self._node.get_logger().error(self.problem)
 
-    def load(self, path: str) -> None:
+    def load(self, path: str, lock: AbstractContextManager[Any] | None = None) -> None:
         """
-        Load a map, on this thread, and use it; meanwhile the old one stays in use.
+        Load a map and use it; meanwhile the old one stays in use.
 
-        :raises StavprError: an invalid file, model or setting; the old map stays in use.
+        :param lock: held while the map comes into use, but not while its file is read.
+        :raises StavprError: an invalid file, model or setting, or a file that takes too long; the
+            old map stays in use.
         """
         with self._loading(path):
-            loaded = read_map(path, self.settings.pipeline)
-            self.worker.run(lambda: self.pipeline.change(loaded=loaded))
+            loaded = self._read_in_time(path)
+            with lock or nullcontext():
+                self.worker.run(lambda: self.pipeline.change(loaded=loaded))
         places = loaded.places
         self._node.get_logger().info(
             f'map {path}: {len(places)} places, features {places.settings.kind}, '
             f'{places.settings.strips} strips of {places.dimension} dimensions'
         )
+
+    def _read_in_time(self, path: str) -> LoadedMap:
+        """Read a map on a thread that is abandoned when it takes too long, or the node ends."""
+        reading = call_on_thread(lambda: read_map(path, self.settings.pipeline), 'reading')
+        end = time.monotonic() + LOAD_TIMEOUT
+        while not wait([reading], END_POLL).done:
+            if self._node.ending.is_set():
+                raise StavprError('the node ends')
+            if time.monotonic() > end:
+                raise StavprError(
+                    f'{path} was not read within {LOAD_TIMEOUT:g} s: copy it to a faster disk'
+                )
+        return reading.result()
 
     @contextmanager
     def _loading(self, path: str) -> Iterator[None]:
