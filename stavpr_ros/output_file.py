@@ -141,7 +141,8 @@ def atomic_output(path: str | Path, kind: FileKind, force: Force = False) -> Ite
         file = AtomicFile(path, kind, force)
         try:
             yield file
-            file.sync() if file.committed else file.commit()
+            if not file.closed:  # by the block, which abandoned it
+                file.sync() if file.committed else file.commit()
         finally:
             file.abandon()
 
