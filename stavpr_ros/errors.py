@@ -55,5 +55,9 @@ class MapFileError(StavprError):
     """A map file is damaged, truncated, foreign or too new to be read."""
 
 
+class JournalError(StavprError):
+    """The journal of a recorded map cannot be read, or is in use."""
+
+
 class FeatureMismatchError(StavprError):
     """The query's features were made with other settings than the map's."""

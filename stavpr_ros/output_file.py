@@ -83,11 +83,10 @@ class AtomicFile(io.BufferedWriter):
         self._path, self._kind, self._force = path, kind, force
         self._target = Path(os.path.realpath(path))
         _require_replaceable(self._target, path, kind, force)
-        name = hashlib.sha256(os.fsencode(self._target.name)).hexdigest()[:12]
-        self._temporary = self._target.parent / f'.stavpr-{name}'
         self.committed = False
         _sweep(self._target.parent)
-        super().__init__(io.FileIO(_create_locked(self._temporary, path), 'r+'))
+        self._temporary, file = create_temporary(self._target)
+        super().__init__(io.FileIO(file, 'r+'))
         try:
             with suppress(FileNotFoundError):
                 self._take_over(os.stat(self._target))
@@ -214,19 +213,26 @@ def _busy(path: str | Path) -> OutputTakenError:
     )
 
 
-def _create_locked(temporary: Path, path: str | Path) -> int:
-    """Create and lock a temporary file; one of that name that no one writes is deleted."""
+def create_temporary(target: Path) -> tuple[Path, int]:
+    """
+    Create and lock the temporary file of a target; one that a killed writer left is deleted.
+
+    :returns: its path, and its descriptor.
+    :raises OutputTakenError: another program writes the target.
+    """
+    name = hashlib.sha256(os.fsencode(target.name)).hexdigest()[:12]
+    temporary = target.parent / f'.stavpr-{name}'
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
     while True:
         try:
             file = os.open(temporary, flags, 0o666)
         except FileExistsError as error:
             if not _delete_stale(temporary):
-                raise _busy(path) from error
+                raise _busy(target) from error
             continue
         fcntl.flock(file, fcntl.LOCK_EX)
         if os.fstat(file).st_nlink:
-            return file
+            return temporary, file
         os.close(file)  # another writer took it for a stale one before it was locked
 
 

@@ -110,7 +110,7 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
         if left_behind and interrupted():  # Python would wait for its threads without limit
             sys.stdout.flush()
             sys.stderr.flush()
-            os._exit(0)
+            os._exit(int(getattr(node, 'failed', False)))
 
 
 def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: int = 1) -> None:

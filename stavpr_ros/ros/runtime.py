@@ -7,15 +7,19 @@ from concurrent.futures import wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 import math
+from pathlib import Path
 import threading
 import time
 import traceback
 from typing import Any
 
 from stavpr_msgs.msg import MapInfo
-from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.errors import JournalError, SettingsError, StavprError
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping.journal import Base
+from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
-from stavpr_ros.pipeline.saving import save_recorded_map
+from stavpr_ros.pipeline.saving import recover_maps, save_recorded_map
 from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
@@ -27,6 +31,7 @@ from stavpr_ros.ros.subscriptions import OdometryInput
 from stavpr_ros.threads import call_on_thread, limit_threads
 from std_msgs.msg import Header
 
+RECORDED = 'recorded.stavpr'  # in the maps folder, where no save_path is set
 LOAD_TIMEOUT = 120.0  # seconds to read a map
 REPORT_PERIOD = 10.0  # seconds between repeated warnings
 
@@ -72,9 +77,12 @@ class Runtime:
         self._output = Output(node, settings.queue_size)
         self._pipeline: Pipeline | None = None
         try:
+            recovered = recover_maps(self._journaled, node.get_logger())
             self._pipeline = self.worker.run(self._make_pipeline)
-            if settings.map_path:
-                self.load(settings.map_path)
+            # a route of loop closure does not continue a map
+            continued = recovered if settings.operation != 'loop_closure' else ''
+            if map_path := settings.map_path or continued:
+                self.load(map_path)
         except BaseException:
             self.close()
             raise
@@ -87,7 +95,21 @@ class Runtime:
 
     def _make_pipeline(self) -> Pipeline:
         limit_threads(self.settings.threads)
-        return Pipeline(self.settings.pipeline, self.settings.operation)
+        return Pipeline(self.settings.pipeline, self.settings.operation, self._open_journal)
+
+    @property
+    def _journaled(self) -> Path:
+        """Return the file whose name the journal of recorded places has."""
+        return Path(self.settings.save_path or self.settings.maps_path / RECORDED)
+
+    def _open_journal(self, base: Base, template: PlaceMap) -> JournalWriter | None:
+        """Open the journal of the first unsaved place; None, and an error, if it is impossible."""
+        log = self._node.get_logger()
+        try:
+            return JournalWriter(self._journaled, base, template, log.error)
+        except JournalError as error:
+            log.error(f'recorded places are in memory only: {error}')
+            return None
 
     # life cycle
 
@@ -112,6 +134,7 @@ class Runtime:
         finally:
             if not self.worker.stop():
                 self._node.left_behind = True
+            self._close_journals()
             self._output.close()
 
     def save_at_end(self) -> None:
@@ -120,8 +143,17 @@ class Runtime:
 
     def _save(self, on_worker: Callable[[Callable[[], Any]], Any]) -> None:
         if self._pipeline is not None:
-            log = self._node.get_logger()
-            save_recorded_map(self._pipeline, on_worker, self.settings.save_path, log)
+            log, path = self._node.get_logger(), self.settings.save_path
+            if not save_recorded_map(self._pipeline, on_worker, path, log):
+                self._node.failed = True
+
+    def _close_journals(self) -> None:
+        if self._pipeline is not None:
+            for path in self._pipeline.close_journals(not self.settings.save_path):
+                self._node.get_logger().warning(
+                    f'places that are in no map stay in {path}: the next start of the node makes '
+                    'a map of them, or `stavpr map recover`'
+                )
 
     def _unsubscribe(self) -> None:
         for subscription in (self.images, self.odometry):

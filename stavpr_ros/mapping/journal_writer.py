@@ -1,0 +1,194 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Writing the journal of a recorded map, on a thread of its own."""
+
+from array import array
+from collections.abc import Callable
+from contextlib import suppress
+import fcntl
+import os
+from pathlib import Path
+import threading
+import time
+
+from stavpr_ros.errors import JournalError
+from stavpr_ros.mapping.journal import Base, frame, header, JournalPlace, numbered, SUFFIX
+from stavpr_ros.mapping.place_map import PlaceMap
+from stavpr_ros.output_file import create_temporary, sync_folder
+
+SYNC_PERIOD = 1.0  # seconds between syncs, and between attempts after an error
+WAITING = 2**28  # most bytes that wait for room on the disk
+SLACK = 2**24  # bytes of forgotten places, and half of the file, before it is rewritten
+PIECE = 2**20  # bytes copied at a time
+
+
+class JournalWriter:
+    """
+    Appends places to a new journal; an error of the disk does not stop the recording.
+
+    Places are written at once and synced every second. While the disk is full they wait, and are
+    written when there is room again.
+
+    :param target: file that the map will be saved to; the journal is beside it, ``path``.
+    :param base: the map that the places continue.
+    :param template: a map of one place with the settings of the features.
+    :param log: called with an error, once.
+    :raises JournalError: it cannot be created.
+    """
+
+    def __init__(
+        self, target: str | Path, base: Base, template: PlaceMap, log: Callable[[str], object]
+    ) -> None:
+        self._template, self._base, self._log = template, base, log
+        content = header(base, template)
+        try:
+            self.path, self._file = _create(Path(target))
+            _write(self._file, content, 0)
+            os.fsync(self._file)
+            sync_folder(self.path.parent)
+        except OSError as error:
+            raise JournalError(
+                f'no journal can be written beside {target} ({error.strerror}): make room, or set '
+                'another save_path'
+            ) from error
+        # of the thread
+        self._size = self._start = len(content)
+        self._ends = array('q')  # of each place in the file
+        self._dirty = self._problem = False
+        # of both
+        self._changed = threading.Condition()
+        self._waiting: list[bytes] = []
+        self._forgotten = 0  # of the places in the file and of those that wait
+        self._rebased = self._closing = self._deleting = False
+        self._thread = threading.Thread(target=self._run, name='journal', daemon=True)
+        self._thread.start()
+
+    def append(self, place: JournalPlace) -> None:
+        """Add a place, without waiting for the disk."""
+        content = frame(place.encode())
+        with self._changed:
+            full = self._problem and sum(map(len, self._waiting)) > WAITING
+            self._waiting.append(b'' if full else content)  # the error is logged
+            self._changed.notify()
+
+    def forget(self, count: int, base: Base | None = None) -> None:
+        """
+        Drop the first places, which were evicted or are in a map file.
+
+        :param base: the map that the others continue now; None = as before.
+        """
+        with self._changed:
+            self._forgotten += count
+            if base is not None:
+                self._base, self._rebased = base, True
+            self._changed.notify()
+
+    def close(self, delete: bool = False) -> None:
+        """Write everything, or delete the journal, and unlock it."""
+        with self._changed:
+            self._closing, self._deleting = True, delete
+            self._changed.notify()
+        self._thread.join()
+        if delete:
+            self.path.unlink(missing_ok=True)
+        os.close(self._file)
+
+    def _run(self) -> None:
+        synced = time.monotonic()
+        while True:
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: self._closing or (not self._problem and self._has_work()),
+                    SYNC_PERIOD if self._dirty or self._problem else None,
+                )
+                closing = self._closing
+            if self._deleting:
+                return
+            try:
+                self._append_waiting()
+                self._rewrite_if_needed()
+                if self._dirty and (closing or time.monotonic() >= synced + SYNC_PERIOD):
+                    os.fsync(self._file)
+                    self._dirty, synced = False, time.monotonic()
+                self._problem = False
+            except OSError as error:
+                self._report(error)
+            if closing:
+                return
+
+    def _has_work(self) -> bool:
+        return bool(self._waiting) or self._rebased
+
+    def _append_waiting(self) -> None:
+        with self._changed:
+            waiting = self._waiting.copy()
+        if waiting:
+            _write(self._file, b''.join(waiting), self._size)
+            for content in waiting:
+                self._size += len(content)
+                self._ends.append(self._size)
+            self._dirty = True
+            with self._changed:
+                del self._waiting[: len(waiting)]
+
+    def _rewrite_if_needed(self) -> None:
+        """Make a new file of the places that are still needed, if the base changed or many go."""
+        with self._changed:
+            # some of the forgotten ones may still wait
+            count, base, rebased = min(self._forgotten, len(self._ends)), self._base, self._rebased
+        begin = self._ends[count - 1] if count else self._start
+        gone = begin - self._start
+        if not rebased and gone <= max(SLACK, self._size // 2):
+            return
+        content = header(base, self._template)
+        temporary, file = create_temporary(self.path)
+        try:
+            _write(file, content, 0)
+            for at in range(begin, self._size, PIECE):
+                piece = os.pread(self._file, min(PIECE, self._size - at), at)
+                _write(file, piece, len(content) + at - begin)
+            os.fsync(file)
+            os.replace(temporary, self.path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            os.close(file)
+            raise
+        os.close(self._file)
+        self._file, self._dirty = file, False
+        sync_folder(self.path.parent)
+        moved = begin - len(content)
+        self._ends = array('q', (end - moved for end in self._ends[count:]))
+        self._start, self._size = len(content), self._size - moved
+        with self._changed:
+            self._forgotten -= count
+            self._rebased = self._rebased and self._base != base
+
+    def _report(self, error: OSError) -> None:
+        with suppress(OSError):
+            os.ftruncate(self._file, self._size)  # a part of a place
+        if not self._problem:
+            self._log(
+                f'the journal {self.path} cannot be written ({error.strerror}): places since then '
+                'are in memory only; make room, or save the map elsewhere'
+            )
+        self._problem = True
+
+
+def _create(target: Path) -> tuple[Path, int]:
+    """Create and lock the journal of a file, or of the first numbered name that has none."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    for path in numbered(target):
+        journal = path.with_name(path.name + SUFFIX)
+        with suppress(FileExistsError):
+            file = os.open(journal, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+            fcntl.flock(file, fcntl.LOCK_EX)
+            return journal, file
+    raise AssertionError
+
+
+def _write(file: int, content: bytes, offset: int) -> None:
+    """Write all bytes at an offset; the system may take them in parts."""
+    rest = memoryview(content)
+    while rest:
+        written = os.pwrite(file, rest, offset)
+        rest, offset = rest[written:], offset + written
