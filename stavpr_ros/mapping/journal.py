@@ -97,18 +97,26 @@ def frame(content: bytes) -> bytes:
     return _FRAME.pack(len(content), zlib.crc32(content)) + content
 
 
-def header(base: Base, template: PlaceMap) -> bytes:
+def header(base: Base, template: bytes) -> bytes:
     """
     Return the two records that begin a journal.
 
-    :param template: a map of one place with the settings of the features.
+    :param template: file of a map of one place, with the settings of the features.
+    """
+    about = {'format': FORMAT, 'version': VERSION, 'base': asdict(base)}
+    return frame(json.dumps(about).encode()) + frame(template)
+
+
+def map_bytes(place_map: PlaceMap) -> bytes:
+    """
+    Return the file of a map.
+
+    :raises OutputError: there is no room for a temporary file.
     """
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, 'template')
-        save_map(template, path)
-        content = path.read_bytes()
-    about = {'format': FORMAT, 'version': VERSION, 'base': asdict(base)}
-    return frame(json.dumps(about).encode()) + frame(content)
+        path = Path(folder, 'map')
+        save_map(place_map, path)
+        return path.read_bytes()
 
 
 class JournalReader:

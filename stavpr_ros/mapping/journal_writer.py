@@ -11,8 +11,16 @@ from pathlib import Path
 import threading
 import time
 
-from stavpr_ros.errors import JournalError
-from stavpr_ros.mapping.journal import Base, frame, header, JournalPlace, numbered, SUFFIX
+from stavpr_ros.errors import JournalError, OutputError
+from stavpr_ros.mapping.journal import (
+    Base,
+    frame,
+    header,
+    JournalPlace,
+    map_bytes,
+    numbered,
+    SUFFIX,
+)
 from stavpr_ros.mapping.place_map import PlaceMap
 from stavpr_ros.output_file import create_temporary, sync_folder
 
@@ -26,8 +34,8 @@ class JournalWriter:
     """
     Appends places to a new journal; an error of the disk does not stop the recording.
 
-    Places are written at once and synced every second. While the disk is full they wait, and are
-    written when there is room again.
+    Places are written at once, and synced every second by another thread. While the disk is full
+    they wait, and are written when there is room again. All calls must come from one thread.
 
     :param target: file that the map will be saved to; the journal is beside it, ``path``.
     :param base: the map that the places continue.
@@ -39,37 +47,37 @@ class JournalWriter:
     def __init__(
         self, target: str | Path, base: Base, template: PlaceMap, log: Callable[[str], object]
     ) -> None:
-        self._template, self._base, self._log = template, base, log
-        content = header(base, template)
+        self._base, self._log = base, log
         try:
+            self._template = map_bytes(template)
+            content = header(base, self._template)
             self.path, self._file = _create(Path(target))
             _write(self._file, content, 0)
             os.fsync(self._file)
             sync_folder(self.path.parent)
-        except OSError as error:
+        except (OSError, OutputError) as error:
             raise JournalError(
-                f'no journal can be written beside {target} ({error.strerror}): make room, or set '
-                'another save_path'
+                f'no journal can be written beside {target} ({error}): make room, or set another '
+                'save_path'
             ) from error
-        # of the thread
         self._size = self._start = len(content)
         self._ends = array('q')  # of each place in the file
-        self._dirty = self._problem = False
-        # of both
-        self._changed = threading.Condition()
         self._waiting: list[bytes] = []
         self._forgotten = 0  # of the places in the file and of those that wait
+        self._dirty = self._problem = False
         self._rebased = self._closing = self._deleting = False
+        self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name='journal', daemon=True)
         self._thread.start()
 
     def append(self, place: JournalPlace) -> None:
-        """Add a place, without waiting for the disk."""
+        """Add a place: it is in the file when this returns, and synced a second later."""
         content = frame(place.encode())
         with self._changed:
             full = self._problem and sum(map(len, self._waiting)) > WAITING
             self._waiting.append(b'' if full else content)  # the error is logged
-            self._changed.notify()
+            if not self._problem:
+                self._write_waiting()
 
     def forget(self, count: int, base: Base | None = None) -> None:
         """
@@ -81,10 +89,10 @@ class JournalWriter:
             self._forgotten += count
             if base is not None:
                 self._base, self._rebased = base, True
-            self._changed.notify()
+                self._changed.notify()
 
     def close(self, delete: bool = False) -> None:
-        """Write everything, or delete the journal, and unlock it."""
+        """Sync everything, or delete the journal, and unlock it."""
         with self._changed:
             self._closing, self._deleting = True, delete
             self._changed.notify()
@@ -93,83 +101,85 @@ class JournalWriter:
             self.path.unlink(missing_ok=True)
         os.close(self._file)
 
+    def _write_waiting(self) -> None:
+        """Write the places that wait; the lock is held."""
+        try:
+            _write(self._file, b''.join(self._waiting), self._size)
+        except OSError as error:
+            self._report(error)
+            return
+        for content in self._waiting:
+            self._size += len(content)
+            self._ends.append(self._size)
+        self._waiting.clear()
+        self._dirty, self._problem = True, False
+
     def _run(self) -> None:
-        synced = time.monotonic()
+        """Sync, and rewrite the file where needed, every second."""
         while True:
             with self._changed:
-                self._changed.wait_for(
-                    lambda: self._closing or (not self._problem and self._has_work()),
-                    SYNC_PERIOD if self._dirty or self._problem else None,
-                )
+                self._changed.wait_for(lambda: self._closing or self._rebased, SYNC_PERIOD)
+                if self._deleting:
+                    return
                 closing = self._closing
-            if self._deleting:
-                return
+                if self._waiting:
+                    self._write_waiting()
+                dirty, self._dirty = self._dirty, False
             try:
-                self._append_waiting()
-                self._rewrite_if_needed()
-                if self._dirty and (closing or time.monotonic() >= synced + SYNC_PERIOD):
+                if dirty:
                     os.fsync(self._file)
-                    self._dirty, synced = False, time.monotonic()
-                self._problem = False
-            except OSError as error:
-                self._report(error)
+                self._rewrite_if_needed()
+            except (OSError, OutputError) as error:
+                with self._changed:
+                    self._report(error)
+                    self._dirty = True
+                time.sleep(0 if closing else SYNC_PERIOD)
             if closing:
                 return
-
-    def _has_work(self) -> bool:
-        return bool(self._waiting) or self._rebased
-
-    def _append_waiting(self) -> None:
-        with self._changed:
-            waiting = self._waiting.copy()
-        if waiting:
-            _write(self._file, b''.join(waiting), self._size)
-            for content in waiting:
-                self._size += len(content)
-                self._ends.append(self._size)
-            self._dirty = True
-            with self._changed:
-                del self._waiting[: len(waiting)]
 
     def _rewrite_if_needed(self) -> None:
         """Make a new file of the places that are still needed, if the base changed or many go."""
         with self._changed:
             # some of the forgotten ones may still wait
             count, base, rebased = min(self._forgotten, len(self._ends)), self._base, self._rebased
-        begin = self._ends[count - 1] if count else self._start
-        gone = begin - self._start
-        if not rebased and gone <= max(SLACK, self._size // 2):
+            begin, end = self._ends[count - 1] if count else self._start, self._size
+        if not rebased and begin - self._start <= max(SLACK, end // 2):
             return
         content = header(base, self._template)
         temporary, file = create_temporary(self.path)
         try:
             _write(file, content, 0)
-            for at in range(begin, self._size, PIECE):
-                piece = os.pread(self._file, min(PIECE, self._size - at), at)
-                _write(file, piece, len(content) + at - begin)
+            moved = begin - len(content)
+            self._copy(file, begin, end, moved)
             os.fsync(file)
-            os.replace(temporary, self.path)
+            with self._changed:
+                self._copy(file, end, self._size, moved)  # places that came meanwhile
+                os.replace(temporary, self.path)
+                os.close(self._file)
+                self._file, self._dirty = file, True
+                self._ends = array('q', (end - moved for end in self._ends[count:]))
+                self._start, self._size = len(content), self._size - moved
+                self._forgotten -= count
+                self._rebased = self._base != base
         except BaseException:
             temporary.unlink(missing_ok=True)
             os.close(file)
             raise
-        os.close(self._file)
-        self._file, self._dirty = file, False
         sync_folder(self.path.parent)
-        moved = begin - len(content)
-        self._ends = array('q', (end - moved for end in self._ends[count:]))
-        self._start, self._size = len(content), self._size - moved
-        with self._changed:
-            self._forgotten -= count
-            self._rebased = self._rebased and self._base != base
 
-    def _report(self, error: OSError) -> None:
+    def _copy(self, file: int, begin: int, end: int, moved: int) -> None:
+        """Copy a part of this file to another, ``moved`` bytes nearer to its start."""
+        for at in range(begin, end, PIECE):
+            _write(file, os.pread(self._file, min(PIECE, end - at), at), at - moved)
+
+    def _report(self, error: Exception) -> None:
+        """Log an error, unless it lasts; the lock is held."""
         with suppress(OSError):
             os.ftruncate(self._file, self._size)  # a part of a place
         if not self._problem:
             self._log(
-                f'the journal {self.path} cannot be written ({error.strerror}): places since then '
-                'are in memory only; make room, or save the map elsewhere'
+                f'the journal {self.path} cannot be written ({error}): places since then are in '
+                'memory only; make room, or save the map elsewhere'
             )
         self._problem = True
 
