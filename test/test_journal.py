@@ -34,7 +34,7 @@ def start(target):
 
     def start(operation='mapping', loaded=None, **settings):
         def open_journal(base, template):
-            return JournalWriter(target, base, template, print)
+            return JournalWriter.create(target, base, template, print)
 
         started.append(Pipeline(settings_of(**settings), operation, open_journal))
         if loaded:
@@ -83,7 +83,7 @@ def places_of(place_map):
 @pytest.fixture
 def written(small_map, target):
     """Write a journal of a whole map; return its path."""
-    writer = JournalWriter(target, Base(), small_map, print)
+    writer = JournalWriter.create(target, Base(), small_map, print)
     for place in places_of(small_map):
         writer.append(place)
     writer.close()
@@ -138,7 +138,7 @@ def test_recover_file_that_is_no_journal_fails_and_keeps_it(content, tmp_path):
 
 def test_recover_what_is_no_file_or_in_use_fails(small_map, target, tmp_path):
     os.mkfifo(tmp_path / 'fifo')
-    writer = JournalWriter(target, Base(), small_map, print)
+    writer = JournalWriter.create(target, Base(), small_map, print)
     for path, text in (
         (tmp_path / 'missing', 'cannot be read'),
         (tmp_path / 'fifo', 'no regular file'),
@@ -320,7 +320,7 @@ target, output, case = sys.argv[1:]
 writers, unlimited = [], (resource.RLIM_INFINITY,) * 2
 
 def open_journal(base, template):
-    writers.append(JournalWriter(target, base, template, print))
+    writers.append(JournalWriter.create(target, base, template, print))
     return writers[0]
 
 pipeline = Pipeline(settings_of(), 'mapping', open_journal)

@@ -97,13 +97,14 @@ def frame(content: bytes) -> bytes:
     return _FRAME.pack(len(content), zlib.crc32(content)) + content
 
 
-def header(base: Base, template: bytes) -> bytes:
+def header(base: Base, template: bytes, source: str = '') -> bytes:
     """
     Return the two records that begin a journal.
 
     :param template: file of a map of one place, with the settings of the features.
+    :param source: of the places, so that only the same work is resumed.
     """
-    about = {'format': FORMAT, 'version': VERSION, 'base': asdict(base)}
+    about = {'format': FORMAT, 'version': VERSION, 'base': asdict(base), 'source': source}
     return frame(json.dumps(about).encode()) + frame(template)
 
 
@@ -123,8 +124,9 @@ class JournalReader:
     """
     A journal that no one writes; it stays locked until it is closed.
 
-    ``base`` is the map that it continues, ``template`` a map of one place with its settings,
-    ``size`` the number of bytes up to the end of the last whole record that was read.
+    ``base`` is the map that it continues, ``source`` what it was made of, ``template`` a map of
+    one place with its settings (``template_content`` its file), ``size`` the number of bytes up to
+    the end of the last whole record that was read.
 
     :raises JournalError: it cannot be read, or a living program writes it.
     """
@@ -144,6 +146,10 @@ class JournalReader:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close and unlock the journal."""
         self._file.close()
 
     def places(self) -> Iterator[JournalPlace]:
@@ -172,10 +178,11 @@ class JournalReader:
             about = json.loads(self._record() or b'')
             if about['format'] != FORMAT or about['version'] != VERSION:
                 raise ValueError('another format or version')
-            base = Base(**about['base'])
+            base, self.source = Base(**about['base']), str(about['source'])
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder, 'template')
-                path.write_bytes(self._record() or b'')
+                self.template_content = self._record() or b''
+                path.write_bytes(self.template_content)
                 return base, load_map(path)
         except (ValueError, KeyError, TypeError, StavprError) as error:
             raise JournalError(

@@ -3,7 +3,7 @@
 """Writing the journal of a recorded map, on a thread of its own."""
 
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 import fcntl
 import os
@@ -17,6 +17,7 @@ from stavpr_ros.mapping.journal import (
     frame,
     header,
     JournalPlace,
+    JournalReader,
     map_bytes,
     numbered,
     SUFFIX,
@@ -32,36 +33,32 @@ PIECE = 2**20  # bytes copied at a time
 
 class JournalWriter:
     """
-    Appends places to a new journal; an error of the disk does not stop the recording.
+    Appends places to a journal; an error of the disk does not stop the recording.
 
     Places are written at once, and synced every second by another thread. While the disk is full
     they wait, and are written when there is room again. All calls must come from one thread.
 
-    :param target: file that the map will be saved to; the journal is beside it, ``path``.
-    :param base: the map that the places continue.
-    :param template: a map of one place with the settings of the features.
+    :param path: of the journal; ``file`` its descriptor, locked, ``ends`` the end of each place.
+    :param start: size of its header, which ``base``, ``template`` and ``source`` are in, see
+        :func:`stavpr_ros.mapping.journal.header`.
     :param log: called with an error, once.
-    :raises JournalError: it cannot be created.
     """
 
     def __init__(
-        self, target: str | Path, base: Base, template: PlaceMap, log: Callable[[str], object]
+        self,
+        path: Path,
+        file: int,
+        start: int,
+        ends: Iterable[int],
+        base: Base,
+        template: bytes,
+        source: str,
+        log: Callable[[str], object],
     ) -> None:
-        self._base, self._log = base, log
-        try:
-            self._template = map_bytes(template)
-            content = header(base, self._template)
-            self.path, self._file = _create(Path(target))
-            _write(self._file, content, 0)
-            os.fsync(self._file)
-            sync_folder(self.path.parent)
-        except (OSError, OutputError) as error:
-            raise JournalError(
-                f'no journal can be written beside {target} ({error}): make room, or set another '
-                'save_path'
-            ) from error
-        self._size = self._start = len(content)
-        self._ends = array('q')  # of each place in the file
+        self.path, self._file, self._start = path, file, start
+        self._ends = array('q', ends)
+        self._size = self._ends[-1] if self._ends else start
+        self._base, self._template, self._source, self._log = base, template, source, log
         self._waiting: list[bytes] = []
         self._forgotten = 0  # of the places in the file and of those that wait
         self._dirty = self._problem = False
@@ -69,6 +66,73 @@ class JournalWriter:
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name='journal', daemon=True)
         self._thread.start()
+
+    @classmethod
+    def create(
+        cls,
+        target: str | Path,
+        base: Base,
+        template: PlaceMap,
+        log: Callable[[str], object],
+        source: str = '',
+    ) -> 'JournalWriter':
+        """
+        Begin a journal.
+
+        :param target: file that the map will be saved to; the journal is beside it.
+        :param base: the map that the places continue.
+        :param template: a map of one place with the settings of the features.
+        :raises JournalError: it cannot be created.
+        """
+        try:
+            content = map_bytes(template)
+            begin = header(base, content, source)
+            path, file = _create(Path(target))
+            _write(file, begin, 0)
+            os.fsync(file)
+            sync_folder(path.parent)
+        except (OSError, OutputError) as error:
+            raise JournalError(
+                f'no journal can be written beside {target} ({error}): make room, or set another '
+                'save_path'
+            ) from error
+        return cls(path, file, len(begin), (), base, content, source, log)
+
+    @classmethod
+    def resume(
+        cls, reader: JournalReader, log: Callable[[str], object]
+    ) -> tuple['JournalWriter', int]:
+        """
+        Continue a journal behind its last whole place.
+
+        :param reader: of the journal; it is closed.
+        :returns: the writer, and the number of that place, -1 = none.
+        """
+        start, last, ends = reader.size, -1, array('q')
+        for place in reader.places():
+            ends.append(reader.size)
+            last = place.number
+        size = ends[-1] if ends else start
+        file = os.open(reader.path, os.O_RDWR | os.O_CLOEXEC)
+        reader.close()
+        fcntl.flock(file, fcntl.LOCK_EX)
+        os.ftruncate(file, size)
+        made = cls(
+            reader.path,
+            file,
+            start,
+            ends,
+            reader.base,
+            reader.template_content,
+            reader.source,
+            log,
+        )
+        return made, last
+
+    @property
+    def failed(self) -> bool:
+        """The disk is full: the last places are in memory only."""
+        return self._problem
 
     def append(self, place: JournalPlace) -> None:
         """Add a place: it is in the file when this returns, and synced a second later."""
@@ -145,7 +209,7 @@ class JournalWriter:
             begin, end = self._ends[count - 1] if count else self._start, self._size
         if not rebased and begin - self._start <= max(SLACK, end // 2):
             return
-        content = header(base, self._template)
+        content = header(base, self._template, self._source)
         temporary, file = create_temporary(self.path)
         try:
             _write(file, content, 0)

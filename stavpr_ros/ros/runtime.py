@@ -106,7 +106,7 @@ class Runtime:
         """Open the journal of the first unsaved place; None, and an error, if it is impossible."""
         log = self._node.get_logger()
         try:
-            return JournalWriter(self._journaled, base, template, log.error)
+            return JournalWriter.create(self._journaled, base, template, log.error)
         except JournalError as error:
             log.error(f'recorded places are in memory only: {error}')
             return None
