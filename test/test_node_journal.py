@@ -124,7 +124,7 @@ def recording(robot, tmp_path):
         given = PARAMETERS | {'operation': 'mapping', 'queue_size': 1000} | files
         words = [word for name, value in given.items() for word in ('-p', f'{name}:={value}')]
         started.append(Process(tmp_path / 'log', 'node', '--ros-args', *words))
-        # a killed node stays in the graph for a while: the log tells the new one
+        # a killed node stays in the graph for a while: wait for the log of the new one
         robot.until(lambda: 'backend' in started[-1].output(), 'the node')
         robot.wait_for_node()
         return started[-1]
