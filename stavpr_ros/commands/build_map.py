@@ -263,7 +263,7 @@ def main(args: list[str] | None = None) -> int:
 
         state = 'nothing was written; the same command continues the work'
         place_map, journal = _build(arguments)
-        save_map(place_map, arguments.output, arguments.force)
+        save_map(place_map, arguments.output, force=arguments.force)
         journal.unlink()
         state = f'{arguments.output} is written, without a suggested threshold'
         _report(place_map, arguments.output)

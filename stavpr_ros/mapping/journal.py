@@ -334,7 +334,8 @@ def _save_beside(place_map: PlaceMap, target: Path) -> Path:
     for path in numbered(target):
         version = FileVersion.of(path)
         try:
-            save_map(place_map, path, version if _begins(path, place_map) and version else False)
+            force = version if version and _begins(path, place_map) else False
+            save_map(place_map, path, force=force)
             return path
         except OutputTakenError:
             continue

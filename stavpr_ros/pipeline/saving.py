@@ -25,7 +25,7 @@ def write_map(pipeline: Pipeline, on_worker: OnWorker, path: str, overwrite: For
     """
     require_replaceable(path, MAP, overwrite)  # before places are copied
     snapshot = on_worker(pipeline.snapshot)
-    save_map(snapshot.places, path, overwrite)
+    save_map(snapshot.places, path, force=overwrite)
     on_worker(lambda: snapshot.mark_saved(path))
     return len(snapshot.places)
 
