@@ -80,8 +80,8 @@ def test_build_journal_of_another_work_is_refused(frames, tmp_path):
 
 
 def test_build_journal_memory_does_not_grow_with_the_places(tmp_path):
-    """Places of 57 kB, 172 MB in all."""
-    n, d, memory = 3000, 2048, []
+    """Places of 6 kB, 126 MB in all."""
+    n, d, memory = 20_000, 224, []
     image = np.zeros((96, 128, 3), np.uint8)
 
     def anonymous():
@@ -90,7 +90,7 @@ def test_build_journal_memory_does_not_grow_with_the_places(tmp_path):
 
     def frames():
         for i in range(n):
-            if i % 100 == 0:
+            if i % 1000 == 0:
                 memory.append(anonymous())
             yield Frame(image, i, f'{i}')
 
@@ -98,7 +98,7 @@ def test_build_journal_memory_does_not_grow_with_the_places(tmp_path):
         def extract(self, images):
             strips = torch.full((7, len(images), d), d**-0.5)
             weights = torch.full((7, len(images)), 7**-0.5)
-            return LocalFeatures(strips, weights, EXTRACTOR.settings)
+            return LocalFeatures(strips, weights, EXTRACTOR.settings, (14, 2))
 
     extractor = Extractor(settings=EXTRACTOR.settings, projection=None)
     journal = build_journal(frames(), extractor, tmp_path / 'x', 'drive', progress=False)
