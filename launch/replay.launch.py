@@ -61,5 +61,4 @@ def generate_launch_description() -> LaunchDescription:
             description='shut down the node after the replay',
         ),
     ]
-    described = node_launch(OpaqueFunction(function=_replay))
-    return LaunchDescription([*own, *described.entities])
+    return node_launch(*own, OpaqueFunction(function=_replay))

@@ -66,8 +66,9 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'map_path',
             '',
-            'Map file made by build_map or save_map. Without one, localization waits for the '
-            'service ~/load_map, and mapping starts a new map.',
+            'Map file made by build_map or save_map; ~ is the home folder, a relative path is in '
+            'the working directory. Without one, localization waits for the service '
+            '~/load_map, and mapping starts a new map.',
         ),
         NodeParameter(
             'save_path',
@@ -297,6 +298,12 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         ),
     ),
     'Output': (
+        NodeParameter(
+            'robot_id',
+            '',
+            'Name of the robot, copied into the messages and the diagnostics, for systems of '
+            'several robots.',
+        ),
         NodeParameter('map_frame', 'map', 'Frame of the poses of the map, for ~/pose.'),
         NodeParameter(
             'diagnostics_period', 1.0, 'Period of the diagnostics.', 's', 'start', (0.1, 60.0)

@@ -172,7 +172,7 @@ class Robot:
         """
         self.stamp += SECOND
         header, half = Header(frame_id='wheels', stamp=self.time()), np.radians(degrees) / 2
-        odometry = Odometry(header=header)
+        odometry = Odometry(header=header, child_frame_id='base')
         odometry.pose.pose.position.x = float(x)
         orientation = odometry.pose.pose.orientation
         orientation.z, orientation.w = float(np.sin(half)), float(np.cos(half))

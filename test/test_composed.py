@@ -16,6 +16,7 @@ from rclpy.parameter import Parameter
 from robot import image_message, PARAMETERS, parameters_of, RELIABLE
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import load_map
 from stavpr_ros.ros.node import PlaceRecognitionNode
 from stavpr_ros.threads import limit_threads
@@ -116,6 +117,30 @@ def test_shutdown_of_ros_before_the_node_saves_the_map(make, context, route, tmp
     node.destroy_node()
     assert 0 < len(load_map(path)) <= 20
     assert not [thread for thread in threading.enumerate() if thread.name == 'recognition']
+
+
+def test_integer_where_a_number_is_expected_is_converted(make):
+    """As in `threshold: 1` of a parameter file, and in `ros2 param set NODE threshold 1`."""
+    node = make(mode='paper', threshold=1)
+    assert repr(node.settings.pipeline.threshold) == '1.0'
+    assert set_parameter(node, 'threshold', 2).successful
+    assert repr(node.get_parameter('threshold').value) == '2.0'
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'expected'),
+    [
+        ('threshold', 'high', "threshold = 'high' has the wrong type: expected a number"),
+        ('queue_size', 4.5, 'queue_size = 4.5 has the wrong type: expected an integer'),
+        ('vertical', 1, 'vertical = 1 has the wrong type: expected true or false'),
+        ('robot_id', 2, 'robot_id = 2 has the wrong type: expected text'),
+    ],
+)
+def test_parameter_of_the_wrong_type_is_rejected_by_name(make, name, value, expected):
+    with pytest.raises(SettingsError, match=expected):
+        make(**{name: value})
+    result = set_parameter(make(), name, value)
+    assert (result.successful, expected in result.reason) == (False, True)
 
 
 def test_parameters_that_are_rejected_change_nothing(make, map_file):

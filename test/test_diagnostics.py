@@ -40,6 +40,7 @@ COUNTS = ImageCounts(
 SETTINGS = {row.name: row.default for row in PARAMETERS} | {'backend': 'cpu'}
 HEALTH = Health(
     state='active',
+    hardware_id='r2 /camera',
     settings=node_settings(SETTINGS),
     counts=COUNTS,
     map_info=MapInfo(path='route.map', state='loaded', places=1000, features='gradient'),
@@ -92,7 +93,7 @@ def test_array_is_stamped_named_and_serializable():
     array = diagnostic_array(HEALTH, '/robot/stavpr', Time(sec=7, nanosec=8))
     assert (array.header.stamp.sec, array.header.stamp.nanosec) == (7, 8)
     assert [s.name for s in array.status] == [f'robot/stavpr: {part}' for part in PARTS]
-    assert {s.hardware_id for s in array.status} == {'CPU'}
+    assert {s.hardware_id for s in array.status} == {'r2 /camera'}
     assert deserialize_message(serialize_message(array), DiagnosticArray) == array
 
 
@@ -200,12 +201,13 @@ CASES = {
         (
             WARN,
             f'odometry, required by a parameter, was never received: {ODOMETRY}',
-            {'odometry': 'never'},
+            {'odometry': 'never', 'keyframe_distance': 1.0},
         ),
+        (OK, STEADY, {'odometry': 'never', 'operation': 'mapping'}),
         (
             WARN,
             f'odometry, required by a parameter, has stopped: {ODOMETRY}',
-            {'odometry': 'stale'},
+            {'odometry': 'stale', 'keyframe_distance': 1.0},
         ),
         (OK, STEADY, {'odometry': 'fresh'}),
         (
@@ -313,7 +315,8 @@ def test_input_without_a_valid_image_is_an_error(other):
 
 def test_input_with_several_faults_lists_the_worst_first():
     drops = {'lost in transport': 1, 'invalid: size': 2}
-    found, _ = status('input', recent_drops=drops, recent_statuses={}, odometry='stale')
+    changes = {'odometry': 'stale', 'keyframe_distance': 1.0}
+    found, _ = status('input', recent_drops=drops, recent_statuses={}, **changes)
     assert found.level == ERROR
     assert [text.split()[0] for text in found.message.split('; ')] == ['all', '1', 'odometry,']
 
@@ -322,6 +325,74 @@ def test_recognition_counts_only_matches_and_rejections():
     statuses = {'match': 1, 'no match': 1, 'skipped': 90, 'warming up': 8}
     found, _ = status('recognition', recent_statuses=statuses)
     assert found.message.startswith('1 of 2 images matched')
+
+
+@pytest.mark.parametrize(
+    ('changes', 'value'),
+    [
+        ({}, 'not needed'),
+        ({'odometry': 'fresh', 'operation': 'mapping'}, 'fresh, optional'),
+        ({'odometry': 'stale', 'keyframe_angle': 1.0}, 'stale'),
+    ],
+)
+def test_value_of_odometry_states_whether_it_is_used(changes, value):
+    assert values('input', **changes)['odometry'] == value
+
+
+@pytest.mark.parametrize(
+    ('part', 'changes', 'message'),
+    [
+        ('input', {'contrast': 1.25}, 'the images show nothing (standard deviation 1.2 of 255): '),
+        (
+            'input',
+            {'odometry': 'never', 'operation': 'mapping', 'odometry_fault': 'remap odom'},
+            'odometry, for poses of the map, was never received: remap odom',
+        ),
+        (
+            'input',
+            {'odometry': 'stale', 'keyframe_distance': 1.0, 'odometry_fault': 'remap odom'},
+            'odometry, required by a parameter, has stopped: remap odom',
+        ),
+        ('recognition', {'places': 19}, 'the map has fewer places (19) than a window has images '),
+        (
+            'recognition',
+            {'statuses': {'no match': 100}, 'nearest': 0.75},
+            'none of 100 images was ever matched, the best had probability 0.250: compare the '
+            'route, the direction and the keyframe rules with those of the map, or lower '
+            'min_probability (0.5)',
+        ),
+        (
+            'recognition',
+            {'mode': 'paper', 'threshold': 0.125, 'nearest': 0.5, 'statuses': {'no match': 100}},
+            'none of 100 images was ever matched, the best had distance 0.500: compare the '
+            'route, the direction and the keyframe rules with those of the map, or raise '
+            'threshold (0.125)',
+        ),
+        (
+            'recognition',
+            {'statuses': {'no match': 100}, 'nearest': 0.25},
+            'none of 100 images was ever matched: the geometric check rejects all, ',
+        ),
+    ],
+)
+def test_faults_of_the_setup_are_warnings_with_a_remedy(part, changes, message):
+    found, others = status(part, **changes)
+    assert (found.level, found.message[: len(message)]) == (WARN, message)
+    assert set(others.values()) == {OK}
+
+
+@pytest.mark.parametrize(
+    ('part', 'changes'),
+    [
+        ('input', {'contrast': 3.0}),
+        ('input', {'contrast': 1.0, 'rate_in': 0.0}),
+        ('recognition', {'places': 20}),
+        ('recognition', {'statuses': {'no match': 99}}),
+        ('recognition', {'statuses': {'no match': 1000}, 'operation': 'loop_closure'}),
+    ],
+)
+def test_setups_that_may_work_are_no_fault(part, changes):
+    assert status(part, **changes)[0].level == OK
 
 
 def test_values_of_input_are_complete():

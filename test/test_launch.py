@@ -10,6 +10,7 @@ it runs one of the files as well.
 import ast
 import importlib.util
 from pathlib import Path
+import re
 import subprocess
 import sys
 from types import ModuleType, SimpleNamespace
@@ -24,14 +25,23 @@ from stavpr_ros.parameters import BY_NAME
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
 NAMES = [path.name.partition('.')[0] for path in FILES]
-OPERATIONS = {'stavpr': None, 'replay': None, 'mapping': 'mapping', 'loop_closure': 'loop_closure'}
+FIXED = {
+    'stavpr': {},
+    'replay': {},
+    'mapping': {'operation': 'mapping'},
+    'loop_closure': {'operation': 'loop_closure'},
+    'multi_camera': {},
+    'nav2': {'autostart': False},
+}
+GIVEN = {'cameras': 'front'}  # required arguments
+TEXTS = {bool: ('true', True), int: ('3', 3), float: ('1', 1.0), str: ('2', '2')}
 
 
 class Recorded:
     """An action or substitution that keeps its arguments."""
 
     def __init__(self, *positional, **named):
-        self.first = self.entities = positional[0] if positional else None
+        self.first = self.entities = self.name = positional[0] if positional else None
         self.__dict__.update(named)
 
     def perform(self, context):
@@ -56,6 +66,13 @@ STAND_INS = (
     'launch_ros.parameter_descriptions',
     'launch_ros.substitutions',
 )
+
+
+class Context(dict):
+    """Launch configurations, and the file that is launched."""
+
+    def get_locals_as_dict(self):
+        return {'current_launch_file_path': '/launch/file.launch.py'}
 
 
 def describe(path):
@@ -83,10 +100,11 @@ def load(monkeypatch):
         assert len(arguments) == len(declared)
 
         def start(**given):
-            context = {n: getattr(a, 'default_value', None) for n, a in arguments.items()} | given
-            return [node for e in those('OpaqueFunction') for node in e.function(context)]
+            defaults = {n: getattr(a, 'default_value', None) for n, a in arguments.items()}
+            context = Context(defaults | GIVEN | given)
+            return [node for e in those('OpaqueFunction') for node in e.function(context) or ()]
 
-        return SimpleNamespace(arguments=arguments, start=start)
+        return SimpleNamespace(arguments=arguments, start=start, nodes=those('Node'))
 
     yield load_by_name
     sys.modules.pop('stavpr_ros.ros.launching', None)
@@ -100,7 +118,7 @@ def words(value):
 
 
 def test_launch_files_are_all_installed():
-    assert sorted(OPERATIONS) == NAMES
+    assert sorted(FIXED) == NAMES
     folder = Path(get_package_share_directory('stavpr_ros')) / 'launch'
     for path in FILES:
         assert (folder / path.name).read_text() == path.read_text()
@@ -113,43 +131,92 @@ def test_launching_imports_nothing_heavy():
     modules |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
     own = {name for name in modules if name.startswith('stavpr_ros')}
     assert own == {'stavpr_ros.parameters'}  # see test_parameters
-    assert {name.partition('.')[0] for name in modules - own} == {'typing', 'launch', 'launch_ros'}
+    foreign = {name.partition('.')[0] for name in modules - own}
+    assert foreign - set(sys.stdlib_module_names) == {'launch', 'launch_ros'}
 
 
 @pytest.mark.parametrize('name', NAMES)
 def test_launch_file_has_an_argument_for_every_parameter(load, name):
     """Everything is given at once: names and types are those of the table."""
-    launch = load(name)
-    fixed = {'operation'} if OPERATIONS[name] else set()
+    launch, fixed = load(name), FIXED[name]
     common = {'image', 'odom', 'namespace', 'params_file', 'use_sim_time'}
-    own = {'bag', 'topic', 'rate', 'lossless', 'shutdown'} if name == 'replay' else set()
-    assert set(launch.arguments) == (set(BY_NAME) - fixed) | common | own
+    own = {'replay': {'bag', 'topic', 'rate', 'lossless', 'shutdown'}, 'multi_camera': {'cameras'}}
+    expected = (set(BY_NAME) - set(fixed)) | common | own.get(name, set())
+    assert set(launch.arguments) == expected
     for argument in launch.arguments.values():
         assert len(argument.description) > 10
-        assert hasattr(argument, 'default_value') or argument.first == 'bag'
-    parameters = launch.start(**dict.fromkeys(launch.arguments, 'true'))[0].parameters[1]
-    assert set(parameters) == set(BY_NAME) | {'use_sim_time'}
-    assert parameters.pop('use_sim_time').value_type is bool
+        assert hasattr(argument, 'default_value') or argument.first in ('bag', 'cameras')
+    types = {row.name: type(row.default) for row in BY_NAME.values()} | {'use_sim_time': bool}
+    given = {n: TEXTS[kind][0] for n, kind in types.items() if n not in fixed}
+    parameters = launch.start(**given)[0].parameters[1]
+    assert set(parameters) == set(types)
     for parameter, value in parameters.items():
         if parameter in fixed:
-            assert value == OPERATIONS[name]
+            assert value == fixed[parameter]
         else:
-            assert value.value_type is type(BY_NAME[parameter].default)
-            assert words(value.first) == f'${{{parameter}}}'
+            kind = types[parameter]
+            assert (repr(value.first), value.value_type) == (repr(TEXTS[kind][1]), kind)
 
 
 @pytest.mark.parametrize('name', NAMES)
 def test_launch_file_leaves_empty_arguments_to_the_parameter_file(load, name):
     node = load(name).start()[0]
-    fixed = {} if OPERATIONS[name] is None else {'operation': OPERATIONS[name]}
     assert words(node.parameters[0]) == '${params_file}'
-    assert node.parameters[1:] == [fixed]
+    assert node.parameters[1:] == [FIXED[name]]
     assert Path(executable(node.executable)).exists()
     assert (node.package, node.name) == ('stavpr_ros', 'stavpr')
-    assert words(node.namespace) == '${namespace}'
+    assert words(node.namespace) == '${namespace}' + '/front' * (name == 'multi_camera')
     topics = {topic: words(to) for topic, to in node.remappings}
     expected = {'image': '${image}', 'image/compressed': '${image}/compressed', 'odom': '${odom}'}
     assert topics == expected
+
+
+def test_launch_of_cameras_starts_a_node_for_each_with_its_name_in_paths(load):
+    nodes = load('multi_camera').start(cameras='front, rear', map_path='maps/{camera}.stavpr')
+    assert [words(node.namespace) for node in nodes] == ['${namespace}/front', '${namespace}/rear']
+    paths = [node.parameters[1]['map_path'].first for node in nodes]
+    assert paths == ['maps/front.stavpr', 'maps/rear.stavpr']
+
+
+def test_launch_for_nav2_has_a_manager_without_bond(load):
+    (manager,) = load('nav2').nodes
+    assert manager.package == 'nav2_lifecycle_manager'
+    assert manager.parameters == [
+        {'autostart': True, 'node_names': ['stavpr'], 'bond_timeout': 0.0}
+    ]
+    assert words(manager.namespace) == '${namespace}'
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'expected'),
+    [
+        ('threshold', 'high', "threshold = 'high': expected a number"),
+        ('queue_size', '4.5', "queue_size = '4.5': expected an integer"),
+        ('autostart', 'yes', "autostart = 'yes': expected true or false"),
+    ],
+)
+def test_launch_argument_of_the_wrong_type_is_rejected_by_name(load, name, value, expected):
+    with pytest.raises(RuntimeError, match=re.escape(expected)):
+        load('stavpr').start(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'expected'),
+    [
+        (['max_rat:=3', 'image:=/camera'], "argument 'max_rat' is unknown: did you mean max_rate"),
+        (['camera_topic:=/c'], "argument 'camera_topic' is unknown: see the option --show-args"),
+    ],
+)
+@pytest.mark.parametrize('file', [['stavpr_ros', 'x.launch.py'], ['/launch/file.launch.py']])
+def test_launch_argument_that_is_unknown_is_rejected(load, monkeypatch, file, arguments, expected):
+    monkeypatch.setattr(sys, 'argv', ['ros2', 'launch', *file, *arguments])
+    with pytest.raises(RuntimeError, match=re.escape(expected)):
+        load('stavpr').start()
+
+
+def test_launch_included_in_another_file_accepts_the_arguments_of_that(load, monkeypatch):
+    monkeypatch.setattr(sys, 'argv', ['ros2', 'launch', 'my_robot', 'robot.launch.py', 'lidar:=1'])
+    assert load('stavpr').start()
 
 
 def test_launch_of_replay_passes_its_options(load):
@@ -165,6 +232,15 @@ def test_launch_of_replay_passes_its_options(load):
     assert type(replay.on_exit[0]).__name__ == 'Shutdown'
     _, replay = launch.start(bag='drive', rate='2')
     assert [words(word) for word in replay.arguments] == ['${bag}', '--rate', '${rate}']
+
+
+def test_documented_launch_arguments_exist(load):
+    pages = [ROOT / 'README.md', *(ROOT / 'docs').glob('*.md')]
+    text = ' '.join(page.read_text() for page in pages).replace('\\\n', ' ')
+    found = re.findall(r'^ros2 launch stavpr_ros (\w+)\.launch\.py(.*)', text, re.M)
+    assert {'stavpr', 'replay', 'multi_camera', 'nav2'} <= {name for name, _ in found}
+    for name, given in found:
+        assert set(re.findall(r'(\w+):=', given)) <= set(load(name).arguments), (name, given)
 
 
 RUN = """

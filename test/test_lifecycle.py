@@ -60,7 +60,8 @@ def test_node_through_all_states_behaves_as_each_state(robot, node, map_file, ro
     assert 'in the window' in robot.refuses(Relocalize, 'relocalize')
     robot.until_diagnosed('processing', DiagnosticStatus.OK, 'inactive: no image is processed')
 
-    for first in (10, 20):  # both times with an empty window
+    received = []
+    for first in (10, 20):  # both times with an empty window, counts go on
         assert robot.transition('activate')
         assert robot.state() == 'active'
         robot.wait_for_node()
@@ -68,6 +69,7 @@ def test_node_through_all_states_behaves_as_each_state(robot, node, map_file, ro
         match = robot.show(route[first + LENGTH - 1])
         assert (match.status, match.newest_index) == (PlaceMatch.MATCH, first + LENGTH - 1)
         robot.until_diagnosed('processing', DiagnosticStatus.OK, 'ms an image')
+        received.append(int(robot.counts('input')['received']))
 
         assert robot.transition('deactivate')
         assert robot.state() == 'inactive'
@@ -77,6 +79,7 @@ def test_node_through_all_states_behaves_as_each_state(robot, node, map_file, ro
         assert robot.does(Relocalize, 'relocalize')  # the window is kept
         assert len(robot.answers) == before
 
+    assert received[1] >= received[0] + LENGTH
     assert robot.transition('cleanup')
     assert robot.state() == 'unconfigured'
     robot.until_map(state='none', places=0)

@@ -8,6 +8,7 @@ import io
 import json
 import os
 import pickle
+import re
 import threading
 import zipfile
 
@@ -58,6 +59,17 @@ def partial_map(small_map):
     poses[[0, 7]] = np.nan
     thumbnails = (b'', *small_map.thumbnails[1:])
     return dataclasses.replace(small_map, poses=poses, thumbnails=thumbnails)
+
+
+def test_map_id_depends_on_the_content_alone(partial_map, tmp_path):
+    moved = dataclasses.replace(partial_map, stamps=partial_map.stamps + 1)
+    ids = []
+    for name, place_map in (('a', partial_map), ('b', partial_map), ('c', moved)):
+        save_map(place_map, tmp_path / name)
+        ids.append(load_map(tmp_path / name).map_id)
+    assert re.fullmatch('[0-9a-f]{16}', ids[0])
+    assert ids[0] == ids[1] != ids[2]
+    assert partial_map.map_id == ''
 
 
 @pytest.fixture

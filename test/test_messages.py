@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of matches, field by field, and drawn images; no node that spins."""
 
+from dataclasses import replace
 import math
 
 from builtin_interfaces.msg import Time
@@ -26,6 +27,7 @@ from stavpr_ros.ros.output import (
     matched_pose_message,
     nanoseconds,
     pose_message,
+    PoseFrames,
     time_message,
 )
 from stavpr_ros.ros.subscriptions import odometry_pose
@@ -75,7 +77,7 @@ BLANK = (
     | dict.fromkeys(('distance', 'probability', 'second_best_distance'), math.nan)
     | dict.fromkeys(('window_first', 'window_middle', 'window_last'), HEADER.stamp)
     | dict.fromkeys(('place_stamp', 'newest_stamp'), Time())
-    | dict.fromkeys(('place_id', 'newest_id'), '')
+    | dict.fromkeys(('place_id', 'newest_id', 'robot_id', 'map_id', 'session'), '')
     | {'threshold': 0.3, 'header': HEADER, 'path': []}
 )
 
@@ -144,6 +146,20 @@ def test_match_message_of_a_match(places):
          place_id='id 32', newest_id='id 35', inliers=40)  # fmt: skip
 
 
+def test_messages_of_a_map_name_the_robot_and_the_map(small_map):
+    stored = replace(small_map, map_id='0123456789abcdef')
+    match = accepted(candidates=(Candidate(32, 0.25),))
+    info = map_info_message('mapping', 'full', 'a', stored, None, Time(), 'r2')
+    for message in (
+        match_message(HEADER, match, stored, 'r2'),
+        candidates_message(HEADER, match, stored, 'r2'),
+        loop_closure_message(HEADER, replace(match, image_index=44), stored, 'r2'),
+        info,
+    ):
+        assert (message.robot_id, message.map_id) == ('r2', '0123456789abcdef')
+    assert (list(info.sessions), info.feature_version) == ([], 0)
+
+
 def test_match_message_of_mode_robust_has_the_probability(places):
     message = match_message(HEADER, rejected(relative=True, probability=0.75), places)
     same(message, **SEQUENCE, status=PlaceMatch.NO_MATCH, reason='too far', path=path_of(message),
@@ -177,7 +193,7 @@ def test_candidates_message_lists_places(places, relative, probabilities):
 def test_loop_closure_message_of_a_match(places, first_image, has_poses):
     """The middle of the window is image first + 2; image 41 has no pose."""
     match = accepted(image_index=first_image + 4, inliers=9, probability=0.75)
-    message = loop_closure_message(HEADER, match, places)
+    message = loop_closure_message(HEADER, match, places, 'r2', PoseFrames('odom', 'base'))
     pairs = [(first_image + q, m) for q, m in PATH.tolist()]
     assert [(pair.query_index, pair.place_index) for pair in message.pairs] == pairs
     stamps = [(pair.query_stamp, pair.place_stamp) for pair in message.pairs]
@@ -186,9 +202,10 @@ def test_loop_closure_message_of_a_match(places, first_image, has_poses):
     expected = LoopClosure(
         header=HEADER, query_index=query, query_stamp=Time(sec=query + 1), place_index=32,
         place_stamp=Time(sec=33), has_poses=has_poses, distance=0.25, threshold=message.threshold,
-        probability=0.75, inliers=9, pairs=message.pairs,
+        probability=0.75, inliers=9, pairs=message.pairs, robot_id='r2',
     )  # fmt: skip
     if has_poses:
+        expected.pose_frame, expected.pose_child_frame = 'odom', 'base'
         expected.query_pose = pose_message(np.array([query, query**2, 0, 0, 0, 0, 1]))
         expected.place_pose = pose_message(np.array([32, 32**2, 0, 0, 0, 0, 1]))
     assert message == expected

@@ -8,6 +8,7 @@ from builtin_interfaces.msg import Time
 import cv2
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
+import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile, ReliabilityPolicy
 from robot import image_message, RELIABLE, SECOND
@@ -89,6 +90,23 @@ def test_keyframes_by_distance_and_angle_use_odometry(robot, start, route):
     assert robot.show(route[8]).status == WARMING_UP
     robot.until(lambda: not robot.odometry.get_subscription_count(), 'the end of odometry')
     assert robot.counts('input')['odometry'] == 'not needed'
+
+
+def test_wrongly_remapped_odometry_and_a_covered_lens_are_diagnosed(robot, start, publish, route):
+    """The topic with odometry is named; a topic of another type too."""
+    start('-r', 'odom:=/wheel', keyframe_distance=1.0)
+    found = 'nothing is published on /wheel, odometry is on /odom: remap odom'
+    robot.until_diagnosed('input', WARN, found)
+    publish(Image, '/wheel')
+    robot.until_diagnosed('input', WARN, 'sensor_msgs/msg/Image is published on /wheel, odometry')
+    robot.set(keyframe_distance=0.0)
+    robot.show(np.full_like(route[0], 200))
+    robot.until_diagnosed('input', WARN, 'the images show nothing (standard deviation 0.0 of 255)')
+    robot.show(route[0])
+    robot.until(
+        lambda: 'show nothing' not in robot.diagnostics['input'].message,
+        'images that show a place',
+    )
 
 
 def test_compressed_images_on_a_remapped_topic_are_recognized(robot, start, publish, route):

@@ -72,6 +72,7 @@ def test_loop_closures_of_the_node_are_those_of_the_library(robot, laps, tmp_pat
             assert pair.place_stamp.sec == stamps[pair.place_index] // SECOND
         assert closure.has_poses == (not set(places) & set(BLIND))
         if closure.has_poses:
+            assert (closure.pose_frame, closure.pose_child_frame) == ('wheels', 'base')
             x = closure.query_pose.position.x, closure.place_pose.position.x
             assert x == pytest.approx([x_of(place) for place in places])
     assert len(closures) == closed >= IMAGES - LAP - 2 * LENGTH

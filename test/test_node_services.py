@@ -126,6 +126,12 @@ def test_services_without_a_map_return_the_reason(robot, start, route, map_file,
     ):
         assert words in robot.refuses(kind, name, **fields)
         robot.until_logged(f'{name} failed: ')
+    match = robot.call(Relocalize, 'relocalize').match
+    indices = 'place_index', 'newest_index', 'sequence_middle', 'second_best_index', 'inliers'
+    assert {getattr(match, name) for name in indices} == {-1}
+    assert (match.status, 'no map' in match.reason) == (PlaceMatch.NOT_READY, True)
+    logged = [line for line in robot.log if 'relocalize failed' in line]
+    assert len(logged) == 1, logged
     assert robot.does(Trigger, 'reset').message
     assert list(tmp_path.iterdir()) == []
     assert robot.does(LoadMap, 'load_map', path=map_file).map.places == 60

@@ -9,10 +9,16 @@ from parameter_files import configuration_yaml, documentation_markdown
 import pytest
 from stavpr_ros.alignment.settings import STRATEGIES
 from stavpr_ros.devices import BACKENDS
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import MapFileError, SettingsError
 from stavpr_ros.features.registry import KINDS
 from stavpr_ros.parameters import BASIC, BY_NAME, GROUPS, PARAMETERS
-from stavpr_ros.pipeline import node_settings, NodeSettings, OPERATIONS, PipelineSettings
+from stavpr_ros.pipeline import (
+    node_settings,
+    NodeSettings,
+    OPERATIONS,
+    PipelineSettings,
+    read_map,
+)
 from stavpr_ros.recognition.matcher import PRECISIONS
 from stavpr_ros.recognition.robust import MODES
 from stavpr_ros.recognition.verification import METHODS
@@ -127,6 +133,48 @@ def test_invalid_values_are_rejected_by_name(values, words, monkeypatch):
     monkeypatch.setattr('stavpr_ros.pipeline.settings.choose_backend', lambda backend: backend)
     with pytest.raises(SettingsError, match=words):
         node_settings(DEFAULTS | values)
+
+
+def test_paths_are_absolute_and_expanded(monkeypatch, tmp_path):
+    monkeypatch.setenv('HOME', '/home/robot')
+    monkeypatch.chdir(tmp_path)
+    given = {'map_path': '~/a.stavpr', 'save_path': 'b.stavpr', 'model_path': '~/net.onnx'}
+    settings = node_settings(DEFAULTS | given)
+    assert settings.map_path == '/home/robot/a.stavpr'
+    assert settings.save_path == str(tmp_path / 'b.stavpr')
+    assert settings.pipeline.model_path == '/home/robot/net.onnx'
+    assert node_settings(DEFAULTS | {'model_path': 'download'}).pipeline.model_path == 'download'
+
+
+@pytest.mark.parametrize(
+    ('files', 'remedy'),
+    [(['b.stavpr', 'a.stavpr'], 'a.stavpr, b.stavpr'), (['a.png'], 'build a map of its images')],
+)
+def test_read_map_of_a_folder_names_its_maps(tmp_path, files, remedy):
+    for name in files:
+        (tmp_path / name).touch()
+    with pytest.raises(MapFileError, match=f'is a folder, not a map: .*{remedy}'):
+        read_map(str(tmp_path), PipelineSettings())
+
+
+@pytest.mark.parametrize(
+    ('values', 'missing'),
+    [
+        ({}, 'model and layer missing'),
+        ({'feature_settings': '{"layer": "relu"}'}, 'model missing'),
+        ({'model_path': 'net.onnx'}, 'layer missing'),
+    ],
+)
+def test_network_without_its_settings_is_rejected_by_name(values, missing):
+    with pytest.raises(SettingsError, match=f'features onnx are invalid .{missing}.*model_path'):
+        PipelineSettings(features='onnx', **values).extractor()
+
+
+def test_network_of_feature_settings_and_model_path_is_accepted():
+    settings = PipelineSettings(
+        features='onnx', feature_settings='{"layer": "relu"}', model_path='/nowhere/net.onnx'
+    )
+    assert settings.model_path == '/nowhere/net.onnx'
 
 
 @pytest.mark.parametrize(

@@ -139,17 +139,24 @@ def test_gaps_and_jumps_are_counted_with_the_longest(statistics):
     assert (counts.jumps_back, counts.longest_jump_back) == (1, 60)
 
 
-def test_reset_sets_all_counts_to_zero(clock, statistics):
+def test_restart_keeps_totals_and_nothing_recent(clock, statistics):
     fresh = statistics.counts()
     statistics.received()
     answer(statistics, 'no match', 'x', 3, 0.1, matching=1)
     statistics.dropped('queue full')
-    statistics.gap(1)
-    statistics.jump_back(1)
+    statistics.gap(2)
+    statistics.jump_back(3)
     clock.now += 5
-    assert statistics.counts() != fresh
-    statistics.reset()
-    assert str(statistics.counts()) == str(fresh)  # as text, in which NaN equals NaN
+    statistics.restart()
+    totals = {'received': 1, 'answered': 1, 'gaps': 1, 'longest_gap': 2, 'jumps_back': 1}
+    totals |= {
+        'nearest': 0.1,
+        'longest_jump_back': 3,
+        'drops': {'queue full': 1},
+        'statuses': {'no match': 1},
+    }
+    expected = dataclasses.replace(fresh, **totals)
+    assert str(statistics.counts()) == str(expected)  # as text, in which NaN equals NaN
 
 
 @pytest.fixture

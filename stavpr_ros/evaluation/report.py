@@ -59,6 +59,7 @@ class Report:
             numbers['false_alarm_rate'] = evaluation.false_alarm_rate('sequence')
             numbers['unknown_images'] = len(evaluation.unknown.single)
         numbers |= {'images': len(self.query), 'places': len(self.reference)}
+        numbers['map_id'] = self.reference.map_id
         numbers |= {'settings': self.settings, 'times': self.times}
         return jsonable(numbers)
 

@@ -199,16 +199,20 @@ def settings_from_json(kind: str, text: str, model: str = '') -> Any:
     :raises SettingsError: no such kind, no such setting, a missing one, or no JSON object.
     """
     cls = settings_class(kind)
-    names = [field.name for field in dataclasses.fields(cls)]
+    fields = dataclasses.fields(cls)
+    names = [field.name for field in fields]
+    required = [field.name for field in fields if field.default is dataclasses.MISSING]
     try:
         values = json.loads(text)
         if not isinstance(values, dict):
             raise TypeError('expected an object, {"name": value}')
         if model and 'model' in names:
             values['model'] = model
+        if missing := [name for name in required if name not in values]:
+            raise TypeError(f'{" and ".join(missing)} missing')
         return cls(**values)
     except (ValueError, TypeError) as error:
         raise SettingsError(
             f'settings {text!r} of features {kind} are invalid ({error}): expected a JSON object '
-            f'with {", ".join(names)}'
+            f'with {", ".join(names)} (parameter feature_settings; model also as model_path)'
         ) from error

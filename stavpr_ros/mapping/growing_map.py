@@ -31,6 +31,8 @@ class GrowingMap:
     :raises InputError: the projection is not that of the settings.
     """
 
+    map_id = ''  # that of a PlaceMap is of its file
+
     def __init__(
         self,
         settings: FeatureSettings,

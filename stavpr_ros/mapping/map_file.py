@@ -258,6 +258,11 @@ def _read_array(archive: zipfile.ZipFile, name: str, digest: str) -> np.ndarray:
     return content[header.seek(0, io.SEEK_CUR) :].view(dtype).reshape(shape)
 
 
+def _map_id(members: dict[str, str]) -> str:
+    """Return the identity of the content of a map, from the hash of each member."""
+    return hashlib.sha256(''.join(sorted(members.values())).encode()).hexdigest()[:16]
+
+
 def _assemble(manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> PlaceMap:
     try:
         settings = FeatureSettings.from_json(manifest['settings'])
@@ -299,6 +304,7 @@ def _assemble(manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> PlaceM
             ids=tuple(str(identifier) for identifier in manifest['ids']),
             poses=arrays.get('poses'),
             thumbnails=thumbnails,
+            map_id=_map_id(manifest['members']),
         )
     except (InputError, SettingsError) as error:
         raise ValueError(str(error)) from error

@@ -42,6 +42,8 @@ class PlaceMap:
         of NaN = unknown for that place; None = unknown for all.
     :param thumbnails: a small JPEG of each place, n byte strings, an empty one = none of that
         place; empty = none kept.
+    :param map_id: first 16 hexadecimal digits of the hash of the content of its file, '' = it was
+        not read from a file.
     """
 
     features: LocalFeatures
@@ -50,6 +52,7 @@ class PlaceMap:
     ids: tuple[str, ...]
     poses: np.ndarray | None = None
     thumbnails: tuple[bytes, ...] = field(default=(), repr=False)
+    map_id: str = ''
 
     def __post_init__(self) -> None:
         n = len(self.features)

@@ -15,7 +15,7 @@ def maps_folder(parameter: str) -> Path:
     :param parameter: maps_folder, '' = ``stavpr/maps`` in the user's data folder.
     """
     if parameter:
-        return Path(parameter).absolute()
+        return Path(parameter).expanduser().absolute()
     data = os.environ.get('XDG_DATA_HOME', '')
     # the XDG Base Directory Specification: a relative one is ignored
     home = Path(data) if os.path.isabs(data) else Path.home() / '.local' / 'share'

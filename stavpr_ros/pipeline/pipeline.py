@@ -62,6 +62,7 @@ class Pipeline:
         # of the map, where loop closure has places of its own
         self._map_save_state = self.save_state
         self.list_candidates = True  # with every match
+        self.contrast = math.nan  # of the last image
         self._start(operation, settings, None)
 
     @property
@@ -233,6 +234,7 @@ class Pipeline:
     ) -> Match:
         with _timed(stages, 'decoding'):
             image = decode_message(message)
+            self.contrast = _contrast(image)
             if reason := self._keyframes.too_alike(image):
                 return Match(Status.SKIPPED, reason, image=image, cause=NOT_A_KEYFRAME)
         if self._is_full(operation):
@@ -315,6 +317,12 @@ class Pipeline:
     @staticmethod
     def _is_full(operation: Operation | None) -> bool:
         return isinstance(operation, Mapping) and operation.places.full
+
+
+def _contrast(image: np.ndarray) -> float:
+    """Return the standard deviation of the green channel, of 255; from 32 rows or columns."""
+    step = max(1, min(image.shape[:2]) // 32)
+    return float(image[::step, ::step, 1].std())
 
 
 @contextmanager

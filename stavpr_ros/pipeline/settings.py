@@ -4,6 +4,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+import os
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,7 @@ class PipelineSettings:
             )
         settings_class(self.features)  # rejects an unknown kind
         if self.feature_settings:
-            settings_from_json(self.features, self.feature_settings)
+            settings_from_json(self.features, self.feature_settings, self.model_path)
         self.recognition()
 
     @property
@@ -162,11 +163,9 @@ class PipelineSettings:
 
         :raises StavprError: invalid settings of the features, or a missing model file.
         """
-        backbone = None
-        if self.feature_settings or self.model_path:
-            backbone = settings_from_json(
-                self.features, self.feature_settings or '{}', self.model_path
-            )
+        backbone = settings_from_json(
+            self.features, self.feature_settings or '{}', self.model_path
+        )
         return FeatureExtractor(self.features, backbone, device=choose_backend(self.backend))
 
 
@@ -189,6 +188,7 @@ class NodeSettings:
     odometry_timeout: float
     save_path: str
     map_frame: str
+    robot_id: str
     diagnostics_period: float
     verbosity: str
     threads: int
@@ -208,6 +208,15 @@ class NodeSettings:
         return self.pipeline.keyframes.needs_poses or self.operation != 'localization'
 
 
+def absolute_path(path: str) -> str:
+    """
+    Return the absolute path of a file, '' of none; launch files leave ``~`` as it is.
+
+    :param path: may begin with ``~``; a relative one is relative to the working directory.
+    """
+    return os.path.abspath(os.path.expanduser(path)) if path else ''
+
+
 def node_settings(values: Mapping[str, Any]) -> NodeSettings:
     """
     Build the settings from the values of all parameters.
@@ -220,6 +229,8 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
         if choices and value not in choices:
             raise SettingsError(f'{name} = {value!r} is unknown: take one of {", ".join(choices)}')
     values = {**values, 'threshold': None if values['threshold'] < 0 else values['threshold']}
+    values |= {name: absolute_path(values[name]) for name in ('map_path', 'save_path')}
+    values['model_path'] = os.path.expanduser(values['model_path'])  # or a word: cached, download
     method = values['geometric_check']
     pipeline = PipelineSettings(
         spatial=SpatialSettings(

@@ -3,9 +3,12 @@
 """Start of an operation: all that may fail or takes long, before the pipeline is changed."""
 
 from dataclasses import dataclass
+import os
+from pathlib import Path
 
 import numpy as np
 from stavpr_ros.devices import choose_backend
+from stavpr_ros.errors import MapFileError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, open_map, PlaceMap
 from stavpr_ros.pipeline.operations import Localization, LoopClosing, Mapping, Operation
@@ -31,6 +34,10 @@ def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
 
     :raises StavprError: an invalid file, or a missing model.
     """
+    if os.path.isdir(path):
+        maps = ', '.join(sorted(file.name for file in Path(path).glob('*.stavpr')))
+        remedy = f'name one of its maps: {maps}' if maps else 'build a map of its images'
+        raise MapFileError(f'{path} is a folder, not a map: {remedy} (build_map makes map files)')
     place_map = open_map(path)
     extractor = place_map.extractor(choose_backend(settings.backend), settings.model_path)
     return LoadedMap(path, place_map, extractor)

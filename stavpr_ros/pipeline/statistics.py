@@ -41,7 +41,7 @@ class ImageCounts:
     """
     All counts at one moment. 'Recent' is the last ``RECENT`` seconds.
 
-    :param uptime: seconds since the start or the last reset.
+    :param uptime: seconds since the start or the last activation; totals are since the start.
     :param received: images received; ``answered``: those with a result.
     :param rate_in: images received per second, recently; ``rate_out``: results per second.
     :param received_age: seconds since the last image, None = there was none; ``answered_age``
@@ -51,6 +51,7 @@ class ImageCounts:
         recent ones.
     :param status: of the last result, with its reason, place (-1 = none) and distance (NaN =
         none).
+    :param nearest: smallest distance of all results, +inf = none had one.
     :param stages: recent times by stage.
     :param total: recent times of all stages together, None = no measurement; ``work``: without
         waiting.
@@ -73,6 +74,7 @@ class ImageCounts:
     reason: str = ''
     place: int = -1
     distance: float = math.nan
+    nearest: float = math.inf
     stages: Mapping[str, StageTime] = field(default_factory=dict)
     total: StageTime | None = None
     work: StageTime | None = None
@@ -125,15 +127,16 @@ class Statistics:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self.reset()
+        self._counts = ImageCounts()
+        self._drops: Counter[str] = Counter()
+        self._statuses: Counter[str] = Counter()
+        self.restart()
 
-    def reset(self) -> None:
-        """Set all counts to zero."""
+    def restart(self) -> None:
+        """Begin another activation: totals stay, recent events and the last result are gone."""
         with self._lock:
             self._start = self._clock()
-            self._counts = ImageCounts()
-            self._drops: Counter[str] = Counter()
-            self._statuses: Counter[str] = Counter()
+            self._count(status='', reason='', place=-1, distance=math.nan)
             self._received: _Recent[None] = _Recent()
             self._results: _Recent[tuple[str, Mapping[str, float]]] = _Recent()
             self._dropped: _Recent[tuple[str, int]] = _Recent()
@@ -166,6 +169,7 @@ class Statistics:
                 reason=reason,
                 place=place,
                 distance=distance,
+                nearest=min(self._counts.nearest, distance),  # NaN is not less
             )
 
     def dropped(self, cause: str, count: int = 1) -> None:

@@ -76,7 +76,6 @@ def diagnostic_array(health: Health, node: str, stamp: Time) -> DiagnosticArray:
         'recognition': (idle or [recognition_finding(health)], _recognition_values(health)),
         'processing': (idle or [processing_finding(health)], _processing_values(health)),
     }
-    device = _device(health.backend)
     statuses = []
     for part, (findings, values) in parts.items():
         findings.sort(key=lambda finding: finding[0], reverse=True)  # monitors cut long messages
@@ -85,7 +84,7 @@ def diagnostic_array(health: Health, node: str, stamp: Time) -> DiagnosticArray:
                 level=findings[0][0],
                 name=f'{node.lstrip("/")}: {part}',
                 message='; '.join(text for _, text in findings),
-                hardware_id=device,
+                hardware_id=health.hardware_id,
                 values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
             )
         )
@@ -109,9 +108,15 @@ def _input_values(health: Health) -> dict[str, Value]:
         'longest_gap_s': counts.longest_gap,
         'jumps_back': counts.jumps_back,
         'longest_jump_back_s': counts.longest_jump_back,
-        'odometry': health.odometry or 'not needed',
+        'odometry': _odometry(health),
         **_drop_values(counts, of_input=True),
     }
+
+
+def _odometry(health: Health) -> str:
+    if not health.odometry:
+        return 'not needed'
+    return health.odometry + ('' if health.odometry_required else ', optional')
 
 
 def _map_values(health: Health) -> dict[str, Value]:

@@ -9,6 +9,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.statistics import ImageCounts, RECENT
+from stavpr_ros.ros.faults import blank_images, never_matched, short_map
 from stavpr_ros.ros.input import InputStatus
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -35,13 +36,17 @@ class Health:
     :param problem: cause of the last failed transition or load; empty = none failed.
     :param loading: path of the map that is being loaded by a service; empty = none.
     :param input: topic and publishers of the images; empty while the node is not active.
-    :param odometry: fresh, stale or never; empty = no parameter needs it.
+    :param hardware_id: robot and camera of the statuses.
+    :param odometry: fresh, stale or never; empty = it is not subscribed to.
     :param queue: waiting images; ``window``: images in the window.
     :param missing: prerequisite of a match that is missing; empty = none.
+    :param odometry_fault: why no odometry can arrive on its topic; empty = unknown.
+    :param contrast: standard deviation of the last image, of 255; NaN = unknown.
     """
 
     state: str
     problem: str = ''
+    hardware_id: str = ''
     settings: NodeSettings
     counts: ImageCounts
     map_info: MapInfo
@@ -51,11 +56,18 @@ class Health:
     queue: int = 0
     window: int = 0
     missing: str = ''
+    odometry_fault: str = ''
+    contrast: float = math.nan
 
     @property
     def map_path(self) -> str:
         """Return the file of the map that is loaded or in use; empty = none."""
         return self.loading or self.map_info.path
+
+    @property
+    def odometry_required(self) -> bool:
+        """Whether images without a pose are skipped; places of recorded maps can do without."""
+        return self.settings.pipeline.keyframes.needs_poses
 
     @property
     def backend(self) -> str:
@@ -78,7 +90,11 @@ def input_findings(health: Health) -> list[Finding]:
     findings = []
     if age > SILENCE:
         findings.append(_silence(health, age))
-    elif health.input.incompatible and health.input.publishers > 1 and counts.received:
+    elif (
+        health.input.incompatible
+        and health.input.publishers > 1
+        and counts.received_age is not None
+    ):
         # a single publisher is not the refused one: images arrive
         refused = f'{_of(health.input.incompatible, "publisher")} refused for QoS'
         findings.append((WARN, f'{refused}, while images of others arrive: {_qos_remedy(health)}'))
@@ -86,13 +102,18 @@ def input_findings(health: Health) -> list[Finding]:
     if lost := counts.recent_drops.get('lost in transport', 0):
         remedy = 'give the publisher more shared memory (docs/troubleshooting.md, images are lost)'
         findings.append((WARN, f'{_of(lost, "image")} lost in transport {recent}: {remedy}'))
-    if health.odometry in ('stale', 'never'):
+    if health.odometry in ('stale', 'never') and (
+        health.odometry_required or health.odometry_fault
+    ):
+        need = 'required by a parameter' if health.odometry_required else 'for poses of the map'
         state = 'was never received' if health.odometry == 'never' else 'has stopped'
-        remedy = 'start it, compare its topic and its stamps'
-        findings.append((WARN, f'odometry, required by a parameter, {state}: {remedy}'))
+        remedy = health.odometry_fault or 'start it, compare its topic and its stamps'
+        findings.append((WARN, f'odometry, {need}, {state}: {remedy}'))
     elif without := counts.recent_drops.get('no odometry', 0):
         text = f'{_of(without, "image")} without odometry at their stamps {recent}: compare both'
         findings.append((WARN, text))
+    if counts.rate_in and (blank := blank_images(health.contrast)):
+        findings.append((WARN, blank))
     if findings:
         return findings
     if counts.received_age is None:
@@ -174,6 +195,12 @@ def recognition_finding(health: Health) -> Finding:
         return OK, 'waiting for the map'
     if health.missing:
         return WARN, f'no match is possible: {health.missing}'
+    settings = health.settings.pipeline
+    if health.settings.operation == 'localization' and health.map_info.state == 'loaded':
+        hopeless = short_map(health.map_info.places, settings.sequence.length)
+        hopeless = hopeless or never_matched(counts, settings)
+        if hopeless:
+            return WARN, hopeless
     if health.window < health.settings.pipeline.sequence.length:
         return (
             OK,

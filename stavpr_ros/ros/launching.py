@@ -2,6 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arguments and node of the launch files, from the table of parameters; a light import."""
 
+from collections.abc import Iterable
+import difflib
+from pathlib import Path
+import sys
 from typing import Any
 
 from launch import LaunchContext, LaunchDescription
@@ -16,6 +20,9 @@ PACKAGE = 'stavpr_ros'
 TYPES: dict[str, type] = {row.name: type(row.default) for row in PARAMETERS} | {
     'use_sim_time': bool
 }
+EXPECTED: dict[type, str] = {bool: 'true or false', int: 'an integer', float: 'a number'}
+CAMERA = '{camera}'
+"""In a text, the name of each of several cameras."""
 
 
 def remappings() -> list[tuple[str, Any]]:
@@ -28,22 +35,75 @@ def remappings() -> list[tuple[str, Any]]:
     ]
 
 
-def node_launch(*others: Any, **fixed: object) -> LaunchDescription:
+def node_launch(
+    *others: Any,
+    cameras: LaunchConfiguration | None = None,
+    image: str = 'image',
+    odom: str = 'odom',
+    **fixed: object,
+) -> LaunchDescription:
     """
     Describe the launch of the node; every parameter is an argument.
 
-    :param others: further actions, after the node.
+    :param others: further arguments, and actions after the node.
+    :param cameras: names of cameras, separated by commas: one node each, in a namespace of this
+        name; None = one node.
+    :param image, odom: default topics.
     :param fixed: parameters that the launch file sets itself.
     """
-    return LaunchDescription([*_arguments(fixed), _node(fixed), *others])
+    own = [other for other in others if isinstance(other, DeclareLaunchArgument)]
+    arguments = [*own, *_arguments(image, odom, fixed)]
+    actions = [other for other in others if other not in own]
+    check = _check([argument.name for argument in arguments])
+    return LaunchDescription([*arguments, check, _nodes(cameras, fixed), *actions])
 
 
-def _arguments(fixed: dict[str, object]) -> list[DeclareLaunchArgument]:
+def unknown_arguments(given: Iterable[str], known: Iterable[str]) -> list[str]:
+    """
+    Return a sentence for each argument that no launch file declares; launch ignores them.
+
+    :param given: words of the command line, arguments as ``NAME:=VALUE``.
+    """
+    problems = []
+    for name, found, _ in (word.partition(':=') for word in given):
+        if found and name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f'did you mean {near[0]}?' if near else 'see the option --show-args'
+            problems.append(f'argument {name!r} is unknown: {hint}')
+    return problems
+
+
+def value_of(name: str, text: str) -> bool | float | str:
+    """
+    Return the value of an argument that is a parameter.
+
+    :raises RuntimeError: a text of another type; names the parameter.
+    """
+    kind = TYPES[name]
+    try:
+        return {'true': True, 'false': False}[text.lower()] if kind is bool else kind(text)
+    except (KeyError, ValueError):
+        raise RuntimeError(f'{name} = {text!r}: expected {EXPECTED[kind]}') from None
+
+
+def _check(known: list[str]) -> OpaqueFunction:
+    """Reject unknown arguments, unless the command line is that of another launch file."""
+
+    def check(context: LaunchContext) -> None:
+        file = context.get_locals_as_dict().get('current_launch_file_path')
+        own = PACKAGE in sys.argv or file in (str(Path(word).resolve()) for word in sys.argv)
+        if own and (problems := unknown_arguments(sys.argv, known)):
+            raise RuntimeError('; '.join(problems))
+
+    return OpaqueFunction(function=check)
+
+
+def _arguments(image: str, odom: str, fixed: dict[str, object]) -> list[DeclareLaunchArgument]:
     sentences = {row.name: row.sentence for row in PARAMETERS}
     sentences['use_sim_time'] = 'Take the time from the topic /clock.'
     return [
-        DeclareLaunchArgument('image', default_value='image', description='topic of the images'),
-        DeclareLaunchArgument('odom', default_value='odom', description='topic of the odometry'),
+        DeclareLaunchArgument('image', default_value=image, description='topic of the images'),
+        DeclareLaunchArgument('odom', default_value=odom, description='topic of the odometry'),
         DeclareLaunchArgument(
             'namespace', default_value='', description='namespace of node and topics'
         ),
@@ -64,25 +124,30 @@ def _arguments(fixed: dict[str, object]) -> list[DeclareLaunchArgument]:
     ]
 
 
-def _node(fixed: dict[str, object]) -> OpaqueFunction:
-    """Start the node with the given arguments; the others are left to the parameter file."""
+def _nodes(cameras: LaunchConfiguration | None, fixed: dict[str, object]) -> OpaqueFunction:
+    """Start a node for each camera with the given arguments; the file has the others."""
 
     def start(context: LaunchContext) -> list[Node]:
-        given = {
-            name: ParameterValue(LaunchConfiguration(name), value_type=kind)
-            for name, kind in TYPES.items()
-            if name not in fixed and LaunchConfiguration(name).perform(context)
-        }
-        return [
-            Node(
-                package=PACKAGE,
-                executable='node',
-                name='stavpr',
-                namespace=LaunchConfiguration('namespace'),
-                output='screen',
-                remappings=remappings(),
-                parameters=[LaunchConfiguration('params_file'), given | fixed],
-            )
-        ]
+        names = [''] if cameras is None else cameras.perform(context).replace(' ', '').split(',')
+        texts = {n: LaunchConfiguration(n).perform(context) for n in TYPES if n not in fixed}
+        return [_node(texts, fixed, camera) for camera in names]
 
     return OpaqueFunction(function=start)
+
+
+def _node(texts: dict[str, str], fixed: dict[str, object], camera: str) -> Node:
+    namespace = LaunchConfiguration('namespace')
+    values = {
+        name: ParameterValue(value_of(name, text.replace(CAMERA, camera)), value_type=TYPES[name])
+        for name, text in texts.items()
+        if text
+    }
+    return Node(
+        package=PACKAGE,
+        executable='node',
+        name='stavpr',
+        namespace=[namespace, '/', camera] if camera else namespace,
+        output='screen',
+        remappings=remappings(),
+        parameters=[LaunchConfiguration('params_file'), values | fixed],
+    )

@@ -17,7 +17,7 @@ from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 from stavpr_msgs.msg import MapInfo
-from stavpr_ros.errors import StavprError
+from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
@@ -31,6 +31,7 @@ from stavpr_ros.ros.parameters import (
     require_changeable,
     require_inside,
     require_writable,
+    typed,
     unknown_parameters,
 )
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
@@ -186,7 +187,7 @@ class PlaceRecognitionNode(ManagedNode):
         gc.freeze()
 
     def _activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self.statistics.reset()
+        self.statistics.restart()
         self.runtime.activate()
         return TransitionCallbackReturn.SUCCESS
 
@@ -211,14 +212,17 @@ class PlaceRecognitionNode(ManagedNode):
     # parameters, map and operation
 
     def set_parameters(self, parameters: list[Parameter]) -> list[SetParametersResult]:
-        """Set parameters, one thread at a time: stored values are those in force."""
+        """Set parameters one by one, one thread at a time: stored values are those in force."""
         with self._lock:
-            return list(super().set_parameters(parameters))
+            return [self.set_parameters_atomically([parameter]) for parameter in parameters]
 
     def set_parameters_atomically(self, parameters: list[Parameter]) -> SetParametersResult:
         """Set parameters, all or none, one thread at a time."""
-        with self._lock:
-            return super().set_parameters_atomically(parameters)
+        try:
+            with self._lock:
+                return super().set_parameters_atomically([typed(row) for row in parameters])
+        except SettingsError as error:
+            return self._rejected(error)
 
     def load_map(self, path: str) -> None:
         """
@@ -257,9 +261,12 @@ class PlaceRecognitionNode(ManagedNode):
                 with self._lock:
                     self._require_valid(changes)
         except StavprError as error:
-            self.get_logger().error(f'parameters rejected: {error}')
-            return SetParametersResult(successful=False, reason=str(error))
+            return self._rejected(error)
         return SetParametersResult(successful=True)
+
+    def _rejected(self, error: StavprError) -> SetParametersResult:
+        self.get_logger().error(f'parameters rejected: {error}')
+        return SetParametersResult(successful=False, reason=str(error))
 
     def _require_valid(self, values: dict[str, Any]) -> None:
         current = {name: self.get_parameter(name).value for name in values}
@@ -301,9 +308,11 @@ class PlaceRecognitionNode(ManagedNode):
 
     def _health(self) -> Health:
         self._publish_map_info()
+        camera = self.resolve_topic_name('image')
         health = Health(
             state=self.state,
             problem=self.problem,
+            hardware_id=f'{self.settings.robot_id} {camera}'.lstrip(),
             settings=self.settings,
             counts=self.statistics.counts(),
             map_info=self._map_info.last or MapInfo(state='none'),
@@ -317,7 +326,8 @@ class PlaceRecognitionNode(ManagedNode):
         def describe() -> MapInfo | None:
             runtime = self._runtime
             if state:
-                return MapInfo(operation=self.settings.operation, state=state, path=path)
+                operation, robot_id = self.settings.operation, self.settings.robot_id
+                return MapInfo(operation=operation, state=state, path=path, robot_id=robot_id)
             return None if runtime is None else runtime.map_info()
 
         self._map_info.publish(describe)

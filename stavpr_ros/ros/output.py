@@ -4,6 +4,7 @@
 
 import array
 from collections.abc import Callable
+from dataclasses import dataclass
 import math
 import threading
 from typing import Any
@@ -41,6 +42,22 @@ SECOND = 1_000_000_000
 MIN_VARIANCE = 0.01  # of a pose: (0.1 m)^2 and (0.1 rad)^2
 
 
+@dataclass(frozen=True)
+class PoseFrames:
+    """
+    The frames of the poses of places.
+
+    :param frame: in which the poses are.
+    :param child: whose poses they are, '' = unknown.
+    """
+
+    frame: str = ''
+    child: str = ''
+
+
+NO_FRAMES = PoseFrames()
+
+
 def time_message(nanoseconds: int) -> Time:
     """Return a time as a message; 0 means unknown."""
     return Time(sec=int(nanoseconds) // SECOND, nanosec=int(nanoseconds) % SECOND)
@@ -60,16 +77,26 @@ def pose_message(pose: np.ndarray) -> Pose:
     return message
 
 
+def _origin(robot_id: str, places: PlaceMap | GrowingMap | None) -> dict[str, str]:
+    """Return the fields that name the robot, and the map that indices refer to."""
+    return {'robot_id': robot_id, 'map_id': '' if places is None else places.map_id}
+
+
 def match_message(
-    header: Header, match: Match, places: PlaceMap | GrowingMap | None = None
+    header: Header,
+    match: Match,
+    places: PlaceMap | GrowingMap | None = None,
+    robot_id: str = '',
 ) -> PlaceMatch:
     """
     Return the message of a match.
 
     :param places: the map that the indices of the match refer to.
+    :param robot_id: the parameter of this name.
     """
     message = PlaceMatch(
         header=header,
+        **_origin(robot_id, places),
         status=match.status,
         reason=match.reason,
         place_index=match.place_index,
@@ -106,12 +133,14 @@ def match_message(
 
 
 def candidates_message(
-    header: Header, match: Match, places: PlaceMap | GrowingMap | None
+    header: Header, match: Match, places: PlaceMap | GrowingMap | None, robot_id: str = ''
 ) -> PlaceCandidates | None:
     """Return the message of the candidates of a match, None without any."""
     if not match.candidates or places is None:
         return None
-    message = PlaceCandidates(header=header, threshold=match.threshold)
+    message = PlaceCandidates(
+        header=header, **_origin(robot_id, places), threshold=match.threshold
+    )
     for candidate in match.candidates:
         place = places.place(candidate.place)
         message.candidates.append(
@@ -127,9 +156,17 @@ def candidates_message(
 
 
 def loop_closure_message(
-    header: Header, match: Match, route: PlaceMap | GrowingMap | None
+    header: Header,
+    match: Match,
+    route: PlaceMap | GrowingMap | None,
+    robot_id: str = '',
+    frames: PoseFrames = NO_FRAMES,
 ) -> LoopClosure | None:
-    """Return the loop closure of a match on a growing route, None for any other match."""
+    """
+    Return the loop closure of a match on a growing route, None for any other match.
+
+    :param frames: of the poses of the route.
+    """
     first = match.first_image_index
     if not match.accepted or first < 0 or route is None:
         return None
@@ -146,6 +183,7 @@ def loop_closure_message(
     query, place = route.place(middle), route.place(match.place_index)
     message = LoopClosure(
         header=header,
+        **_origin(robot_id, route),
         query_index=middle,
         query_stamp=time_message(query.stamp),
         place_index=match.place_index,
@@ -158,6 +196,7 @@ def loop_closure_message(
     )
     if query.pose is not None and place.pose is not None:
         message.has_poses = True
+        message.pose_frame, message.pose_child_frame = frames.frame, frames.child
         message.query_pose, message.place_pose = pose_message(query.pose), pose_message(place.pose)
     return message
 
@@ -209,10 +248,12 @@ def map_info_message(
     places: PlaceMap | GrowingMap | None,
     extractor: FeatureExtractor | None,
     stamp: Time,
+    robot_id: str = '',
 ) -> MapInfo:
     """Return the description of the map in use."""
     message = MapInfo(
         header=Header(stamp=stamp),
+        **_origin(robot_id, places),
         operation=operation,
         state=state,
         path=path,
@@ -238,10 +279,11 @@ class Output:
     The publishers of matches.
 
     :param burst: matches that may be published at once.
+    :param robot_id: the parameter of this name.
     """
 
-    def __init__(self, node: ManagedNode, burst: int) -> None:
-        self._node = node
+    def __init__(self, node: ManagedNode, burst: int, robot_id: str) -> None:
+        self._node, self._robot_id = node, robot_id
         self._qos = QoSProfile(depth=max(DEPTH, burst), reliability=ReliabilityPolicy.RELIABLE)
         self.match = self._publisher(PlaceMatch, '~/match')
         self.place_index = self._publisher(Int32, '~/place_index')
@@ -271,22 +313,27 @@ class Output:
         header: Header,
         match: Match,
         places: PlaceMap | GrowingMap | None = None,
-        frame: str = '',
+        frames: PoseFrames = NO_FRAMES,
     ) -> PlaceMatch:
         """
         Publish the results for one image, ``~/match`` last; return that message.
 
         :param places: the map that the indices of the match refer to.
+        :param frames: of its poses.
         """
-        message = match_message(header, match, places)
+        robot_id = self._robot_id
+        message = match_message(header, match, places, robot_id)
         try:
             if match.accepted:
                 self.place_index.publish(Int32(data=message.place_index))
                 self.distance.publish(Float32(data=message.distance))
             for publisher, more in (
-                (self.loop_closure, loop_closure_message(header, match, places)),
-                (self.pose, matched_pose_message(header, match, places, frame)),
-                (self.candidates, candidates_message(header, match, places)),
+                (
+                    self.loop_closure,
+                    loop_closure_message(header, match, places, robot_id, frames),
+                ),
+                (self.pose, matched_pose_message(header, match, places, frames.frame)),
+                (self.candidates, candidates_message(header, match, places, robot_id)),
             ):
                 if more is not None:
                     publisher.publish(more)

@@ -8,15 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from stavpr_ros.errors import OutputError, SettingsError
 from stavpr_ros.output_file import require_room
 from stavpr_ros.parameters import BY_NAME, NodeParameter, PARAMETERS
 from stavpr_ros.pipeline.maps_folder import inside
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 _FILES = ('map_path', 'save_path', 'model_path')
+_TYPES = {
+    bool: 'true or false',
+    int: 'an integer',
+    float: 'a number',
+    str: """text; quote a number or a truth value twice: "'2'\"""",
+}
 _CHANGED_BY_SERVICE = {'map_path': 'load_map', 'operation': 'set_operation'}
 
 
@@ -39,12 +45,35 @@ def descriptor(row: NodeParameter) -> ParameterDescriptor:
     return result
 
 
-def declare_parameters(node: Node) -> dict[str, Any]:
-    """Declare the parameters on a node and return their values, name to value."""
-    return {
-        row.name: node.declare_parameter(row.name, row.default, descriptor(row)).value
-        for row in PARAMETERS
-    }
+def typed(parameter: Parameter) -> Parameter:
+    """
+    Return a parameter with the type of its row; rclpy rejects an integer in place of a double.
+
+    :raises SettingsError: another type; names the parameter.
+    """
+    row, value = BY_NAME.get(parameter.name), parameter.value
+    if row is None or type(value) is type(row.default):
+        return parameter
+    if isinstance(row.default, float) and type(value) is int:
+        return Parameter(row.name, value=float(value))
+    raise SettingsError(
+        f'{row.name} = {value!r} has the wrong type: expected {_TYPES[type(row.default)]}'
+    )
+
+
+def declare_parameters(node: ManagedNode) -> dict[str, Any]:
+    """
+    Declare the parameters on a node and return their values, name to value.
+
+    :raises SettingsError: a parameter was given with the wrong type.
+    """
+    given = node.parameter_overrides
+    values = {}
+    for row in PARAMETERS:
+        value = typed(given[row.name]).value if row.name in given else row.default
+        node.declare_parameter(row.name, value, descriptor(row), ignore_override=True)
+        values[row.name] = value
+    return values
 
 
 def unknown_parameters(given: Iterable[str]) -> list[str]:
@@ -80,7 +109,9 @@ def require_changeable(changes: Mapping[str, Any], state: str) -> None:
         )
 
 
-def inside_maps_folder(parameters: list[Parameter], node: Node, folder: Path) -> list[Parameter]:
+def inside_maps_folder(
+    parameters: list[Parameter], node: ManagedNode, folder: Path
+) -> list[Parameter]:
     """
     Return parameters that are set after the start, with absolute paths of the files they name.
 
@@ -89,7 +120,7 @@ def inside_maps_folder(parameters: list[Parameter], node: Node, folder: Path) ->
     return [_with_path(parameter, node, folder) for parameter in parameters]
 
 
-def _with_path(parameter: Parameter, node: Node, folder: Path) -> Parameter:
+def _with_path(parameter: Parameter, node: ManagedNode, folder: Path) -> Parameter:
     name, value = parameter.name, parameter.value
     known = name in _FILES and isinstance(value, str) and value
     if not known or value == node.get_parameter(name).value:

@@ -21,6 +21,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from rclpy.logging import get_logger
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.service import Service
 
 START_POLL = 0.0005  # seconds between two checks whether a thread has begun a callback
@@ -142,14 +143,14 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return 'finalized' if self._destroyed else str(self._state_machine.current_state[1])
 
     @property
-    def parameter_overrides(self) -> list[str]:
+    def parameter_overrides(self) -> dict[str, Parameter]:
         """
-        Return the names of the parameters that were given, declared or not.
+        Return the parameters that were given, declared or not, by name.
 
         No upstream issue was found: rclpy ignores those that no one declares, and has no public
         way to list them.
         """
-        return list(self._parameter_overrides)
+        return dict(self._parameter_overrides)
 
     def advance(self, trigger: Callable[[], TransitionCallbackReturn]) -> bool:
         """

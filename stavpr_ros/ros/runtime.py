@@ -25,7 +25,7 @@ from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import END_POLL, ImageInput, InputStatus, STOP_TIMEOUT, Worker
-from stavpr_ros.ros.output import map_info_message, nanoseconds, Output
+from stavpr_ros.ros.output import map_info_message, nanoseconds, Output, PoseFrames
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import OdometryInput
 from stavpr_ros.threads import call_on_thread, limit_threads
@@ -74,7 +74,7 @@ class Runtime:
         self.loading = self.problem = ''
         self._load_lock = threading.Lock()
         self.worker = Worker(self._process, settings.queue_size, node.ending)
-        self._output = Output(node, settings.queue_size)
+        self._output = Output(node, settings.queue_size, settings.robot_id)
         self._pipeline: Pipeline | None = None
         try:
             recovered = recover_maps(self._journaled, node.get_logger())
@@ -269,21 +269,23 @@ class Runtime:
             pipeline.places,
             pipeline.extractor,
             self._node.get_clock().now().to_msg(),
+            self.settings.robot_id,
         )
 
     def complete(self, health: Health) -> Health:
         """Return the health of the node with the queue, the window and the subscriptions."""
         pipeline, images, odometry = self.pipeline, self.images, self.odometry
-        needs_poses = pipeline.settings.keyframes.needs_poses  # otherwise poses are optional
         return replace(
             health,
             problem=health.problem or self.problem,
             loading=self.loading,
             input=InputStatus() if images is None else images.status(),
-            odometry=odometry.freshness() if odometry is not None and needs_poses else '',
+            odometry='' if odometry is None else odometry.freshness(),
             queue=self.worker.waiting,
             window=pipeline.window_fill,
             missing=pipeline.missing,
+            odometry_fault='' if odometry is None else odometry.fault(),
+            contrast=pipeline.contrast,
         )
 
     # images
@@ -325,11 +327,11 @@ class Runtime:
         header = item.message.header
         stamp = nanoseconds(header.stamp)
         odometry = self.odometry  # another thread may unsubscribe
-        pose, frame = None, self.settings.map_frame
+        pose, frames = None, PoseFrames(self.settings.map_frame)
         if odometry is not None:
             pose = odometry.trajectory.at(stamp)
             if self.pipeline.operation != 'localization':  # places have the poses of the odometry
-                frame = odometry.frame
+                frames = PoseFrames(odometry.frame, odometry.child_frame)
         self.pipeline.list_candidates = self._output.candidates_requested
         try:
             match = self.pipeline.process(item.message, stamp, pose)
@@ -341,11 +343,11 @@ class Runtime:
             match = Match(Status.INVALID_IMAGE, reason, cause='internal error')
         if match.status is Status.NOT_READY and self.loading:
             match = replace(match, reason=f'map {self.loading} is being loaded')
-        self._publish(header, match, frame, waited)
+        self._publish(header, match, frames, waited)
 
-    def _publish(self, header: Header, match: Match, frame: str, waited: float) -> None:
+    def _publish(self, header: Header, match: Match, frames: PoseFrames, waited: float) -> None:
         began = time.monotonic()
-        message = self._output.publish(header, match, self.pipeline.places, frame)
+        message = self._output.publish(header, match, self.pipeline.places, frames)
         stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
         if match.cause:
             self._statistics.dropped(match.cause)

@@ -12,9 +12,11 @@ from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
 from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.pipeline.saving import write_map
+from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.output import candidates_message, match_message
 from stavpr_ros.ros.rclpy_workarounds import repeat_responses
 from stavpr_ros.ros.runtime import Runtime
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 
@@ -37,6 +39,7 @@ class Services:
     ) -> None:
         self._logger = node.get_logger()
         self._runtime, self._load, self._operate = runtime, load_map, set_operation
+        self._faults: dict[str, str] = {}  # last fault of a service, until it succeeds
         group = MutuallyExclusiveCallbackGroup()
         groups = {
             LoadMap: MutuallyExclusiveCallbackGroup(),
@@ -59,18 +62,28 @@ class Services:
     def _callback(
         self, name: str, serve: Callable[[Runtime, Any, Any], str]
     ) -> Callable[[Any, Any], Any]:
-        """Return a service callback that fills ``success`` and ``message``, and logs errors."""
+        """
+        Return a service callback that fills ``success`` and ``message``.
+
+        An error that is repeated, as by a client that polls, is logged once.
+        """
 
         def callback(request: Any, response: Any) -> Any:
             try:
                 response.message = serve(self._runtime(), request, response)
                 response.success = True
+                self._faults.pop(name, None)
+                return response
             except StavprError as error:
-                response.success, response.message = False, str(error)
-                self._logger.warning(f'{name} failed: {error}')
+                log, response.message = self._logger.warning, str(error)
             except Exception as error:  # a defect: the client must get a response all the same
-                response.success, response.message = False, f'{type(error).__name__}: {error}'
-                self._logger.error(f'{name} failed: {response.message}')
+                log, response.message = self._logger.error, f'{type(error).__name__}: {error}'
+            if self._faults.get(name) != response.message:
+                log(f'{name} failed: {response.message} (logged once while it is repeated)')
+            self._faults[name] = response.message
+            response.success = False
+            if name == 'relocalize':  # indices of -1, where the default 0 would be a place
+                response.match = match_message(Header(), Match(Status.NOT_READY, response.message))
             return response
 
         return callback
@@ -108,7 +121,8 @@ class Services:
             # call
             pipeline, header = runtime.pipeline, runtime.last_header
             match = pipeline.relocalize(count)
-            response.match = match_message(header, match, pipeline.places)
+            robot_id = runtime.settings.robot_id
+            response.match = match_message(header, match, pipeline.places, robot_id)
             candidates = candidates_message(header, match, pipeline.places)
             response.candidates = candidates.candidates if candidates is not None else []
 

@@ -25,6 +25,7 @@ _REMEDIES = {
     'DURABILITY': 'set qos_overrides.{topic}.subscription.durability to volatile, or make the '
     'publisher transient local',
 }
+ODOMETRY = 'nav_msgs/msg/Odometry'
 OVERRIDABLE = (
     QoSPolicyKind.HISTORY,
     QoSPolicyKind.DEPTH,
@@ -73,6 +74,28 @@ def subscribe(
         ) from error
 
 
+def misdirected(node: Node, topic: str) -> str:
+    """
+    Return why no odometry can arrive on a topic; empty if it can, or if there is none anywhere.
+
+    :param topic: after remapping.
+    """
+    publishers = node.get_publishers_info_by_topic(topic)
+    types = sorted({info.topic_type for info in publishers})
+    if ODOMETRY in types:
+        return ''
+    found = f'{", ".join(types)} is published' if types else 'nothing is published'
+    others = [
+        name
+        for name, kinds in node.get_topic_names_and_types()
+        if ODOMETRY in kinds and node.count_publishers(name)
+    ]
+    if not (types or others):
+        return ''
+    hint = f', odometry is on {", ".join(others)}' if others else ''
+    return f'{found} on {topic}{hint}: remap odom to the topic of the odometry'
+
+
 def odometry_pose(message: Odometry) -> np.ndarray:
     """Return the pose of an odometry message, shape (7,), float64."""
     p, o = message.pose.pose.position, message.pose.pose.orientation
@@ -85,14 +108,14 @@ class OdometryInput:
 
     :param timeout: seconds for which the newest pose is valid.
 
-    ``frame`` is the frame of the poses.
+    ``frame`` is the frame of the poses, ``child_frame`` the one whose poses they are.
     """
 
     def __init__(self, node: Node, timeout: float) -> None:
         self.trajectory = Trajectory(timeout)
         self._node, self._timeout = node, timeout
         self._arrived: float | None = None
-        self.frame = ''
+        self.frame = self.child_frame = ''
         self._subscription = subscribe(node, Odometry, 'odom', self._on_odometry, 50)
 
     def freshness(self) -> str:
@@ -100,6 +123,11 @@ class OdometryInput:
         if self._arrived is None:
             return 'never'
         return 'fresh' if time.monotonic() - self._arrived < max(2.0, self._timeout) else 'stale'
+
+    def fault(self) -> str:
+        """Return why nothing can arrive, as a wrong remapping; empty = nothing known."""
+        fresh = self.freshness() == 'fresh'
+        return '' if fresh else misdirected(self._node, self._subscription.topic_name)
 
     def close(self) -> None:
         """Unsubscribe from odometry."""
@@ -113,4 +141,5 @@ class OdometryInput:
                 f'odometry rejected: {error}', throttle_duration_sec=10.0
             )
             return
-        self._arrived, self.frame = time.monotonic(), message.header.frame_id
+        self._arrived = time.monotonic()
+        self.frame, self.child_frame = message.header.frame_id, message.child_frame_id

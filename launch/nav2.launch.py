@@ -1,0 +1,28 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Start the node under the lifecycle manager of Nav2, which configures and activates it.
+
+ros2 launch stavpr_ros nav2.launch.py map_path:=FILE image:=TOPIC
+
+To use the manager of your own Nav2 launch files, start the node with autostart:=false, and add
+its name to node_names there. The node makes no bond: bond_timeout must be 0.
+"""
+
+from launch import LaunchDescription
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from stavpr_ros.ros.launching import node_launch
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Describe the node and its manager."""
+    manager = Node(
+        package='nav2_lifecycle_manager',
+        executable='lifecycle_manager',
+        name='lifecycle_manager_stavpr',
+        namespace=LaunchConfiguration('namespace'),
+        output='screen',
+        parameters=[{'autostart': True, 'node_names': ['stavpr'], 'bond_timeout': 0.0}],
+    )
+    return node_launch(manager, autostart=False)
