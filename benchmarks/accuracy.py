@@ -102,14 +102,20 @@ def long_cases(folder: Path, feature: str) -> Iterator[Case]:
         yield Case('synth_nordland', *shifted, identity(3))
 
 
-def extractor(feature: str, folder: Path) -> FeatureExtractor:
+def extractors(feature: str, folder: Path) -> dict[str, FeatureExtractor]:
     """
-    Make the extractor of a feature.
+    Make the extractor of a feature for each mode.
+
+    Mode paper is the reference and stays as it was: gradients of the intensity itself.
 
     :raises UnavailableError: the extra ``onnx`` or the network's file is missing.
     """
     if feature == 'g':
-        return FeatureExtractor('gradient')
+        linear = settings_class('gradient')(logarithm=False)
+        return {
+            mode: FeatureExtractor('gradient', linear if mode == 'paper' else None)
+            for mode in MODES
+        }
     model = folder / NETWORK
     if not model.is_file():
         raise UnavailableError(f'no file {model}')
@@ -121,7 +127,7 @@ def extractor(feature: str, folder: Path) -> FeatureExtractor:
         mean=(104, 117, 123),
         std=(1, 1, 1),
     )
-    return FeatureExtractor('onnx', settings)
+    return dict.fromkeys(MODES, FeatureExtractor('onnx', settings))
 
 
 def numbers(evaluation: Evaluation, threshold: float | None) -> dict[str, Any]:
@@ -145,12 +151,15 @@ def numbers(evaluation: Evaluation, threshold: float | None) -> dict[str, Any]:
 
 
 def evaluate_case(
-    case: Case, feature: str, making: FeatureExtractor
+    case: Case, feature: str, making: dict[str, FeatureExtractor]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield key and numbers of a case in each mode and at each speed."""
-    place_map, query = (_map(source, making) for source in (case.places, case.query))
-    truth = case.truth(len(query), len(place_map))
-    for mode in MODES:
+    before = None
+    for mode, extractor in making.items():
+        if extractor is not before:
+            place_map, query = (_map(source, extractor) for source in (case.places, case.query))
+            before = extractor
+        truth = case.truth(len(query), len(place_map))
         settings = RecognizerSettings(THRESHOLD, mode=mode)
         for warp in ('same', *KINDS) if case.warps else ('same',):
             count = len(query)
@@ -163,13 +172,13 @@ def evaluate_case(
 
 
 def evaluate_hallway(
-    folder: Path, feature: str, making: FeatureExtractor
+    folder: Path, feature: str, making: dict[str, FeatureExtractor]
 ) -> Iterator[tuple[str, Any]]:
     """Yield key and numbers of the loop closures in each mode."""
-    route = _map(open_source(folder / 'rtabmap_hallway_loop/samples'), making)
     file = folder / 'rtabmap_hallway_loop/samples_GT.bmp'
-    truth = GroundTruth.from_file(file, len(route), len(route), 0).loop_closures(EXCLUDED - 1)
-    for mode in MODES:
+    for mode, extractor in making.items():
+        route = _map(open_source(folder / 'rtabmap_hallway_loop/samples'), extractor)
+        truth = GroundTruth.from_file(file, len(route), len(route), 0).loop_closures(EXCLUDED - 1)
         settings = RecognizerSettings(THRESHOLD, mode=mode)
         evaluation = evaluate_loop_closures(route.features, truth, settings, EXCLUDED)
         threshold = THRESHOLD if mode == 'robust' else None
@@ -201,7 +210,7 @@ def measure(folder: Path, quick: bool) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield key and numbers of every row; print what is left out."""
     for feature in ('g',) if quick else FEATURES:
         try:
-            making = extractor(feature, folder)
+            making = extractors(feature, folder)
         except UnavailableError as error:
             print(f'left out: {FEATURES[feature]}: {error}', file=sys.stderr)
             continue
@@ -210,7 +219,7 @@ def measure(folder: Path, quick: bool) -> Iterator[tuple[str, dict[str, Any]]]:
         yield from evaluate_hallway(folder, feature, making)
         if quick:
             continue
-        yield f'tower/{feature}/robust', evaluate_tower(folder, feature, making)
+        yield f'tower/{feature}/robust', evaluate_tower(folder, feature, making['robust'])
         for case in long_cases(folder, feature):
             yield from evaluate_case(case, feature, making)
 

@@ -16,7 +16,7 @@ import sys
 import time
 from typing import Any
 
-from accuracy import extractor, FEATURES, long_cases, short_cases
+from accuracy import extractors, FEATURES, long_cases, short_cases
 from data import data_folder, NoDataError
 import numpy as np
 from results import environment, heading, RESULTS, ROOT, table
@@ -547,7 +547,7 @@ def measure(
     results: Results = {}
     for feature in chosen:
         try:
-            making = extractor(feature, folder)
+            making = extractors(feature, folder)['robust']
         except UnavailableError as error:
             print(f'left out: {FEATURES[feature]}: {error}', file=sys.stderr)
             continue

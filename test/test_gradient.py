@@ -64,9 +64,9 @@ def gradient_settings(draw):
     """Any settings, of images that are not too large."""
     cell = draw(st.integers(2, 17))
     cells = draw(st.integers(2, 64 // cell + 2))
-    bins, signed = draw(st.integers(2, 12)), draw(st.booleans())
+    bins, signed, logarithm = draw(st.integers(2, 12)), draw(st.booleans()), draw(st.booleans())
     return GradientSettings(
-        cell * cells, draw(st.sampled_from(RESIZE_METHODS)), cell, bins, signed
+        cell * cells, draw(st.sampled_from(RESIZE_METHODS)), cell, bins, signed, logarithm
     )
 
 
@@ -104,6 +104,8 @@ def test_gradient_of_any_image_size_equals_definition(settings, height, width, s
     averages = settings.resize == 'area' and min(height, width) >= settings.size
     method = cv2.INTER_AREA if averages else cv2.INTER_LINEAR
     square = cv2.resize(gray, (settings.size, settings.size), interpolation=method)
+    if settings.logarithm:
+        square = np.rint(255 * np.log(1 + 32 * (square / 255)) / np.log(33))
     assert_same_features(
         Gradient(settings).feature_maps([image])[0], reference_maps(square, settings)
     )

@@ -28,7 +28,7 @@ import torch
 pytestmark = pytest.mark.usefixtures('one_thread')
 SHORT = SequenceSettings(length=5, beta=2.0)
 SECOND = 10**9
-LM_DTW = ROBUST.without('mean_centering', 'place_filter')
+LM_DTW = ROBUST.without('mean_centering', 'whitening', 'place_filter')
 
 
 def features_of(strips):
@@ -218,7 +218,7 @@ def test_loop_closer_at_limit_evicts_an_eighth(laps):
 @pytest.mark.parametrize(('centering', 'limit'), [(True, None), (True, 90), (False, 83)])
 def test_route_features_are_original_less_mean(laps, centering, limit):
     """At the limit, an eighth is evicted."""
-    route, evicted = RouteFeatures(laps.settings, centering, limit), 0
+    route, evicted = RouteFeatures(laps.settings, centering, False, limit), 0
     for i in range(len(laps)):
         if route.count == limit:
             evicted += limit // EVICTED
@@ -242,9 +242,34 @@ def test_route_features_are_original_less_mean(laps, centering, limit):
     assert route.room == (limit or 512)
 
 
+@pytest.mark.parametrize(('centering', 'limit'), [(True, None), (False, 90)])
+def test_route_features_whitened_give_back_the_original(laps, centering, limit):
+    """Whitening is learned again on the way, and features are as if it had been known before."""
+    route, evicted = RouteFeatures(laps.settings, centering, True, limit), 0
+    for i in range(len(laps)):
+        if route.count == limit:
+            evicted += limit // EVICTED
+            route.evict(limit // EVICTED)
+        route.append(laps[i : i + 1])
+        if route.count == 1:
+            first = route.strips[:, :1].clone()
+    added = laps[evicted:]
+    torch.testing.assert_close(route.original().strips, added.strips, atol=2e-5, rtol=0)
+    zero = (added.strips == 0).all(dim=2)
+    norms = route.strips[:, : route.count].norm(dim=2)
+    torch.testing.assert_close(norms, (~zero).float(), atol=1e-5, rtol=0)
+    plain = added.strips - route.mean[:, None]
+    plain[zero] = 0
+    kept = route.strips[:, : route.count]
+    assert not torch.allclose(kept, plain / plain.norm(dim=2, keepdim=True).clamp(min=1e-9))
+    again = RouteFeatures(laps.settings, centering, True, limit)
+    again.append(laps[:1])
+    torch.testing.assert_close(again.strips[:, :1], first)
+
+
 def test_route_features_are_centered_by_recent_mean(laps):
     """By one that is at most an eighth old."""
-    route = RouteFeatures(laps.settings, True, None)
+    route = RouteFeatures(laps.settings, True, False, None)
     for i in range(100):
         route.append(laps[i : i + 1])
     counts = [1]
@@ -256,7 +281,7 @@ def test_route_features_are_centered_by_recent_mean(laps):
 
 def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
     """Rows as they are matched with LM-DTW, images' changes, and one filter over all of them."""
-    options, exclude, l = ROBUST.without('mean_centering'), 12, SHORT.length
+    options, exclude, l = ROBUST.without('mean_centering', 'whitening'), 12, SHORT.length
     closer = LoopCloser(settings_of(options), exclude, laps.settings, limit=90)
     plain = PlainCloser(settings_of(options), exclude, laps)
     s = FilterSettings()
@@ -411,7 +436,7 @@ def test_update_with_error_changes_nothing(laps):
 @pytest.mark.parametrize('exclude', [1, 12])
 def test_loop_closer_with_smallest_limit_matches(exclude):
     features = laps_of(120, 9)
-    settings = settings_of(ROBUST.without('mean_centering'))
+    settings = settings_of(ROBUST.without('mean_centering', 'whitening'))
     with pytest.raises(SettingsError, match=r'limit = 0 .* take at least \d+') as refused:
         LoopCloser(settings, exclude, features.settings, limit=0)
     least = int(str(refused.value).split()[-1])

@@ -24,7 +24,9 @@ from stavpr_ros.recognition.robust import (
     PRIOR,
     ROBUST,
     RobustOptions,
+    STRENGTH,
     THRESHOLD,
+    Whitening,
     ZNormalization,
 )
 from stavpr_ros.sources import open_source
@@ -45,7 +47,7 @@ def test_robust_options_by_name():
     assert options_of('robust') == ROBUST == RobustOptions()
     assert options_of('paper') == PAPER
     assert not PAPER.any
-    assert RobustOptions.only('place_filter') == RobustOptions(False, False, False, True)
+    assert RobustOptions.only('place_filter') == RobustOptions(False, False, False, False, True)
     assert not ROBUST.without('mean_centering', 'place_filter').mean_centering
     assert ROBUST.without('mean_centering').place_filter
     for wrong in (
@@ -67,8 +69,9 @@ def test_mean_centering_subtracts_means_and_keeps_zeros():
     strips /= strips.norm(dim=2, keepdim=True)
     strips[1, 5] = 0
     settings = FeatureSettings('gradient', None, 3)
-    mean_centering = MeanCentering(LocalFeatures(strips, torch.ones(3, 40), settings))
-    centered = mean_centering.places(LocalFeatures(strips, torch.ones(3, 40), settings)).strips
+    features = LocalFeatures(strips, torch.ones(3, 40), settings)
+    mean_centering = MeanCentering(features, whitening=False)
+    centered = mean_centering.places(features).strips
     mean = strips.mean(dim=1)
     for j in range(3):
         for y in (0, 5, 39):
@@ -84,6 +87,42 @@ def test_mean_centering_subtracts_means_and_keeps_zeros():
     mean_centering.reset()
     first = mean_centering.next_query(seen[:, 1])
     assert not torch.allclose(first, second)
+
+
+def test_whitening_equals_equation_in_numpy():
+    """Each principal direction is scaled by its gain; the inverse undoes it."""
+    rng = np.random.default_rng(0)
+    strips = rng.normal(size=(2, 30, 6)) * [3, 2, 1, 1, 0.5, 0.1] @ rng.normal(size=(6, 6))
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+    whitening = Whitening(torch.from_numpy(strips).float())
+    some = rng.normal(size=(2, 4, 6))
+    for j in range(2):
+        values, directions = np.linalg.eigh(strips[j].T @ strips[j])
+        shares = values / values.sum()
+        gains = 1 / np.sqrt(1 + STRENGTH * shares / np.sum(shares**2))
+        assert gains.max() / gains.min() > 1.3
+        expected = some[j] @ directions * gains @ directions.T
+        found = whitening(torch.from_numpy(some).float())
+        np.testing.assert_allclose(found[j], expected, atol=1e-5)
+        np.testing.assert_allclose(whitening.inverse(found)[j], some[j], atol=1e-5)
+
+
+def test_mean_centering_with_whitening_of_map_and_query_agree():
+    generator = torch.Generator().manual_seed(0)
+    strips = torch.rand((3, 40, 8), generator=generator)
+    strips /= strips.norm(dim=2, keepdim=True)
+    strips[1, 5] = 0
+    features = LocalFeatures(strips, torch.ones(3, 40), FeatureSettings('gradient', None, 3))
+    before = strips.clone()
+    centering = MeanCentering(features, centering=False)
+    places = centering.places(features).strips
+    torch.testing.assert_close(centering.next_query(strips[:, 7]), places[:, 7])
+    assert torch.equal(strips, before)
+    assert not places[1, 5].any()
+    assert not torch.allclose(places[0], strips[0], atol=1e-2)
+    norms = places.norm(dim=2)
+    norms[1, 5] = 1
+    torch.testing.assert_close(norms, torch.ones(3, 40))
 
 
 def test_mean_centering_of_long_query_keeps_precision():

@@ -32,13 +32,15 @@ IMAGENET = {'mean': [0.485, 0.456, 0.406], 'std': [0.229, 0.224, 0.225], 'scale'
 MAPS = {
     'gradient': (
         'gradient',
-        {'cell': 8, 'orientations': 4, 'resize': 'area', 'signed': True, 'size': 32},
+        {'cell': 8, 'orientations': 4, 'resize': 'area', 'signed': True, 'size': 32}
+        | {'logarithm': False},
         2,
         None,
     ),
     'gradient_projected': (
         'gradient',
-        {'cell': 16, 'orientations': 8, 'resize': 'area', 'signed': True, 'size': 224},
+        {'cell': 16, 'orientations': 8, 'resize': 'area', 'signed': True, 'size': 224}
+        | {'logarithm': False},
         7,
         16,
     ),

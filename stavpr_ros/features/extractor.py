@@ -49,7 +49,9 @@ class FeatureSettings:
         """
         try:
             fields = json.loads(text)
-            fields['backbone'] = settings_class(fields['kind'])(**fields['backbone'])
+            kind = settings_class(fields['kind'])
+            before = getattr(kind, 'BEFORE', {})
+            fields['backbone'] = kind(**(before | fields['backbone']))
             return cls(**fields)
         except (ValueError, TypeError, KeyError) as error:
             raise SettingsError(

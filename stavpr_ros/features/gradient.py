@@ -5,8 +5,10 @@ Oriented-gradient features: no weights, no training, the default.
 
 Histograms of gradient orientation on a regular grid of overlapping cells, each normalized by the
 four 2 x 2 blocks around it (after Dalal and Triggs, "Histograms of Oriented Gradients for Human
-Detection", CVPR 2005; one channel an orientation, the mean over the four normalizations). On a CPU
-a compiled kernel computes them image by image, elsewhere torch for the whole batch.
+Detection", CVPR 2005; one channel an orientation, the mean over the four normalizations). The
+gradients are those of log(1 + 32 I), intensity I in 0..1: contrast ratios, which a change of light
+leaves as they are. On a CPU a compiled kernel computes them image by image, elsewhere torch for
+the whole batch.
 
 The kernel's arithmetic on pixels runs over rows in SIMD lanes: without look-up and scatter. A
 pixel's share in every orientation is computed, also where it is zero: that is a subtraction and a
@@ -40,6 +42,9 @@ P0, P1, P2, P3, P4, P5, P6 = (
     F(0.00108413043),
 )
 FULL_SCALE = F(255)
+DARK = 32  # the logarithm is linear far below 1 / DARK of the full intensity
+_I = np.arange(256) / 255
+LOGARITHM = np.rint(255 * np.log1p(DARK * _I) / np.log1p(DARK)).astype(np.uint8)
 PER_THREAD = 8  # images at least: starting a thread costs as much as one or two images
 
 
@@ -80,7 +85,8 @@ class Gradient:
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        return resize_square(gray, self.settings.size, self.settings.resize)
+        small = resize_square(gray, self.settings.size, self.settings.resize)
+        return cv2.LUT(small, LOGARITHM) if self.settings.logarithm else small
 
 
 def _on_threads(work: Callable[[int], None], count: int) -> None:

@@ -51,11 +51,17 @@ def _check_resize(method: str) -> None:
 class GradientSettings:
     """Settings of the oriented-gradient features."""
 
+    # of maps that do not hold these settings, since they were made before there were any
+    BEFORE: ClassVar[dict[str, Any]] = {'logarithm': False}
+
     size: int = setting(224, help='images are resized to size x size pixels first')
     resize: str = setting('area', help=_RESIZE_HELP)
     cell: int = setting(16, help='side of a cell in pixels; size must be a multiple of it')
     orientations: int = setting(8, help='number of orientation bins')
     signed: bool = setting(True, help='distinguish dark-to-bright from bright-to-dark')
+    logarithm: bool = setting(
+        True, help='gradients of the logarithm of the intensity, as strong in shadow as in light'
+    )
 
     def __post_init__(self) -> None:
         _check_resize(self.resize)

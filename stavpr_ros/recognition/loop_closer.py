@@ -46,9 +46,9 @@ class LoopCloser(SequenceRecognizer):
 
     Every image becomes a place; an image is compared with those that came at least ``exclude``
     images and ``exclude_seconds`` before it. Growing needs no rebuild: memory doubles when it is
-    full, and the mean that is subtracted (option ``mean_centering``) is updated when the route is
-    an eighth longer. The closer is the owner of the route's features; :meth:`features` returns
-    them as they came.
+    full; the mean that is subtracted (option ``mean_centering``) is updated when the route is an
+    eighth longer, as is ``whitening`` until it is settled. The closer is the owner of the route's
+    features; :meth:`features` returns them as they came.
 
     With a ``limit``, the oldest eighth of the places is evicted whenever there are so many. Places
     are numbered from the start of the route all the same: a number never comes to mean another
@@ -81,8 +81,9 @@ class LoopCloser(SequenceRecognizer):
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
         self._band = settings.spatial.band(W)
         self._a = adaptive_weights(W, settings.spatial, np.dtype(np.float32))
+        options = settings.applied_options
         self._route = RouteFeatures(
-            feature_settings, settings.applied_options.mean_centering, limit
+            feature_settings, options.mean_centering, options.whitening, limit
         )
         # stamps of the latest places, not yet old enough in seconds
         self._young: deque[int] = deque()

@@ -22,6 +22,7 @@ from stavpr_ros.recognition.match import (
 )
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust import (
+    evenly,
     MeanCentering,
     options_of,
     RobustOptions,
@@ -254,7 +255,9 @@ class PlaceRecognizer(SequenceRecognizer):
         super().__init__(settings, place_map.settings, len(place_map))
         features, options = place_map.features[:], settings.applied_options
         require_finite(features, 'the map')
-        self._centering = MeanCentering(features) if options.mean_centering else None
+        self._centering = None
+        if options.mean_centering or options.whitening:
+            self._centering = MeanCentering(features, options.mean_centering, options.whitening)
         if self._centering is not None:
             features = self._centering.places(features)
         backend = choose_backend(backend)
@@ -272,7 +275,7 @@ class PlaceRecognizer(SequenceRecognizer):
     def _distances_to_itself(self, features: LocalFeatures) -> np.ndarray:
         """Return the distances of some places to all, shape (m, n); NaN to their neighbors."""
         n, radius = len(features), self._settings.nms_radius
-        some = np.unique(np.linspace(0, max(n - 1, 0), min(n, PLACES_TO_START_FROM)).astype(int))
+        some = evenly(n, PLACES_TO_START_FROM)
         matrix = self._matcher.distance_matrix(features.strips[:, some], features.weights[:, some])
         rows = matrix.cpu().numpy()
         for row, place in zip(rows, some.tolist(), strict=True):

@@ -21,6 +21,9 @@ THRESHOLD = 1 - MIN_PROBABILITY  # of the distance, 1 less the probability
 PRIOR = 20  # images that the statistics of the map count for in those of the query
 PIECE = 8192  # images centered at a time
 MEMORY = 150  # rows after which old ones fade
+RANK = 64  # directions that whitening shrinks, at most
+SAMPLE = 256  # places that whitening is learned from
+STRENGTH = 1.5  # of whitening: c in the gains of its directions
 MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
 
 
@@ -32,6 +35,8 @@ class RobustOptions:
     :param mean_centering: subtract the mean of the map's features from its features, and the
         running mean of the query from the query's: the part shared by all images distinguishes no
         places.
+    :param whitening: shrink the directions in which the map's places vary most
+        (:class:`Whitening`): what many places share distinguishes few of them.
     :param query_znorm: z-normalize the distances of an image to all places: some images are far
         from all.
     :param reference_znorm: z-normalize the distances of a place to the latest images, against
@@ -42,6 +47,7 @@ class RobustOptions:
     """
 
     mean_centering: bool = True
+    whitening: bool = True
     query_znorm: bool = True
     reference_znorm: bool = True
     place_filter: bool = True
@@ -77,7 +83,7 @@ class RobustOptions:
         return RobustOptions(**values)
 
 
-PAPER = RobustOptions(False, False, False, False)
+PAPER = RobustOptions(False, False, False, False, False)
 ROBUST = RobustOptions()
 
 
@@ -114,16 +120,16 @@ class FilterSettings:
 
     speeds: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
     levels: tuple[float, ...] = (-1.0, -2.0, -3.25)
-    weight: float = 0.25
+    weight: float = 0.28
     most_change: float = 2.0
     least_change: float = 0.2
     standstill: float = 0.1
-    keep_level: float = 0.998
+    keep_level: float = 0.9995
     keep_speed: float = 0.98
     spread: float = 0.05
     leave: float = 0.01
-    enter: float = 0.01
-    start: float = 0.7
+    enter: float = 0.003
+    start: float = 0.9
     change_deviation: float = 0.5
 
     def level_changes(self) -> np.ndarray:
@@ -151,17 +157,74 @@ class FilterSettings:
         return np.concatenate([before, weights[None]]).astype(np.float32)
 
 
+class Whitening:
+    """
+    Shrinks the directions in which places vary most, for each strip alone.
+
+    With the principal directions u_i of the places and their shares s_i of the variance,
+
+        x -> x + sum_i (g_i - 1) u_i u_i^T x,    g_i = (1 + c s_i / sum_j s_j^2)^(-1/2).
+
+    Shares are relative to their mean, weighted by themselves, so that c has the same meaning for
+    all kinds of features. Whitening in full, c to infinity, would make noise of weak directions as
+    strong as the others: a map of one light does not show what other lights change.
+
+    :param strips: unit-norm features of some places, (W, m, d), m > 0.
+    """
+
+    def __init__(self, strips: torch.Tensor) -> None:
+        samples = strips.double()
+        # of the places with each other: there are fewer of them than dimensions
+        values, vectors = torch.linalg.eigh(samples @ samples.mT)
+        shares = values.clamp(min=0) / values.sum(dim=1, keepdim=True).clamp(min=1e-12)
+        spread = (shares**2).sum(dim=1, keepdim=True).clamp(min=1e-12)
+        gains = torch.rsqrt(1 + STRENGTH * shares / spread)[:, None, -RANK:]
+        directions = samples.mT @ vectors[:, :, -RANK:]
+        directions /= directions.norm(dim=1, keepdim=True).clamp_(min=1e-9)
+        self._directions = directions.mT.float().contiguous()  # (W, rank, d)
+        self._change, self._inverse = (gains - 1).float(), (1 / gains - 1).float()
+
+    def __call__(self, strips: torch.Tensor) -> torch.Tensor:
+        """Return features (W, n, d) with the directions shrunk, of less than unit norm."""
+        return self._scaled(strips, self._change)
+
+    def inverse(self, strips: torch.Tensor) -> torch.Tensor:
+        """Return the features that became these."""
+        return self._scaled(strips, self._inverse)
+
+    def _scaled(self, strips: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
+        parts = torch.bmm(strips, self._directions.mT) * change
+        return torch.baddbmm(strips, parts, self._directions)
+
+    def to(self, device: torch.device) -> 'Whitening':
+        """Return this, moved to a device."""
+        for name in ('_directions', '_change', '_inverse'):
+            setattr(self, name, getattr(self, name).to(device))
+        return self
+
+
 class MeanCentering:
     """
-    Subtracts the part of the features that all images of a traverse share.
+    Subtracts the part of the features that all images of a traverse share, and whitens the rest.
 
     Features have unit norm again afterwards; zero features stay zero.
 
     :param features: those of the map, strips (W, n, d).
+    :param centering, whitening: which of the two to apply.
     """
 
-    def __init__(self, features: LocalFeatures) -> None:
+    def __init__(
+        self, features: LocalFeatures, centering: bool = True, whitening: bool = True
+    ) -> None:
+        self._centering = centering
         self._mean = features.strips.sum(dim=1) / max(len(features), 1)  # (W, d)
+        if not centering:
+            self._mean.zero_()
+        self._whitening: Whitening | None = None
+        if whitening and len(features):
+            some = evenly(len(features), SAMPLE)
+            centered = self.places(features[some]).strips
+            self._whitening = Whitening(centered.cpu()).to(centered.device)
         self.reset()
 
     def reset(self) -> None:
@@ -170,19 +233,37 @@ class MeanCentering:
         self._sum, self._count = self._mean.double() * PRIOR, PRIOR
 
     def places(self, features: LocalFeatures) -> LocalFeatures:
-        """Return features of the map, or of single images, less the map's mean."""
-        return replace(features, strips=without_mean(features.strips, self._mean))
+        """Return features of the map, or of single images, less the map's mean, whitened."""
+        strips = without_mean(features.strips, self._mean)
+        if self._whitening is not None:
+            for piece in strips.split(PIECE, dim=1):
+                piece.copy_(unit_norm(self._whitening(piece)))
+        return replace(features, strips=strips)
 
     def next_query(self, strips: torch.Tensor) -> torch.Tensor:
         """
-        Return the next image's features less the query's running mean, it included.
+        Return the next image's features less the query's running mean, it included, whitened.
 
         :param strips: shape (W, d); the same is returned.
         """
         strips = strips.to(self._mean.device)
-        self._sum = self._sum + strips
-        self._count += 1
-        return without_mean(strips[:, None], (self._sum / self._count).float())[:, 0]
+        if self._centering:
+            self._sum = self._sum + strips
+            self._count += 1
+        centered = without_mean(strips[:, None], (self._sum / self._count).float())
+        if self._whitening is not None:
+            centered = unit_norm(self._whitening(centered))
+        return centered[:, 0]
+
+
+def evenly(n: int, count: int) -> np.ndarray:
+    """Return at most ``count`` places of n, evenly spaced, int64."""
+    return np.unique(np.linspace(0, max(n - 1, 0), min(n, count)).astype(np.int64))
+
+
+def unit_norm(strips: torch.Tensor) -> torch.Tensor:
+    """Return features (..., d) with unit norm; zero ones stay zero."""
+    return strips / strips.norm(dim=-1, keepdim=True).clamp_(min=1e-12)
 
 
 def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:

@@ -1,34 +1,42 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Features of a route that grows by one place at a time, mean-centered, in memory once."""
+"""Features of a route that grows by one place at a time, centered and whitened, in memory once."""
 
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.recognition.robust import evenly, unit_norm, Whitening
 import torch
 
 ROOM = 256  # places that there is room for at first; doubled when they are full
 GROWTH = 1.125  # the mean is updated when the route is so much longer
+SAMPLE = 128  # places that whitening is learned from
+SETTLED = 2000  # places from which on it is not learned again
 PIECE = 512  # places centered at a time: the intermediate results stay in the cache
 
 
 class RouteFeatures:
     """
-    Features of the places of a route, less their mean if that is wanted, unit norm.
+    Features of the places of a route, less their mean and whitened if that is wanted, unit norm.
 
-    With the norm that a centered feature had before it was made unit norm, the features give back
-    the original ones: nothing is held twice.
+    With the norm that a feature had before it was made unit norm, the features give back the
+    original ones: nothing is held twice.
 
     :param settings: how the features are made.
     :param mean_centering: subtract the mean.
+    :param whitening: whiten; learned again from time to time while the route is short.
     :param limit: most places there will be; None = no limit.
     """
 
-    def __init__(self, settings: FeatureSettings, mean_centering: bool, limit: int | None) -> None:
+    def __init__(
+        self, settings: FeatureSettings, mean_centering: bool, whitening: bool, limit: int | None
+    ) -> None:
         self.count = 0
         self.strips = torch.empty((settings.strips, 0, 0))  # centered, (W, room, d)
         self._settings, self._centering, self._limit = settings, mean_centering, limit
+        self._whitens = whitening
+        self._whitening: Whitening | None = None  # of the features less the mean
         self._cells: tuple[int, int] | None = None
         self._weights = torch.empty((settings.strips, 0))
-        # (W, room): the norm of each feature less the mean; 0 for zero features
+        # (W, room): the norm of each feature before it was made unit norm; 0 for zero features
         self._norms = torch.empty((settings.strips, 0))
         self._sum = self._mean = torch.empty(
             (settings.strips, 0)
@@ -54,15 +62,15 @@ class RouteFeatures:
         """
         Return the features as they were appended, in memory of their own.
 
-        Without centering exactly, with it up to the rounding of float32.
+        Without centering and whitening exactly, with them up to the rounding of float32.
         """
         n = self.count
-        strips = self.strips[:, :n].clone()
-        if self._centering and n:
-            norms = self._norms[:, :n, None]
-            strips *= norms
+        if n and (self._centering or self._whitens):
+            strips = self._centered()
             for j in range(len(strips)):
-                strips[j] += self._mean[j] * (norms[j] > 0)
+                strips[j] += self._mean[j] * (self._norms[j, :n, None] > 0)
+        else:
+            strips = self.strips[:, :n].clone()
         return LocalFeatures(strips, self._weights[:, :n].clone(), self._settings, self._cells)
 
     def append(self, features: LocalFeatures) -> bool:
@@ -72,15 +80,16 @@ class RouteFeatures:
         if grows:
             self._grow(strips.shape[2])
             self._cells = features.cells
-        self.strips[:, self.count] = strips[:, 0]
+        self.strips[:, self.count] = self._whitened(strips)[:, 0]
         self._weights[:, self.count] = features.weights[:, 0]
         self._norms[:, self.count] = strips[:, 0].any(dim=1)
         self.count += 1
         if self._centering:
             self._sum += strips[:, 0]
-            self._center(self.count - 1, self.count - 1, -self._mean)
+        if self._centering or self._whitens:
+            self._shift(self.count - 1, self.count - 1, -self._whitened(self._mean[:, None])[:, 0])
             if self.count >= self._next_mean:
-                self._move_mean(0)
+                self._learn(0)
                 self._next_mean = int(self.count * GROWTH) + 1
         return grows
 
@@ -88,16 +97,24 @@ class RouteFeatures:
         """Drop the oldest places; the mean is then that of the others until the next eviction."""
         kept = self.count - count
         self._weights[:, :kept] = self._weights[:, count : self.count].clone()
-        if self._centering:
+        if self._centering or self._whitens:
             self._subtract_from_sum(count)
             self.count = kept
-            self._move_mean(count)
+            self._learn(count)
             self._next_mean = self.count + count + 1
             return
         for first in range(count, self.count, count):
             last = min(first + count, self.count)
             self.strips[:, first - count : last - count] = self.strips[:, first:last]
         self.count = kept
+
+    def _whitened(self, strips: torch.Tensor) -> torch.Tensor:
+        return self._whitening(strips) if self._whitening else strips
+
+    def _centered(self) -> torch.Tensor:
+        """Return the features less the mean, not whitened, of their own norm, (W, n, d)."""
+        strips = self.strips[:, : self.count] * self._norms[:, : self.count, None]
+        return self._whitening.inverse(strips) if self._whitening else strips
 
     def _grow(self, d: int) -> None:
         """Double the room; memory that is not used yet is not touched."""
@@ -117,19 +134,31 @@ class RouteFeatures:
 
     def _subtract_from_sum(self, count: int) -> None:
         """Subtract the original features of the oldest places from the sum."""
+        if not self._centering:
+            return
+        total, alive = torch.zeros_like(self._mean), self._norms[:, :count] > 0
         for j in range(len(self.strips)):
             for low in range(0, count, PIECE):
                 piece = slice(low, min(low + PIECE, count))
-                norms = self._norms[j, piece]
-                self._sum[j] -= norms @ self.strips[j, piece] + (norms > 0).sum() * self._mean[j]
+                total[j] += self._norms[j, piece] @ self.strips[j, piece]
+        if self._whitening:
+            total = self._whitening.inverse(total[:, None])[:, 0]
+        self._sum -= total + alive.sum(dim=1, keepdim=True) * self._mean
 
-    def _move_mean(self, first: int) -> None:
-        """Subtract the present mean instead of the previous one; ``first`` becomes place 0."""
-        mean = (self._sum / self.count).float()
-        self._center(first, 0, self._mean - mean)
+    def _learn(self, first: int) -> None:
+        """Take the present mean and, of a short route, whitening; ``first`` becomes place 0."""
+        mean = (self._sum / self.count).float() if self._centering else self._mean
+        self._shift(first, 0, self._whitened((self._mean - mean)[:, None])[:, 0])
         self._mean = mean
+        if self._whitens and self.count <= SETTLED:
+            strips = self._centered()
+            some = strips[:, evenly(self.count, SAMPLE)]
+            self._whitening = Whitening(unit_norm(some))
+            strips, norms = self._whitening(strips), self._norms[:, : self.count]
+            norms.copy_(strips.norm(dim=2).clamp_(min=1e-12) * (norms > 0))
+            self.strips[:, : self.count] = unit_norm(strips)
 
-    def _center(self, first: int, to: int, change: torch.Tensor) -> None:
+    def _shift(self, first: int, to: int, change: torch.Tensor) -> None:
         """
         Add to features, and make them unit norm again; zero features stay zero.
 
