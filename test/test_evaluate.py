@@ -260,7 +260,7 @@ def report(run, tmp_path):
 
     def call(*arguments):
         folder = tmp_path / 'report'
-        code, text, errors = run(*arguments, '--output', folder)
+        code, text, errors = run(*arguments, '--output', folder, '--force')
         assert code == 0, errors
         with (folder / 'answers.csv').open() as file:
             rows = list(csv.DictReader(file))
