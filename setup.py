@@ -16,7 +16,16 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = 'stavpr_ros'
-EXECUTABLES = ('node', 'build_map', 'replay', 'demo', 'record', 'evaluate', 'experiments')
+EXECUTABLES = (
+    'node',
+    'build_map',
+    'replay',
+    'demo',
+    'record',
+    'monitor',
+    'evaluate',
+    'experiments',
+)
 
 # The command `evaluate` is part of every installation.
 EVALUATION = ['jinja2>=3.1', 'scikit-learn>=1.4']

@@ -4,6 +4,7 @@
 Replay a bag, or a folder of images, into the node.
 
 ros2 launch stavpr_ros replay.launch.py bag:=drive.bag map_path:=route.stavpr
+ros2 launch stavpr_ros replay.launch.py bag:=drive.bag operation:=mapping keyframe_distance:=0.5
 """
 
 from launch import LaunchContext, LaunchDescription
@@ -12,16 +13,42 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from stavpr_ros.ros.launching import node_launch, PACKAGE, remappings
 
+OPTIONS = {
+    'topic': 'image topic in the bag; empty: the only one',
+    'odometry': 'odometry topic in the bag, published on odom; empty: the only one if '
+    'keyframe_distance or keyframe_angle is given, else none',
+    'also': 'further topics of the bag, separated by spaces, published under their names',
+    'rate': 'factor on the recorded pace; empty: 1',
+    'fps': 'images per second at which a folder was recorded; empty: 10',
+    'start_offset': 'recorded seconds to leave out at the beginning; empty: 0',
+    'duration': 'recorded seconds to replay; empty: all',
+}
+SWITCHES = {
+    'lossless': 'publish each image after the match of the last one; leave rate empty',
+    'loop': 'start again at the end',
+    'start_paused': 'start paused: see the services of /stavpr_replay',
+    'shutdown': 'shut down the node after the replay',
+}
+
 
 def _replay(context: LaunchContext) -> list[Node]:
     """Start the replay with the given options; it waits for the subscription of the node."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in (*OPTIONS, *SWITCHES)}
+
+    def is_set(name: str) -> bool:
+        return LaunchConfiguration(name).perform(context) not in {'', '0', '0.0', 'false', 'False'}
+
     words = [LaunchConfiguration('bag')]
-    for option in ('topic', 'rate'):
-        if LaunchConfiguration(option).perform(context):
-            words += [f'--{option}', LaunchConfiguration(option)]
-    if LaunchConfiguration('lossless').perform(context) == 'true':
-        words.append('--lossless')
-    ends = LaunchConfiguration('shutdown').perform(context) == 'true'
+    for name in OPTIONS:
+        if given[name]:
+            words += [f'--{name.replace("_", "-")}', *given[name].split()]
+    if not given['odometry'] and (is_set('keyframe_distance') or is_set('keyframe_angle')):
+        words.append('--odometry')
+    for name in ('lossless', 'loop', 'start_paused'):
+        if is_set(name):
+            words.append(f'--{name.replace("_", "-")}')
+    if is_set('use_sim_time'):
+        words.append('--clock')
     return [
         Node(
             package=PACKAGE,
@@ -30,35 +57,24 @@ def _replay(context: LaunchContext) -> list[Node]:
             arguments=words,
             remappings=remappings(),
             output='screen',
-            on_exit=[Shutdown(reason='the replay has ended')] if ends else None,
+            on_exit=[Shutdown(reason='the replay has ended')] if is_set('shutdown') else None,
         )
     ]
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Describe the node and the replay."""
-    booleans = ['true', 'false']
+    """Describe the node and the replay; with use_sim_time, the replay publishes /clock."""
     own = [
         DeclareLaunchArgument('bag', description='ROS 1 or ROS 2 bag, or folder of images'),
-        DeclareLaunchArgument(
-            'topic', default_value='', description='image topic in the bag; empty: the only one'
+        *(
+            DeclareLaunchArgument(name, default_value='', description=description)
+            for name, description in OPTIONS.items()
         ),
-        DeclareLaunchArgument(
-            'rate',
-            default_value='',
-            description='factor on the recorded rate, or Hz of a folder; empty: 1, or 10',
-        ),
-        DeclareLaunchArgument(
-            'lossless',
-            default_value='false',
-            choices=booleans,
-            description='publish each image after the match of the last one; leave rate empty',
-        ),
-        DeclareLaunchArgument(
-            'shutdown',
-            default_value='false',
-            choices=booleans,
-            description='shut down the node after the replay',
+        *(
+            DeclareLaunchArgument(
+                name, default_value='false', choices=['true', 'false'], description=description
+            )
+            for name, description in SWITCHES.items()
         ),
     ]
     return node_launch(*own, OpaqueFunction(function=_replay))

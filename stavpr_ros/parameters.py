@@ -306,6 +306,18 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         ),
         NodeParameter('map_frame', 'map', 'Frame of the poses of the map, for ~/pose.'),
         NodeParameter(
+            'publish_tf',
+            False,
+            'localization: publish the transform from map_frame to the frame of the odometry on '
+            '/tf, for maps with poses; requires tf2_msgs, and odometry on the topic odom.',
+        ),
+        NodeParameter(
+            'publish_initialpose',
+            False,
+            'localization: publish initialpose (x, y, yaw), for Nav2, at the first match after '
+            'the start, a reset or sequence_length images without a match; for maps with poses.',
+        ),
+        NodeParameter(
             'diagnostics_period', 1.0, 'Period of the diagnostics.', 's', 'start', (0.1, 60.0)
         ),
         NodeParameter(

@@ -36,6 +36,9 @@ FIXED = {
 GIVEN = {'cameras': 'front'}  # required arguments
 TEXTS = {bool: ('true', True), int: ('3', 3), float: ('1', 1.0), str: ('2', '2')}
 
+REPLAY = {'bag', 'topic', 'odometry', 'also', 'rate', 'fps', 'start_offset', 'duration'}
+REPLAY |= {'lossless', 'loop', 'start_paused', 'shutdown'}
+
 
 class Recorded:
     """An action or substitution that keeps its arguments."""
@@ -140,7 +143,7 @@ def test_launch_file_has_an_argument_for_every_parameter(load, name):
     """Everything is given at once: names and types are those of the table."""
     launch, fixed = load(name), FIXED[name]
     common = {'image', 'odom', 'namespace', 'params_file', 'use_sim_time'}
-    own = {'replay': {'bag', 'topic', 'rate', 'lossless', 'shutdown'}, 'multi_camera': {'cameras'}}
+    own = {'replay': REPLAY, 'multi_camera': {'cameras'}}
     expected = (set(BY_NAME) - set(fixed)) | common | own.get(name, set())
     assert set(launch.arguments) == expected
     for argument in launch.arguments.values():
@@ -227,11 +230,28 @@ def test_launch_of_replay_passes_its_options(load):
     assert words(dict(replay.remappings)['image']) == '${image}'
     assert Path(executable(replay.executable)).exists()
     _, replay = launch.start(bag='drive', topic='/camera', lossless='true', shutdown='true')
-    expected = ['${bag}', '--topic', '${topic}', '--lossless']
+    expected = ['${bag}', '--topic', '/camera', '--lossless']
     assert [words(word) for word in replay.arguments] == expected
     assert type(replay.on_exit[0]).__name__ == 'Shutdown'
-    _, replay = launch.start(bag='drive', rate='2')
-    assert [words(word) for word in replay.arguments] == ['${bag}', '--rate', '${rate}']
+    _, replay = launch.start(bag='drive', rate='2', start_offset='5', also='/tf /tf_static')
+    expected = ['${bag}', '--also', '/tf', '/tf_static', '--rate', '2', '--start-offset', '5']
+    assert [words(word) for word in replay.arguments] == expected
+
+
+@pytest.mark.parametrize(
+    ('given', 'expected'),
+    [
+        ({'keyframe_distance': '0.5'}, ['--odometry']),
+        ({'keyframe_angle': '10'}, ['--odometry']),
+        ({'keyframe_distance': '0.5', 'odometry': '/wheels'}, ['--odometry', '/wheels']),
+        ({'keyframe_distance': '0.0'}, []),
+        ({'use_sim_time': 'true', 'loop': 'true'}, ['--loop', '--clock']),
+        ({'use_sim_time': 'false', 'start_paused': 'true'}, ['--start-paused']),
+    ],
+)
+def test_launch_of_replay_adds_what_the_parameters_of_the_node_need(load, given, expected):
+    _, replay = load('replay').start(bag='drive', **given)
+    assert [words(word) for word in replay.arguments] == ['${bag}', *expected]
 
 
 def test_documented_launch_arguments_exist(load):

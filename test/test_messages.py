@@ -321,8 +321,8 @@ def test_match_image_shows_status_place_and_distance_or_probability(
         route.add(features, thumbnail=encode_thumbnail(image) if i != 35 else b'')
     texts = []
 
-    def draw(shown, thumbnail, text, is_match):
-        texts.append((thumbnail is not None, text, is_match))
+    def draw(shown, thumbnail, text, is_match, label=''):
+        texts.append((thumbnail is not None, text, is_match, label))
         assert shown is query
 
     monkeypatch.setattr(overlay, 'match_image', draw)
@@ -331,8 +331,13 @@ def test_match_image_shows_status_place_and_distance_or_probability(
     overlay.draw_match(rejected(image=query, inliers=3, relative=True, probability=0.934), route)
     overlay.draw_match(Match(Status.SKIPPED, 'because', image=query), None)
     assert texts == [
-        (False, 'match: place 35, distance 0.250 (threshold 0.300), 20 inliers', True),
-        (True, 'no match: place 32, distance 0.250 (threshold 0.300)', False),
-        (True, 'no match: place 32, p 0.93, 3 inliers', False),
-        (False, 'skipped because', False),
+        (
+            False,
+            'match: place 35, distance 0.250 (threshold 0.300), 20 inliers',
+            True,
+            'map place 35',
+        ),
+        (True, 'no match: place 32, distance 0.250 (threshold 0.300)', False, 'map place 32'),
+        (True, 'no match: place 32, p 0.93, 3 inliers', False, 'map place 32'),
+        (False, 'skipped because', False, ''),
     ]

@@ -211,7 +211,7 @@ def test_replay_of_a_folder_with_a_damaged_image_skips_it(tmp_path, subscribe, r
         cv2.imwrite(str(tmp_path / f'{i}.png'), image)
     (tmp_path / '2.png').write_bytes(b'damaged')
     subscriber = subscribe()
-    code, output, errors = replay(tmp_path, '--rate', '20')
+    code, output, errors = replay(tmp_path, '--fps', '20', '--rate', '2')
     assert code == 0
     assert '1 skipped' in output
     assert '2.png: 7 bytes are no image' in errors

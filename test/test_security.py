@@ -45,6 +45,7 @@ def test_policy_of_the_node_is_what_it_uses(policy, context, transport):
     if names['subscribe'] & BOTH_CAMERAS:  # one of them at a time
         names['subscribe'] |= BOTH_CAMERAS
     names['subscribe'].add('/clock')  # with use_sim_time
+    names['publish'] |= {'/tf', '/initialpose'}  # with publish_tf, and for Nav2
     assert names == {'request': set(), **policy['node']}
 
 

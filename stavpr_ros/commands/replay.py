@@ -3,23 +3,34 @@
 """``replay``: publish the images of a bag or folder, at a pace or each after the last result."""
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+import heapq
 import math
 import sys
 import time
 
 import rclpy
 from stavpr_ros.commands.program import DONE, FAILED, make_parser, run_program
-from stavpr_ros.errors import ImageError, StavprError
+from stavpr_ros.errors import ImageError, SourceError, StavprError, UnavailableError
 from stavpr_ros.ros.process import own_arguments, prepare_transport, ros_node
-from stavpr_ros.ros.replay import NoResultError, NoSubscriberError, Replayer
+from stavpr_ros.ros.replay import (
+    message_class,
+    NoResultError,
+    NoSubscriberError,
+    Replayer,
+    ReplayOptions,
+)
 from stavpr_ros.sources import open_source
+from stavpr_ros.sources.bag import BagSource, ODOMETRY
+from stavpr_ros.sources.bag_messages import list_topics, read_messages
 from stavpr_ros.sources.folder import FolderSource
-from stavpr_ros.sources.frame import ImageRecord
+from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
 from tqdm import tqdm
 
 NO_SUBSCRIBER, NO_RESULT = 3, 4  # exit codes, besides those of every command
-FOLDER_RATE = 10.0
+FOLDER_FPS = 10.0
+CLOCK_RATE = 40.0  # that of `ros2 bag play`
+ONLY = ''  # --odometry without a topic
 
 EPILOG = """\
 examples:
@@ -29,8 +40,13 @@ examples:
         a ROS 2 bag, twice as fast
   ros2 run stavpr_ros replay traverse.mcap --lossless
         each image after the result of the last one on /stavpr/match; nothing is dropped
-  ros2 run stavpr_ros replay photos --rate 5 --ros-args -r image:=/camera/image
+  ros2 run stavpr_ros replay traverse --odometry --also /tf /tf_static --clock
+        the bag's odometry on the topic odom, two more topics, and /clock for use_sim_time
+  ros2 run stavpr_ros replay photos --fps 5 --ros-args -r image:=/camera/image
         a folder of images, 5 per second, on another topic
+
+On a terminal, space pauses and resumes, s or the right arrow publishes the next image. The
+services ~/pause, ~/resume, ~/toggle_paused and ~/play_next (std_srvs/Trigger) do the same.
 
 exit codes:
   0    all images were published, and arrived where that can be known
@@ -71,34 +87,97 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
         tqdm.write(f'replay: {text}', file=sys.stderr)
 
     source = open_source(options.bag, options.topic, skip)
-    if isinstance(source, FolderSource):
-        records, rate = source.records(options.rate or FOLDER_RATE), 1.0
-    else:
-        records, rate = source.records(), options.rate or 1.0
+    others = _others(options, source, notify)
+    whole = options.duration == math.inf and not (options.start_offset or options.loop)
     # no bar without a terminal
-    with tqdm(total=len(source), unit='image', desc='replay', disable=None) as bar:
+    with tqdm(
+        total=len(source) if whole else None, unit='image', desc='replay', disable=None
+    ) as bar:
         prepare_transport()
         with ros_node(lambda: rclpy.create_node('stavpr_replay'), ros_arguments) as node:
-            replayer = Replayer(
-                node, notify, rate, options.lossless, options.timeout, options.wait
+            how = ReplayOptions(
+                options.rate or 1.0,
+                options.lossless,
+                options.timeout,
+                options.wait,
+                options.start_paused,
+                options.clock or 0.0,
             )
+            replayer = Replayer(node, notify, how, others)
             try:
-                report = _replay(replayer, records, bar.update)
+                report = _replay(replayer, options, source, bar.update)
             finally:
                 replayer.close()
+    if not (replayer.published or skipped):
+        raise SourceError(
+            f'{options.bag} has no image from second {options.start_offset:g} on, for '
+            f'{options.duration:g} s: choose another --start-offset or --duration'
+        )
     print(f'{report}, {len(skipped)} skipped')
-    return FAILED if len(skipped) == len(source) else DONE
+    return DONE if replayer.published else FAILED
+
+
+def _others(
+    options: argparse.Namespace, source: FolderSource | BagSource, notify: Callable[[str], None]
+) -> dict[RecordedTopic, str]:
+    """Return the topics to publish beside the images, and the names to publish them on."""
+    if options.odometry is None and options.also is None:
+        return {}
+    if isinstance(source, FolderSource):
+        raise SourceError(
+            f'{source.path} is a folder of images: --odometry and --also require a bag'
+        )
+    topics = list_topics(source.path)
+
+    def find(name: str, of_type: str = '') -> RecordedTopic:
+        found = [
+            topic
+            for topic in topics.values()
+            if of_type in {'', topic.message_type}
+            and name.strip('/') in {'', topic.name.strip('/')}
+        ]
+        if len(found) != 1:
+            listed = ', '.join(f'{each.name} ({each.message_type})' for each in topics.values())
+            raise SourceError(
+                f'{len(found)} topics {name} {of_type} with messages in {source.path}: expected '
+                f'one of {listed}'
+            )
+        return found[0]
+
+    requested = [find(name) for name in options.also or ()]
+    if options.also == []:
+        for topic in topics.values():
+            try:
+                message_class(topic.message_type)
+            except UnavailableError as error:
+                notify(f'{topic.name} is left out: {error}')
+            else:
+                requested.append(topic)
+    others = {topic: topic.name for topic in requested if topic.name != source.topic}
+    if options.odometry is not None:
+        others[find(options.odometry, ODOMETRY)] = 'odom'
+    return others
 
 
 def _replay(
-    replayer: Replayer, records: Iterator[ImageRecord], count: Callable[[], object]
+    replayer: Replayer,
+    options: argparse.Namespace,
+    source: FolderSource | BagSource,
+    count: Callable[[], object],
 ) -> str:
     """Publish the records; return a summary."""
+
+    def counted() -> Iterator[ImageRecord | MessageRecord]:
+        for record in _records(options, source, replayer.topics):
+            yield record
+            if isinstance(record, ImageRecord):
+                count()
+
     replayer.wait_for_subscribers()
     began = time.monotonic()
-    for record in records:
-        replayer.send(record)
-        count()
+    replayer.play(counted())
+    while options.loop and replayer.published:
+        replayer.play(counted())
     seconds = time.monotonic() - began
     replayer.finish()
     rate = replayer.published / max(seconds, 1e-9)
@@ -106,9 +185,24 @@ def _replay(
         f'{replayer.published} images published on {replayer.publisher.topic_name} '
         f'in {seconds:.1f} s ({rate:.1f} per second)'
     )
-    if replayer.lossless:
+    if options.lossless:
         summary += f', {replayer.resent} sent again, {replayer.dropped} dropped'
     return summary
+
+
+def _records(
+    options: argparse.Namespace, source: FolderSource | BagSource, topics: Collection[str]
+) -> Iterator[ImageRecord | MessageRecord]:
+    """Yield the images, and the messages of other topics, in the order of recording."""
+    span = options.start_offset, options.duration
+    if isinstance(source, FolderSource):
+        return source.records(options.fps, *span)
+    images = source.records(*span)
+    if not topics:
+        return images
+    # of two of one time, the image is the later one: its odometry is there
+    others = read_messages(source.path, topics, *span)
+    return heapq.merge(others, images, key=lambda record: record.time_ns)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -119,16 +213,60 @@ def _parser() -> argparse.ArgumentParser:
         help='a ROS 2 bag (folder, .db3 or .mcap file), a ROS 1 .bag, or a folder of images',
     )
     parser.add_argument('--topic', help='image topic in the bag; needed if it has several')
+    parser.add_argument(
+        '--odometry',
+        nargs='?',
+        const=ONLY,
+        metavar='TOPIC',
+        help='publish this topic of nav_msgs/Odometry, by default the only one, on odom',
+    )
+    parser.add_argument(
+        '--also',
+        nargs='*',
+        metavar='TOPIC',
+        help='publish these topics under their names; without a name: all (cameras, tf, ...)',
+    )
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument(
         '--rate',
         type=_positive,
         metavar='R',
-        help=f'factor on the recorded pace (1); for a folder images per second ({FOLDER_RATE:g})',
+        help='factor on the recorded pace (1)',
     )
     pace.add_argument(
         '--lossless', action='store_true', help='send each image after the result of the last one'
     )
+    parser.add_argument(
+        '--fps',
+        type=_positive,
+        default=FOLDER_FPS,
+        metavar='HZ',
+        help='images per second at which a folder was recorded (%(default)g)',
+    )
+    parser.add_argument('--loop', action='store_true', help='start again at the end')
+    parser.add_argument(
+        '--start-offset',
+        type=_not_negative,
+        default=0.0,
+        metavar='S',
+        help='start so many recorded seconds after the beginning',
+    )
+    parser.add_argument(
+        '--duration',
+        type=_positive,
+        default=math.inf,
+        metavar='S',
+        help='end after so many recorded seconds',
+    )
+    parser.add_argument(
+        '--clock',
+        nargs='?',
+        type=_positive,
+        const=CLOCK_RATE,
+        metavar='HZ',
+        help=f'publish the recorded time on /clock for use_sim_time ({CLOCK_RATE:g} Hz)',
+    )
+    parser.add_argument('--start-paused', action='store_true', help='start paused')
     parser.add_argument(
         '--timeout',
         type=_positive,
@@ -147,6 +285,10 @@ def _positive(text: str) -> float:
     if not (value > 0 and math.isfinite(value)):
         raise argparse.ArgumentTypeError(f'{text}: expected a number above 0')
     return value
+
+
+def _not_negative(text: str) -> float:
+    return 0.0 if float(text) == 0 else _positive(text)
 
 
 if __name__ == '__main__':

@@ -18,9 +18,10 @@ COMMANDS = {
     'node': 'run the place-recognition node (ROS 2)',
     'replay': 'publish a bag or a folder of images to the node (ROS 2)',
     'record': 'write matches or loop closures to a JSON Lines file (ROS 2)',
+    'monitor': 'show the node in a web browser (ROS 2)',
     'demo': 'build, run and evaluate everything on a synthetic street (ROS 2)',
 }
-NEED_ROS = ('node', 'replay', 'record', 'demo')
+NEED_ROS = ('node', 'replay', 'record', 'monitor', 'demo')
 
 
 def usage() -> str:

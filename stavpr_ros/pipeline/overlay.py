@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Draws a query beside the place that it was matched with, fast enough for every frame."""
+"""Draws a query beside its place, and the distances of a window, fast enough for every frame."""
 
 import math
 
@@ -11,6 +11,8 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.recognition import Match
 
 RIGHT, NO_MATCH = (46, 125, 80), (200, 150, 40)  # RGB
+NEARBY = 150  # places shown to each side of a match
+SIZE = (900, 240)  # pixels of the drawn distances, about
 _INK, _PAPER, _EMPTY = (32, 34, 38), (250, 250, 248), (226, 226, 222)
 
 
@@ -35,11 +37,13 @@ def draw_match(match: Match, places: PlaceMap | GrowingMap | None) -> np.ndarray
         text += f' (threshold {match.threshold:.3f})'
     if match.inliers >= 0:
         text += f', {match.inliers} inliers'
-    return match_image(match.image, places.thumbnail(place), text, match.accepted)
+    return match_image(
+        match.image, places.thumbnail(place), text, match.accepted, f'map place {place}'
+    )
 
 
 def match_image(
-    query: np.ndarray, place: np.ndarray | None, text: str, accepted: bool
+    query: np.ndarray, place: np.ndarray | None, text: str, accepted: bool, label: str = ''
 ) -> np.ndarray:
     """
     Put a query and the place it was matched with side by side, with a line of text below.
@@ -48,6 +52,7 @@ def match_image(
     :param place: RGB uint8 of any size, or None where there is nothing to show.
     :param text: the status, one line of ASCII; shrunk until it fits.
     :param accepted: whether the bar at the edge is that of a match.
+    :param label: of the place.
     :returns: RGB, shape (h + bar, 2 w + gap, 3), uint8.
     """
     for name, image in (('query', query), ('place', place)):
@@ -73,10 +78,72 @@ def match_image(
                 interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR,
             )
         sheet[:height, width + gap :] = place
+        _label(sheet[:height, width + gap :], label, bar)
+    _label(sheet[:height, :width], 'camera', bar)
     strip = sheet[height:]
     strip[:, : max(4, bar // 3)] = RIGHT if accepted else NO_MATCH
     _write(strip[:, max(4, bar // 3) :], text, bar * 0.45)
     return sheet
+
+
+def draw_window(rows: np.ndarray, first: int, match: Match) -> np.ndarray:
+    """
+    Draw the distances of a window, one row per image, and the warping path over them.
+
+    Of a large map, only the surroundings of the nearest sequence are shown.
+
+    :param rows: distances, shape (m, n), oldest image first; +inf = not compared.
+    :param first: index of the place of the first column.
+    :returns: RGB, uint8, dark = near.
+    """
+    middle = match.sequence.middle if match.sequence is not None else first
+    left = min(max(0, middle - first - NEARBY), max(0, rows.shape[1] - 2 * NEARBY))
+    shown = rows[:, left : left + 2 * NEARBY]
+    height, width = shown.shape
+    across, down = max(1, round(SIZE[0] / width)), max(1, round(SIZE[1] / max(height, 1)))
+    finite = np.where(np.isfinite(shown), shown, np.nan)
+    low, high = (
+        np.nan_to_num(f(finite)) if np.isfinite(finite).any() else 0.0
+        for f in (np.nanmin, np.nanmax)
+    )
+    gray = np.nan_to_num((finite - low) / max(high - low, 1e-9), nan=1.0) * 255
+    sheet = cv2.applyColorMap(gray.astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
+    sheet = np.ascontiguousarray(np.repeat(np.repeat(sheet, down, axis=0), across, axis=1))
+    if match.sequence is not None and len(match.path):
+        points = [
+            ((place - first - left) * across + across // 2, image * down + down // 2)
+            for image, place in match.path.tolist()
+        ]
+        ink = (255, 255, 255) if match.accepted else NO_MATCH
+        cv2.polylines(sheet, [np.array(points, np.int32)], False, ink, 2, cv2.LINE_AA)
+    bar = np.full((24, sheet.shape[1], 3), _PAPER, np.uint8)
+    text = f'images of the window (newest below) x places {first + left} to '
+    text += f'{first + left + width - 1}'
+    if match.relative and match.sequence is not None:
+        text += f'; place {middle}, p {match.probability:.2f}'
+    _write(bar, text, 11)
+    return np.vstack([sheet, bar])
+
+
+def least_of_each(rows: np.ndarray, columns: int) -> np.ndarray:
+    """
+    Return rows of at most so many columns, each the least of its part of the places.
+
+    :param rows: shape (m, n), n at least 1.
+    """
+    n = rows.shape[1]
+    if n <= columns:
+        return rows
+    return np.minimum.reduceat(rows, np.arange(columns) * n // columns, axis=1)
+
+
+def _label(area: np.ndarray, text: str, height: int) -> None:
+    """Write a label into the upper left corner of an image."""
+    if text:
+        width = min(area.shape[1], round(len(text) * height * 0.4) + 8)
+        corner = area[: round(height * 0.8), :width]
+        corner[:] = _PAPER
+        _write(corner, text, height * 0.45)
 
 
 def _write(area: np.ndarray, text: str, size: float, centered: bool = False) -> None:

@@ -200,6 +200,15 @@ class Pipeline:
             )
         return replace(self._last, candidates=tuple(recognizer.ranked(count)))
 
+    def window_distances(self) -> tuple[np.ndarray, int]:
+        """
+        Return the distances of the images in the window to the places.
+
+        :returns: shape (m, n), float32, empty where nothing is compared; index of the first place.
+        """
+        recognizer = self._operation.recognizer if self._operation else None
+        return recognizer.window_rows() if recognizer else (np.empty((0, 0), np.float32), 0)
+
     def process(self, message: Any, stamp: int, pose: np.ndarray | None = None) -> Match:
         """
         Process one image message, raw or compressed. An invalid image changes nothing.

@@ -192,6 +192,8 @@ class NodeSettings:
     diagnostics_period: float
     verbosity: str
     threads: int
+    publish_tf: bool
+    publish_initialpose: bool
     pipeline: PipelineSettings
 
     def __post_init__(self) -> None:
@@ -204,8 +206,9 @@ class NodeSettings:
 
     @property
     def needs_odometry(self) -> bool:
-        """Whether poses are used, for keyframes or for the places of a growing map."""
-        return self.pipeline.keyframes.needs_poses or self.operation != 'localization'
+        """Whether poses are used: for keyframes, places of a growing map, or the transform."""
+        used = self.pipeline.keyframes.needs_poses or self.publish_tf
+        return used or self.operation != 'localization'
 
 
 def absolute_path(path: str) -> str:

@@ -159,6 +159,17 @@ class SequenceRecognizer:
         buffer = self._buffer
         return self._znorm.scaled(buffer.rows()[-1, : buffer.places].cpu().numpy())
 
+    def window_rows(self) -> tuple[np.ndarray, int]:
+        """
+        Return the distances of the images in the window, as :meth:`newest_row`, oldest first.
+
+        :returns: shape (m, n), float32, +inf for places not compared; the index of the first
+            place.
+        """
+        buffer = self._buffer
+        rows = buffer.rows()[buffer.length - len(buffer) :, : buffer.known].cpu().numpy()
+        return self._znorm.scaled(rows), buffer.first
+
     def _clear_window(self) -> None:
         self._buffer.clear()
         if self._filter is not None:

@@ -1,29 +1,39 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Publishes image records at a pace, or each after the result of the one before."""
+"""Publishes the records of a bag at a pace, or each image after the result of the last one."""
 
 import array
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
+import importlib.util
 import math
+from pathlib import Path
+import re
 import time
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
-from stavpr_ros.errors import StavprError
+from stavpr_ros.errors import StavprError, UnavailableError
+from stavpr_ros.ros.playback import keyboard, Playback
 from stavpr_ros.ros.process import Discovery
 from stavpr_ros.signals import signals_deferred
-from stavpr_ros.sources.frame import ImageRecord
+from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
 from std_msgs.msg import Header
+from std_srvs.srv import Trigger
 
 SECOND = 1_000_000_000
 SPIN_SECONDS = 0.1  # until a signal is noticed
 TRIES = 3  # how often one image is sent
 RELIABLE = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
+OTHERS_DEPTH = 1000  # messages of one topic between two images
 
 
 class NoSubscriberError(StavprError):
@@ -51,41 +61,91 @@ def image_message(record: ImageRecord) -> Image:
     return message
 
 
-class Replayer:
+def message_class(name: str) -> type:
     """
-    Publishes images on the topic ``image`` of a node, which it spins.
+    Return the class of a message type.
 
-    :param node: for the publisher and the subscription of the results.
-    :param notify: called with messages for the user: waiting for a subscriber, an image sent
-        again.
+    :param name: such as ``nav_msgs/msg/Odometry``; it may come from a foreign file, so only
+        packages with messages are imported.
+    :raises UnavailableError: its package is not installed.
+    """
+    if words := re.fullmatch(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)', name):
+        package, kind = words.groups()
+        spec = importlib.util.find_spec(package)  # does not import it
+        folders = (spec.submodule_search_locations if spec else None) or []
+        if any(Path(folder, 'msg').is_dir() for folder in folders):
+            found = getattr(importlib.import_module(f'{package}.msg'), kind, None)
+            if isinstance(found, type):
+                return found
+    raise UnavailableError(
+        f'the message type {name} is not installed: install its package and source its '
+        'environment, or leave the topic out'
+    )
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """
+    How records are published.
+
     :param rate: factor on the recorded pace, above 0; without effect with ``lossless``.
     :param lossless: publish the next image after the result of the last one on ``stavpr/match``.
     :param timeout: seconds without a result after which an image is sent again.
     :param wait: seconds to wait for subscribers; None = no limit.
+    :param paused: wait for a step before the first image.
+    :param clock: messages per second on ``/clock``, 0 = none.
+    """
+
+    rate: float = 1.0
+    lossless: bool = False
+    timeout: float = 20.0
+    wait: float | None = None
+    paused: bool = False
+    clock: float = 0.0
+
+
+class Replayer:
+    """
+    Publishes images on the topic ``image`` of a node, which it spins, and other messages.
+
+    :param node: for the publishers, the services and the subscription of the results.
+    :param notify: called with messages for the user: waiting for a subscriber, an image sent
+        again.
+    :param topics: what is published beside the images, topic of the bag to topic of ROS.
+    :raises UnavailableError: a message type is not installed.
     """
 
     def __init__(
         self,
         node: Node,
         notify: Callable[[str], None],
-        rate: float,
-        lossless: bool,
-        timeout: float,
-        wait: float | None,
+        options: ReplayOptions,
+        topics: Mapping[RecordedTopic, str],
     ) -> None:
-        self.node, self.notify = node, notify
-        self._rate, self._timeout, self._wait = rate, timeout, wait
-        self.lossless = lossless
+        self.node, self.notify, self.options = node, notify, options
         self.published = self.resent = self.dropped = 0
         self.publisher = node.create_publisher(Image, 'image', RELIABLE)
+        self._others = {topic.name: self._publish_on(topic, to) for topic, to in topics.items()}
         self._match_topic = node.resolve_topic_name('stavpr/match')
-        if lossless:
+        if options.lossless:
             node.create_subscription(PlaceMatch, 'stavpr/match', self._on_match, RELIABLE)
+        self.playback = Playback(None if options.lossless else options.rate, options.paused)
+        self._serve()
+        self._clock: Publisher | None = None
+        if options.clock:
+            self._clock = node.create_publisher(ClockMessage, '/clock', RELIABLE)
+            steady = Clock(clock_type=ClockType.STEADY_TIME)
+            node.create_timer(1 / options.clock, self._publish_clock, clock=steady)
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._discovery = Discovery(node, self._endpoints, timeout)
+        self._discovery = Discovery(node, self._endpoints, options.timeout)
         self._outstanding: Header | None = None
-        self._start: tuple[float, int] | None = None
+        self._poll: Callable[[], None] = lambda: None
+
+    @property
+    def topics(self) -> Collection[str]:
+        """Return the topics of the bag that are published beside the images."""
+        return self._others.keys()
 
     def wait_for_subscribers(self) -> None:
         """
@@ -103,25 +163,47 @@ class Replayer:
                 notified = missing
             return not missing
 
-        if not self._spin_until(complete, self._wait):
+        if not self._spin_until(complete, self.options.wait):
             raise NoSubscriberError(
-                f'waited {self._wait:g} s for {self._missing()}: expected a running node; '
+                f'waited {self.options.wait:g} s for {self._missing()}: expected a running node; '
                 'start it, compare the topics (`ros2 topic list`) and ROS_DOMAIN_ID, or wait '
                 'longer (--wait)'
             )
         self._wait_for_discovery()
 
-    def send(self, record: ImageRecord) -> None:
+    def play(self, records: Iterable[ImageRecord | MessageRecord]) -> None:
         """
-        Publish one image when it is due; if lossless, return after its result.
+        Publish each record when it is due; if lossless, an image after the last one's result.
+
+        While it runs, keys of the terminal pause, resume and step.
 
         :raises NoResultError: lossless, and no result after all tries.
         """
+        playback = self.playback
+        keys = {' ': self._toggle, 's': playback.step, '\x1b[C': playback.step}
+        first = True
+        with keyboard(keys) as self._poll:
+            for record in records:
+                if first:
+                    playback.start(record.time_ns)
+                    first = False
+                self._send(record)
+        self._poll = lambda: None
+
+    def _send(self, record: ImageRecord | MessageRecord) -> None:
+        is_image = isinstance(record, ImageRecord)
+        if is_image:
+            self._spin_once(0.0)  # also while late: pause is served
+        self._wait_until_due(record.time_ns)
+        self.playback.passed(record.time_ns, is_image)
+        self._publish_clock()
+        if isinstance(record, MessageRecord):
+            self._others[record.topic].publish(record.content)
+            return
         message = image_message(record)
-        if self.lossless:
+        if self.options.lossless:
             self._send_until_answered(message)
         else:
-            self._wait_until_due(record.time_ns)
             self.publisher.publish(message)
         self.published += 1
 
@@ -131,8 +213,10 @@ class Replayer:
 
         :raises NoResultError: a reliable subscriber has not acknowledged them in time.
         """
-        timeout = self._timeout
-        if not self._spin_until(lambda: self.publisher.wait_for_all_acked(Duration()), timeout):
+        timeout = self.options.timeout
+        if not self._spin_until(
+            lambda: all(each.wait_for_all_acked(Duration()) for each in self._publishers), timeout
+        ):
             raise NoResultError(
                 f'the last images on {self.publisher.topic_name} are not acknowledged after '
                 f'{timeout:g} s: expected reliable subscribers to take them; check for a busy one'
@@ -151,15 +235,20 @@ class Replayer:
             left = end - time.monotonic()
             if left <= 0:
                 return False
-            with signals_deferred():
-                self._executor.spin_once(timeout_sec=min(left, SPIN_SECONDS))
+            self._spin_once(left)
         return True
+
+    def _spin_once(self, seconds: float) -> None:
+        """Serve one callback, or wait for one at most so long; read the keys."""
+        with signals_deferred():
+            self._executor.spin_once(timeout_sec=min(seconds, SPIN_SECONDS))
+        self._poll()
 
     def _missing(self) -> str:
         """Return the endpoint that is not discovered yet; empty = none."""
         if not self.publisher.get_subscription_count():
             return f'a subscriber of {self.publisher.topic_name}'
-        if self.lossless and not self.node.count_publishers(self._match_topic):
+        if self.options.lossless and not self.node.count_publishers(self._match_topic):
             return f'a publisher of {self._match_topic}'
         return ''
 
@@ -169,20 +258,23 @@ class Replayer:
         self._spin_until(self._discovery.done, None)
 
     def _endpoints(self) -> list[Any]:
-        """Return the subscriptions to the images and the publishers of results."""
-        found = self.node.get_subscriptions_info_by_topic(self.publisher.topic_name)
-        if self.lossless:
+        """Return the subscriptions to our topics and the publishers of results."""
+        found = [
+            info
+            for each in self._publishers
+            for info in self.node.get_subscriptions_info_by_topic(each.topic_name)
+        ]
+        if self.options.lossless:
             found += self.node.get_publishers_info_by_topic(self._match_topic)
         return found
 
     def _wait_until_due(self, time_ns: int) -> None:
-        if self._start is None:
-            self._start = time.monotonic(), time_ns
-        began, first_ns = self._start
-        left = began + (time_ns - first_ns) / SECOND / self._rate - time.monotonic()
-        if left > 10:
-            self.notify(f'the next image is due in {left:.0f} s, as recorded (see --rate)')
-        self._spin_until(lambda: False, left)
+        notified = False
+        while (left := self.playback.seconds_until(time_ns)) > 0:
+            if 10 < left < math.inf and not notified:
+                self.notify(f'the next image is due in {left:.0f} s, as recorded (see --rate)')
+                notified = True
+            self._spin_once(left)
 
     def _send_until_answered(self, message: Image) -> None:
         """
@@ -192,7 +284,7 @@ class Replayer:
         again to a slow node has two results; with an equal header the second counts for the next
         image.
         """
-        stamp, timeout = message.header.stamp, self._timeout
+        stamp, timeout = message.header.stamp, self.options.timeout
         name = f'image {self.published + 1} (stamp {stamp.sec}.{stamp.nanosec:09d})'
         for attempt in range(TRIES):
             if attempt:
@@ -217,3 +309,46 @@ class Replayer:
             self.notify(
                 f'image {self.published + 1} was dropped by the node: check for another publisher'
             )
+
+    @property
+    def _publishers(self) -> list[Publisher]:
+        return [self.publisher, *self._others.values()]
+
+    def _publish_on(self, topic: RecordedTopic, name: str) -> Publisher:
+        durability = (
+            DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE
+        )
+        profile = QoSProfile(
+            depth=OTHERS_DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=durability
+        )
+        return self.node.create_publisher(message_class(topic.message_type), name, profile)
+
+    def _publish_clock(self) -> None:
+        if self._clock is not None and self.playback.started:
+            seconds, nanoseconds = divmod(self.playback.now_ns(), SECOND)
+            message = ClockMessage()
+            message.clock.sec, message.clock.nanosec = seconds, nanoseconds
+            self._clock.publish(message)
+
+    def _toggle(self) -> None:
+        self.playback.pause(not self.playback.paused)
+        self.notify('paused' if self.playback.paused else 'resumed')
+
+    def _serve(self) -> None:
+        """Serve the services, with the names of those of ``ros2 bag play``."""
+        playback = self.playback
+        for name, act in (
+            ('pause', lambda: playback.pause(True)),
+            ('resume', lambda: playback.pause(False)),
+            ('toggle_paused', self._toggle),
+            ('play_next', playback.step),
+        ):
+
+            def serve(
+                _: Trigger.Request, response: Trigger.Response, act: Callable[[], Any] = act
+            ) -> Trigger.Response:
+                response.success = act() is not False
+                response.message = 'paused' if playback.paused else 'playing'
+                return response
+
+            self.node.create_service(Trigger, f'~/{name}', serve)

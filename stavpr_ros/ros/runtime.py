@@ -25,9 +25,11 @@ from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import END_POLL, ImageInput, InputStatus, STOP_TIMEOUT, Worker
+from stavpr_ros.ros.navigation import Navigation
 from stavpr_ros.ros.output import map_info_message, nanoseconds, Output, PoseFrames
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import OdometryInput
+from stavpr_ros.ros.visualization import Visualization
 from stavpr_ros.threads import call_on_thread, limit_threads
 from std_msgs.msg import Header
 
@@ -73,9 +75,11 @@ class Runtime:
         self.last_header = Header()  # of the last image in the window
         self.loading = self.problem = ''
         self._load_lock = threading.Lock()
+        self._navigation = Navigation(node, settings)
         self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size, settings.robot_id)
         self._pipeline: Pipeline | None = None
+        self._views = Visualization(node, lambda: self.worker.call(self._publish_route))
         try:
             recovered = recover_maps(self._journaled, node.get_logger())
             self._pipeline = self.worker.run(self._make_pipeline)
@@ -136,6 +140,8 @@ class Runtime:
                 self._node.left_behind = True
             self._close_journals()
             self._output.close()
+            self._views.close()
+            self._navigation.close()
 
     def save_at_end(self) -> None:
         """Save a recorded map, unless the worker stays busy."""
@@ -207,6 +213,7 @@ class Runtime:
             loaded = self._read_in_time(path)
             with lock or nullcontext():
                 self.worker.run(lambda: self.pipeline.change(loaded=loaded))
+            self.worker.call(self._publish_route)
         places = loaded.places
         self._node.get_logger().info(
             f'map {path}: {len(places)} places, features {places.settings.kind}, '
@@ -333,6 +340,7 @@ class Runtime:
             if self.pipeline.operation != 'localization':  # places have the poses of the odometry
                 frames = PoseFrames(odometry.frame, odometry.child_frame)
         self.pipeline.list_candidates = self._output.candidates_requested
+        self.pipeline.list_candidates |= self._views.needs_candidates
         try:
             match = self.pipeline.process(item.message, stamp, pose)
         except Exception as error:
@@ -341,12 +349,15 @@ class Runtime:
             )
             reason = f'internal error: {type(error).__name__}: {error}'
             match = Match(Status.INVALID_IMAGE, reason, cause='internal error')
+        odometry_frame = '' if odometry is None else odometry.frame
+        self._navigation.publish(header, match, self.pipeline.places, pose, odometry_frame)
         if match.status is Status.NOT_READY and self.loading:
             match = replace(match, reason=f'map {self.loading} is being loaded')
         self._publish(header, match, frames, waited)
 
     def _publish(self, header: Header, match: Match, frames: PoseFrames, waited: float) -> None:
         began = time.monotonic()
+        self._views.publish(header, match, self.pipeline, frames.frame)
         message = self._output.publish(header, match, self.pipeline.places, frames)
         stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
         if match.cause:
@@ -356,6 +367,13 @@ class Runtime:
         self.last_header = header
         place = message.newest_index if match.status is Status.MAPPED else message.place_index
         self._statistics.answered(match.status.name, match.reason, place, message.distance, stages)
+
+    def _publish_route(self) -> None:
+        """Publish the route for a new subscriber, in the frame of the last image if it grows."""
+        if self._pipeline is not None:  # a subscriber may come first
+            in_map = self.pipeline.operation == 'localization'
+            frame = self.settings.map_frame if in_map else self._views.frame
+            self._views.publish_route(self.pipeline.places, frame)
 
     def _log_cause(self, match: Match) -> None:
         """Log why an image is in no window: an invalid one once for each cause."""

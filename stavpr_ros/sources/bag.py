@@ -3,6 +3,7 @@
 """The images of one topic of a ROS 1 or ROS 2 bag as a sequence, and its odometry."""
 
 from collections.abc import Callable, Iterator
+import math
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -56,13 +57,15 @@ class BagSource:
         """Decode one image after the other."""
         return self._each(self._frame)
 
-    def records(self) -> Iterator[ImageRecord]:
+    def records(self, start: float = 0.0, duration: float = math.inf) -> Iterator[ImageRecord]:
         """
         Yield the messages as recorded; compressed images decoded to ``rgb8``.
 
+        :param start: seconds after the start of the bag.
+        :param duration: seconds from there on.
         :raises SourceError: the bag is damaged further on, or ends early.
         """
-        return self._each(self._record)
+        return self._each(self._record, start, duration)
 
     def _frame(self, index: int, time_ns: int, message: Any) -> Frame:
         return Frame(decode_message(message), _stamp(message) or time_ns, f'{self.topic}#{index}')
@@ -83,10 +86,17 @@ class BagSource:
             message.data,
         )
 
-    def _each(self, finish: Callable[[int, int, Any], Item]) -> Iterator[Item]:
+    def _each(
+        self,
+        finish: Callable[[int, int, Any], Item],
+        start: float = 0.0,
+        duration: float = math.inf,
+    ) -> Iterator[Item]:
         with open_bag(self.path) as bag:
             index = -1
-            for index, (time_ns, raw) in enumerate(self._messages(bag)):
+            wanted = [each for each in bag.connections if each.topic == self.topic]
+            messages = bag.messages(self.path, wanted, start, duration)
+            for index, (_, time_ns, raw) in enumerate(messages):
                 try:
                     item = finish(index, time_ns, self._message(bag, raw))
                 except ImageError as error:
@@ -98,18 +108,12 @@ class BagSource:
                     self.on_error(named)
                     continue
                 yield item
-            if index + 1 < self._count:
+            if (start, duration) == (0, math.inf) and index + 1 < self._count:
                 raise SourceError(
                     f'{self.path} ends early: {index + 1} of the {self._count} messages of '
                     f'{self.topic} '
                     'that it states are present; try `ros2 bag reindex`'
                 )
-
-    def _messages(self, bag: OpenBag) -> Iterator[tuple[int, bytes]]:
-        wanted = [connection for connection in bag.connections if connection.topic == self.topic]
-        with reading(self.path):
-            for _, time_ns, raw in bag.reader.messages(wanted):
-                yield time_ns, raw
 
     def _message(self, bag: OpenBag, raw: bytes) -> Any:
         try:

@@ -5,6 +5,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+import math
 from pathlib import Path
 import shutil
 import sqlite3
@@ -18,6 +19,7 @@ from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import SourceError, StavprError
 
 METADATA = 'metadata.yaml'
+SECOND = 1_000_000_000
 STORAGE_SUFFIXES = frozenset({'.db3', '.mcap'})
 LOG_SUFFIXES = ('-wal', '-journal')
 """Files of SQLite beside a database with writes that are not in the database yet."""
@@ -39,6 +41,21 @@ class OpenBag:
     def connections(self) -> list[Connection]:
         """Return the recorded connections, one per topic and publisher."""
         return list(self.reader.connections)
+
+    def messages(
+        self, path: Path, connections: list[Connection], start: float, duration: float
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """
+        Yield the messages of some connections, with their times of recording, ns, in order.
+
+        :param path: of the bag, for errors.
+        :param start: seconds after the start of the bag.
+        :param duration: seconds from there on.
+        """
+        with reading(path):
+            first = self.reader.start_time + round(start * SECOND)
+            last = None if math.isinf(duration) else first + round(duration * SECOND)
+            yield from self.reader.messages(connections, first if start else None, last)
 
 
 def is_bag(path: Path) -> bool:

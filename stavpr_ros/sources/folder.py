@@ -3,6 +3,7 @@
 """A folder of image files as a sequence."""
 
 from collections.abc import Callable, Iterator
+import math
 import os
 from pathlib import Path
 import re
@@ -67,19 +68,28 @@ class FolderSource:
         for _, frame in self._numbered():
             yield frame
 
-    def records(self, frames_per_second: float) -> Iterator[ImageRecord]:
+    def records(
+        self, frames_per_second: float, start: float = 0.0, duration: float = math.inf
+    ) -> Iterator[ImageRecord]:
         """
         Yield the images as messages; file i, from 1, has the stamp i / frames_per_second.
 
         :param frames_per_second: assumed frame rate, above 0.
+        :param start: seconds after the first file.
+        :param duration: seconds from there on.
         """
         if not frames_per_second > 0:
             raise InputError(f'{frames_per_second} frames per second: expected more than 0')
-        for i, frame in self._numbered():
+        # the last instant before a file counts as its own: i / 10 is not exact
+        first, last = (
+            math.ceil(min(t * frames_per_second - 1e-6, len(self)))
+            for t in (start, start + duration)
+        )
+        for i, frame in self._numbered(max(first, 0), last):
             yield ImageRecord.of_image(frame.image, round((i + 1) * SECOND / frames_per_second))
 
-    def _numbered(self) -> Iterator[tuple[int, Frame]]:
-        for i, file in enumerate(self.files):
+    def _numbered(self, first: int = 0, last: int | None = None) -> Iterator[tuple[int, Frame]]:
+        for i, file in enumerate(self.files[first:last], first):
             try:
                 frame = Frame(_read(file), 0, text_of(file.name))
             except ImageError as error:

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The items of sources: a decoded image, or an image message as recorded."""
+"""The items of sources: a decoded image, or a message as recorded."""
 
 from dataclasses import dataclass
 from typing import Any, Self
@@ -65,3 +65,32 @@ class ImageRecord:
         stamp = time_ns if stamp_ns is None else stamp_ns
         data = np.ascontiguousarray(image).reshape(-1)
         return cls(time_ns, stamp, frame_id, height, width, 'rgb8', False, width * 3, data)
+
+
+@dataclass(frozen=True)
+class RecordedTopic:
+    """
+    One topic of a bag.
+
+    :param message_type: such as ``nav_msgs/msg/Odometry``.
+    :param latched: whether a publisher kept its messages for late subscribers.
+    """
+
+    name: str
+    message_type: str
+    latched: bool
+
+
+@dataclass(frozen=True)
+class MessageRecord:
+    """
+    One recorded message of any type.
+
+    :param time_ns: when it was recorded, nanoseconds.
+    :param topic: its name.
+    :param content: the message, serialized as CDR.
+    """
+
+    time_ns: int
+    topic: str
+    content: bytes

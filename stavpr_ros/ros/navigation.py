@@ -1,0 +1,146 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""For navigation, off by default: the transform from map to odometry, and the initial pose."""
+
+from typing import Any
+
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+import numpy as np
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from scipy.spatial.transform import Rotation
+from stavpr_ros.errors import UnavailableError
+from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.pipeline import NodeSettings
+from stavpr_ros.recognition import Match
+from stavpr_ros.ros.output import matched_pose_message, pose_message
+from std_msgs.msg import Header
+
+# (0.5 m)^2 and (15 degrees)^2, as RViz's 2D Pose Estimate: a place does not determine the lateral
+# offset from the mapped route
+MIN_VARIANCE_XY, MIN_VARIANCE_YAW = 0.25, 0.0685
+TF_DEPTH = 100  # that of tf2_ros
+
+
+class Navigation:
+    """
+    Publishes ``map -> odom`` on ``/tf``, and ``initialpose`` once per relocalization.
+
+    :raises UnavailableError: ``publish_tf`` is set and tf2_msgs is not installed.
+    """
+
+    def __init__(self, node: Node, settings: NodeSettings) -> None:
+        self._node, self._settings = node, settings
+        self._tf: Any = None
+        self._initial_pose: Any = None
+        if settings.publish_tf:
+            self._tf = node.create_publisher(_tf_message(), '/tf', TF_DEPTH)
+        if settings.publish_initialpose:
+            self._initial_pose = node.create_publisher(PoseWithCovarianceStamped, 'initialpose', 1)
+        self._unmatched = settings.pipeline.sequence.length  # images since the last match
+        self._places: PlaceMap | GrowingMap | None = None
+        self._transform: TransformStamped | None = None
+
+    def publish(
+        self,
+        header: Header,
+        match: Match,
+        places: PlaceMap | GrowingMap | None,
+        odometry: np.ndarray | None,
+        odometry_frame: str,
+    ) -> None:
+        """
+        Publish what one image implies, in operation localization; on the worker.
+
+        :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
+        """
+        if match.cause or not isinstance(places, PlaceMap):
+            return
+        if places is not self._places:
+            self._places, self._transform = places, None
+            self._unmatched = self._settings.pipeline.sequence.length
+        try:
+            if self._tf is not None:
+                self._publish_transform(header, match, places, odometry, odometry_frame)
+            if self._initial_pose is not None:
+                self._publish_initial_pose(header, match, places)
+        except rclpy_implementation.RCLError:
+            if self._node.context.ok():  # else ROS was shut down before the node
+                raise
+
+    def close(self) -> None:
+        """Destroy the publishers, and release the map."""
+        self._places = None
+        for publisher in (self._tf, self._initial_pose):
+            if publisher is not None:
+                self._node.destroy_publisher(publisher)
+
+    def _publish_transform(
+        self,
+        header: Header,
+        match: Match,
+        places: PlaceMap,
+        odometry: np.ndarray | None,
+        odometry_frame: str,
+    ) -> None:
+        """Publish the transform of this match; without one, the last, with the new stamp."""
+        pose = places.place(match.newest_index).pose if match.accepted else None
+        if pose is not None and odometry is not None:
+            self._transform = transform_message(
+                map_to_odometry(pose, odometry), self._settings.map_frame, odometry_frame
+            )
+        if self._transform is not None:
+            self._transform.header.stamp = header.stamp
+            self._tf.publish(_tf_message()(transforms=[self._transform]))
+
+    def _publish_initial_pose(self, header: Header, match: Match, places: PlaceMap) -> None:
+        """Publish the first match after a whole window without one, or with a new window."""
+        lost = self._unmatched >= self._settings.pipeline.sequence.length - 1
+        self._unmatched = 0 if match.accepted else self._unmatched + 1
+        message = matched_pose_message(header, match, places, self._settings.map_frame)
+        if lost and message is not None:
+            self._initial_pose.publish(planar(message))
+
+
+def map_to_odometry(place: np.ndarray, odometry: np.ndarray) -> np.ndarray:
+    """
+    Return the pose of the odometry's frame in the map.
+
+    :param place: pose of the robot in the map, x y z and quaternion x y z w, shape (7,).
+    :param odometry: pose of the robot in the odometry's frame, shape (7,).
+    """
+    turn = Rotation.from_quat(place[3:]) * Rotation.from_quat(odometry[3:]).inv()
+    return np.concatenate([place[:3] - turn.apply(odometry[:3]), turn.as_quat()])
+
+
+def transform_message(pose: np.ndarray, parent: str, child: str) -> TransformStamped:
+    """Return a pose of a frame, shape (7,), as a transform without a stamp."""
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id = parent
+    moved = message.transform.translation
+    moved.x, moved.y, moved.z = map(float, pose[:3])
+    message.transform.rotation = pose_message(pose).orientation
+    return message
+
+
+def planar(message: PoseWithCovarianceStamped) -> PoseWithCovarianceStamped:
+    """Return a pose for navigation in the plane: x, y and yaw, with their covariance alone."""
+    result = PoseWithCovarianceStamped(header=message.header)
+    pose, o = result.pose.pose, message.pose.pose.orientation
+    pose.position.x, pose.position.y = message.pose.pose.position.x, message.pose.pose.position.y
+    yaw = Rotation.from_quat([o.x, o.y, o.z, o.w]).as_euler('ZYX')[0]
+    pose.orientation.z, pose.orientation.w = float(np.sin(yaw / 2)), float(np.cos(yaw / 2))
+    for i, least in ((0, MIN_VARIANCE_XY), (7, MIN_VARIANCE_XY), (35, MIN_VARIANCE_YAW)):
+        result.pose.covariance[i] = max(least, message.pose.covariance[i])
+    return result
+
+
+def _tf_message() -> Any:
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError as error:
+        raise UnavailableError(
+            'publish_tf requires the package tf2_msgs: install it (ros-jazzy-tf2-msgs) and '
+            'source its environment, or leave publish_tf off'
+        ) from error
+    return TFMessage

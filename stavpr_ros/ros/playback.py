@@ -1,0 +1,113 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The time of a replay, with pause and step, and the keys that control it."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+import math
+import os
+import select
+import sys
+import termios
+import time
+import tty
+
+SECOND = 1_000_000_000
+
+
+class Playback:
+    """
+    Maps the time of recording to the time of this machine; it can be paused and stepped.
+
+    :param rate: recorded seconds per second, above 0; None = items are due at once, and time is
+        that of the last item.
+    :param steady: returns seconds; replaced in tests.
+    """
+
+    def __init__(
+        self, rate: float | None, paused: bool, steady: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._rate, self._steady = rate, steady
+        self.paused = paused
+        self._steps = 0
+        self._position: int | None = None  # recorded time at the anchor, ns
+        self._anchor = 0.0
+
+    def start(self, time_ns: int) -> None:
+        """Start at a recorded time, or start again."""
+        self._position, self._anchor = time_ns, self._steady()
+
+    @property
+    def started(self) -> bool:
+        """Whether :meth:`start` was called."""
+        return self._position is not None
+
+    def now_ns(self) -> int:
+        """Return the recorded time, ns; 0 before the start."""
+        if self._position is None:
+            return 0
+        if self.paused or self._rate is None:
+            return self._position
+        return self._position + round((self._steady() - self._anchor) * self._rate * SECOND)
+
+    def seconds_until(self, time_ns: int) -> float:
+        """Return the seconds until an item of a recorded time is due; inf while paused."""
+        if self.paused:
+            return 0.0 if self._steps else math.inf
+        return 0.0 if self._rate is None else (time_ns - self.now_ns()) / SECOND / self._rate
+
+    def passed(self, time_ns: int, is_step: bool) -> None:
+        """Note that an item was published; while paused, time follows the items."""
+        if self.paused or self._rate is None:
+            self._position = max(self._position or 0, time_ns)
+        if is_step and self._steps:
+            self._steps -= 1
+
+    def pause(self, paused: bool) -> None:
+        """Pause, or resume."""
+        if self._position is not None:
+            self._position, self._anchor = self.now_ns(), self._steady()
+        self.paused, self._steps = paused, 0
+
+    def step(self) -> bool:
+        """Make the items up to the next image due; return whether it is paused, as it must be."""
+        self._steps += self.paused
+        return self.paused
+
+
+@contextmanager
+def keyboard(keys: Mapping[str, Callable[[], object]]) -> Iterator[Callable[[], None]]:
+    """
+    Read single keys from the terminal, if there is one and this process is in its foreground.
+
+    :param keys: the function of each key.
+    :returns: a function that calls those of the keys pressed since.
+    """
+    try:
+        terminal = sys.stdin.fileno()
+        before = termios.tcgetattr(terminal) if _in_foreground(terminal) else None
+    except (OSError, ValueError, AttributeError, termios.error):
+        before = None
+    if before is None:
+        yield lambda: None
+        return
+
+    def poll() -> None:
+        # reading in the background would stop the process
+        while _in_foreground(terminal) and select.select([terminal], [], [], 0)[0]:
+            pressed = os.read(terminal, 16).decode(errors='replace')
+            if not pressed:
+                return
+            # the sequence of an arrow is one key
+            for key in [pressed] if pressed in keys else pressed:
+                keys.get(key, lambda: None)()
+
+    tty.setcbreak(terminal, termios.TCSANOW)
+    try:
+        yield poll
+    finally:
+        termios.tcsetattr(terminal, termios.TCSANOW, before)
+
+
+def _in_foreground(terminal: int) -> bool:
+    return os.isatty(terminal) and os.tcgetpgrp(terminal) == os.getpgrp()

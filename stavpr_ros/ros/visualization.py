@@ -1,0 +1,215 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Topics for viewers (RViz 2, Foxglove, the monitor), published while somebody subscribes."""
+
+import array
+from collections import deque
+from collections.abc import Callable
+import math
+from typing import Any
+
+import cv2
+from geometry_msgs.msg import Point, PoseStamped
+from nav_msgs.msg import Path
+import numpy as np
+from rclpy.event_handler import PublisherEventCallbacks, UnsupportedEventTypeError
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from sensor_msgs.msg import CompressedImage, Image
+from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.pipeline import Pipeline
+from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each
+from stavpr_ros.recognition import Match
+from stavpr_ros.ros.output import image_message, LATCHED, pose_message
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+KEPT = 200  # matched poses and loop closures that are shown
+COLUMNS = 512  # of ~/distances, at most
+GROWTH = 1.05  # a growing route is published again when it has grown by this factor
+QUALITY = 80  # of JPEG
+
+Places = PlaceMap | GrowingMap | None
+
+
+class Visualization:
+    """
+    Publishers of the map's route, matched poses, markers, match images and distances.
+
+    :param on_subscriber: called on another thread when the route has a new subscriber; it calls
+        :meth:`publish_route` on the worker.
+
+    ``frame`` is that of the last image.
+    """
+
+    def __init__(self, node: Node, on_subscriber: Callable[[], object]) -> None:
+        self._node, self._on_subscriber = node, on_subscriber
+        self._route = self._latched(Path, '~/map_path')
+        self._matched = node.create_publisher(Path, '~/matched_path', 1)
+        self._markers = node.create_publisher(MarkerArray, '~/markers', 1)
+        self._image = node.create_publisher(CompressedImage, '~/match_image/compressed', 1)
+        self._window = node.create_publisher(Image, '~/window_image', 1)
+        self._distances = node.create_publisher(Image, '~/distances', 10)
+        self._published: tuple[Places, int, str] = (None, 0, '')
+        self.frame = ''
+        self._poses: deque[PoseStamped] = deque(maxlen=KEPT)
+        self._closures: deque[tuple[Point, Point, ColorRGBA]] = deque(maxlen=KEPT)
+
+    @property
+    def needs_candidates(self) -> bool:
+        """Whether the markers, which show candidates, have a subscriber."""
+        return self._is_requested(self._markers)
+
+    def publish(self, header: Header, match: Match, pipeline: Pipeline, frame: str) -> None:
+        """
+        Publish what is requested for one image; on the worker.
+
+        :param frame: of the poses of the places.
+        """
+        try:
+            self._publish(header, match, pipeline, frame)
+        except rclpy_implementation.RCLError:
+            if self._node.context.ok():  # else ROS was shut down before the node
+                raise
+
+    def publish_route(self, places: Places, frame: str) -> None:
+        """Publish the poses of all places, if they are requested and not published yet."""
+        last, count, last_frame = self._published
+        size = 0 if places is None else len(places)
+        same = places is last and frame == last_frame and count <= size < count * GROWTH + 1
+        if same or not self._is_requested(self._route):
+            return
+        self._published = places, size, frame
+        message = Path(header=Header(frame_id=frame, stamp=self._node.get_clock().now().to_msg()))
+        poses = None if places is None else places.poses
+        if poses is not None:
+            known = poses[np.isfinite(poses).all(axis=1)]
+            message.poses = [
+                PoseStamped(header=message.header, pose=pose_message(pose)) for pose in known
+            ]
+        self._route.publish(message)
+
+    def close(self) -> None:
+        """Destroy the publishers, and release the map: the executor may keep them for a while."""
+        self._on_subscriber, self._published = lambda: None, (None, 0, '')
+        for publisher in (
+            *(self._route, self._matched, self._markers),
+            *(self._image, self._window, self._distances),
+        ):
+            self._node.destroy_publisher(publisher)
+
+    def _publish(self, header: Header, match: Match, pipeline: Pipeline, frame: str) -> None:
+        places = pipeline.places
+        if frame != self.frame:
+            self.frame = frame
+            self._poses.clear()
+            self._closures.clear()
+        self.publish_route(places, frame)
+        self._note(header, match, places)
+        if self._is_requested(self._matched) and match.accepted:
+            own = Header(stamp=header.stamp, frame_id=frame)
+            self._matched.publish(Path(header=own, poses=list(self._poses)))
+        if self._is_requested(self._markers):
+            self._markers.publish(self._markers_message(header, match, places))
+        if match.image is not None and self._is_requested(self._image):
+            drawn = cv2.cvtColor(draw_match(match, places), cv2.COLOR_RGB2BGR)
+            _, jpeg = cv2.imencode('.jpg', drawn, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+            self._image.publish(CompressedImage(header=header, format='jpeg', data=jpeg.tobytes()))
+        if self._is_requested(self._window) or self._is_requested(self._distances):
+            self._publish_distances(header, match, pipeline)
+
+    def _publish_distances(self, header: Header, match: Match, pipeline: Pipeline) -> None:
+        rows, first = pipeline.window_distances()
+        if not rows.size:
+            return
+        if self._is_requested(self._window):
+            self._window.publish(image_message(header, draw_window(rows, first, match)))
+        if self._is_requested(self._distances):
+            missing = max(0, len(pipeline.places or ()) - rows.shape[1])
+            row = np.pad(rows[-1:], ((0, 0), (0, missing)), constant_values=np.inf)
+            row = least_of_each(row, COLUMNS).astype(np.float32)
+            message = Image(header=header, height=1, width=row.size, encoding='32FC1')
+            message.step = row.size * 4
+            message.data = array.array('B', row.tobytes())
+            self._distances.publish(message)
+
+    def _note(self, header: Header, match: Match, places: Places) -> None:
+        """Keep the pose of the matched place, and on a growing route the loop closure."""
+        if not match.accepted or places is None:
+            return
+        pose = places.place(match.newest_index).pose
+        if pose is not None:
+            stamped = Header(stamp=header.stamp, frame_id=self.frame)
+            self._poses.append(PoseStamped(header=stamped, pose=pose_message(pose)))
+        if match.image_index >= 0:
+            query = places.place(match.image_index).pose
+            if pose is not None and query is not None:
+                self._closures.append((_point(query), _point(pose), color(match.probability)))
+
+    def _markers_message(self, header: Header, match: Match, places: Places) -> MarkerArray:
+        """Return the closures, the matched place with its text, and the candidates."""
+        own = Header(stamp=header.stamp, frame_id=self.frame)
+        markers = [Marker(header=own, action=Marker.DELETEALL)]
+
+        def add(kind: int, **fields: Any) -> Marker:
+            marker = Marker(header=own, ns='stavpr', id=len(markers), type=kind, **fields)
+            marker.pose.orientation.w = 1.0
+            markers.append(marker)
+            return marker
+
+        if self._closures:
+            lines = add(Marker.LINE_LIST)
+            lines.scale.x = 0.05
+            lines.points = [point for a, b, _ in self._closures for point in (a, b)]
+            lines.colors = [shade for *_, shade in self._closures for _ in range(2)]
+        if places is not None:
+            best = [] if not match.accepted else [(match.newest_index, match.probability, 0.8)]
+            for place, probability, size in best + [
+                (each.place, 1 - each.distance if match.relative else math.nan, 0.4)
+                for each in match.candidates
+            ]:
+                if (pose := places.place(place).pose) is not None:
+                    ball = add(Marker.SPHERE, color=color(probability))
+                    ball.pose.position = _point(pose)
+                    ball.scale.x = ball.scale.y = ball.scale.z = size
+            if match.accepted and (pose := places.place(match.newest_index).pose) is not None:
+                text = add(Marker.TEXT_VIEW_FACING, color=color(match.probability))
+                text.pose.position = _point(pose)
+                text.pose.position.z += 1.0
+                text.scale.z = 0.6
+                text.text = f'place {match.newest_index}'
+                if match.relative:
+                    text.text += f', p {match.probability:.2f}'
+        return MarkerArray(markers=markers)
+
+    def _latched(self, kind: type, topic: str) -> Publisher:
+        def on_matched(event: Any) -> None:
+            if event.current_count_change > 0:
+                self._on_subscriber()
+
+        events = PublisherEventCallbacks(matched=on_matched)
+        try:
+            return self._node.create_publisher(kind, topic, LATCHED, event_callbacks=events)
+        except UnsupportedEventTypeError:  # then it is published with the next image
+            return self._node.create_publisher(kind, topic, LATCHED)
+
+    def _is_requested(self, publisher: Publisher) -> bool:
+        try:
+            return bool(publisher.get_subscription_count())
+        except rclpy_implementation.RCLError:
+            if self._node.context.ok():
+                raise
+            return False
+
+
+def color(probability: float) -> ColorRGBA:
+    """Return the color of a probability, red = 0 to green = 1; blue = unknown."""
+    if math.isnan(probability):
+        return ColorRGBA(r=0.2, g=0.4, b=1.0, a=0.9)
+    return ColorRGBA(r=1 - probability, g=probability, b=0.1, a=0.9)
+
+
+def _point(pose: np.ndarray) -> Point:
+    x, y, z = map(float, pose[:3])
+    return Point(x=x, y=y, z=z)

@@ -1,0 +1,245 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The monitor: its history, its web server, and the node that it shows."""
+
+import base64
+from http.client import HTTPConnection
+import json
+import re
+import signal
+import threading
+
+import numpy as np
+from processes import Process, TIMEOUT
+import pytest
+from robot import LENGTH
+from stavpr_ros.errors import StavprError, UnavailableError
+from stavpr_ros.ros.monitor import encode_row, History, KEPT, Monitor
+from stavpr_ros.ros.monitor_server import MonitorServer
+
+
+@pytest.fixture
+def history():
+    return History(sample_seconds=0)
+
+
+def test_history_since_a_version_returns_what_has_changed(history):
+    history.set('state', 'active')
+    history.add({'place': 1})
+    version, changes = history.since(0, TIMEOUT)
+    assert changes == {'state': 'active', 'samples': [{'place': 1}]}
+    history.set('state', 'active')  # no change
+    history.add({'place': 2})
+    version, changes = history.since(version, TIMEOUT)
+    assert changes == {'samples': [{'place': 2}]}
+    assert history.since(version, 0) == (version, {'samples': []})
+
+
+def test_history_keeps_the_last_samples_only(history):
+    for i in range(KEPT + 5):
+        history.add({'place': i})
+    samples = history.since(0, TIMEOUT)[1]['samples']
+    assert (len(samples), samples[0]['place']) == (KEPT, 5)
+
+
+def test_history_leaves_out_samples_that_follow_at_once():
+    history = History(sample_seconds=1000)
+    history.add({'place': 1})
+    history.add({'place': 2})
+    assert history.since(0, TIMEOUT)[1]['samples'] == [{'place': 1}]
+
+
+def test_history_when_closed_wakes_those_who_wait(history):
+    waiting = threading.Thread(target=lambda: history.since(0, TIMEOUT))
+    waiting.start()
+    history.close()
+    waiting.join(TIMEOUT)
+    assert not waiting.is_alive()
+
+
+def test_encode_row_by_hand():
+    row = np.array([1, 3, 2, np.inf, 9], np.float32)  # least 1, median 2.5
+    assert list(base64.b64decode(encode_row(row))) == [0, 255, 170, 255, 255]
+    assert list(base64.b64decode(encode_row(np.full(3, np.inf, np.float32)))) == [255] * 3
+
+
+# the server
+
+
+@pytest.fixture
+def served(history):
+    """Return a function that sends a request, with the commands that the server has run."""
+    commands = []
+
+    def command(name, value):
+        commands.append((name, value))
+        if name == 'stop':
+            raise StavprError('not now')
+        return f'{name} {value}'
+
+    server = MonitorServer('127.0.0.1', 0, history, command)
+    server.start()
+
+    def request(method, path, body=None, **headers):
+        connection = HTTPConnection('127.0.0.1', server.server_port, timeout=TIMEOUT)
+        names = {name.replace('_', '-'): value for name, value in headers.items()}
+        connection.request(method, path, body, names)
+        response = connection.getresponse()
+        content = response.read() if path != '/events' else response.readline()
+        connection.close()
+        return response.status, content
+
+    request.commands, request.server = commands, server
+    yield request
+    server.stop()
+
+
+def test_server_page_needs_nothing_from_the_network(served):
+    status, page = served('GET', '/')
+    assert status == 200
+    assert b'<canvas id="matrix"' in page
+    assert not re.findall(rb'(?:src|href)="(?!data:)|https?://|@import|url\(', page)
+
+
+def test_server_sends_events_and_the_image(served, history):
+    assert served('GET', '/image.jpg')[0] == 404
+    history.set('state', 'active')
+    history.show(b'jpeg')
+    status, line = served('GET', '/events')
+    assert status == 200
+    assert json.loads(line.removeprefix(b'data: ')) == {
+        'state': 'active',
+        'image': 2,
+        'samples': [],
+    }
+    assert served('GET', '/image.jpg?2') == (200, b'jpeg')
+    assert served('GET', '/../setup.py')[0] == 404
+
+
+def test_server_counts_the_pages_that_are_open(served, history):
+    connection = HTTPConnection('127.0.0.1', served.server.server_port, timeout=TIMEOUT)
+    connection.request('GET', '/events')
+    history.set('state', 'active')
+    connection.getresponse().readline()
+    assert history.viewers == 1
+    served.server.stop()
+    connection.close()
+
+
+def test_server_runs_commands_and_returns_their_errors(served):
+    sent = {'Content_Type': 'application/json'}
+    body = json.dumps({'name': 'operation', 'value': 'mapping'})
+    status, answer = served('POST', '/command', body, **sent)
+    assert (status, json.loads(answer)) == (200, {'success': True, 'message': 'operation mapping'})
+    status, answer = served('POST', '/command', '{"name": "stop"}', **sent)
+    assert json.loads(answer) == {'success': False, 'message': 'not now'}
+    assert served.commands == [('operation', 'mapping'), ('stop', '')]
+
+
+@pytest.mark.parametrize(
+    ('body', 'headers', 'status'),
+    [
+        ('{"name": "stop"}', {'Content_Type': 'text/plain'}, 400),  # a page of another site can
+        ('{"name": "stop"}', {'Content_Type': 'application/x-www-form-urlencoded'}, 400),
+        ('{"name": "stop"}', {'Content_Type': 'application/json', 'Host': 'evil.org:80'}, 403),
+        ('[]', {'Content_Type': 'application/json'}, 400),
+        ('no JSON', {'Content_Type': 'application/json'}, 400),
+        ('{}', {'Content_Type': 'application/json', 'Content_Length': '99999'}, 400),
+        ('{}', {'Content_Type': 'application/json', 'Content_Length': 'x'}, 400),
+    ],
+)
+def test_server_refuses_commands_of_other_sites_and_garbage(served, body, headers, status):
+    assert served('POST', '/command', body, **headers)[0] == status
+    assert served.commands == []
+
+
+@pytest.mark.parametrize('host', ['localhost:8080', '127.0.0.1', '[::1]:80', '192.168.1.7:8080'])
+def test_server_accepts_addresses_of_this_machine(served, host):
+    assert served('GET', '/', Host=host)[0] == 200
+
+
+def test_server_on_a_port_in_use_is_rejected(served, history):
+    port = served.server.server_port
+    with pytest.raises(UnavailableError, match=f'127.0.0.1:{port} cannot be used: .*--port'):
+        MonitorServer('127.0.0.1', port, history, None)
+
+
+def test_server_prints_no_error_of_a_browser_that_has_gone(served, capsys):
+    for error, is_printed in ((ConnectionResetError(), False), (KeyError('defect'), True)):
+        try:
+            raise error
+        except Exception:
+            served.server.handle_error(None, ('127.0.0.1', 1))
+        assert ('Traceback' in capsys.readouterr().err) == is_printed
+
+
+# the node
+
+
+def test_monitor_shows_and_controls_the_node(robot, start, route, history):
+    start()
+    monitor = Monitor(robot.node, '/stavpr', history)
+
+    def shown():
+        return history.since(0, TIMEOUT)[1]
+
+    def command(name, value=''):
+        results = []
+        thread = threading.Thread(target=lambda: results.append(monitor.command(name, value)))
+        thread.start()
+        robot.until(lambda: not thread.is_alive(), name)
+        return results[0]
+
+    with history.viewer():
+        robot.until(lambda: shown().get('state') == 'active', 'the state')
+        robot.until(lambda: 'route' in shown(), 'the route')
+        robot.drive(route[: LENGTH + 3])
+        shown_images = iter(route)
+
+        def complete():
+            robot.show(next(shown_images))
+            return history.image and 'pose' in shown() and shown()['samples'][-1]['row']
+
+        robot.until(complete, 'an image, a pose and distances')
+    parts = shown()
+    assert parts['map']['places'] == len(parts['route']) == 60
+    match = next(sample for sample in parts['samples'] if sample['status'] == 'match')
+    assert match['probability'] > 0.05
+    assert {part['name'].split()[-1] for part in parts['diagnostics']} >= {'input', 'map'}
+    assert history.image[:2] == b'\xff\xd8'
+    robot.until(lambda: monitor._images is None, 'no subscription without a page')
+    assert command('reset') == 'the window is empty'
+    assert command('stop') == 'deactivate: done'
+    robot.until(lambda: shown()['state'] == 'inactive', 'the state')
+    assert command('start') == 'activate: done'
+    assert command('operation', 'mapping') == 'operation mapping'
+    robot.until(lambda: shown()['map']['operation'] == 'mapping', 'the operation')
+    with pytest.raises(StavprError, match='expected start, stop, reset or operation'):
+        monitor.command('explode', '')
+
+
+def test_monitor_without_a_node_refuses_commands(context, history):
+    import rclpy
+
+    node = rclpy.create_node('lonely', context=context)
+    monitor = Monitor(node, 'nobody', history)
+    with pytest.raises(StavprError, match='/nobody is not running'):
+        monitor.command('stop', '')
+    assert history.since(0, TIMEOUT)[1]['state'] == 'not found'
+    node.destroy_node()
+
+
+def test_monitor_executable_serves_the_page_until_a_signal(tmp_path):
+    process = Process(tmp_path / 'monitor.log', 'monitor', '--port', '0')
+    try:
+        address = re.compile(r'monitor of /stavpr: open http://127.0.0.1:(\d+)/')
+        end = threading.Event()
+        while not (found := address.search(process.output())):
+            assert process.popen.poll() is None
+            end.wait(0.05)
+        connection = HTTPConnection('127.0.0.1', int(found[1]), timeout=TIMEOUT)
+        connection.request('GET', '/events')
+        assert b'not found' in connection.getresponse().readline()
+        assert process.stop(signal.SIGINT) == 0  # with a page open
+    finally:
+        process.end()

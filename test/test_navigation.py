@@ -1,0 +1,140 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The transform from map to odometry, and the initial pose."""
+
+import math
+import sys
+from types import ModuleType, SimpleNamespace
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
+from pipelines import at, LENGTH, localizing, message, SECOND
+import pytest
+from scipy.spatial.transform import Rotation
+from stavpr_msgs.msg import PlaceMatch
+from stavpr_ros.ros.navigation import map_to_odometry, Navigation, planar
+from stavpr_ros.ros.output import pose_message
+from test_visualization import header, Publishers
+
+
+def posed(x, y, degrees):
+    return np.array([x, y, 0, *Rotation.from_euler('z', degrees, degrees=True).as_quat()])
+
+
+def test_map_to_odometry_takes_the_pose_of_odometry_to_that_of_the_map():
+    place, odometry = posed(5, 2, 90), posed(1, 0, 0)
+    np.testing.assert_allclose(map_to_odometry(place, odometry), posed(5, 1, 90), atol=1e-12)
+    # the odometry's frame in the map, then the robot in that: the robot in the map
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        place, odometry = (
+            np.concatenate([rng.normal(size=3), Rotation.random(rng=rng).as_quat()])
+            for _ in range(2)
+        )
+        frame = map_to_odometry(place, odometry)
+        turn = Rotation.from_quat(frame[3:])
+        np.testing.assert_allclose(frame[:3] + turn.apply(odometry[:3]), place[:3], atol=1e-12)
+        turned = (turn * Rotation.from_quat(odometry[3:])).as_matrix()
+        np.testing.assert_allclose(turned, Rotation.from_quat(place[3:]).as_matrix(), atol=1e-12)
+
+
+def test_planar_keeps_yaw_and_has_the_covariance_of_x_y_and_yaw_only():
+    tilted = Rotation.from_euler('ZYX', [40, 20, 10], degrees=True).as_quat()
+    given = PoseWithCovarianceStamped()
+    given.pose.pose = pose_message(np.array([1, 2, 3, *tilted]))
+    given.pose.covariance[::7] = [0.01, 4.0, 0.3, 0.3, 0.3, 0.01]
+    flat = planar(given).pose
+    position, o = flat.pose.position, flat.pose.orientation
+    assert (position.x, position.y, position.z) == (1, 2, 0)
+    assert (o.x, o.y) == (0, 0)
+    assert math.degrees(2 * math.atan2(o.z, o.w)) == pytest.approx(40)
+    expected = np.zeros(36)
+    expected[[0, 7, 35]] = 0.25, 4, 0.0685
+    np.testing.assert_array_equal(flat.covariance, expected)
+
+
+@pytest.fixture
+def publishing(map_file, monkeypatch):
+    """Return a function that shows images to a localizing pipeline and publishes."""
+
+    class TFMessage:
+        def __init__(self, transforms):
+            self.transforms = [(t.header.stamp.sec, t.transform) for t in transforms]
+            self.frames = [(t.header.frame_id, t.child_frame_id) for t in transforms]
+
+    module = ModuleType('tf2_msgs.msg')
+    module.TFMessage = TFMessage
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', module)
+    pipeline = localizing(map_file)
+    settings = SimpleNamespace(
+        publish_tf=True, publish_initialpose=True, map_frame='map', pipeline=pipeline.settings
+    )
+    publishers = Publishers(())
+    navigation = Navigation(publishers, settings)
+
+    def show(images, first=0):
+        statuses = []
+        for i, image in enumerate(images, first):
+            match = pipeline.process(message(image), (i + 1) * SECOND)
+            navigation.publish(header(i), match, pipeline.places, at(i - 10), 'odom')
+            statuses.append(match.accepted)
+        return statuses
+
+    return SimpleNamespace(
+        show=show, pipeline=pipeline, tf=publishers.by_topic['/tf'].messages,
+        initial=publishers.by_topic['initialpose'].messages,
+    )  # fmt: skip
+
+
+def test_transform_is_that_of_the_last_match_with_the_stamp_of_the_image(publishing, route):
+    accepted = publishing.show(route[:10])
+    first = accepted.index(True)
+    assert len(publishing.tf) == 10 - first
+    for i, sent in enumerate(publishing.tf, first):
+        ((stamp, transform),) = sent.transforms
+        assert (stamp, sent.frames) == (i + 1, [('map', 'odom')])
+        assert transform.translation.x == pytest.approx(10, abs=1)  # odometry is at x - 10
+        assert transform.rotation.w == pytest.approx(1)
+
+
+def test_initial_pose_is_published_once_for_each_relocalization(publishing, route):
+    accepted = publishing.show(route[:20])
+    assert sum(accepted) > 10
+    (pose,) = publishing.initial
+    first = accepted.index(True)
+    assert pose.header.stamp.sec == first + 1
+    assert pose.pose.pose.position.x == pytest.approx(first, abs=1)
+    publishing.pipeline.reset()  # a new window
+    assert not any(publishing.show(route[30 : 30 + LENGTH - 1], 30))
+    assert any(publishing.show(route[30 + LENGTH - 1 : 45], 30 + LENGTH - 1))
+    assert len(publishing.initial) == 2
+    assert publishing.initial[-1].header.stamp.sec > 30
+
+
+def test_navigation_on_a_growing_route_publishes_nothing(publishing, route):
+    publishing.pipeline.change(operation='mapping')
+    publishing.show(route[:10])
+    assert not publishing.tf
+    assert not publishing.initial
+
+
+def test_node_with_publish_tf_without_tf2_msgs_explains_it(robot, start, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
+    start(wait=False, publish_tf=True)
+    robot.until_logged('publish_tf requires the package tf2_msgs: install it')
+    robot.until_state('unconfigured')
+
+
+def test_node_publishes_the_initial_pose_and_subscribes_to_no_odometry(robot, start, route):
+    start(publish_initialpose=True)
+    poses = robot.listen(PoseWithCovarianceStamped, '/initialpose')
+    robot.until(lambda: robot.node.count_publishers('/initialpose') == 1, 'the publisher')
+    shown = iter(route)
+
+    def matched():
+        return robot.show(next(shown)).status == PlaceMatch.MATCH
+
+    robot.until(matched, 'a match')
+    robot.until(lambda: poses, 'the initial pose')
+    assert poses[0].header.frame_id == 'map'
+    assert robot.odometry.get_subscription_count() == 0

@@ -1,0 +1,361 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Replay as `ros2 bag play`: pace, pause, step, loop, part of a bag, /clock, other topics."""
+
+from contextlib import contextmanager
+import fcntl
+import math
+import os
+import pty
+import subprocess
+import sys
+import termios
+import threading
+
+from bags import SECOND, TEXT, write_odometry, writing
+from nav_msgs.msg import Odometry
+import numpy as np
+from processes import environment, TIMEOUT
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Image
+from stavpr_ros.commands import replay
+from stavpr_ros.errors import SourceError, UnavailableError
+from stavpr_ros.ros import process
+from stavpr_ros.ros.playback import Playback
+from stavpr_ros.ros.replay import message_class, Replayer, ReplayOptions
+from stavpr_ros.sources.bag import BagSource
+from stavpr_ros.sources.bag_messages import list_topics, read_messages
+from stavpr_ros.sources.folder import FolderSource
+from stavpr_ros.sources.frame import ImageRecord, RecordedTopic
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+DOMAIN = 101  # another one than that of the processes of other tests
+FIRST = 100 * SECOND
+
+
+def images(count, gap=SECOND):
+    """One image a second from second 100 on, its stamp that of the odometry beside it."""
+    pixels = np.zeros((2, 3, 3), np.uint8)
+    return [ImageRecord.of_image(pixels + i, FIRST + i * gap) for i in range(count)]
+
+
+# time
+
+
+class Steady:
+    seconds = 5.0
+
+    def __call__(self):
+        return self.seconds
+
+
+def test_playback_at_twice_the_pace_halves_the_time_left():
+    steady = Steady()
+    playback = Playback(2.0, False, steady)
+    playback.start(FIRST)
+    steady.seconds += 1
+    assert playback.now_ns() == FIRST + 2 * SECOND
+    assert playback.seconds_until(FIRST + 6 * SECOND) == 2.0
+
+
+def test_playback_after_a_pause_continues_where_it_stopped():
+    steady = Steady()
+    playback = Playback(1.0, False, steady)
+    playback.start(FIRST)
+    steady.seconds += 1
+    playback.pause(True)
+    steady.seconds += 60
+    assert playback.seconds_until(FIRST) == math.inf
+    assert playback.now_ns() == FIRST + SECOND
+    playback.pause(False)
+    steady.seconds += 1
+    assert playback.now_ns() == FIRST + 2 * SECOND
+
+
+def test_playback_step_passes_all_up_to_the_next_image():
+    playback = Playback(1.0, True)
+    playback.start(FIRST)
+    assert playback.step()
+    for time_ns, is_image in ((FIRST, False), (FIRST + SECOND, True)):
+        assert playback.seconds_until(time_ns) == 0
+        playback.passed(time_ns, is_image)
+        assert playback.now_ns() == time_ns
+    assert playback.seconds_until(FIRST + 2 * SECOND) == math.inf
+
+
+def test_playback_step_while_it_plays_is_refused():
+    playback = Playback(1.0, False)
+    assert not playback.step()
+
+
+# parts of a source, and its other topics
+
+
+@pytest.mark.parametrize('ros1', [False, True])
+def test_bag_with_start_and_duration_yields_that_part(tmp_path, ros1):
+    path = tmp_path / ('one.bag' if ros1 else 'two')
+    write_odometry(path, [FIRST + i * SECOND for i in range(6)], ros1, images(6))
+    # the bag begins with a text at second 99
+    records = BagSource(path).records(start=3, duration=2)
+    assert [record.time_ns // SECOND for record in records] == [102, 103]
+    records = read_messages(path, ['/odom'], start=3, duration=2)
+    assert [record.time_ns // SECOND for record in records] == [102, 103]
+    assert len(list(BagSource(path).records(start=100))) == 0
+
+
+def test_folder_with_start_and_duration_yields_that_part(tmp_path, route):
+    for i in range(10):
+        (tmp_path / f'{i}.ppm').write_bytes(b'P6 3 2 255 ' + bytes(18))
+    source = FolderSource(tmp_path)
+    stamps = [record.stamp_ns for record in source.records(10, start=0.3, duration=0.4)]
+    assert stamps == [400_000_000, 500_000_000, 600_000_000, 700_000_000]
+    assert len(list(source.records(10, start=7.0))) == 0
+
+
+def test_messages_of_ros1_are_those_of_ros2(tmp_path):
+    """Headers of ROS 1 have a number more, and CameraInfo other names of fields."""
+    contents = {}
+    for name, ros1 in (('one.bag', True), ('two', False)):
+        with writing(tmp_path / name, ros1) as bag:
+            region = bag.make('sensor_msgs/msg/RegionOfInterest', 1, 2, 3, 4, True)
+            numbers = [np.arange(count, dtype=float) for count in (5, 9, 9, 12)]
+            fields = [bag.header(FIRST), 480, 640, 'plumb_bob', *numbers, 0, 0, region]
+            bag.write('/info', 'sensor_msgs/msg/CameraInfo', FIRST, *fields)
+        (record,) = read_messages(tmp_path / name, ['/info'])
+        contents[ros1] = record.content
+    assert contents[True] == contents[False]
+
+
+def test_messages_of_an_unknown_type_of_ros1_are_rejected(tmp_path):
+    write_odometry(tmp_path / 'one.bag', [FIRST], ros1=True)
+    with writing(tmp_path / 'broken.bag', ros1=True) as bag:
+        bag.write_bytes('/odom', 'nav_msgs/msg/Odometry', FIRST, b'short')
+    with pytest.raises(SourceError, match='5 bytes are no nav_msgs/msg/Odometry'):
+        list(read_messages(tmp_path / 'broken.bag', ['/odom']))
+
+
+def test_message_class_imports_packages_of_messages_only():
+    assert message_class('nav_msgs/msg/Odometry') is Odometry
+    for name in (
+        'os/msg/path',
+        'antigravity/msg/Text',
+        'tests_of_nobody/msg/Text',
+        'nav_msgs/msg/__name__',
+        'x',
+        '../a/msg/B',
+    ):
+        with pytest.raises(UnavailableError, match='is not installed'):
+            message_class(name)
+
+
+# messages over ROS
+
+
+@contextmanager
+def spinning(name):
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    node = rclpy.create_node(name, context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    try:
+        yield node
+    finally:
+        executor.shutdown()
+        thread.join()
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+class Received:
+    """What a subscriber has received, topic and message."""
+
+    def __init__(self, node, *topics):
+        self.messages, self.changed = [], threading.Condition()
+        for message_type, topic in topics:
+            node.create_subscription(message_type, topic, self._keep(topic), 1000)
+
+    def _keep(self, topic):
+        def keep(message):
+            with self.changed:
+                self.messages.append((topic, message))
+                self.changed.notify_all()
+
+        return keep
+
+    def wait(self, enough):
+        with self.changed:
+            assert self.changed.wait_for(lambda: enough(self.messages), TIMEOUT), self.messages
+
+    def of(self, topic):
+        return [message for name, message in self.messages if name == topic]
+
+
+@contextmanager
+def replayer(options, topics=None):
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    node = rclpy.create_node('stavpr_replay', context=context)
+    made = Replayer(node, lambda text: None, options, topics or {})
+    try:
+        yield made
+    finally:
+        made.close()
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def seconds(header):
+    return header.stamp.sec
+
+
+def test_replay_with_other_topics_publishes_their_messages(tmp_path):
+    path = write_odometry(
+        tmp_path / 'bag', [FIRST + i * SECOND for i in range(3)], images=images(3)
+    )
+    topics = list_topics(path)
+    assert topics['/odom'] == RecordedTopic('/odom', 'nav_msgs/msg/Odometry', False)
+    published = {topics['/odom']: 'odom', topics['/text']: '/text'}
+    received_on = ((Odometry, '/odom'), (String, '/text'), (Image, '/image'))
+    with spinning('others') as node, replayer(ReplayOptions(rate=20.0), published) as made:
+        received = Received(node, *received_on)
+        made.wait_for_subscribers()
+        records = [*read_messages(path, made.topics), *images(3)]
+        made.play(sorted(records, key=lambda record: record.time_ns))
+        made.finish()
+        received.wait(lambda messages: len(messages) == 7)
+    assert [seconds(message.header) for message in received.of('/odom')] == [100, 101, 102]
+    assert [message.pose.pose.position.x for message in received.of('/odom')] == [0, 1, 2]
+    assert made.published == len(received.of('/image')) == 3
+
+
+def test_replay_keeps_latched_messages_for_late_subscribers():
+    latched = RecordedTopic('/tf_static', TEXT, True)
+    with replayer(ReplayOptions(), {latched: '/tf_static'}) as made:
+        made._others['/tf_static'].publish(String(data='kept'))
+        with spinning('late') as node:
+            kept, profile = Received(node), QoSProfile(depth=1)
+            profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
+            node.create_subscription(String, '/tf_static', kept._keep('/tf_static'), profile)
+            kept.wait(lambda messages: messages)
+
+
+def test_replay_clock_advances_with_the_records_and_restarts_with_a_loop():
+    options = ReplayOptions(rate=100.0, clock=200.0)
+    with spinning('clocked') as node, replayer(options) as made:
+        received = Received(node, (Clock, '/clock'), (Image, '/image'))
+        made.wait_for_subscribers()
+        made.play(images(50))
+        once = len(received.of('/clock'))
+        made.play(images(50))
+        made.finish()
+        received.wait(lambda _: len(received.of('/image')) == 100)
+    times = [clock.clock.sec + clock.clock.nanosec / 1e9 for clock in received.of('/clock')]
+    backward = [i for i in range(1, len(times)) if times[i] < times[i - 1]]
+    assert len(backward) == 1
+    assert abs(times[backward[0]] - 100) < 1
+    assert once > 50  # with each image, and between them
+
+
+def test_replay_services_pause_step_and_resume():
+    with spinning('control') as node, replayer(ReplayOptions(rate=1000.0, paused=True)) as made:
+        received = Received(node, (Image, '/image'))
+
+        def call(name):
+            client = node.create_client(Trigger, f'/stavpr_replay/{name}')
+            assert client.wait_for_service(TIMEOUT)
+            done = threading.Event()
+            future = client.call_async(Trigger.Request())
+            future.add_done_callback(lambda _: done.set())
+            assert done.wait(TIMEOUT)
+            return future.result().success, future.result().message
+
+        def play():
+            made.wait_for_subscribers()
+            made.play(images(4))
+            made.finish()
+
+        player = threading.Thread(target=play)
+        player.start()
+        for count in (1, 2):
+            assert call('play_next') == (True, 'paused')
+            received.wait(lambda messages, count=count: len(messages) == count)
+            assert call('pause') == (True, 'paused')
+            assert len(received.messages) == count
+        assert call('resume') == (True, 'playing')
+        received.wait(lambda messages: len(messages) == 4)
+        player.join(TIMEOUT)
+    assert [seconds(image.header) for image in received.of('/image')] == [100, 101, 102, 103]
+
+
+def test_replay_command_with_keys_loops_over_a_part_of_a_bag(tmp_path):
+    """Step and resume on a terminal; odometry, other topics and the clock beside the images."""
+    path = write_odometry(
+        tmp_path / 'bag', [FIRST + i * SECOND for i in range(6)], images=images(6)
+    )
+    terminal, its_end = pty.openpty()
+    command = [sys.executable, '-m', 'stavpr_ros.commands.replay', str(path)]
+    command += '--odometry --also --clock --loop --start-paused --rate 20'.split()  # noqa: SIM905
+    command += ['--start-offset', '3', '--duration', '2', '--ros-args', '-r', 'odom:=/robot/odom']
+    with spinning('terminal') as node:
+        received = Received(node, (Image, '/image'), (Odometry, '/robot/odom'), (Clock, '/clock'))
+        running = subprocess.Popen(
+            command,
+            env=environment() | {'ROS_DOMAIN_ID': str(DOMAIN)},
+            stdin=its_end,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509
+        )
+        try:
+            received.wait(lambda _: received.of('/clock'))
+            os.write(terminal, b's')
+            received.wait(lambda _: received.of('/image'))
+            os.write(terminal, b' ')
+            assert any('resumed' in line for line in iter(running.stderr.readline, ''))
+            received.wait(lambda _: len(received.of('/image')) >= 5)
+            os.write(terminal, b'\x03')  # Ctrl-C
+            assert running.wait(TIMEOUT) == 130
+        finally:
+            running.kill()
+            running.wait()
+            running.stderr.close()
+            os.close(terminal)
+            os.close(its_end)
+    stamps = [seconds(image.header) for image in received.of('/image')]
+    assert stamps[:5] == [102, 103, 102, 103, 102]
+    assert {seconds(message.header) for message in received.of('/robot/odom')} == {102, 103}
+
+
+@pytest.mark.parametrize(
+    ('options', 'error'),
+    [
+        (['--start-offset', '1000'], 'has no image from second 1000 on'),
+        (['--also', '/nothing'], '0 topics /nothing'),
+        (['--odometry', '/text'], '0 topics /text nav_msgs/msg/Odometry with messages'),
+    ],
+)
+def test_replay_command_of_a_part_that_is_missing_fails(
+    tmp_path, capsys, monkeypatch, options, error
+):
+    path = write_odometry(tmp_path / 'bag', [FIRST], images=images(1))
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
+    monkeypatch.setenv(process.PROFILES_VARIABLE, '')  # what the command sets ends with the test
+    with spinning('missing') as node:
+        Received(node, (Image, '/image'))
+        assert replay.main([str(path), *options]) == 1
+    assert error in capsys.readouterr().err
+
+
+def test_replay_command_of_a_folder_with_odometry_fails(tmp_path, capsys):
+    (tmp_path / '0.ppm').write_bytes(b'P6 3 2 255 ' + bytes(18))
+    assert replay.main([str(tmp_path), '--odometry']) == 1
+    assert '--odometry and --also require a bag' in capsys.readouterr().err

@@ -1,0 +1,275 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The topics for viewers: by a stand-in for the publishers, and of the node."""
+
+from itertools import pairwise
+import json
+from pathlib import Path as Pathname
+import re
+from types import SimpleNamespace
+
+from ament_index_python.packages import get_package_share_directory
+from builtin_interfaces.msg import Time
+import cv2
+from nav_msgs.msg import Path
+import numpy as np
+from pipelines import LENGTH, localizing, message, process, recorded, SECOND
+import pytest
+from robot import LATCHED
+from sensor_msgs.msg import CompressedImage, Image
+from stavpr_msgs.msg import PlaceMatch
+from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each
+from stavpr_ros.recognition import Match, Status
+from stavpr_ros.ros.visualization import color, GROWTH, Visualization
+from std_msgs.msg import Header
+from visualization_msgs.msg import Marker, MarkerArray
+import yaml
+
+TOPICS = {'map_path', 'matched_path', 'markers', 'match_image/compressed', 'window_image'}
+TOPICS |= {'distances'}
+
+
+class Publisher:
+    def __init__(self, is_requested):
+        self.is_requested, self.messages = is_requested, []
+        self.publish = self.messages.append
+
+    def get_subscription_count(self):
+        return int(self.is_requested)
+
+
+class Publishers:
+    """Makes publishers for a visualization; only the topics of ``requested`` have a subscriber."""
+
+    def __init__(self, requested):
+        self.requested, self.by_topic = requested, {}
+        self.context = SimpleNamespace(ok=lambda: True)
+
+    def create_publisher(self, kind, topic, qos, event_callbacks=None):
+        topic = topic.removeprefix('~/')
+        self.by_topic[topic] = Publisher(topic in self.requested)
+        return self.by_topic[topic]
+
+    def get_clock(self):
+        return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=Time))
+
+    def messages(self, topic):
+        return self.by_topic[topic].messages
+
+
+def views_of(*requested):
+    publishers = Publishers(requested)
+    return Visualization(publishers, lambda: None), publishers
+
+
+def header(i=0):
+    return Header(stamp=Time(sec=i + 1), frame_id='camera')
+
+
+@pytest.fixture
+def localized(map_file, route):
+    """Return a pipeline whose window is matched, and the match of the last image."""
+    pipeline = localizing(map_file)
+    return pipeline, process(pipeline, route[: LENGTH + 4])[-1]
+
+
+def test_visualization_without_subscribers_publishes_and_draws_nothing(localized, monkeypatch):
+    pipeline, match = localized
+    monkeypatch.setattr(pipeline, 'window_distances', lambda: pytest.fail('not requested'))
+    views, publishers = views_of()
+    views.publish(header(), match, pipeline, 'map')
+    views.publish_route(pipeline.places, 'map')
+    assert set(publishers.by_topic) == TOPICS
+    assert not any(publisher.messages for publisher in publishers.by_topic.values())
+    assert not views.needs_candidates
+
+
+def test_visualization_of_a_match_publishes_routes_and_markers(localized):
+    pipeline, match = localized
+    assert match.accepted
+    views, publishers = views_of('map_path', 'matched_path', 'markers')
+    for i in range(2):
+        views.publish(header(i), match, pipeline, 'map')
+    (route,) = publishers.messages('map_path')  # it has not changed
+    assert route.header.frame_id == 'map'
+    assert [stamped.pose.position.x for stamped in route.poses] == list(range(60))
+    last = publishers.messages('matched_path')[-1].poses
+    place = float(match.newest_index)
+    assert [(p.header.stamp.sec, p.pose.position.x) for p in last] == [(1, place), (2, place)]
+    assert views.needs_candidates
+    clear, ball, *candidates, text = publishers.messages('markers')[-1].markers
+    assert clear.action == Marker.DELETEALL
+    assert (ball.type, ball.pose.position.x) == (Marker.SPHERE, place)
+    assert ball.color == color(match.probability)
+    assert len(candidates) == len(match.candidates)
+    assert text.text == f'place {match.newest_index}, p {match.probability:.2f}'
+    assert len({marker.id for marker in publishers.messages('markers')[-1].markers}) == len(
+        publishers.messages('markers')[-1].markers
+    )
+
+
+def test_visualization_of_an_image_without_a_match_shows_no_place(localized):
+    pipeline, _ = localized
+    views, publishers = views_of(*TOPICS)
+    views.publish(header(), Match(Status.DROPPED, 'because'), pipeline, 'map')
+    assert [m.action for m in publishers.messages('markers')[0].markers] == [Marker.DELETEALL]
+    assert not publishers.messages('matched_path')
+    assert not publishers.messages('match_image/compressed')
+
+
+def test_visualization_of_loop_closures_connects_query_and_place(route):
+    pipeline = recorded(route, 'loop_closure')
+    views, publishers = views_of('markers', 'map_path')
+    matches = process(pipeline, route[:30], first=30, poses=True)
+    for i, match in enumerate(matches):
+        views.publish(header(i), match, pipeline, 'odom')
+    accepted = [match for match in matches if match.accepted]
+    lines = publishers.messages('markers')[-1].markers[1]
+    assert lines.type == Marker.LINE_LIST
+    assert len(lines.points) == len(lines.colors) == 2 * len(accepted) > 0
+    last = pipeline.places.place(accepted[-1].newest_index).pose[0]
+    assert lines.points[-1].x == last
+    assert all(message.header.frame_id == 'odom' for message in publishers.messages('map_path'))
+
+
+def test_visualization_of_a_growing_route_is_published_when_it_has_grown(route):
+    pipeline = recorded(route, count=30)
+    views, publishers = views_of('map_path')
+    for i in range(30):
+        views.publish(
+            header(), process(pipeline, route[30 + i : 31 + i], 30 + i, True)[0], pipeline, ''
+        )
+    sizes = [len(message.poses) for message in publishers.messages('map_path')]
+    assert sizes[0] == 31
+    assert all(b >= a * GROWTH for a, b in pairwise(sizes))
+    assert 5 < len(sizes) < 20
+
+
+def test_visualization_in_another_frame_starts_again(localized):
+    pipeline, match = localized
+    views, publishers = views_of('matched_path', 'map_path')
+    for frame in ('map', 'map', 'odom'):
+        views.publish(header(), match, pipeline, frame)
+    assert [len(m.poses) for m in publishers.messages('matched_path')] == [1, 2, 1]
+    assert [m.header.frame_id for m in publishers.messages('map_path')] == ['map', 'odom']
+
+
+def test_visualization_of_distances_is_the_newest_row(localized):
+    pipeline, match = localized
+    views, publishers = views_of('distances', 'window_image', 'match_image/compressed')
+    views.publish(header(), match, pipeline, 'map')
+    (row,) = publishers.messages('distances')
+    assert (row.encoding, row.height, row.width, row.step) == ('32FC1', 1, 60, 240)
+    values = np.frombuffer(row.data, np.float32)
+    rows, first = pipeline.window_distances()
+    assert first == 0
+    np.testing.assert_array_equal(values, rows[-1])
+    assert values.argmin() == match.newest_index
+    assert publishers.messages('window_image')[0].encoding == 'rgb8'
+    (jpeg,) = publishers.messages('match_image/compressed')
+    drawn = cv2.imdecode(np.frombuffer(jpeg.data, np.uint8), cv2.IMREAD_COLOR)
+    expected = draw_match(match, pipeline.places).astype(int)
+    error, swapped = (np.abs(drawn[..., ::step] - expected).mean() for step in (-1, 1))
+    assert error < 10 < swapped
+
+
+def test_window_rows_of_a_window_that_fills_are_those_of_its_images(map_file, route):
+    pipeline = localizing(map_file)
+    assert pipeline.window_distances()[0].shape == (0, 0)
+    for i in range(LENGTH + 2):
+        pipeline.process(message(route[i]), (i + 1) * SECOND)
+        rows, _ = pipeline.window_distances()
+        assert rows.shape == (min(i + 1, LENGTH), 60)
+        np.testing.assert_array_equal(rows[-1], pipeline._operation.recognizer.newest_row())
+
+
+def test_least_of_each_part_by_hand():
+    rows = np.array([[3, 1, 2, 5, 4, np.inf]], np.float32)
+    np.testing.assert_array_equal(least_of_each(rows, 3), [[1, 2, 4]])
+    np.testing.assert_array_equal(least_of_each(rows, 6), rows)
+    assert least_of_each(np.zeros((2, 1000), np.float32), 512).shape == (2, 512)
+
+
+@pytest.mark.parametrize('places', [1, 40, 5000])
+def test_draw_window_shows_the_path_over_its_places(places):
+    rows = np.ones((5, places), np.float32)
+    rows[:, places // 2] = 0
+    rows[:, 0] = np.inf
+    path = np.array([[i, places // 2] for i in range(5)], np.int32)
+    sequence = SimpleNamespace(middle=places // 2, distance=0.1)
+    match = Match(Status.MATCH, sequence=sequence, path=path, relative=True, probability=0.9)
+    drawn = draw_window(rows, 0, match)
+    without = draw_window(rows, 0, Match(Status.WARMING_UP))
+    assert drawn.dtype == np.uint8
+    assert 200 < drawn.shape[1] < 1400
+    assert (drawn == 255).all(axis=2).any()
+    if places <= 40:
+        assert drawn.shape == without.shape
+        assert (drawn != without).any()
+
+
+DISPLAYS = {
+    'Path': 'nav_msgs/msg/Path',
+    'MarkerArray': 'visualization_msgs/msg/MarkerArray',
+    'PoseWithCovariance': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'Image': 'sensor_msgs/msg/Image',
+}
+
+
+def test_node_publishes_the_topics_of_the_layouts(robot, start):
+    start()
+    config = Pathname(get_package_share_directory('stavpr_ros')) / 'config'
+    rviz = yaml.safe_load((config / 'stavpr.rviz').read_text())['Visualization Manager']
+    named = {
+        (display['Topic']['Value'], DISPLAYS[display['Class'].partition('/')[2]])
+        for display in rviz['Displays']
+        if 'Topic' in display
+    }
+    assert len(named) >= 6
+    foxglove = json.loads((config / 'foxglove.json').read_text())
+    topics = set(re.findall(r'"(/stavpr/[a-z_/]+)', json.dumps(foxglove)))
+    assert len(topics) >= 7
+
+    def published():
+        return dict(robot.node.get_publisher_names_and_types_by_node('stavpr', '/'))
+
+    robot.until(lambda: topics <= published().keys(), f'publishers of {sorted(topics)}')
+    for topic, kind in named:
+        assert published()[topic] == [kind]
+
+    def panels(part):
+        return {part} if isinstance(part, str) else panels(part['first']) | panels(part['second'])
+
+    assert panels(foxglove['layout']) == set(foxglove['configById'])
+
+
+def test_node_publishes_the_route_for_a_late_subscriber_without_an_image(robot, start):
+    start()
+    routes = robot.listen(Path, '/stavpr/map_path', LATCHED)
+    robot.until(lambda: routes, 'the route')
+    assert len(routes[0].poses) == 60
+    assert routes[0].header.frame_id == 'map'
+
+
+def test_node_publishes_for_viewers(robot, start, route):
+    start()
+    received = {
+        topic: robot.listen(kind, f'/stavpr/{topic}')
+        for topic, kind in (
+            ('matched_path', Path),
+            ('markers', MarkerArray),
+            ('match_image/compressed', CompressedImage),
+            ('window_image', Image),
+            ('distances', Image),
+        )
+    }
+    shown = iter(route)
+
+    def complete():
+        match = robot.show(next(shown))
+        return match.status == PlaceMatch.MATCH and all(received.values())
+
+    robot.until(complete, 'a message on each topic')
+    last = robot.answers[-1].header
+    for topic in ('match_image/compressed', 'distances'):
+        robot.until(lambda topic=topic: received[topic][-1].header == last, topic)
