@@ -43,8 +43,20 @@ class SourceError(StavprError):
     """A folder or a bag of images cannot be read."""
 
 
+class OutputError(StavprError):
+    """A file cannot be written."""
+
+
+class OutputTakenError(OutputError):
+    """A file is not written, since one is there that must stay, or another program writes it."""
+
+
 class MapFileError(StavprError):
-    """A map file cannot be written, or is damaged, truncated, foreign or too new to be read."""
+    """A map file is damaged, truncated, foreign or too new to be read."""
+
+
+class JournalError(StavprError):
+    """The journal of a recorded map cannot be read, or is in use."""
 
 
 class FeatureMismatchError(StavprError):

@@ -1,22 +1,286 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check of an output file before the work starts."""
+"""The one way to write a file: all of it or nothing, and never over somebody else's."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+import fcntl
+import hashlib
+import io
 import os
+from pathlib import Path
+import re
+import stat
+from typing import NamedTuple
 
-from stavpr_ros.errors import SourceError
+from stavpr_ros.errors import OutputError, OutputTakenError
+
+HEAD = 4096  # first bytes of a file, enough to recognize its kind
+_TEMPORARY = re.compile(r'\.stavpr-[0-9a-f]{12}')
 
 
-def require_room(path: str) -> None:
+@dataclass(frozen=True)
+class FileKind:
     """
-    Reject a file that cannot be written.
+    A kind of output file.
 
-    :raises SourceError: it is a folder, or its folder is missing or write-protected.
+    :param name: in error messages.
+    :param matches: whether a file that begins with these bytes, at most ``HEAD``, is of this kind.
+    """
+
+    name: str
+    matches: Callable[[bytes], bool]
+
+
+def _is_map(head: bytes) -> bool:
+    # version 1: ZIP whose manifest comes first; version 2: safetensors, a length and a header
+    return (head.startswith(b'PK\x03\x04') or head[8:9] == b'{') and b'"stavpr-map"' in head
+
+
+MAP = FileKind('map', _is_map)
+RECORDING = FileKind('recording of matches', lambda head: head.startswith(b'{"stamp": '))
+JSON = FileKind('JSON file', lambda head: head.lstrip()[:1] in (b'{', b'['))
+PNG = FileKind('PNG image', lambda head: head.startswith(b'\x89PNG'))
+ARRAYS = FileKind('file of NumPy arrays', lambda head: head.startswith(b'PK\x03\x04'))
+HTML = FileKind('HTML page', lambda head: head.lstrip().lower().startswith(b'<!doctype html'))
+
+
+def csv_kind(columns: list[str]) -> FileKind:
+    """Return the kind of a CSV file with these names in its first line."""
+    line = ','.join(columns).encode()
+    return FileKind('CSV file with these columns', lambda head: head.startswith(line))
+
+
+class FileVersion(NamedTuple):
+    """Identity of a file as it was last written; this module makes another file each time."""
+
+    device: int
+    inode: int
+    mtime_ns: int
+
+    @classmethod
+    def of(cls, path: str | Path) -> 'FileVersion | None':
+        """Return the version of the file that is there now, None = none."""
+        try:
+            there = os.stat(path)
+        except OSError:
+            return None
+        return cls(there.st_dev, there.st_ino, there.st_mtime_ns)
+
+
+Force = bool | FileVersion  # whether to replace a file of the kind; a version: that file only
+
+
+class AtomicFile(io.BufferedWriter):
+    """
+    A new file that takes its place when it is committed; see :func:`atomic_output`.
+
+    It is written under a temporary name in the folder of its target, and locked until it is
+    closed: a killed writer leaves a temporary without a lock, which the next one deletes.
+    """
+
+    def __init__(self, path: str | Path, kind: FileKind, force: Force) -> None:
+        self._path, self._kind, self._force = path, kind, force
+        self._target = Path(os.path.realpath(path))
+        _require_replaceable(self._target, path, kind, force)
+        self.committed = False
+        _sweep(self._target.parent)
+        self._temporary, file = create_temporary(self._target)
+        super().__init__(io.FileIO(file, 'r+'))
+        try:
+            with suppress(FileNotFoundError):
+                self._take_over(os.stat(self._target))
+        except BaseException:
+            self.abandon()
+            raise
+
+    def _take_over(self, there: os.stat_result) -> None:
+        """Give this file the owner, where the rights allow it, and the mode of another."""
+        with suppress(PermissionError):
+            os.fchown(self.fileno(), there.st_uid, there.st_gid)
+        os.fchmod(self.fileno(), stat.S_IMODE(there.st_mode))
+
+    def commit(self) -> None:
+        """
+        Sync the file, and let it replace its target; writing may go on.
+
+        :raises OutputTakenError: meanwhile the target came into being, or changed its kind.
+        """
+        self.sync()
+        _require_replaceable(self._target, self._path, self._kind, self._force)
+        os.replace(self._temporary, self._target)
+        self.committed = True
+        sync_folder(self._target.parent)
+
+    def sync(self) -> None:
+        """Write everything to the disk."""
+        self.flush()
+        os.fsync(self.fileno())
+
+    def abandon(self) -> None:
+        """Close the file without what is not flushed; delete it if it is not committed."""
+        if not self.committed:
+            self._temporary.unlink(missing_ok=True)
+        self.raw.close()
+
+
+@contextmanager
+def atomic_output(path: str | Path, kind: FileKind, force: Force = False) -> Iterator[AtomicFile]:
+    """
+    Write a file; when the block ends it is complete under its name, or not there.
+
+    Mode and owner of a file that is replaced are kept, and so is a symbolic link, whose target is
+    replaced. File and folder are synced.
+
+    :param force: replace an existing file of this kind; a version: only if it is that one.
+    :raises OutputTakenError: the file exists, unless it may be replaced, or is being written.
+    :raises OutputError: it cannot be written; what was there is untouched.
+    """
+    with _explained(path):
+        file = AtomicFile(path, kind, force)
+        try:
+            yield file
+            if not file.closed:  # by the block, which abandoned it
+                file.sync() if file.committed else file.commit()
+        finally:
+            file.abandon()
+
+
+def write_output(path: str | Path, content: str | bytes, kind: FileKind, force: Force) -> None:
+    """Write a file at once, text as UTF-8; see :func:`atomic_output`."""
+    with atomic_output(path, kind, force) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def require_room(path: str | Path) -> None:
+    """
+    Reject a path at which no file can be made.
+
+    :raises OutputError: it is a folder, or its folder is missing or write-protected.
     """
     if os.path.isdir(path):
-        raise SourceError(f'{path} is a folder: name a file in it')
-    folder = os.path.dirname(os.path.abspath(path))
+        raise OutputError(f'{path} is a folder: name a file in it')
+    folder = os.path.dirname(os.path.realpath(path))
     if not os.path.isdir(folder):
-        raise SourceError(f'the folder of {path} does not exist: make it first')
+        raise OutputError(f'the folder of {path} does not exist: make it first')
     if not os.access(folder, os.W_OK):
-        raise SourceError(f'the folder of {path} is write-protected: name another')
+        raise OutputError(f'the folder of {path} is write-protected: name another')
+
+
+def require_replaceable(path: str | Path, kind: FileKind, force: Force = False) -> None:
+    """
+    Reject a file that must not, or cannot, be written; for a check before long work.
+
+    :raises OutputTakenError: it exists, and is no file of this kind or ``force`` is not given.
+    :raises OutputError: its folder is missing or write-protected.
+    """
+    with _explained(path):
+        _require_replaceable(Path(os.path.realpath(path)), path, kind, force)
+
+
+def _require_replaceable(target: Path, path: str | Path, kind: FileKind, force: Force) -> None:
+    require_room(target)
+    if not os.path.lexists(target):
+        return
+    head = _head(target, path)
+    if head and not kind.matches(head):
+        raise OutputTakenError(f'{path} exists and is no {kind.name}: it is never replaced')
+    if force is not True and (force is False or force != FileVersion.of(target)):
+        raise OutputTakenError(
+            f'{path} exists already: choose another name, or replace it by --force (services: '
+            'overwrite)'
+        )
+
+
+def _head(target: Path, path: str | Path) -> bytes:
+    """Return the first bytes of a regular file that no one is writing."""
+    file = os.open(target, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        if not stat.S_ISREG(os.fstat(file).st_mode):
+            raise OutputTakenError(f'{path} exists and is no regular file: it is never replaced')
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise _busy(path) from error
+        return os.read(file, HEAD)
+    finally:
+        os.close(file)
+
+
+def _busy(path: str | Path) -> OutputTakenError:
+    return OutputTakenError(
+        f'{path} is being written by another program: wait, or name another file'
+    )
+
+
+def create_temporary(target: Path) -> tuple[Path, int]:
+    """
+    Create and lock the temporary file of a target; one that a killed writer left is deleted.
+
+    :returns: its path, and its descriptor.
+    :raises OutputTakenError: another program writes the target.
+    """
+    name = hashlib.sha256(os.fsencode(target.name)).hexdigest()[:12]
+    temporary = target.parent / f'.stavpr-{name}'
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+    while True:
+        try:
+            file = os.open(temporary, flags, 0o666)
+        except FileExistsError as error:
+            if not _delete_stale(temporary):
+                raise _busy(target) from error
+            continue
+        fcntl.flock(file, fcntl.LOCK_EX)
+        if os.fstat(file).st_nlink:
+            return temporary, file
+        os.close(file)  # another writer took it for a stale one before it was locked
+
+
+def _sweep(folder: Path) -> None:
+    """Delete the temporaries of killed writers."""
+    with os.scandir(folder) as entries:
+        stale = [entry.path for entry in entries if _TEMPORARY.fullmatch(entry.name)]
+    for path in stale:
+        _delete_stale(Path(path))
+
+
+def _delete_stale(temporary: Path) -> bool:
+    """Delete a temporary file unless its writer lives; return whether it is gone."""
+    try:
+        file = os.open(temporary, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return True
+    except OSError:
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # a writer that was done meanwhile has moved this one, and the next made another
+        if os.path.samestat(os.fstat(file), os.lstat(temporary)):
+            os.unlink(temporary)
+    except FileNotFoundError:
+        pass
+    except OSError:
+        return False
+    finally:
+        os.close(file)
+    return True
+
+
+def sync_folder(folder: Path) -> None:
+    """Write the names in a folder to the disk."""
+    file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
+
+
+@contextmanager
+def _explained(path: str | Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f'{path} cannot be written ({error.strerror or error}); what was there is untouched'
+        ) from error

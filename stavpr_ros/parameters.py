@@ -264,6 +264,14 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
     ),
     'Recorded maps': (
         NodeParameter(
+            'maps_folder',
+            '',
+            'Folder of the maps that services name; map_path, save_path and model_path must also '
+            'be in it when they are set after the start. Empty: stavpr/maps in $XDG_DATA_HOME, '
+            'that is ~/.local/share.',
+            when='start',
+        ),
+        NodeParameter(
             'feature_settings',
             '',
             'Settings of the features as a JSON object; missing keys take their defaults.',

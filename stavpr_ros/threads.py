@@ -2,8 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the numerics use the processor beside everything else that runs on a robot."""
 
+from collections.abc import Callable
+from concurrent.futures import Future
 from functools import cache
 import os
+import threading
+from typing import TypeVar
+
+Result = TypeVar('Result')
 
 
 def wait_passively() -> None:
@@ -42,3 +48,17 @@ def _unlimited() -> tuple[int, int]:
     import torch
 
     return torch.get_num_threads(), cv2.getNumThreads()
+
+
+def call_on_thread(function: Callable[[], Result], name: str) -> Future[Result]:
+    """Call a function on a thread of its own; it may be abandoned, the process does not wait."""
+    future: Future[Result] = Future()
+
+    def call() -> None:
+        try:
+            future.set_result(function())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=call, name=name, daemon=True).start()
+    return future

@@ -29,6 +29,12 @@ def data_folder() -> Path:
     return folder
 
 
+@pytest.fixture(scope='session', autouse=True)
+def user_data(tmp_path_factory):
+    """Keep the user's own folder of maps out of the tests, also of their processes."""
+    os.environ['XDG_DATA_HOME'] = str(tmp_path_factory.mktemp('data'))
+
+
 def route_images(count: int, seed: int = 0, size: tuple[int, int] = (96, 128)) -> list[np.ndarray]:
     """Return views of one long random texture, each a step further along it, RGB uint8."""
     rng = np.random.default_rng(seed)
@@ -100,7 +106,7 @@ def map_file(small_map, tmp_path_factory) -> str:
 
 
 @pytest.fixture
-def start(robot, map_file):
+def start(robot, map_file, tmp_path_factory):
     """Start a node in this process that localizes on the map; it ends with the test."""
     from robot import NodeThread
 
@@ -108,7 +114,8 @@ def start(robot, map_file):
 
     def start(*arguments, wait=True, **parameters):
         robot.forget()
-        started.append(NodeThread(arguments, {'map_path': map_file} | parameters))
+        files = {'map_path': map_file, 'maps_folder': str(tmp_path_factory.getbasetemp())}
+        started.append(NodeThread(arguments, files | parameters))
         if wait:
             robot.wait_for_node()
         return started[-1].node

@@ -102,7 +102,7 @@ def test_build_map_with_options_writes_map(run, traverse, poses, tmp_path):
 def test_build_map_with_keyframe_options_selects_images(run, traverse, poses, tmp_path):
     """Every second image, two meters on; a minimum distance of three leaves every fourth."""
     output = tmp_path / 'map.stavpr'
-    paths = ['--input', traverse, '--output', output]
+    paths = ['--input', traverse, '--output', output, '--force']
     options = ['--keyframe-distance', 3, '--keyframe-change', 0.01, '--thumbnail-width', 64]
     result = run(build_map, *paths, '--poses', poses, '--every', 2, *options)
     assert result.code == 0, result.err
@@ -119,7 +119,7 @@ def test_build_map_with_odometry_sets_poses(run, tmp_path):
     stamps = [(102 + i) * SECOND for i in range(8)]
     bag = write_odometry(tmp_path / 'bag', stamps, images=image_records(10, 100))
     output = tmp_path / 'map.stavpr'
-    paths = ['--input', bag, '--output', output]
+    paths = ['--input', bag, '--output', output, '--force']
     result = run(build_map, *paths, '--odometry', '/odom')
     assert result.code == 0, result.err
     assert '10 of 10 images became places, 8 of them with a pose' in result.out

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node in a process of another program: its executor, its context, its end."""
 
+import os
 import threading
 import time
 
@@ -216,7 +217,8 @@ def test_place_has_the_pose_at_the_stamp_of_its_image(make, route):
 def test_start_that_fails_is_repeated_after_a_parameter_set_meanwhile(
     make, map_file, tmp_path, monkeypatch
 ):
-    node = make(autostart=True, map_path=str(tmp_path / 'missing.stavpr'))
+    missing, folder = str(tmp_path / 'missing.stavpr'), os.path.dirname(map_file)
+    node = make(autostart=True, map_path=missing, maps_folder=folder)
     trigger = node.trigger_configure
 
     def fail_and_set():
@@ -237,7 +239,8 @@ def test_start_that_fails_is_repeated_after_a_parameter_set_meanwhile(
 
 
 def test_save_path_that_cannot_be_written_is_rejected(make, tmp_path):
-    node = make(operation='mapping', save_path=str(tmp_path / 'missing' / 'route.stavpr'))
+    path = str(tmp_path / 'missing' / 'route.stavpr')
+    node = make(operation='mapping', save_path=path, maps_folder=str(tmp_path))
     assert node.trigger_configure() != SUCCESS
     assert (node.state, 'save_path' in node.problem) == ('unconfigured', True)
     for path, valid in (

@@ -52,7 +52,7 @@ def numbers(run, tmp_path):
 
     def call(*arguments):
         path = tmp_path / 'out.json'
-        code, _, errors = run(*arguments, '--json', path)
+        code, _, errors = run(*arguments, '--json', path, '--force')
         assert code == 0, errors
         return read_json(path.read_text())
 
@@ -260,7 +260,7 @@ def report(run, tmp_path):
 
     def call(*arguments):
         folder = tmp_path / 'report'
-        code, text, errors = run(*arguments, '--output', folder)
+        code, text, errors = run(*arguments, '--output', folder, '--force')
         assert code == 0, errors
         with (folder / 'answers.csv').open() as file:
             rows = list(csv.DictReader(file))
@@ -500,3 +500,18 @@ def test_evaluate_of_loop_closures_in_the_hallway_gives_the_measured_recall(data
     assert found['sequence']['recall_at_1'] > 0.8
     assert found['default_threshold']['threshold'] == 0.5  # 1 - min_probability
     assert found['decision']['precision'] == found['default_threshold']['precision'] == 1
+
+
+def test_reports_and_numbers_are_replaced_only_by_force(run, folders, tmp_path):
+    """Refused before the work begins; files of other kinds are never replaced."""
+    out, folder = tmp_path / 'out.json', tmp_path / 'report'
+    folder.mkdir()
+    (folder / 'report.html').write_text('<!doctype html>\n')
+    out.write_text('{}')
+    for option, path in (('--json', out), ('--output', folder)):
+        code, _, errors = run(*pair(folders), option, path)
+        assert (code, 'exists already' in errors) == (1, True), errors
+    out.write_text('my notes')
+    code, _, errors = run(*pair(folders), '--json', out, '--force')
+    assert (code, 'is no JSON file: it is never replaced' in errors) == (1, True), errors
+    assert (out.read_text(), os.listdir(folder)) == ('my notes', ['report.html'])

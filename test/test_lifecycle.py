@@ -103,7 +103,7 @@ def test_node_in_transitions_publishes_events(robot, node, map_file):
     configure(robot, map_file)
     for label in ('activate', 'deactivate', 'cleanup'):
         assert robot.transition(label)
-    robot.set(map_path='/nowhere/route.stavpr')
+    robot.set(map_path='missing.stavpr')
     assert not robot.transition('configure')
     robot.until(lambda: len(messages) == 11, 'eleven events')
     assert events() == [

@@ -4,17 +4,17 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 import threading
-from unittest.mock import patch
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 import pytest
+from rcl_interfaces.srv import GetParameters
 from robot import image_message, LENGTH, SECOND
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
+from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.ros import runtime
 from std_srvs.srv import Trigger
@@ -24,28 +24,90 @@ PAPER = {'mode': 'paper', 'threshold': 0.2}  # certain after one window
 
 
 @contextmanager
-def while_loading(robot, path):
-    """Load a file that is no map; reading it takes until the end of the block."""
-    path.write_bytes(b'no map')
-    futures, proceed, read = [], threading.Event(), runtime.read_map
+def while_loading(robot, path, monkeypatch):
+    """Load a file: reading it takes until the end of the block, and then it is no map."""
+    futures, end = [], threading.Event()
 
-    def slow(*arguments):
-        proceed.wait()
-        return read(*arguments)
+    def read_slowly(file, settings):
+        end.wait()
+        raise MapFileError(f'{file} is no map')
 
     def loading():
         return bool(robot.infos) and robot.infos[-1].state == 'loading'
 
-    with patch.object(runtime, 'read_map', slow):
-        try:
-            with robot.request(futures, LoadMap, 'load_map', loading, path=str(path)):
-                yield path
-                proceed.set()
-                robot.until(futures[0].done, 'the response of load_map')
-        finally:
-            proceed.set()
+    with monkeypatch.context() as disk:
+        disk.setattr(runtime, 'read_map', read_slowly)
+        with robot.request(futures, LoadMap, 'load_map', loading, path=str(path)):
+            yield path
+            end.set()
+            robot.until(futures[0].done, 'the response of load_map')
     assert not futures[0].result().success
     assert path.name in futures[0].result().message
+
+
+def test_services_while_a_map_is_loaded_are_served(robot, start, route, tmp_path, monkeypatch):
+    """All but a second load_map: a file on a broken disk stops nothing else."""
+    start(map_path='', operation='mapping')
+    robot.drive(route[:3])
+    with while_loading(robot, tmp_path / 'slow.stavpr', monkeypatch):
+        robot.does(SaveMap, 'save_map', path=str(tmp_path / 'recorded.stavpr'))
+        robot.does(Trigger, 'reset')
+        robot.does(SetOperation, 'set_operation', operation='localization')
+        robot.set(min_probability=0.1)
+        assert 'in the window' in robot.refuses(Relocalize, 'relocalize')
+        assert robot.transition('deactivate')
+        assert robot.transition('cleanup')
+
+
+def test_load_map_that_takes_too_long_fails(robot, start, tmp_path, monkeypatch):
+    start(map_path='')
+    end = threading.Event()
+    monkeypatch.setattr(runtime, 'read_map', lambda path, settings: end.wait())
+    monkeypatch.setattr(runtime, 'LOAD_TIMEOUT', 0.1)
+    message = robot.refuses(LoadMap, 'load_map', path=str(tmp_path / 'slow.stavpr'))
+    end.set()
+    assert message == f'{tmp_path}/slow.stavpr was not read within 0.1 s: copy it to a faster disk'
+
+
+def test_services_and_parameters_name_files_in_the_maps_folder_only(
+    robot, start, map_file, tmp_path
+):
+    """Responses have the absolute path; files of the start are free."""
+    folder, secret = tmp_path / 'maps', tmp_path / '.bashrc'
+    folder.mkdir()
+    secret.write_text('export PATH\n')
+    (folder / 'link').symlink_to(secret)
+    (folder / 'outside').symlink_to(tmp_path)
+    start(maps_folder=str(folder))
+    own = str(folder / 'own.stavpr')
+    assert robot.does(SaveMap, 'save_map', path='own.stavpr').message == f'60 places to {own}'
+    loaded = robot.does(LoadMap, 'load_map', path='own.stavpr')
+    assert (loaded.message, loaded.map.path) == (f'60 places from {own}', own)
+    assert robot.does(LoadMap, 'load_map', path=own).success
+    for path in (map_file, str(secret), '../.bashrc', 'link', 'outside/.bashrc', '.'):
+        for kind, name, fields in (
+            (LoadMap, 'load_map', {}),
+            (SaveMap, 'save_map', {'overwrite': True}),
+        ):
+            message = robot.refuses(kind, name, path=path, **fields)
+            assert f'{path!r} is no file in the maps folder {folder}' in message
+        with pytest.raises(AssertionError, match=r'save_path: .* is no file in the maps folder'):
+            robot.set(save_path=path)
+    assert secret.read_text() == 'export PATH\n'
+    robot.set(save_path='late.stavpr')
+    values = robot.call(GetParameters, 'get_parameters', names=['save_path']).values
+    assert values[0].string_value == str(folder / 'late.stavpr')
+    robot.set(save_path=str(folder / 'late.stavpr'))
+    robot.set(save_path='')
+
+
+def test_save_map_over_a_file_that_is_no_map_is_refused(robot, start, tmp_path):
+    """Also where the user keeps maps in the home folder."""
+    start(maps_folder=str(tmp_path))
+    (tmp_path / '.bashrc').write_text('export PATH\n')
+    message = robot.refuses(SaveMap, 'save_map', path='.bashrc', overwrite=True)
+    assert 'exists and is no map: it is never replaced' in message
+    assert (tmp_path / '.bashrc').read_text() == 'export PATH\n'
 
 
 def test_services_without_a_map_return_the_reason(robot, start, route, map_file, tmp_path):
@@ -59,7 +121,7 @@ def test_services_without_a_map_return_the_reason(robot, start, route, map_file,
         (SaveMap, 'save_map', {'path': str(tmp_path / 'nothing.stavpr')}, 'no map'),
         (SaveMap, 'save_map', {}, 'set a path'),
         (LoadMap, 'load_map', {}, 'is no file'),
-        (LoadMap, 'load_map', {'path': '/nowhere/a.stavpr'}, 'does not exist'),
+        (LoadMap, 'load_map', {'path': 'missing.stavpr'}, 'does not exist'),
         (SetOperation, 'set_operation', {'operation': 'teleport'}, 'teleport'),
     ):
         assert words in robot.refuses(kind, name, **fields)
@@ -76,23 +138,11 @@ def test_services_without_a_map_return_the_reason(robot, start, route, map_file,
     assert robot.drive(route[:LENGTH])[-1].newest_index == LENGTH - 1
 
 
-def test_damage_of_the_map_in_use_is_reported_after_the_first_match(
-    robot, start, route, map_file, tmp_path
+def test_images_while_the_first_map_is_loaded_are_not_ready(
+    robot, start, route, tmp_path, monkeypatch
 ):
-    content, damaged = bytearray(Path(map_file).read_bytes()), tmp_path / 'damaged.stavpr'
-    strips = load_map(map_file).features.strips.numpy().tobytes()
-    content[content.index(strips[:64]) + 1] ^= 1  # too little for a check of the values
-    damaged.write_bytes(content)
-    start(map_path=str(damaged))
-    robot.until_logged('the map in use is not reliable: ')
-    robot.until_diagnosed('map', DiagnosticStatus.WARN, 'is damaged')
-    assert robot.drive(route[:LENGTH])[-1].newest_index == LENGTH - 1
-    assert 'is damaged' in robot.refuses(SetOperation, 'set_operation', operation='mapping')
-
-
-def test_images_while_the_first_map_is_loaded_are_not_ready(robot, start, route, tmp_path):
     start(map_path='')
-    with while_loading(robot, tmp_path / 'slow.stavpr') as slow:
+    with while_loading(robot, tmp_path / 'slow.stavpr', monkeypatch) as slow:
         matches = robot.drive(route[:5])
         assert {match.status for match in matches} == {PlaceMatch.NOT_READY}
         assert {match.reason for match in matches} == {f'map {slow} is being loaded'}
@@ -187,11 +237,13 @@ def test_load_map_during_a_stream_processes_every_image(robot, start, small_map,
     assert shown == [('loading', 60), ('loaded', n)]
 
 
-def test_load_map_of_a_damaged_file_keeps_the_map_and_the_window(robot, start, route, tmp_path):
+def test_load_map_of_a_damaged_file_keeps_the_map_and_the_window(
+    robot, start, route, tmp_path, monkeypatch
+):
     start()
     matches = robot.drive(route[:6])
     infos = len(robot.infos)
-    with while_loading(robot, tmp_path / 'slow.stavpr'):
+    with while_loading(robot, tmp_path / 'slow.stavpr', monkeypatch):
         robot.until_map(state='loading', places=60)
         matches += robot.drive(route[6:12])
     matches += robot.drive(route[12:14])

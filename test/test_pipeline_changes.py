@@ -21,7 +21,7 @@ from pipelines import (
     statuses,
 )
 import pytest
-from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, MapFileError
+from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, OutputError
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.pipeline import OPERATIONS, Pipeline
@@ -237,12 +237,12 @@ def test_saving_is_atomic_and_overwrites_on_request_only(route, tmp_path, monkey
     path = tmp_path / 'recorded.stavpr'
     pipeline = Pipeline(settings_of(), 'mapping')
     process(pipeline, route[:3])
-    with pytest.raises(MapFileError, match='make it first'):
+    with pytest.raises(OutputError, match='make it first'):
         save(pipeline, tmp_path / 'missing' / 'recorded.stavpr')
     assert (save(pipeline, path), pipeline.path, pipeline.unsaved) == (3, str(path), 0)
     assert stamps_of(load_map(path)) == [1, 2, 3]
     process(pipeline, route[3:4], first=3)
-    with pytest.raises(MapFileError, match='exists already'):
+    with pytest.raises(OutputError, match='exists already'):
         save(pipeline, path)
     assert pipeline.unsaved == 1
     content = path.read_bytes()
@@ -252,7 +252,7 @@ def test_saving_is_atomic_and_overwrites_on_request_only(route, tmp_path, monkey
 
     with monkeypatch.context() as disk:
         disk.setattr(os, 'replace', fail)
-        with pytest.raises(MapFileError):
+        with pytest.raises(OutputError):
             save(pipeline, path, overwrite=True)
     assert (path.read_bytes(), pipeline.unsaved) == (content, 1)
     assert [file.name for file in tmp_path.iterdir()] == ['recorded.stavpr']

@@ -17,12 +17,12 @@ from stavpr_msgs.srv import LoadMap
 
 
 @pytest.fixture
-def run(robot, tmp_path):
+def run(robot, tmp_path, tmp_path_factory):
     """Start a node; it is ended with the test."""
     started = []
 
     def run(options=(), **parameters):
-        values = PARAMETERS | parameters
+        values = PARAMETERS | {'maps_folder': tmp_path_factory.getbasetemp()} | parameters
         started.append(node_process(tmp_path / 'node.log', *options, **values))
         return started[0]
 

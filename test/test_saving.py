@@ -2,9 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recorded map is saved at the end, and no file of another map is overwritten."""
 
+import threading
+
 from pipelines import localizing, process, save, settings_of
 import pytest
 from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.output_file import FileVersion
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.pipeline.saving import save_recorded_map, write_map
 
@@ -63,7 +66,7 @@ def test_save_recorded_map_after_a_backup_overwrites_its_own_file(small_map, rou
 
 
 def test_save_recorded_map_that_fails_logs_the_loss(mapping, tmp_path):
-    lost = [('warning', '7 recorded places are lost: set save_path, or call ~/save_map')]
+    lost = [('warning', '7 recorded places are in no map: set save_path, call ~/save_map')]
     assert at_the_end(mapping, '') == lost
     level, text = at_the_end(mapping, tmp_path / 'missing' / 'route.stavpr')[-1]
     assert (level, 'does not exist' in text) == ('error', True)
@@ -130,16 +133,53 @@ def test_write_map_keeps_the_state_of_a_map_loaded_meanwhile(another, mapping, m
 
     write_map(mapping, on_worker, path, overwrite=False)
     assert (mapping.unsaved, mapping.path) == (0, map_file if another else path)
-    assert mapping.save_state.owns(map_file) == another
+    assert mapping.save_state.owned(map_file) == (FileVersion.of(map_file) if another else False)
 
 
 def test_mark_saved_in_any_order_counts_the_places_of_each_snapshot(mapping, route, tmp_path):
     """A service, and a transition on another thread: places after both are unsaved."""
     path = str(tmp_path / 'route.stavpr')
-    snapshots = [mapping.snapshot(path, overwrite=True)]
+    snapshots = [mapping.snapshot()]
     process(mapping, route[7:9], first=7)
-    snapshots.append(mapping.snapshot(path, overwrite=True))
+    snapshots.append(mapping.snapshot())
     process(mapping, route[9:10], first=9)
     for snapshot in reversed(snapshots):
         snapshot.mark_saved(path)
     assert mapping.unsaved == 1
+
+
+def test_save_recorded_map_beside_one_saved_by_another_node_takes_a_numbered_name(
+    small_map, route, tmp_path
+):
+    """Two nodes have loaded one map, extend it, and end: both save to its file."""
+    path = str(tmp_path / 'route.stavpr')
+    save_map(small_map, path)
+    first, second = nodes = [Pipeline(settings_of(), 'mapping') for _ in range(2)]
+    for node, images in zip(nodes, (route[:2], route[:3]), strict=True):
+        node.change(loaded=read_map(path, node.settings))
+        process(node, images)
+    assert at_the_end(first, path)[-1][1] == f'62 places written to {path}'
+    assert at_the_end(second, path)[-1][1].endswith(
+        '63 places written to ' + path[:-7] + '-2.stavpr'
+    )
+    assert (len(load_map(path)), len(load_map(tmp_path / 'route-2.stavpr'))) == (62, 63)
+
+
+def test_save_recorded_map_of_two_nodes_at_once_keeps_both(route, tmp_path):
+    path, results = tmp_path / 'route.stavpr', []
+    start = threading.Barrier(2)
+    nodes = [Pipeline(settings_of(), 'mapping') for _ in range(2)]
+    for node, images in zip(nodes, (route[:2], route[:3]), strict=True):
+        process(node, images)
+
+    def end(node):
+        start.wait()
+        results.append(at_the_end(node, path)[-1])
+
+    threads = [threading.Thread(target=end, args=(node,)) for node in nodes]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [level for level, _ in results] == ['info', 'info']
+    assert {len(load_map(file)) for file in tmp_path.iterdir()} == {2, 3}

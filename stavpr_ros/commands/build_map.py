@@ -5,13 +5,14 @@
 import argparse
 from collections.abc import Iterator
 from itertools import islice
+import json
 from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
-from stavpr_ros.output_file import require_room
+from stavpr_ros.output_file import MAP, require_replaceable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from stavpr_ros.sources.bag import BagSource
     from stavpr_ros.sources.folder import FolderSource
     from stavpr_ros.sources.frame import Frame
+
+MOST_SUGGESTED = 20_000  # places of a map that a threshold of mode paper is suggested for
 
 EPILOG = """
 examples:
@@ -28,6 +31,8 @@ examples:
       --keyframe-distance 1 --keyframe-angle 15
   build_map --input drive/ --output route.stavpr --projection 512 --features onnx \\
       --onnx-model squeezenet.onnx --onnx-layer fire6/concat_1
+
+An interrupted command leaves MAP.journal, and the same command continues it.
 
 exit codes: 0 the map is written; 1 it is not (the reason is printed, an earlier map is untouched);
 2 usage; 130 interrupted (it prints whether the map is written)
@@ -44,6 +49,7 @@ def _parser() -> argparse.ArgumentParser:
         '--input', required=True, metavar='FOLDER|BAG', help='images, or a ROS 1 or ROS 2 bag'
     )
     parser.add_argument('--output', required=True, metavar='MAP', help='the file to write')
+    parser.add_argument('--force', action='store_true', help='replace an existing map')
     parser.add_argument('--topic', help='image topic of the bag, if it has several')
     parser.add_argument(
         '--every', type=int, default=1, metavar='N', help='take every N-th image (%(default)s)'
@@ -136,7 +142,7 @@ def _check(arguments: argparse.Namespace) -> None:
         )
     if arguments.thumbnail_width is not None and arguments.no_thumbnails:
         raise SettingsError('--thumbnail-width and --no-thumbnails: give one')
-    require_room(arguments.output)
+    require_replaceable(arguments.output, MAP, arguments.force)
 
 
 def _keyframes(arguments: argparse.Namespace) -> 'KeyframeSettings':
@@ -172,9 +178,11 @@ def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajecto
     return poses[:: arguments.every]
 
 
-def _build(arguments: argparse.Namespace) -> 'PlaceMap':
+def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
+    """Return the map, and the journal that it is in."""
     from stavpr_ros.commands.feature_options import make_extractor
-    from stavpr_ros.mapping import build_map
+    from stavpr_ros.mapping.builder import build_journal
+    from stavpr_ros.mapping.journal_map import journal_map
     from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
     from stavpr_ros.sources import open_source
 
@@ -191,14 +199,17 @@ def _build(arguments: argparse.Namespace) -> 'PlaceMap':
     )
     images = _Images(source, arguments.every)
     width = THUMBNAIL_WIDTH if arguments.thumbnail_width is None else arguments.thumbnail_width
-    place_map = build_map(
+    journal = build_journal(
         images,
         extractor,
+        arguments.output,
+        _source_of(arguments),
         _poses(arguments, len(source)),
         thumbnails=not arguments.no_thumbnails,
         keyframes=keyframes,
         thumbnail_width=width,
     )
+    place_map = journal_map(journal)
     if arguments.odometry and not place_map.has_poses:
         raise SourceError(
             f'--odometry {arguments.odometry}: no image has a pose; are the stamps of both from '
@@ -207,7 +218,13 @@ def _build(arguments: argparse.Namespace) -> 'PlaceMap':
     if skipped:
         print(f'{len(skipped)} images skipped', file=sys.stderr)
     print(f'{len(place_map)} of {images.read} images became places{_known_poses(place_map)}')
-    return place_map
+    return place_map, journal
+
+
+def _source_of(arguments: argparse.Namespace) -> str:
+    """Describe the images and the options: only the same are continued after an interruption."""
+    given = vars(arguments) | {'input': str(Path(arguments.input).resolve())}
+    return json.dumps({name: given[name] for name in sorted(given.keys() - {'output', 'force'})})
 
 
 def _known_poses(place_map: 'PlaceMap') -> str:
@@ -220,6 +237,9 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
     from stavpr_ros.errors import InputError
     from stavpr_ros.recognition.threshold import suggest_threshold
 
+    if len(place_map) > MOST_SUGGESTED:
+        print(f'{output}: {len(place_map)} places')
+        return  # the suggestion for mode paper would take the whole map into memory
     megabytes = Path(output).stat().st_size / 1e6
     strips = place_map.features.strips
     shape = f'{strips.shape[0]} strips of {strips.shape[2]} dimensions'
@@ -241,8 +261,10 @@ def main(args: list[str] | None = None) -> int:
         arguments = _parser().parse_args(args)
         from stavpr_ros.mapping import save_map
 
-        place_map = _build(arguments)
-        save_map(place_map, arguments.output)
+        state = 'nothing was written; the same command continues the work'
+        place_map, journal = _build(arguments)
+        save_map(place_map, arguments.output, force=arguments.force)
+        journal.unlink()
         state = f'{arguments.output} is written, without a suggested threshold'
         _report(place_map, arguments.output)
 

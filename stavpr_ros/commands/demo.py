@@ -202,7 +202,7 @@ def _localization(arguments: argparse.Namespace, folder: Path) -> None:
     length, map_path = arguments.sequence_length, folder / 'map.stavpr'
     _print(f'2. The map of the first traverse: {map_path}')
     place_map = pair.reference.build_map(make_extractor(arguments), _skip)
-    save_map(place_map, map_path)
+    save_map(place_map, map_path, force=True)
     threshold = _threshold(place_map, arguments)
 
     _print('3. The second traverse through the node, over ROS, with a replay and a recorder')

@@ -10,7 +10,7 @@ from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import SourceError
-from stavpr_ros.output_file import require_room
+from stavpr_ros.output_file import HTML, JSON, require_replaceable
 from stavpr_ros.parameters import BY_NAME
 
 if TYPE_CHECKING:
@@ -94,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument_group('output').add_argument
     add('--json', metavar='FILE', help='write the numbers')
     add('--output', metavar='FOLDER', help=f'write a report ({OUTPUT} without --json)')
+    add('--force', action='store_true', help='replace earlier numbers and reports')
     add('--window', type=int, metavar='I', help='plot the warping path around query image I')
     add_feature_options(parser)
     return parser
@@ -346,23 +347,25 @@ def _print_metrics(report: 'Report') -> None:
 def _run(arguments: argparse.Namespace) -> None:
     from stavpr_ros.evaluation.extra import import_extra
     from stavpr_ros.evaluation.report import chosen_window
-    from stavpr_ros.evaluation.report_files import write_folder, write_json
+    from stavpr_ros.evaluation.report_files import PAGE, write_folder, write_json
 
     folder = arguments.output or (None if arguments.json else OUTPUT)
     if arguments.json:
-        require_room(arguments.json)
+        require_replaceable(arguments.json, JSON, arguments.force)
     if folder:
         import_extra('jinja2')
         if Path(folder).is_file():
             raise SourceError(f'{folder} is a file: --output takes a folder')
+        if Path(folder).is_dir():
+            require_replaceable(Path(folder) / PAGE, HTML, arguments.force)
     report = _report(arguments)
     chosen_window(report.evaluation, arguments.window)  # an invalid image fails before writing
     _print_metrics(report)
     if arguments.json:
-        write_json(report, Path(arguments.json))
+        write_json(report, Path(arguments.json), arguments.force)
         print(f'numbers: {arguments.json}')
     if folder:
-        print(f'report: {write_folder(report, Path(folder))}')
+        print(f'report: {write_folder(report, Path(folder), arguments.force)}')
 
 
 def main(args: list[str] | None = None) -> int:

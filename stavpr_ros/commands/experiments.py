@@ -4,13 +4,12 @@
 
 import argparse
 import json
-from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import SettingsError, SourceError
-from stavpr_ros.output_file import require_room
+from stavpr_ros.output_file import JSON, require_replaceable, write_output
 
 if TYPE_CHECKING:
     from stavpr_ros.evaluation.metrics import Metrics
@@ -67,6 +66,7 @@ def _parser() -> argparse.ArgumentParser:
         '--values', nargs='+', type=float, default=(), metavar='X', help='of sweep'
     )
     parser.add_argument('--json', metavar='FILE', help='write all numbers')
+    parser.add_argument('--force', action='store_true', help='replace an existing FILE')
     add_feature_options(parser)
     return parser
 
@@ -176,7 +176,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
     import_extra('sklearn.metrics')
     if arguments.json:
-        require_room(arguments.json)
+        require_replaceable(arguments.json, JSON, arguments.force)
     _check_features(arguments)
     columns, datasets = _columns(arguments), _datasets(arguments)
     rows = [['data set', 'features', *(column.title for column in columns)]]
@@ -196,12 +196,8 @@ def _run(arguments: argparse.Namespace) -> None:
     print(f'{arguments.experiment}, mode {arguments.mode}: f1')
     print(_table(rows))
     if arguments.json:
-        try:
-            Path(arguments.json).write_text(
-                json.dumps(jsonable(results), indent=2) + '\n', encoding='utf-8'
-            )
-        except OSError as error:
-            raise SourceError(f'{arguments.json} cannot be written: {error}') from error
+        text = json.dumps(jsonable(results), indent=2) + '\n'
+        write_output(arguments.json, text, JSON, arguments.force)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run stavpr_ros map``: show, check, convert, export and merge maps."""
+"""``ros2 run stavpr_ros map``: show, check, convert, export, merge and recover maps."""
 
 import argparse
 from datetime import datetime, UTC
@@ -8,9 +8,10 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
+from stavpr_ros.commands import map_recover
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import MapFileError, SettingsError
-from stavpr_ros.output_file import require_room
+from stavpr_ros.output_file import ARRAYS, atomic_output, require_room
 
 if TYPE_CHECKING:
     from stavpr_ros.mapping import PlaceMap
@@ -23,13 +24,14 @@ examples:
   map export route.stavpr arrays.npz
   map merge both.stavpr day.stavpr night.stavpr
   map sessions both.stavpr day.stavpr --keep day
+  map recover route.stavpr.journal
 
 exit codes: 0 done, or all maps are sound; 1 not (the reason is printed); 2 usage
 """
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = make_parser('map', 'Show, check, convert, export and merge maps.', EPILOG)
+    parser = make_parser('map', 'Show, check, convert, export, merge and recover maps.', EPILOG)
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
 
     def add(name: str, text: str, *files: str, output: bool = False) -> argparse.ArgumentParser:
@@ -58,6 +60,9 @@ def _parser() -> argparse.ArgumentParser:
     chosen = action.add_mutually_exclusive_group(required=True)
     chosen.add_argument('--keep', metavar='ID', help='only the places of this session')
     chosen.add_argument('--remove', metavar='ID', help='all places but those of this session')
+    map_recover.add_arguments(
+        add('recover', 'Make a map of the journal of an interrupted recording.')
+    )
     return parser
 
 
@@ -159,7 +164,8 @@ def _sessions(arguments: argparse.Namespace) -> None:
 def _write(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import save_map
 
-    map_id = save_map(place_map, arguments.output, getattr(arguments, 'storage', ''))
+    storage = getattr(arguments, 'storage', '')
+    map_id = save_map(place_map, arguments.output, storage, arguments.force)
     size = Path(arguments.output).stat().st_size / 1e6
     print(f'{arguments.output}: {len(place_map)} places, {size:.1f} MB, id {map_id}')
 
@@ -180,15 +186,19 @@ def _export(arguments: argparse.Namespace) -> None:
         'projection': place_map.projection.matrix if place_map.projection else None,
         'settings': np.array(place_map.settings.to_json()),
     }
-    with open(arguments.output, 'wb') as file:
-        found = {name: array for name, array in arrays.items() if array is not None}
+    found = {name: array for name, array in arrays.items() if array is not None}
+    with atomic_output(arguments.output, ARRAYS, arguments.force) as file:
         np.savez(file, **found)  # type: ignore[arg-type]
     print(f'{arguments.output}: {len(place_map)} places; numpy.load reads it')
 
 
+def _recover(arguments: argparse.Namespace) -> int:
+    return map_recover.recover_map(arguments.journal, arguments.output)
+
+
 def _check_output(arguments: argparse.Namespace) -> None:
     """Reject an output that exists, or that is one of the inputs."""
-    if 'output' not in arguments:
+    if 'output' not in arguments or arguments.action == 'recover':
         return
     require_room(arguments.output)
     output = Path(arguments.output)
@@ -207,7 +217,7 @@ def main(args: list[str] | None = None) -> int:
         _check_output(arguments)
         actions = {
             'info': _info, 'verify': _verify, 'convert': _convert, 'export': _export,
-            'merge': _merge, 'sessions': _sessions,
+            'merge': _merge, 'sessions': _sessions, 'recover': _recover,
         }  # fmt: skip
         return actions[arguments.action](arguments)
 

@@ -3,11 +3,15 @@
 """``ros2 run stavpr_ros node``: the place-recognition node."""
 
 import sys
+from typing import TYPE_CHECKING
 
 from stavpr_ros.errors import StavprError
 from stavpr_ros.parameters import PARAMETERS
 from stavpr_ros.signals import end_process, interrupted, obey_signals
 from stavpr_ros.threads import wait_passively
+
+if TYPE_CHECKING:
+    from stavpr_ros.ros.node import PlaceRecognitionNode
 
 HELP = """usage: node [--ros-args -p map_path:=FILE [-p NAME:=VALUE ...] [-r image:=TOPIC]]
 
@@ -26,7 +30,8 @@ status NOT_READY with the reason; set them later by ~/load_map and the parameter
 
 parameters:
 {parameters}
-exit codes: 0 stopped by a signal, 1 an invalid parameter, or the backend is not available
+exit codes: 0 stopped by a signal; 1 an invalid parameter, the backend is not available, or a
+recorded map could not be saved at the end
 """
 
 
@@ -46,24 +51,33 @@ def main(args: list[str] | None = None) -> int:
         return 0
     obey_signals()
     wait_passively()
+    nodes: list[PlaceRecognitionNode] = []
     try:
-        return _run(args)
+        if code := _run(args, nodes):
+            return code
     except KeyboardInterrupt:
-        end_process(0)
+        pass
     except Exception:  # an interrupt inside a foreign library may be raised as another exception
-        if interrupted():
-            end_process(0)
-        raise
+        if not interrupted():
+            raise
+    code = int(any(node.failed for node in nodes))
+    if interrupted():
+        end_process(code)
+    return code
 
 
-def _run(args: list[str] | None) -> int:
+def _run(args: list[str] | None, nodes: 'list[PlaceRecognitionNode]') -> int:
     from rclpy.exceptions import ParameterException
     from rclpy.logging import get_logger
     from stavpr_ros.ros.node import PlaceRecognitionNode
     from stavpr_ros.ros.process import ros_node, spin_until
 
+    def make() -> PlaceRecognitionNode:
+        nodes.append(PlaceRecognitionNode())
+        return nodes[0]
+
     try:
-        with ros_node(PlaceRecognitionNode, args) as node:
+        with ros_node(make, args) as node:
             spin_until(node, threads=node.THREADS)
     except (StavprError, ParameterException) as error:
         get_logger('stavpr').fatal(f'cannot start: {error}')

@@ -6,12 +6,13 @@ import argparse
 from collections.abc import Sequence
 import json
 import math
+import os
 import sys
 import time
-from typing import Any, TextIO, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.commands.program import make_parser, run_program
-from stavpr_ros.errors import SourceError
+from stavpr_ros.output_file import atomic_output, AtomicFile, RECORDING
 
 if TYPE_CHECKING:
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
@@ -80,11 +81,10 @@ def _run(given: list[str]) -> None:
     from stavpr_ros.ros.process import own_arguments
 
     arguments = _parser().parse_args(own_arguments(given))
-    try:
-        with open(arguments.output, 'w') as file:
-            written = _write_messages(arguments, file, given)
-    except OSError as error:
-        raise SourceError(f'{arguments.output} cannot be written: {error}') from error
+    with atomic_output(arguments.output, RECORDING, arguments.force) as file:
+        written = _write_messages(arguments, file, given)
+        if not written and os.path.exists(arguments.output):
+            file.abandon()  # an earlier recording is replaced by the first message
     print(f'{written} {arguments.kind} written to {arguments.output}')
 
 
@@ -92,6 +92,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = make_parser('record', __doc__.partition(': ')[2], EPILOG)
     parser.add_argument(
         '--output', required=True, metavar='FILE', help='the file to write (JSON lines)'
+    )
+    parser.add_argument(
+        '--force', action='store_true', help='replace an existing recording, at the first message'
     )
     parser.add_argument(
         '--loop-closures',
@@ -104,7 +107,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _write_messages(arguments: argparse.Namespace, file: TextIO, ros_arguments: list[str]) -> int:
+def _write_messages(
+    arguments: argparse.Namespace, file: AtomicFile, ros_arguments: list[str]
+) -> int:
     """Write messages until a signal; return their number."""
     import rclpy
     from rclpy.qos import QoSProfile
@@ -120,8 +125,9 @@ def _write_messages(arguments: argparse.Namespace, file: TextIO, ros_arguments: 
 
     def write(message: Any) -> None:
         nonlocal written
-        file.write(json.dumps(record_of(message) | {'received': time.time_ns()}) + '\n')
-        file.flush()
+        line = json.dumps(record_of(message) | {'received': time.time_ns()}) + '\n'
+        file.write(line.encode())
+        file.flush() if file.committed else file.commit()
         written += 1
 
     try:

@@ -13,7 +13,7 @@ ROS_MODULES = ('rclpy', 'ament_index_python', 'stavpr_msgs')
 
 COMMANDS = {
     'build_map': 'build a reference map from a folder of images or a bag',
-    'map': 'show, check, convert, export and merge maps',
+    'map': 'show, check, convert, export, merge and recover maps',
     'weights': 'download the published weights of a network',
     'evaluate': 'evaluate the recognition of one traverse on the map of another',
     'experiments': "reproduce the paper's tables on local data sets",

@@ -59,7 +59,7 @@ class Recording:
     def save_feature_settings(self, extractor: FeatureExtractor, path: Path) -> None:
         """Write a map of one image, which sets the features of a node that closes loops."""
         images = islice(self.open(lambda _: None), 1)
-        save_map(build_map(images, extractor, thumbnails=False, progress=False), path)
+        save_map(build_map(images, extractor, thumbnails=False, progress=False), path, force=True)
 
 
 @dataclass(frozen=True)

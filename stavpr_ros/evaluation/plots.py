@@ -10,11 +10,13 @@ Map indices run along x and query indices along y, as in the paper's matrices.
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+import io
 from pathlib import Path
 from typing import Any, Literal, TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.evaluation.calibration import Calibration
+from stavpr_ros.output_file import PNG, write_output
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -263,7 +265,9 @@ def page(path: Path, width: float, height: float) -> Iterator['Figure']:
     with rc_context(look):
         figure = Figure(figsize=(width, height), dpi=DPI, layout='constrained')
         yield figure
-        FigureCanvasAgg(figure).print_png(path)
+        content = io.BytesIO()
+        FigureCanvasAgg(figure).print_png(content)
+        write_output(path, content.getvalue(), PNG, force=True)
 
 
 @contextmanager

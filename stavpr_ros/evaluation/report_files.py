@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The files of a report: JSON, CSV, plots and the page."""
 
+from collections.abc import Iterable
 import csv
+import io
 import json
 from pathlib import Path
 
@@ -19,51 +21,54 @@ from stavpr_ros.evaluation.report import (
     worst_mistakes,
 )
 from stavpr_ros.evaluation.report_page import html_page
+from stavpr_ros.output_file import csv_kind, HTML, JSON, require_replaceable, write_output
 
+PAGE = 'report.html'
 MISTAKES = 9  # on the page
 
 
-def write_json(report: Report, path: Path) -> None:
+def write_json(report: Report, path: Path, force: bool = False) -> None:
     """
     Write the numbers.
 
-    :raises SourceError: the file cannot be written.
+    :param force: replace an existing file of numbers.
+    :raises OutputError: the file cannot be written.
     """
-    try:
-        text = json.dumps(report.to_json(), indent=2, allow_nan=False)
-        path.write_text(text + '\n', encoding='utf-8')
-    except OSError as error:
-        raise SourceError(f'{path} cannot be written: {error}') from error
+    text = json.dumps(report.to_json(), indent=2, allow_nan=False)
+    write_output(path, text + '\n', JSON, force)
 
 
-def write_folder(report: Report, folder: Path) -> Path:
+def write_folder(report: Report, folder: Path, force: bool = False) -> Path:
     """
     Write the numbers, the matches, the curves, the plots and the page.
 
+    :param force: replace an earlier report.
     :returns: the page.
-    :raises SourceError: the folder or a file in it cannot be written.
+    :raises SourceError: the folder cannot be made.
+    :raises OutputError: a file cannot be written, or must not be replaced.
     :raises UnavailableError: jinja2 is not installed.
     """
-    page = folder / 'report.html'
+    page = folder / PAGE
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write_matches(report, folder / 'answers.csv')
-        _write_curves(report.evaluation, folder / 'curves.csv')
-        boxes = _draw(report, folder)
-        embedded = {
-            'precision_recall': folder / 'precision_recall.png',
-            'distances': folder / 'distances.png',
-            'matrix': folder / 'similarity_matrix.png',
-            'drive': folder / 'drive.png',
-        }
-        if report.evaluation.calibration is not None:
-            embedded['calibration'] = folder / 'calibration.png'
-        contents = {name: path.read_bytes() for name, path in embedded.items()}
-        mistakes = worst_mistakes(report.evaluation, MISTAKES)
-        page.write_text(html_page(report, mistakes, contents, boxes), encoding='utf-8')
     except OSError as error:
         raise SourceError(f'the report cannot be written into {folder}: {error}') from error
-    write_json(report, folder / 'results.json')
+    require_replaceable(page, HTML, force)  # the page stands for its report
+    _write_matches(report, folder / 'answers.csv')
+    _write_curves(report.evaluation, folder / 'curves.csv')
+    boxes = _draw(report, folder)
+    embedded = {
+        'precision_recall': folder / 'precision_recall.png',
+        'distances': folder / 'distances.png',
+        'matrix': folder / 'similarity_matrix.png',
+        'drive': folder / 'drive.png',
+    }
+    if report.evaluation.calibration is not None:
+        embedded['calibration'] = folder / 'calibration.png'
+    contents = {name: path.read_bytes() for name, path in embedded.items()}
+    mistakes = worst_mistakes(report.evaluation, MISTAKES)
+    write_output(page, html_page(report, mistakes, contents, boxes), HTML, force)
+    write_json(report, folder / 'results.json', force=True)
     return page
 
 
@@ -85,18 +90,22 @@ def _write_matches(report: Report, path: Path) -> None:
         'probability': results.probabilities.tolist(),
         'recorded_image': report.drive.images.tolist(),
     }
-    with path.open('w', newline='', encoding='utf-8') as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(zip(*columns.values(), strict=True))
+    _write_csv(path, list(columns), zip(*columns.values(), strict=True))
 
 
 def _write_curves(evaluation: Evaluation, path: Path) -> None:
-    with path.open('w', newline='', encoding='utf-8') as file:
-        writer = csv.writer(file)
-        writer.writerow(['answers', 'threshold', 'precision', 'recall'])
-        for name in METRICS:
-            writer.writerows([name, *point] for point in getattr(evaluation, name).curve.tolist())
+    points = [
+        [name, *point] for name in METRICS for point in getattr(evaluation, name).curve.tolist()
+    ]
+    _write_csv(path, ['answers', 'threshold', 'precision', 'recall'], points)
+
+
+def _write_csv(path: Path, columns: list[str], rows: Iterable[Iterable[object]]) -> None:
+    text = io.StringIO(newline='')
+    writer = csv.writer(text)
+    writer.writerow(columns)
+    writer.writerows(rows)
+    write_output(path, text.getvalue(), csv_kind(columns), force=True)
 
 
 def _draw(report: Report, folder: Path) -> dict[str, Box]:

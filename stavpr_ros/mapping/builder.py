@@ -6,11 +6,14 @@ from collections.abc import Generator, Iterable, Iterator, Sized
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from itertools import islice
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.errors import InputError, JournalError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.mapping.journal import Base, JournalPlace, JournalReader, SUFFIX
+from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.keyframes import KeyframeSelector, KeyframeSettings
 from stavpr_ros.mapping.place_map import (
     encode_thumbnail,
@@ -70,29 +73,17 @@ def build_map(
     :raises InputError: no images, no places, or poses that do not fit.
     :raises SettingsError: a rule of motion without poses.
     """
-    keyframes = keyframes or KeyframeSettings()
-    if keyframes.needs_poses and poses is None:
-        raise SettingsError(
-            'keyframe distance or angle without poses: give poses, or leave them out'
-        )
-    if thumbnail_width < 1:
-        raise SettingsError(f'thumbnail width {thumbnail_width} must be at least 1 pixel')
-    places = _places(frames, poses, keyframes)
+    work = _Work(extractor, poses, keyframes, thumbnails, thumbnail_width)
     features: list[LocalFeatures] = []
     found: list[tuple[int, str, np.ndarray | None, bytes]] = []
-    total = len(frames) if isinstance(frames, Sized) else None
-    with (
-        closing(_batches_ahead(places)) as batches,
-        tqdm(
-            total=total, unit='image', desc='extracting', disable=None if progress else True
-        ) as bar,
-    ):
-        for batch in batches:
-            features.append(extractor.extract([place.frame.image for place in batch]))
-            for _, frame, pose in batch:
-                thumbnail = encode_thumbnail(frame.image, thumbnail_width) if thumbnails else b''
-                found.append((frame.stamp, plain_text(frame.identifier), pose, thumbnail))
-            bar.update(batch[-1].number + 1 - bar.n)
+    with closing(_extracted(frames, work, progress)) as batches:
+        for batch, extracted in batches:
+            features.append(extracted)
+            for place in batch:
+                frame = place.frame
+                found.append(
+                    (frame.stamp, plain_text(frame.identifier), place.pose, work.thumbnail(place))
+                )
     stamps, ids, known, encoded = zip(*found, strict=True)
     return PlaceMap(
         features=LocalFeatures.concatenate(features).to('cpu'),
@@ -102,6 +93,136 @@ def build_map(
         poses=_rows(known),
         thumbnails=encoded if thumbnails else (),
     )
+
+
+def build_journal(
+    frames: Iterable[Frame],
+    extractor: FeatureExtractor,
+    target: str | Path,
+    source: str,
+    poses: np.ndarray | Trajectory | None = None,
+    thumbnails: bool = True,
+    progress: bool = True,
+    keyframes: KeyframeSettings | None = None,
+    thumbnail_width: int = THUMBNAIL_WIDTH,
+) -> Path:
+    """
+    Make a journal of the places that :func:`build_map` finds, in bounded memory.
+
+    An interrupted work is continued: images up to the last place in the journal are not extracted
+    again.
+
+    :param target: file that the map will be saved to; the journal is beside it.
+    :param source: of the images and the options; another one is not continued.
+    :returns: the journal, complete.
+    :raises JournalError: the journal is of another work, in use, or cannot be written.
+    """
+    work = _Work(extractor, poses, keyframes, thumbnails, thumbnail_width)
+    writer, last = _resumed(Path(f'{target}{SUFFIX}'), extractor, source)
+    try:
+        with closing(_extracted(frames, work, progress, last)) as batches:
+            for batch, extracted in batches:
+                features = extracted.to('cpu')
+                if writer is None:
+                    template = PlaceMap(
+                        features[:1], extractor.projection, np.zeros(1, np.int64), ('',)
+                    )
+                    writer = JournalWriter.create(target, Base(), template, _ignore, source)
+                for i, place in enumerate(batch):
+                    writer.append(
+                        _journal_place(place, features[i : i + 1], work.thumbnail(place))
+                    )
+                if writer.failed:
+                    raise JournalError(
+                        f'{writer.path} cannot be written: make room, and run the same again: it '
+                        'continues'
+                    )
+    finally:
+        if writer is not None:
+            writer.close()
+    assert writer is not None
+    return writer.path
+
+
+def _resumed(
+    journal: Path, extractor: FeatureExtractor, source: str
+) -> tuple[JournalWriter | None, int]:
+    """Return the writer of a journal to be continued, and the number of its last image."""
+    if not journal.exists():
+        return None, -1
+    reader = JournalReader(journal)
+    if reader.source != source or reader.template.settings != extractor.settings:
+        reader.close()
+        raise JournalError(
+            f'{journal} is of other images or options: run build_map with those to continue it, '
+            'make a map of it by `stavpr map recover`, or delete it'
+        )
+    return JournalWriter.resume(reader, _ignore)
+
+
+def _ignore(error: str) -> None:
+    """Leave an error of the journal to :func:`build_journal`."""
+
+
+def _journal_place(place: _Place, features: LocalFeatures, thumbnail: bytes) -> JournalPlace:
+    strips, weights = features.strips[:, 0].numpy(), features.weights[:, 0].numpy()
+    frame = place.frame
+    return JournalPlace(
+        place.number,
+        frame.stamp,
+        plain_text(frame.identifier),
+        place.pose,
+        strips,
+        weights,
+        thumbnail,
+    )
+
+
+class _Work:
+    """
+    What becomes a place, and what is kept of it; see :func:`build_map`.
+
+    :raises SettingsError: a rule of motion without poses, or no width of thumbnails.
+    """
+
+    def __init__(
+        self,
+        extractor: FeatureExtractor,
+        poses: np.ndarray | Trajectory | None,
+        keyframes: KeyframeSettings | None,
+        thumbnails: bool,
+        thumbnail_width: int,
+    ) -> None:
+        self.extractor, self.poses = extractor, poses
+        self.keyframes = keyframes or KeyframeSettings()
+        if self.keyframes.needs_poses and poses is None:
+            raise SettingsError(
+                'keyframe distance or angle without poses: give poses, or leave them out'
+            )
+        if thumbnail_width < 1:
+            raise SettingsError(f'thumbnail width {thumbnail_width} must be at least 1 pixel')
+        self._width = thumbnail_width if thumbnails else 0
+
+    def thumbnail(self, place: _Place) -> bytes:
+        """Return the thumbnail of a place; empty without thumbnails."""
+        return encode_thumbnail(place.frame.image, self._width) if self._width else b''
+
+
+def _extracted(
+    frames: Iterable[Frame], work: _Work, progress: bool, last: int = -1
+) -> Generator[tuple[list[_Place], LocalFeatures], None, None]:
+    """Yield batches of places behind the image of number ``last``, with their features."""
+    places = _places(frames, work.poses, work.keyframes, last)
+    total = len(frames) if isinstance(frames, Sized) else None
+    with (
+        closing(_batches_ahead(places)) as batches,
+        tqdm(
+            total=total, unit='image', desc='extracting', disable=None if progress else True
+        ) as bar,
+    ):
+        for batch in batches:
+            yield batch, work.extractor.extract([place.frame.image for place in batch])
+            bar.update(batch[-1].number + 1 - bar.n)
 
 
 def _batches_ahead(places: Generator[_Place, None, None]) -> Generator[list[_Place], None, None]:
@@ -122,13 +243,20 @@ def _batches_ahead(places: Generator[_Place, None, None]) -> Generator[list[_Pla
 
 
 def _places(
-    frames: Iterable[Frame], poses: np.ndarray | Trajectory | None, keyframes: KeyframeSettings
+    frames: Iterable[Frame],
+    poses: np.ndarray | Trajectory | None,
+    keyframes: KeyframeSettings,
+    last: int,
 ) -> Generator[_Place, None, None]:
-    """Choose the images that become places."""
+    """Choose the images that become places, behind the last place of an earlier run, -1 = none."""
     selector = KeyframeSelector(keyframes)
-    images, places, reason = 0, 0, ''
+    images, places, reason = 0, int(last >= 0), ''
     for number, (frame, pose) in enumerate(_with_poses(frames, poses)):
         images += 1
+        if number <= last:
+            if number == last and keyframes.any:
+                selector.accept(frame.stamp, pose, frame.image)
+            continue
         reason = selector.too_soon(frame.stamp, pose) or selector.too_alike(frame.image)
         if reason:
             continue

@@ -10,13 +10,11 @@ executed.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
-import os
 from pathlib import Path
-import tempfile
 from typing import Any
 
 import numpy as np
-from stavpr_ros.errors import MapFileError, SettingsError
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile
 from stavpr_ros.mapping.map_content import map_content, PARTS, require_jpegs
@@ -25,6 +23,7 @@ from stavpr_ros.mapping.map_version1 import read_version1
 from stavpr_ros.mapping.map_version2 import MOST_HEADER, NewPart, read_version2, write_version2
 from stavpr_ros.mapping.place_map import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
+from stavpr_ros.output_file import atomic_output, Force, MAP
 from stavpr_ros.regular_file import open_regular
 
 THUMBNAILS_AT_ONCE = 1000
@@ -32,42 +31,22 @@ STORAGE = {'float32': 'F32', 'float16': 'F16'}
 # ---------------------------------------------------------------------------------------- saving
 
 
-def save_map(place_map: PlaceMap, path: str | Path, storage: str = '') -> str:
+def save_map(
+    place_map: PlaceMap, path: str | Path, storage: str = '', force: Force = False
+) -> str:
     """
-    Write a map to a file atomically: an existing file is replaced by the complete new one.
+    Write a map to a file, all of it or nothing.
 
     :param storage: of the features, ``float32`` or ``float16``; '' = that of the file where they
         are, float32 in memory.
+    :param force: replace an existing map, see :func:`stavpr_ros.output_file.atomic_output`.
     :returns: the id of the map, 16 hexadecimal digits of the hash of its content.
-    :raises MapFileError: the file cannot be written.
+    :raises OutputError: the file is there already, or cannot be written.
     :raises SettingsError: no such storage.
     """
-    path, temporary = Path(path), None
     manifest, parts = _manifest(place_map), _parts(place_map, storage)
-    try:
-        with tempfile.NamedTemporaryFile(
-            dir=path.parent, prefix=f'.{path.name}.', delete=False
-        ) as file:
-            temporary = file.name
-            map_id = write_version2(file, manifest, parts)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise MapFileError(
-            f'map {path} cannot be written ({error}); an existing file is untouched'
-        ) from error
-    finally:
-        if temporary is not None and os.path.exists(temporary):
-            os.unlink(temporary)
-    return map_id
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    with atomic_output(path, MAP, force) as file:
+        return write_version2(file, manifest, parts)
 
 
 def _manifest(place_map: PlaceMap) -> dict[str, Any]:

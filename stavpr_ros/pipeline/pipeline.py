@@ -6,19 +6,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 import math
-import os
-from pathlib import Path
 import time
 from typing import Any
 
 import numpy as np
-from stavpr_ros.errors import ImageError, InputError, MapFileError, StavprError
+from stavpr_ros.errors import ImageError, InputError, StavprError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.pipeline.operations import Mapping, Observation, Operation
-from stavpr_ros.pipeline.save_state import MapSnapshot, SaveState
+from stavpr_ros.pipeline.operations import Localization, Mapping, Observation, Operation
+from stavpr_ros.pipeline.save_state import MapSnapshot, OpenJournal, SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.pipeline.start import LoadedMap, start_operation
 from stavpr_ros.recognition import Match, Status
@@ -37,13 +36,19 @@ class Pipeline:
     Processes image messages. All calls but those of properties must come from one thread.
 
     :param operation: one of ``OPERATIONS``.
+    :param open_journal: of recorded places; None = they are in memory only.
     :raises StavprError: invalid settings, or a missing model.
 
     ``settings`` and ``threshold`` (None = not set) are those in force; :meth:`change` sets them.
     """
 
-    def __init__(self, settings: PipelineSettings, operation: str = 'localization') -> None:
-        self.settings = settings
+    def __init__(
+        self,
+        settings: PipelineSettings,
+        operation: str = 'localization',
+        open_journal: OpenJournal = lambda base, template: None,
+    ) -> None:
+        self.settings, self._open_journal = settings, open_journal
         # of localization, or of loop closure for its kind of features
         self._map: PlaceMap | None = None
         self._extractor: FeatureExtractor | None = None
@@ -142,22 +147,32 @@ class Pipeline:
         self._keyframes.settings = settings.keyframes
         self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
 
-    def snapshot(self, path: str, overwrite: bool) -> MapSnapshot:
+    def snapshot(self) -> MapSnapshot:
         """
         Return the map, or the recorded route, to be written to a file.
 
-        :raises MapFileError: an existing file, or a missing folder.
         :raises InputError: there are no places.
         """
         place_map = self._places_as_map()
         if place_map is None:
             raise InputError(f'there is nothing to save yet: {self.missing or "no places"}')
-        if os.path.exists(path) and not overwrite:
-            raise MapFileError(f'{path} exists already: set overwrite, or choose another name')
-        if not Path(path).absolute().parent.is_dir():
-            raise MapFileError(f'the folder of {path} does not exist: make it first')
         state = self._map_save_state if place_map is self._map else self.save_state
         return MapSnapshot(place_map, state, state.recorded)
+
+    def close_journals(self, delete_route: bool) -> list[str]:
+        """
+        Close the journals at the end; return those that hold unsaved places.
+
+        :param delete_route: a route of loop closure is needed no longer.
+        """
+        kept = []
+        for state in {self.save_state, self._map_save_state}:
+            is_route = self._name == 'loop_closure' and state is self.save_state
+            path = str(state.journal.path) if state.journal and state.unsaved else ''
+            state.close_journal(delete=delete_route and is_route)
+            if path and not (delete_route and is_route):
+                kept.append(path)
+        return kept
 
     def reset(self) -> None:
         """Empty the window: the next images do not continue those before."""
@@ -239,7 +254,8 @@ class Pipeline:
         with _timed(stages, 'matching'):
             match = operation.update(Observation(features, image, stamp, pose))
         self._keyframes.accept(stamp, pose, image)
-        self.save_state.recorded += match.image_index >= 0
+        if not isinstance(operation, Localization):
+            self.save_state.record(operation.places, features, self._open_journal)
         if operation.recognizer is None:
             return replace(match, image=image)
         with _timed(stages, 'verification'):
@@ -281,14 +297,17 @@ class Pipeline:
         save_state = self._map_save_state if place_map is self._map else self.save_state
         if loaded is not None:
             place_map, extractor = loaded.places, loaded.extractor
-            save_state = SaveState(loaded.path)
+            save_state = SaveState(loaded.path, Base.of(loaded.path, loaded.places.stamps))
         operation = start_operation(name, settings, place_map, extractor)
+        before = {self.save_state, self._map_save_state}
         # in mapping, the growing map holds it
         self._map = None if name == 'mapping' else place_map
         self._operation, self._name = operation, name
         self._extractor = operation.extractor if operation is not None else extractor
         self._map_save_state = save_state
         self.save_state = SaveState() if name == 'loop_closure' else save_state
+        for state in before - {self.save_state, save_state}:
+            state.close_journal(delete=False)  # its places were discarded, but may be recovered
         self.reset()
 
     def _require_no_loss(self, name: str, loaded: LoadedMap | None) -> None:

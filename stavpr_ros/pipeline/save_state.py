@@ -2,39 +2,92 @@
 # SPDX-License-Identifier: Apache-2.0
 """The files of a map, and its recorded places that are in none of them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 import os
 
-from stavpr_ros.mapping import PlaceMap
+import numpy as np
+from stavpr_ros.features import LocalFeatures
+from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping.journal import Base, JournalPlace
+from stavpr_ros.mapping.journal_writer import JournalWriter
+from stavpr_ros.output_file import FileVersion, Force
+
+OpenJournal = Callable[[Base, PlaceMap], JournalWriter | None]
 
 
-@dataclass
+@dataclass(eq=False)
 class SaveState:
     """
     Files that hold a map, and the number of its recorded places that are in none.
 
     :param path: file that the map was loaded from or last saved to, '' = none.
+    :param base: its places, which recorded ones continue.
     :param recorded: places recorded since the map was loaded or started; ``saved`` of them are in
-        a file.
+        a file, the others in the ``journal`` if there is one.
     """
 
     path: str = ''
+    base: Base = field(default_factory=Base)
     recorded: int = 0
     saved: int = 0
-    _files: set[str] = field(default_factory=set)
+    journal: JournalWriter | None = None
+    _forgotten: int = 0  # recorded places that the journal needs no longer
+    _files: dict[str, FileVersion | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.path:
-            self._files.add(os.path.abspath(self.path))
+            self.own(self.path)
 
     @property
     def unsaved(self) -> int:
         """Return the number of recorded places that are in no file."""
         return self.recorded - self.saved
 
-    def owns(self, path: str) -> bool:
-        """Return whether a file holds, or held, this map, and may be overwritten."""
-        return os.path.abspath(path) in self._files
+    def own(self, path: str) -> None:
+        """Remember a file that holds this map now."""
+        self._files[os.path.abspath(path)] = FileVersion.of(path)
+
+    def owned(self, path: str) -> Force:
+        """Return the version of a file that holds, or held, this map and may be replaced."""
+        return self._files.get(os.path.abspath(path)) or False
+
+    def record(
+        self, places: GrowingMap, features: LocalFeatures, open_journal: OpenJournal
+    ) -> None:
+        """
+        Count the newest place, and add it to the journal, which the first unsaved one opens.
+
+        :param features: of its image.
+        :param open_journal: returns None if it cannot be written.
+        """
+        newest = places.place(places.first + len(places) - 1)
+        if self.journal is None and self.recorded == self.saved:
+            stamps, ids = np.array([newest.stamp]), (newest.identifier,)
+            template = PlaceMap(features.to('cpu'), places.projection, stamps, ids)
+            self.journal = open_journal(self.base, template)
+            self._forgotten = self.recorded
+        if self.journal is not None:
+            strips, weights = (a[:, 0].cpu().numpy() for a in (features.strips, features.weights))
+            place = JournalPlace(
+                self.recorded, newest.stamp, newest.identifier, newest.pose, strips, weights,
+                places.thumbnails[-1],
+            )  # fmt: skip
+            self.journal.append(place)
+            self._forget(places.first)  # of a route, which counts as recorded does
+        self.recorded += 1
+
+    def close_journal(self, delete: bool) -> None:
+        """Close the journal, and delete it when nothing in it is needed."""
+        if self.journal is not None:
+            self.journal.close(delete or not self.unsaved)
+            self.journal = None
+
+    def _forget(self, until: int, base: Base | None = None) -> None:
+        assert self.journal is not None
+        if until > self._forgotten or base is not None:
+            self.journal.forget(max(0, until - self._forgotten), base)
+            self._forgotten = max(until, self._forgotten)
 
 
 @dataclass(frozen=True)
@@ -48,5 +101,12 @@ class MapSnapshot:
     def mark_saved(self, path: str) -> None:
         """Update the state after writing; later places, or another map in use, are unaffected."""
         state = self.state
-        state.path, state.saved = path, max(state.saved, self.recorded)
-        state._files.add(os.path.abspath(path))
+        state.path = path
+        state.own(path)
+        if self.recorded < state.saved:  # a later state is in another file
+            return
+        state.saved, state.base = self.recorded, Base.of(path, self.places.stamps)
+        if state.journal is not None and state.unsaved:
+            state._forget(self.recorded, state.base)
+        else:
+            state.close_journal(delete=True)

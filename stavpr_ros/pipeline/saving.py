@@ -3,66 +3,93 @@
 """Saving a recorded map while images are processed; files of other maps are never overwritten."""
 
 from collections.abc import Callable
-import itertools
 from logging import Logger
-import os
 from pathlib import Path
 from typing import Any
 
-from stavpr_ros.errors import StavprError
+from stavpr_ros.errors import OutputTakenError, StavprError
 from stavpr_ros.mapping import save_map
+from stavpr_ros.mapping.journal import journals, numbered, recover
+from stavpr_ros.output_file import Force, MAP, require_replaceable
 from stavpr_ros.pipeline.pipeline import Pipeline
-from stavpr_ros.pipeline.save_state import SaveState
 
 OnWorker = Callable[[Callable[[], Any]], Any]
 
 
-def write_map(pipeline: Pipeline, on_worker: OnWorker, path: str, overwrite: bool) -> int:
+def write_map(pipeline: Pipeline, on_worker: OnWorker, path: str, overwrite: Force) -> int:
     """
     Write the map of the pipeline to a file, on this thread; return its number of places.
 
     :param on_worker: calls a function on the thread of the pipeline.
     :raises StavprError: no places, an existing file, or a file that cannot be written.
     """
-    snapshot = on_worker(lambda: pipeline.snapshot(path, overwrite))
-    save_map(snapshot.places, path)
+    require_replaceable(path, MAP, overwrite)  # before places are copied
+    snapshot = on_worker(pipeline.snapshot)
+    save_map(snapshot.places, path, force=overwrite)
     on_worker(lambda: snapshot.mark_saved(path))
     return len(snapshot.places)
 
 
 def save_recorded_map(
     pipeline: Pipeline, on_worker: OnWorker, path: str, log: 'Logger | Any'
-) -> None:
+) -> bool:
     """
     Write unsaved places to ``path``; log errors.
 
     A file of another map is not overwritten, a numbered name beside it is used.
 
-    :param path: '' = nowhere; the loss is logged.
+    :param path: '' = nowhere; that is logged.
+    :returns: whether nothing failed.
     """
     try:
         unsaved = on_worker(lambda: pipeline.unsaved)  # includes the image being processed
         if unsaved and path:
-            target = _free_name(path, pipeline.save_state)
-            log.info(f'writing the map to {target}')
-            places = write_map(pipeline, on_worker, target, overwrite=True)
+            log.info(f'writing the map to {path}')
+            places, target = _write_beside(pipeline, on_worker, path)
             log.info(f'{places} places written to {target}')
         elif unsaved and pipeline.operation != 'loop_closure':
-            log.warning(f'{unsaved} recorded places are lost: set save_path, or call ~/save_map')
+            log.warning(f'{unsaved} recorded places are in no map: set save_path, call ~/save_map')
+        return True
     except TimeoutError:
-        if pipeline.unsaved:
-            log.error('the map is not saved: the worker is still busy at the end of the node')
+        if not pipeline.unsaved:
+            return True
+        log.error('the map is not saved: the worker is still busy at the end of the node')
     except Exception as error:  # any error: the node must end, and the loss must be logged
         cause = str(error) if isinstance(error, StavprError) else repr(error)
         log.error(f'the map is not saved: {cause}')
+    return False
 
 
-def _free_name(path: str, state: SaveState) -> str:
-    """Return the path, or the first numbered name that is free or holds this map."""
-    there = Path(path)
-    numbered = (
-        str(there.with_name(f'{there.stem}-{number}{there.suffix}'))
-        for number in itertools.count(2)
-    )
-    names = itertools.chain([path], numbered)
-    return next(name for name in names if state.owns(name) or not os.path.exists(name))
+def recover_maps(target: str | Path, log: 'Logger | Any') -> str:
+    """
+    Make maps of the journals that a killed node, or a failed save, has left; log each.
+
+    :param target: file that maps are saved to; journals of numbered names count too.
+    :returns: the file of the latest map; '' = there were no journals.
+    """
+    latest = ''
+    for journal in journals(target):
+        try:
+            found = recover(journal)
+        except StavprError as error:
+            log.warning(f'the journal {journal} was left as it is: {error}')
+            continue
+        latest = found.path
+        log.warning(
+            f'{found.recorded} places of an earlier recording were recovered from {journal}: '
+            f'{found.path} has {found.places} places'
+        )
+        if found.problem:
+            log.error(f'{found.path} lacks the map that the recording continued: {found.problem}')
+    return latest
+
+
+def _write_beside(pipeline: Pipeline, on_worker: OnWorker, path: str) -> tuple[int, str]:
+    """Write the map to the path, or the first numbered name that is free or holds this map."""
+    for name in map(str, numbered(path)):
+        try:
+            overwrite = pipeline.save_state.owned(name)
+            return write_map(pipeline, on_worker, name, overwrite), name
+        except OutputTakenError:
+            continue
+    raise AssertionError

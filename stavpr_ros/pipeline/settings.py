@@ -5,6 +5,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 import os
+from pathlib import Path
 from typing import Any
 
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
@@ -14,6 +15,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class, settings_from_json
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.parameters import BY_NAME
+from stavpr_ros.pipeline.maps_folder import maps_folder
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.loop_closer import least_limit
 from stavpr_ros.recognition.robust import MIN_PROBABILITY, options_of
@@ -180,6 +182,7 @@ class NodeSettings:
 
     operation: str
     map_path: str
+    maps_folder: str
     autostart: bool
     image_transport: str
     queue_size: int
@@ -198,6 +201,11 @@ class NodeSettings:
 
     def __post_init__(self) -> None:
         self.pipeline.require_operation(self.operation)
+
+    @property
+    def maps_path(self) -> Path:
+        """Return the folder of the maps that services and late parameters name."""
+        return maps_folder(self.maps_folder)
 
     @property
     def needs_odometry(self) -> bool:

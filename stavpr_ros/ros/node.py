@@ -27,7 +27,9 @@ from stavpr_ros.ros.input import STOP_TIMEOUT
 from stavpr_ros.ros.output import MapInfoPublisher
 from stavpr_ros.ros.parameters import (
     declare_parameters,
+    inside_maps_folder,
     require_changeable,
+    require_inside,
     require_writable,
     typed,
     unknown_parameters,
@@ -49,8 +51,8 @@ class PlaceRecognitionNode(ManagedNode):
     :raises StavprError: parameters that exclude each other, or a backend that is not available.
     """
 
-    # a transition, a service and parameters may each take long; images take the fourth
-    THREADS = 4
+    # a transition, loading, saving, another service and parameters may each take long
+    THREADS = 6  # images take the last
 
     def __init__(self, **options: Any) -> None:
         self._lock = threading.RLock()  # one change of state, parameters or map at a time
@@ -65,6 +67,8 @@ class PlaceRecognitionNode(ManagedNode):
         self.problem = ''  # why the last transition failed
         self._map_info = MapInfoPublisher(self)
         self._served = Services(self, lambda: self.runtime, self.load_map, self.set_operation)
+        folder = self.settings.maps_path
+        self.add_pre_set_parameters_callback(lambda given: inside_maps_folder(given, self, folder))
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         backwards = JumpThreshold(
@@ -227,8 +231,7 @@ class PlaceRecognitionNode(ManagedNode):
         :raises StavprError: the node is not configured, or the map is invalid; the old one stays
             in use.
         """
-        with self._lock:
-            self.runtime.load(path)
+        self.runtime.load(path, self._lock)
 
     def set_operation(self, operation: str) -> None:
         """
@@ -270,6 +273,7 @@ class PlaceRecognitionNode(ManagedNode):
         changes = {name: value for name, value in values.items() if value != current[name]}
         if self._runtime is not None:
             require_changeable(changes, self.state)
+        require_inside(changes, self.settings.maps_path)
         settings = self._settings_with(changes)
         if settings.save_path != self.settings.save_path:
             require_writable(settings.save_path)

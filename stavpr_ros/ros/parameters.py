@@ -4,16 +4,19 @@
 
 from collections.abc import Iterable, Mapping
 import difflib
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.parameter import Parameter
-from stavpr_ros.errors import SettingsError, SourceError
+from stavpr_ros.errors import OutputError, SettingsError
 from stavpr_ros.output_file import require_room
 from stavpr_ros.parameters import BY_NAME, NodeParameter, PARAMETERS
+from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+_FILES = ('map_path', 'save_path', 'model_path')
 _TYPES = {
     bool: 'true or false',
     int: 'an integer',
@@ -106,6 +109,48 @@ def require_changeable(changes: Mapping[str, Any], state: str) -> None:
         )
 
 
+def inside_maps_folder(
+    parameters: list[Parameter], node: ManagedNode, folder: Path
+) -> list[Parameter]:
+    """
+    Return parameters that are set after the start, with absolute paths of the files they name.
+
+    A name that leads out of the folder stays as it is, for :func:`require_inside` to reject.
+    """
+    return [_with_path(parameter, node, folder) for parameter in parameters]
+
+
+def _with_path(parameter: Parameter, node: ManagedNode, folder: Path) -> Parameter:
+    name, value = parameter.name, parameter.value
+    known = name in _FILES and isinstance(value, str) and value
+    if not known or value == node.get_parameter(name).value:
+        return parameter
+    try:
+        return Parameter(name, value=inside(folder, value))
+    except SettingsError:
+        return parameter
+
+
+def require_inside(changes: Mapping[str, Any], folder: Path) -> None:
+    """
+    Reject files outside the maps folder: anyone on the ROS graph may set parameters.
+
+    :param changes: name to value, those that differ from the current values.
+    :raises SettingsError: names the parameter.
+    """
+    for name in _FILES:
+        if changes.get(name):
+            try:
+                inside(folder, changes[name])
+            except SettingsError as error:
+                raise SettingsError(f'{name}: {error}') from error
+    if '"model"' in changes.get('feature_settings', ''):
+        raise SettingsError(
+            'feature_settings: the file of a network is not set after the start by "model", but '
+            'by parameter model_path'
+        )
+
+
 def require_writable(save_path: str) -> None:
     """
     Reject a file that cannot be written, before a recorded map would be lost.
@@ -116,5 +161,5 @@ def require_writable(save_path: str) -> None:
     try:
         if save_path:
             require_room(save_path)
-    except SourceError as error:
+    except OutputError as error:
         raise SettingsError(f'save_path: {error}') from error

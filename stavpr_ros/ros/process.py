@@ -107,7 +107,7 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
     finally:
         rclpy.try_shutdown()
         if left_behind and interrupted():
-            end_process(0)
+            end_process(int(getattr(node, 'failed', False)))
 
 
 def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: int = 1) -> None:

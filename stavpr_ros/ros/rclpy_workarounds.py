@@ -128,6 +128,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         self._in_transition = threading.Lock()
         self.ending = threading.Event()  # set when the process ends: waits are given up
         self.left_behind = False  # work was still running when the node was destroyed
+        self.failed = False  # something was not saved: the exit code is not 0
         self._destroyed = False
         service = self._service_change_state
         self._upstream_change_state = service.callback

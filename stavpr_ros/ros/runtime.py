@@ -3,32 +3,39 @@
 """The configured node: the pipeline on its worker, the subscriptions and the publishers."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import wait
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 import math
+from pathlib import Path
 import threading
 import time
 import traceback
 from typing import Any
 
 from stavpr_msgs.msg import MapInfo
-from stavpr_ros.errors import MapFileError, SettingsError
+from stavpr_ros.errors import JournalError, MapFileError, SettingsError, StavprError
 from stavpr_ros.mapping import PlaceMap, verify_map
+from stavpr_ros.mapping.journal import Base
+from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
-from stavpr_ros.pipeline.saving import save_recorded_map
+from stavpr_ros.pipeline.saving import recover_maps, save_recorded_map
+from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.health import Health
-from stavpr_ros.ros.input import ImageInput, InputStatus, STOP_TIMEOUT, Worker
+from stavpr_ros.ros.input import END_POLL, ImageInput, InputStatus, STOP_TIMEOUT, Worker
 from stavpr_ros.ros.navigation import Navigation
 from stavpr_ros.ros.output import map_info_message, nanoseconds, Output, PoseFrames
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import OdometryInput
 from stavpr_ros.ros.visualization import Visualization
 from stavpr_ros.signals import time_left
-from stavpr_ros.threads import limit_threads
+from stavpr_ros.threads import call_on_thread, limit_threads
 from std_msgs.msg import Header
 
+RECORDED = 'recorded.stavpr'  # in the maps folder, where no save_path is set
+LOAD_TIMEOUT = 120.0  # seconds to read a map
 REPORT_PERIOD = 10.0  # seconds between repeated warnings
 
 
@@ -75,9 +82,12 @@ class Runtime:
         self._pipeline: Pipeline | None = None
         self._views = Visualization(node, lambda: self.worker.call(self._publish_route))
         try:
+            recovered = recover_maps(self._journaled, node.get_logger())
             self._pipeline = self.worker.run(self._make_pipeline)
-            if settings.map_path:
-                self.load(settings.map_path)
+            # a route of loop closure does not continue a map
+            continued = recovered if settings.operation != 'loop_closure' else ''
+            if map_path := settings.map_path or continued:
+                self.load(map_path)
         except BaseException:
             self.close()
             raise
@@ -90,7 +100,21 @@ class Runtime:
 
     def _make_pipeline(self) -> Pipeline:
         limit_threads(self.settings.threads)
-        return Pipeline(self.settings.pipeline, self.settings.operation)
+        return Pipeline(self.settings.pipeline, self.settings.operation, self._open_journal)
+
+    @property
+    def _journaled(self) -> Path:
+        """Return the file whose name the journal of recorded places has."""
+        return Path(self.settings.save_path or self.settings.maps_path / RECORDED)
+
+    def _open_journal(self, base: Base, template: PlaceMap) -> JournalWriter | None:
+        """Open the journal of the first unsaved place; None, and an error, if it is impossible."""
+        log = self._node.get_logger()
+        try:
+            return JournalWriter.create(self._journaled, base, template, log.error)
+        except JournalError as error:
+            log.error(f'recorded places are in memory only: {error}')
+            return None
 
     # life cycle
 
@@ -115,6 +139,7 @@ class Runtime:
         finally:
             if not self.worker.stop():
                 self._node.left_behind = True
+            self._close_journals()
             self._output.close()
             self._views.close()
             self._navigation.close()
@@ -125,8 +150,17 @@ class Runtime:
 
     def _save(self, on_worker: Callable[[Callable[[], Any]], Any]) -> None:
         if self._pipeline is not None:
-            log = self._node.get_logger()
-            save_recorded_map(self._pipeline, on_worker, self.settings.save_path, log)
+            log, path = self._node.get_logger(), self.settings.save_path
+            if not save_recorded_map(self._pipeline, on_worker, path, log):
+                self._node.failed = True
+
+    def _close_journals(self) -> None:
+        if self._pipeline is not None:
+            for path in self._pipeline.close_journals(not self.settings.save_path):
+                self._node.get_logger().warning(
+                    f'places that are in no map stay in {path}: the next start of the node makes '
+                    'a map of them, or `stavpr map recover`'
+                )
 
     def _unsubscribe(self) -> None:
         for subscription in (self.images, self.odometry):
@@ -168,15 +202,18 @@ class Runtime:
                 self.problem = str(error)
                 self._node.get_logger().error(self.problem)
 
-    def load(self, path: str) -> None:
+    def load(self, path: str, lock: AbstractContextManager[Any] | None = None) -> None:
         """
-        Load a map, on this thread, and use it; meanwhile the old one stays in use.
+        Load a map and use it; meanwhile the old one stays in use.
 
-        :raises StavprError: an invalid file, model or setting; the old map stays in use.
+        :param lock: held while the map comes into use, but not while its file is read.
+        :raises StavprError: an invalid file, model or setting, or a file that takes too long; the
+            old map stays in use.
         """
         with self._loading(path):
-            loaded = read_map(path, self.settings.pipeline)
-            self.worker.run(lambda: self.pipeline.change(loaded=loaded))
+            loaded = self._read_in_time(path)
+            with lock or nullcontext():
+                self.worker.run(lambda: self.pipeline.change(loaded=loaded))
             self.worker.call(self._publish_route)
         places = loaded.places
         self._node.get_logger().info(
@@ -196,6 +233,19 @@ class Runtime:
                 self.problem = f'the map in use is not reliable: {error}'
                 self._node.get_logger().error(self.problem)
                 self.on_map_change()
+
+    def _read_in_time(self, path: str) -> LoadedMap:
+        """Read a map on a thread that is abandoned when it takes too long, or the node ends."""
+        reading = call_on_thread(lambda: read_map(path, self.settings.pipeline), 'reading')
+        end = time.monotonic() + LOAD_TIMEOUT
+        while not wait([reading], END_POLL).done:
+            if self._node.ending.is_set():
+                raise StavprError('the node ends')
+            if time.monotonic() > end:
+                raise StavprError(
+                    f'{path} was not read within {LOAD_TIMEOUT:g} s: copy it to a faster disk'
+                )
+        return reading.result()
 
     @contextmanager
     def _loading(self, path: str) -> Iterator[None]:

@@ -3,12 +3,14 @@
 """The services of the node; each returns the error as its message."""
 
 from collections.abc import Callable
+import os
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
+from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.pipeline.saving import write_map
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.output import candidates_message, match_message
@@ -22,7 +24,8 @@ class Services:
     """
     Serves ``~/load_map``, ``~/save_map``, ``~/reset``, ``~/relocalize`` and ``~/set_operation``.
 
-    They share a callback group of their own: a long request delays neither images nor diagnostics.
+    Loading and saving have callback groups of their own, the others share one: a long request
+    delays neither images nor diagnostics, and a file that takes long no other service.
 
     :param runtime: returns the runtime; raises StavprError while the node is not configured.
     """
@@ -38,6 +41,10 @@ class Services:
         self._runtime, self._load, self._operate = runtime, load_map, set_operation
         self._faults: dict[str, str] = {}  # last fault of a service, until it succeeds
         group = MutuallyExclusiveCallbackGroup()
+        groups = {
+            LoadMap: MutuallyExclusiveCallbackGroup(),
+            SaveMap: MutuallyExclusiveCallbackGroup(),
+        }
         for kind, name, serve in (
             (LoadMap, 'load_map', self._load_map),
             (SaveMap, 'save_map', self._save_map),
@@ -47,7 +54,9 @@ class Services:
         ):
             callback = self._callback(name, serve)
             repeat_responses(
-                node.create_service(kind, f'~/{name}', callback, callback_group=group)
+                node.create_service(
+                    kind, f'~/{name}', callback, callback_group=groups.get(kind, group)
+                )
             )
 
     def _callback(
@@ -81,14 +90,18 @@ class Services:
 
     def _load_map(self, runtime: Runtime, request: Any, response: Any) -> str:
         if not request.path:
-            raise StavprError("path = '' is no file: set the path of the map")
-        self._load(request.path)
+            raise StavprError("path = '' is no file: set the name of a map in the maps folder")
+        path = inside(runtime.settings.maps_path, request.path)
+        self._load(path)
         response.map = runtime.map_info()
-        return f'{response.map.places} places from {request.path}'
+        return f'{response.map.places} places from {path}'
 
     def _save_map(self, runtime: Runtime, request: Any, response: Any) -> str:
-        path = request.path or runtime.settings.save_path or runtime.pipeline.path
-        if not path:
+        if request.path:
+            path = inside(runtime.settings.maps_path, request.path)
+        elif own := runtime.settings.save_path or runtime.pipeline.path:
+            path = os.path.abspath(own)
+        else:
             raise StavprError(
                 "path = '', save_path is not set, and the map has no file: set a path"
             )

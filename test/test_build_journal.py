@@ -1,0 +1,122 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""An interrupted build_map continues where it was, in memory that does not grow."""
+
+import os
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from stavpr_ros.commands.map_recover import recover_map
+from stavpr_ros.errors import JournalError, SourceError
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.mapping import build_map, KeyframeSettings, load_map, save_map
+from stavpr_ros.mapping.builder import build_journal
+from stavpr_ros.mapping.journal import JournalReader
+from stavpr_ros.mapping.journal_map import journal_map
+from stavpr_ros.sources.frame import Frame
+import torch
+
+EXTRACTOR = FeatureExtractor()
+
+
+class StopError(Exception):
+    """The work is interrupted."""
+
+
+@pytest.fixture
+def frames(route):
+    return [Frame(image, (i + 1) * 10**9, f'image {i}') for i, image in enumerate(route)]
+
+
+@pytest.fixture
+def poses(frames):
+    poses = np.zeros((len(frames), 7))
+    poses[:, 0], poses[:, 6] = np.arange(len(frames)), 1
+    return poses
+
+
+def until(frames, count):
+    """Yield frames up to a number, and then interrupt the work."""
+    yield from frames[:count]
+    raise StopError
+
+
+def assert_equal(found, expected):
+    assert (found.ids, list(found.thumbnails)) == (expected.ids, list(expected.thumbnails))
+    for name in ('strips', 'weights'):
+        assert torch.equal(getattr(found.features, name), getattr(expected.features, name))
+    np.testing.assert_array_equal(found.stamps, expected.stamps)
+    np.testing.assert_array_equal(found.poses, expected.poses)
+
+
+@pytest.mark.parametrize('keyframes', [None, KeyframeSettings(distance=1.5)])
+def test_build_journal_interrupted_twice_gives_the_map_of_one_run(
+    frames, poses, tmp_path, keyframes
+):
+    target = tmp_path / 'route.stavpr'
+    options = {'keyframes': keyframes, 'progress': False}
+    for count in (20, 45):
+        with pytest.raises(StopError):
+            build_journal(until(frames, count), EXTRACTOR, target, 'drive', poses, **options)
+    with JournalReader(f'{target}.journal') as reader:
+        assert 15 <= [place.number for place in reader.places()][-1] < 45
+    journal = build_journal(frames, EXTRACTOR, target, 'drive', poses, **options)
+    found, expected = journal_map(journal), build_map(frames, EXTRACTOR, poses, **options)
+    assert_equal(found, expected)
+    save_map(found, target)
+    assert_equal(load_map(target), expected)
+    assert build_journal(frames, EXTRACTOR, target, 'drive', poses, **options) == journal
+
+
+def test_build_journal_of_another_work_is_refused(frames, tmp_path):
+    target = tmp_path / 'route.stavpr'
+    with pytest.raises(StopError):
+        build_journal(until(frames, 40), EXTRACTOR, target, 'drive', progress=False)
+    for extractor, source in ((EXTRACTOR, 'other'), (FeatureExtractor(projection=8), 'drive')):
+        with pytest.raises(JournalError, match='is of other images or options'):
+            build_journal(frames, extractor, target, source, progress=False)
+
+
+def test_build_journal_memory_does_not_grow_with_the_places(tmp_path):
+    """Places of 6 kB, 126 MB in all."""
+    n, d, memory = 20_000, 224, []
+    image = np.zeros((96, 128, 3), np.uint8)
+
+    def anonymous():
+        with open('/proc/self/status') as file:
+            return int(re.search(r'RssAnon:\s+(\d+) kB', file.read())[1]) / 1e3
+
+    def frames():
+        for i in range(n):
+            if i % 1000 == 0:
+                memory.append(anonymous())
+            yield Frame(image, i, f'{i}')
+
+    class Extractor(SimpleNamespace):
+        def extract(self, images):
+            strips = torch.full((7, len(images), d), d**-0.5)
+            weights = torch.full((7, len(images)), 7**-0.5)
+            return LocalFeatures(strips, weights, EXTRACTOR.settings, (14, 2))
+
+    extractor = Extractor(settings=EXTRACTOR.settings, projection=None)
+    journal = build_journal(frames(), extractor, tmp_path / 'x', 'drive', progress=False)
+    memory.append(anonymous())
+    place_map = journal_map(journal)
+    memory.append(anonymous())
+    assert len(place_map) == n
+    assert max(memory) - memory[1] < 40
+
+
+def test_recover_map_of_an_interrupted_build_has_the_places_so_far(frames, tmp_path, capsys):
+    target = tmp_path / 'route.stavpr'
+    with pytest.raises(StopError):
+        build_journal(until(frames, 40), EXTRACTOR, target, 'drive', progress=False)
+    with pytest.raises(SourceError, match='name the map'):
+        recover_map(str(tmp_path / 'x'))
+    assert recover_map(f'{target}.journal') == 0
+    places = len(load_map(target))
+    assert 15 < places <= 40
+    assert f'{target}: {places} places, {places} of them from' in capsys.readouterr().out
+    assert os.listdir(tmp_path) == ['route.stavpr']

@@ -1,0 +1,362 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The journal: every recorded place is on disk, whatever ends the recording."""
+
+import os
+import shlex
+import subprocess
+import sys
+
+import numpy as np
+from pipelines import process, save, settings_of
+import pytest
+from stavpr_ros.errors import JournalError, OutputTakenError
+from stavpr_ros.mapping import journal_writer, load_map, save_map
+from stavpr_ros.mapping.journal import Base, JournalPlace, JournalReader, journals, recover
+from stavpr_ros.mapping.journal_writer import JournalWriter
+from stavpr_ros.pipeline import Pipeline, read_map
+from stavpr_ros.pipeline.saving import recover_maps
+from test_saving import Log
+import torch
+
+SETTINGS = settings_of()
+
+
+@pytest.fixture
+def target(tmp_path):
+    return tmp_path / 'route.stavpr'
+
+
+@pytest.fixture
+def start(target):
+    """Make a pipeline that records with a journal; close the journals at the end."""
+    started = []
+
+    def start(operation='mapping', loaded=None, **settings):
+        def open_journal(base, template):
+            return JournalWriter.create(target, base, template, print)
+
+        started.append(Pipeline(settings_of(**settings), operation, open_journal))
+        if loaded:
+            started[-1].change(loaded=read_map(str(loaded), started[-1].settings))
+        return started[-1]
+
+    yield start
+    for pipeline in started:
+        pipeline.close_journals(delete_route=False)
+
+
+def killed(pipeline):
+    """Leave the journal as a killed process does: it is written, and no longer locked."""
+    pipeline.close_journals(delete_route=False)
+
+
+def stamps(path):
+    return load_map(path).stamps.tolist()
+
+
+def seconds(*values):
+    return [value * 10**9 for value in values]
+
+
+def assert_equal(path, place_map):
+    """Compare all parts of the map in a file with those of a map."""
+    found = load_map(path)
+    assert found.settings == place_map.settings
+    for name in ('strips', 'weights'):
+        assert torch.equal(getattr(found.features, name), getattr(place_map.features, name))
+    np.testing.assert_array_equal(found.stamps, place_map.stamps)
+    np.testing.assert_array_equal(found.poses, place_map.poses)
+    assert (found.ids, found.thumbnails) == (place_map.ids, place_map.thumbnails)
+
+
+def places_of(place_map):
+    for i in range(len(place_map)):
+        features = place_map.features[i : i + 1]
+        arrays = features.strips[:, 0].numpy(), features.weights[:, 0].numpy()
+        yield JournalPlace(
+            i, int(place_map.stamps[i]), place_map.ids[i], place_map.pose(i), *arrays,
+            place_map.thumbnails[i],
+        )  # fmt: skip
+
+
+@pytest.fixture
+def written(small_map, target):
+    """Write a journal of a whole map; return its path."""
+    writer = JournalWriter.create(target, Base(), small_map, print)
+    for place in places_of(small_map):
+        writer.append(place)
+    writer.close()
+    return writer.path
+
+
+# ----------------------------------------------------------------------------------------- files
+
+
+def test_recover_returns_every_part_of_every_place(written, small_map, target):
+    result = recover(written)
+    assert (result.path, result.places, result.recorded) == (str(target), 60, 60)
+    assert_equal(target, small_map)
+    assert os.listdir(target.parent) == ['route.stavpr']
+
+
+def test_journal_cut_off_anywhere_keeps_all_places_before(written, small_map, target):
+    content = written.read_bytes()
+    with JournalReader(written) as reader:
+        begin = reader.size
+        ends = [begin, *(reader.size for _ in reader.places())]
+    assert ends[-1] == len(content)
+    for length in np.random.default_rng(0).integers(begin, len(content), 200):
+        written.write_bytes(content[:length])
+        with JournalReader(written) as reader:
+            found = [place.stamp for place in reader.places()]
+        assert found == small_map.stamps[: np.searchsorted(ends, length, 'right') - 1].tolist()
+
+
+def test_journal_damaged_anywhere_keeps_all_places_before_the_damage(written, small_map):
+    content = bytearray(written.read_bytes())
+    with JournalReader(written) as reader:
+        ends = [reader.size, *(reader.size for _ in reader.places())]
+    rng = np.random.default_rng(1)
+    for at in [*ends[:-1], *rng.integers(ends[0], len(content), 100)]:
+        damaged = content.copy()
+        damaged[at] ^= rng.integers(1, 256)
+        written.write_bytes(damaged)
+        with JournalReader(written) as reader:
+            found = [place.stamp for place in reader.places()]
+        assert found == small_map.stamps[: np.searchsorted(ends, at, 'right') - 1].tolist()
+
+
+@pytest.mark.parametrize('content', [b'', b'\xff' * 100, b'\x10\0\0\0\0\0\0\0{}'])
+def test_recover_file_that_is_no_journal_fails_and_keeps_it(content, tmp_path):
+    path = tmp_path / 'x.stavpr.journal'
+    path.write_bytes(content)
+    with pytest.raises(JournalError, match='is no journal, or was cut off before its first place'):
+        recover(path)
+    assert path.read_bytes() == content
+
+
+def test_recover_what_is_no_file_or_in_use_fails(small_map, target, tmp_path):
+    os.mkfifo(tmp_path / 'fifo')
+    writer = JournalWriter.create(target, Base(), small_map, print)
+    for path, text in (
+        (tmp_path / 'missing', 'cannot be read'),
+        (tmp_path / 'fifo', 'no regular file'),
+        (writer.path, 'written by a running program'),
+    ):
+        with pytest.raises(JournalError, match=text):
+            recover(path)
+    writer.close()
+    with pytest.raises(JournalError, match='has no places'):
+        recover(writer.path)
+
+
+def test_recover_to_a_file_that_exists_fails_and_keeps_both(written, small_map, tmp_path):
+    path = tmp_path / 'other.stavpr'
+    save_map(small_map, path)
+    with pytest.raises(OutputTakenError, match='exists already'):
+        recover(written, path)
+    assert written.exists()
+    assert recover(written, tmp_path / 'new.stavpr').places == 60
+
+
+# -------------------------------------------------------------------------------------- recording
+
+
+def test_killed_recording_is_recovered_with_all_places(start, route, target):
+    pipeline = start()
+    process(pipeline, route[:9])
+    assert journals(target) == [target.with_name('route.stavpr.journal')]
+    expected = pipeline.snapshot().places
+    killed(pipeline)
+    log = Log()
+    assert recover_maps(target, log) == str(target)
+    assert '9 places of an earlier recording were recovered' in log.lines[0][1]
+    assert stamps(target) == seconds(*range(1, 10))
+    assert torch.equal(load_map(target).features.strips, expected.features.strips)
+    assert journals(target) == []
+
+
+def test_saving_deletes_the_journal_and_later_places_open_another(start, route, target):
+    pipeline = start()
+    process(pipeline, route[:3])
+    save(pipeline, target)
+    assert journals(target) == []
+    process(pipeline, route[3:5], first=3)
+    killed(pipeline)
+    assert recover(journals(target)[0]).recorded == 2
+    assert stamps(target) == seconds(1, 2, 3, 4, 5)  # in the file that was continued
+    assert os.listdir(target.parent) == ['route.stavpr']
+
+
+def test_saving_while_places_are_recorded_keeps_those_in_the_journal(start, route, target):
+    pipeline = start()
+    process(pipeline, route[:3])
+    snapshot = pipeline.snapshot()
+    process(pipeline, route[3:5], first=3)
+    save_map(snapshot.places, target)
+    snapshot.mark_saved(str(target))
+    process(pipeline, route[5:6], first=5)
+    killed(pipeline)
+    result = recover(journals(target)[0])
+    assert (result.places, result.recorded) == (6, 3)
+    assert stamps(target) == seconds(1, 2, 3, 4, 5, 6)
+
+
+def test_kill_between_saving_and_the_journal_duplicates_nothing(start, route, target):
+    pipeline = start()
+    process(pipeline, route[:3])
+    save_map(pipeline.snapshot().places, target)  # and the process is killed
+    process(pipeline, route[3:4], first=3)
+    killed(pipeline)
+    assert recover(journals(target)[0]).path == str(target)
+    assert stamps(target) == seconds(1, 2, 3, 4)
+
+    pipeline = start(loaded=target)
+    process(pipeline, route[4:6], first=4)
+    save_map(pipeline.snapshot().places, target, force=True)
+    killed(pipeline)
+    assert recover(journals(target)[0]).places == 6
+    assert stamps(target) == seconds(1, 2, 3, 4, 5, 6)
+    assert os.listdir(target.parent) == ['route.stavpr']
+
+
+@pytest.mark.parametrize('change', ['another', 'missing', 'damaged'])
+def test_recover_without_the_map_that_was_continued_keeps_the_places(
+    start, small_map, route, target, tmp_path, change
+):
+    base = tmp_path / 'base.stavpr'
+    save_map(small_map, base)
+    pipeline = start(loaded=base)
+    process(pipeline, route[:4], first=100)
+    killed(pipeline)
+    if change == 'another':
+        save_map(load_map(base), tmp_path / 'copy.stavpr')
+        shifted = small_map.stamps + 1
+        save_map(type(small_map)(small_map.features, small_map.projection, shifted, small_map.ids),
+                 base, force=True)  # fmt: skip
+    elif change == 'missing':
+        base.unlink()
+    else:
+        base.write_bytes(b'PK')
+    log = Log()
+    assert recover_maps(target, log) == str(target)
+    assert len(load_map(target)) == 4
+    assert log.lines[1][0] == 'error'
+    assert 'base.stavpr' in log.lines[1][1]
+
+
+def test_recover_beside_another_map_takes_a_numbered_name(start, small_map, route, target):
+    save_map(small_map, target)
+    pipeline = start()
+    process(pipeline, route[:4], first=100)
+    killed(pipeline)
+    assert recover(journals(target)[0]).path == str(target.with_stem('route-2'))
+    assert (len(load_map(target)), len(load_map(target.with_stem('route-2')))) == (60, 4)
+
+
+def test_journal_of_a_second_recording_takes_a_numbered_name(start, route, target):
+    first, second = start(), start()
+    process(first, route[:2])
+    process(second, route[:3])
+    names = [path.name for path in journals(target)]
+    assert sorted(names) == ['route-2.stavpr.journal', 'route.stavpr.journal']
+    killed(first)
+    log = Log()
+    assert recover_maps(target, log) == str(target)  # and that of the living one stays
+    assert 'written by a running program' in log.lines[1][1]
+    assert [path.name for path in journals(target)] == ['route-2.stavpr.journal']
+
+
+def test_journal_of_a_route_follows_evictions(start, route, target, monkeypatch):
+    monkeypatch.setattr(journal_writer, 'SLACK', 0)
+    pipeline = start('loop_closure', exclude_places=1, max_places=24)
+    process(pipeline, [route[i % 60] for i in range(130)])
+    held = pipeline.snapshot().places
+    size = os.path.getsize(journals(target)[0])
+    killed(pipeline)
+    result = recover(journals(target)[0])
+    found = load_map(result.path)
+    n = len(held)
+    assert n <= len(found) < 80
+    assert found.stamps[-n:].tolist() == held.stamps.tolist()
+    assert torch.allclose(found.features.strips[:, -n:], held.features.strips, atol=1e-6)
+    assert size < 2.5 * len(found) / 80 * 130 * 12000
+
+
+def test_operation_changes_keep_the_journal_of_unsaved_places(start, route, target):
+    pipeline = start()
+    process(pipeline, route[:6])
+    pipeline.change(operation='localization')
+    process(pipeline, route[:6], first=50)
+    pipeline.change(operation='mapping')
+    process(pipeline, route[6:8], first=6)
+    killed(pipeline)
+    assert recover(journals(target)[0]).places == 8
+    assert stamps(target) == seconds(*range(1, 9))
+
+
+def test_discarded_places_stay_in_their_journal(start, small_map, route, target, tmp_path):
+    other = tmp_path / 'other.stavpr'
+    save_map(small_map, other)
+    pipeline = start()
+    process(pipeline, route[:6])
+    pipeline.change(operation='localization')
+    pipeline.change(loaded=read_map(str(other), pipeline.settings))
+    assert recover(journals(target)[0]).places == 6
+
+
+# ---------------------------------------------------------------------------------------- the disk
+
+FULL = """
+import resource, signal, sys
+from pipelines import process, settings_of
+from conftest import route_images
+from stavpr_ros.mapping.journal import recover
+from stavpr_ros.mapping.journal_writer import JournalWriter
+from stavpr_ros.pipeline import Pipeline
+
+target, output, case = sys.argv[1:]
+writers, unlimited = [], (resource.RLIM_INFINITY,) * 2
+
+def open_journal(base, template):
+    writers.append(JournalWriter.create(target, base, template, print))
+    return writers[0]
+
+pipeline = Pipeline(settings_of(), 'mapping', open_journal)
+images = route_images(60)
+process(pipeline, images[:1])
+if case != 'tmpfs':
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
+process(pipeline, images[1:50], first=1)
+assert writers[0]._problem
+if case == 'room':
+    resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+process(pipeline, images[50:], first=50)
+assert len(pipeline.places) == 60
+[journal] = pipeline.close_journals(False)
+resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+print(recover(journal, output).places)
+"""
+
+
+@pytest.mark.parametrize('case', ['room', 'none', 'tmpfs'])
+def test_full_disk_ends_neither_the_recording_nor_the_journal(case, target, tmp_path):
+    """Its stand-in is RLIMIT_FSIZE, or a small file system where the rights allow one."""
+    disk, output = tmp_path / 'disk', tmp_path / 'recovered.stavpr'
+    disk.mkdir()
+    command = [sys.executable, '-c', FULL, str(disk / target.name), str(output), case]
+    if case == 'tmpfs':
+        own = ['unshare', '--map-root-user', '--mount', 'sh', '-c']
+        mount = f'mount -t tmpfs -o size=200k tmpfs {shlex.quote(str(disk))}'
+        if subprocess.run([*own, mount], capture_output=True, check=False).returncode:
+            pytest.skip('no rights to mount a file system')
+        command = [*own, f'{mount} && exec {shlex.join(command)}']
+    path = os.pathsep.join([os.path.dirname(__file__), *sys.path])
+    environment = os.environ | {'PYTHONPATH': path}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count('cannot be written (') == 1, done.stdout
+    places = int(done.stdout.split()[-1])
+    assert places == 60 if case == 'room' else 10 < places < 50
+    assert stamps(output) == seconds(*range(1, places + 1))

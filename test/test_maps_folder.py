@@ -1,0 +1,47 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The folder of maps: where it is, and which names lead into it."""
+
+from pathlib import Path
+
+import pytest
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.pipeline.maps_folder import inside, maps_folder
+
+
+@pytest.mark.parametrize(
+    ('parameter', 'data', 'folder'),
+    [
+        ('', '/data', '/data/stavpr/maps'),
+        ('', '', '/home/robot/.local/share/stavpr/maps'),
+        ('', 'relative', '/home/robot/.local/share/stavpr/maps'),
+        ('/maps', '/data', '/maps'),
+    ],
+)
+def test_maps_folder_follows_parameter_then_xdg_then_home(parameter, data, folder, monkeypatch):
+    monkeypatch.setenv('XDG_DATA_HOME', data)
+    monkeypatch.setenv('HOME', '/home/robot')
+    assert maps_folder(parameter) == Path(folder)
+
+
+def test_inside_of_names_in_the_folder_is_their_absolute_path(tmp_path):
+    folder = tmp_path / 'link'
+    (tmp_path / 'maps' / 'town').mkdir(parents=True)
+    folder.symlink_to('maps')
+    (tmp_path / 'maps' / 'latest').symlink_to('town/a.stavpr')
+    inner = tmp_path / 'maps' / 'town' / 'a.stavpr'
+    for name in ('town/a.stavpr', 'latest', 'town/../town/a.stavpr', str(inner)):
+        assert inside(folder, name) == str(inner)
+    assert inside(tmp_path / 'missing', 'a') == str(tmp_path / 'missing' / 'a')
+
+
+@pytest.mark.parametrize(
+    'name', ['..', '.', '', '/etc/passwd', '../a', 'town/../../a', 'out', 'out/a', 'loop', 'a\0b']
+)
+def test_inside_of_names_that_lead_outside_fails(name, tmp_path):
+    folder = tmp_path / 'maps'
+    folder.mkdir()
+    (folder / 'out').symlink_to('..')
+    (folder / 'loop').symlink_to('/dev/zero')
+    with pytest.raises(SettingsError, match='no file in the maps folder'):
+        inside(folder, name)

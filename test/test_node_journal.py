@@ -1,0 +1,181 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A node that is killed, or cannot save, loses no recorded place."""
+
+import os
+import random
+import resource
+
+from processes import Process, SECOND
+import pytest
+from rclpy.lifecycle import TransitionCallbackReturn
+from robot import image_message, PARAMETERS, parameters_of
+from stavpr_msgs.msg import PlaceMatch
+from stavpr_ros.errors import OutputError
+from stavpr_ros.mapping import load_map
+from stavpr_ros.mapping.journal import journals, recover
+from stavpr_ros.pipeline import saving
+from stavpr_ros.ros.node import PlaceRecognitionNode
+
+SUCCESS = TransitionCallbackReturn.SUCCESS
+
+
+@pytest.fixture
+def make(context, tmp_path):
+    """Make and activate a node that records into the maps folder; it ends with the test."""
+    made = []
+
+    def make(**parameters):
+        values = {'autostart': False, 'operation': 'mapping', 'maps_folder': str(tmp_path)}
+        overrides = parameters_of(PARAMETERS | values | parameters)
+        made.append(PlaceRecognitionNode(context=context, parameter_overrides=overrides))
+        assert made[-1].trigger_configure() == made[-1].trigger_activate() == SUCCESS
+        return made[-1]
+
+    yield make
+    for node in made:
+        node.destroy_node()
+
+
+def record(node, images, first=0):
+    """Show images to a node, and wait until they are processed."""
+    for i, image in enumerate(images, first + 1):
+        node.runtime.images.on_image(image_message(image, i * SECOND))
+        node.runtime.worker.run(lambda: None)
+    while node.runtime.worker.waiting:
+        node.runtime.worker.run(lambda: None)
+    node.runtime.worker.run(lambda: None)
+
+
+def end(node):
+    node.destroy_node()
+    return node.failed
+
+
+def test_node_without_save_path_continues_its_recording_at_the_next_start(make, route, tmp_path):
+    node = make()
+    record(node, route[:5])
+    assert not end(node)
+    assert os.listdir(tmp_path) == ['recorded.stavpr.journal']
+    node = make()
+    assert node.runtime.map_info().path == str(tmp_path / 'recorded.stavpr')
+    assert journals(tmp_path / 'recorded.stavpr') == []
+    record(node, route[5:7], first=5)
+    assert len(node.runtime.pipeline.places) == 7
+    assert not end(node)
+    node = make(operation='localization')  # recognizes what was recorded
+    record(node, route[:7], first=20)
+    assert len(node.runtime.pipeline.places) == 7
+    assert node.runtime.pipeline._last.newest_index == 6
+
+
+def test_node_whose_last_save_fails_keeps_the_journal_and_reports_failure(
+    make, route, tmp_path, monkeypatch
+):
+    path = tmp_path / 'route.stavpr'
+    node = make(save_path=str(path))
+    record(node, route[:5])
+    with monkeypatch.context() as disk:
+
+        def fail(*_):
+            raise OutputError('the disk is full')
+
+        disk.setattr(saving, 'save_map', fail)
+        assert end(node)
+    assert os.listdir(tmp_path) == ['route.stavpr.journal']
+    make(save_path=str(path))
+    assert len(load_map(path)) == 5
+
+
+def test_node_that_saves_deletes_the_journal(make, route, tmp_path):
+    path = tmp_path / 'route.stavpr'
+    node = make(save_path=str(path))
+    record(node, route[:5])
+    assert journals(path)
+    assert not end(node)
+    assert os.listdir(tmp_path) == ['route.stavpr']
+
+
+def test_node_with_a_route_that_is_not_to_be_saved_deletes_its_journal(make, route, tmp_path):
+    node = make(operation='loop_closure')
+    record(node, route[:5])
+    assert journals(tmp_path / 'recorded.stavpr')
+    assert not end(node)
+    assert os.listdir(tmp_path) == []
+
+
+def test_node_that_cannot_write_a_journal_records_all_the_same(make, route, tmp_path):
+    (tmp_path / 'file').touch()
+    node = make(maps_folder=str(tmp_path / 'file'))
+    record(node, route[:5])
+    assert len(node.runtime.pipeline.places) == 5
+
+
+# -------------------------------------------------------------------------------------- processes
+
+
+@pytest.fixture
+def recording(robot, tmp_path):
+    """Start a node process that records to a file; it ends with the test."""
+    started = []
+
+    def start():
+        files = {'save_path': tmp_path / 'route.stavpr', 'maps_folder': tmp_path}
+        given = PARAMETERS | {'operation': 'mapping', 'queue_size': 1000} | files
+        words = [word for name, value in given.items() for word in ('-p', f'{name}:={value}')]
+        started.append(Process(tmp_path / 'log', 'node', '--ros-args', *words))
+        # a killed node stays in the graph for a while: wait for the log of the new one
+        robot.until(lambda: 'backend' in started[-1].output(), 'the node')
+        robot.wait_for_node()
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.end()
+
+
+def mapped(robot):
+    """Return the stamps of the images that were published as places."""
+    places = [match for match in robot.answers if match.status == PlaceMatch.MAPPED]
+    return {match.header.stamp.sec * SECOND for match in places}
+
+
+@pytest.mark.parametrize('kills', [3, pytest.param(20, marks=pytest.mark.long)])
+def test_node_killed_at_a_random_moment_loses_no_published_place(
+    recording, robot, route, tmp_path, kills
+):
+    """The next start makes a map of the journal, which the recording continues."""
+    path, random_ = tmp_path / 'route.stavpr', random.Random(0)
+    published = set()
+    for _ in range(kills):
+        robot.forget()
+        process, first = recording(), robot.stamp + SECOND
+        for image in route[: random_.randrange(1, 20)]:
+            robot.stamp += SECOND
+            robot.publisher.publish(image_message(image, robot.stamp))
+        count = random_.randrange(1, 1 + (robot.stamp - first) // SECOND + 1)
+        robot.until(lambda count=count: len(mapped(robot)) >= count, 'some places')
+        process.popen.kill()
+        process.wait()
+        published |= mapped(robot)
+    assert sum(recover(journal).recorded for journal in journals(path)) > 0
+    stamps = load_map(path).stamps.tolist()
+    assert published <= set(stamps)
+    assert stamps == sorted(set(stamps))
+    assert [name for name in os.listdir(tmp_path) if name.startswith('.')] == []
+
+
+def test_node_on_a_full_disk_ends_with_an_error_and_names_the_journal(
+    recording, robot, route, tmp_path
+):
+    path = tmp_path / 'route.stavpr'
+    process = recording()
+    robot.drive(route[:10])
+    robot.until(lambda: bool(journals(path)), 'the journal')
+    resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, (40_000, resource.RLIM_INFINITY))
+    robot.drive(route[10:15])
+    assert process.stop() == 1
+    output = process.output()
+    assert 'the map is not saved: ' in output
+    assert f'places that are in no map stay in {path}.journal' in output
+    assert 10 <= recover(journals(path)[0]).places <= 15

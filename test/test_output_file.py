@@ -1,0 +1,250 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Output files: complete or absent, never over somebody else's, one writer at a time."""
+
+import os
+from pathlib import Path
+import stat
+import subprocess
+import sys
+import threading
+
+import pytest
+from stavpr_ros.errors import OutputError, OutputTakenError
+from stavpr_ros.output_file import (
+    atomic_output,
+    AtomicFile,
+    csv_kind,
+    HTML,
+    JSON,
+    MAP,
+    PNG,
+    RECORDING,
+    require_replaceable,
+    write_output,
+)
+
+# writes half a file, reports it, and waits to be killed
+WRITER = """
+import sys, time
+from stavpr_ros.output_file import atomic_output, JSON
+with atomic_output(sys.argv[1], JSON, force=True) as file:
+    file.write(b'{"half":')
+    file.flush()
+    print('half', flush=True)
+    time.sleep(1000)
+"""
+
+
+def names(folder):
+    return sorted(os.listdir(folder))
+
+
+@pytest.fixture
+def writer(tmp_path):
+    """Start a process that has written half of a file; kill it at the end."""
+    processes = []
+
+    def start(path):
+        command = [sys.executable, '-c', WRITER, str(path)]
+        processes.append(subprocess.Popen(command, stdout=subprocess.PIPE))
+        assert processes[-1].stdout.readline() == b'half\n'
+        return processes[-1]
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def test_write_output_new_file_has_content_and_the_usual_mode(tmp_path):
+    path = tmp_path / 'a.json'
+    write_output(path, '{"ä": 1}', JSON, force=False)
+    (tmp_path / 'usual').touch()
+    assert path.read_text(encoding='utf-8') == '{"ä": 1}'
+    assert path.stat().st_mode == (tmp_path / 'usual').stat().st_mode
+    assert names(tmp_path) == ['a.json', 'usual']
+
+
+def test_write_output_existing_file_is_replaced_only_by_force(tmp_path):
+    path = tmp_path / 'a.json'
+    path.write_text('{}')
+    with pytest.raises(OutputTakenError, match='exists already: choose another name, or replace'):
+        write_output(path, '[]', JSON, force=False)
+    assert path.read_text() == '{}'
+    write_output(path, '[]', JSON, force=True)
+    assert path.read_text() == '[]'
+
+
+def test_write_output_file_of_another_kind_is_never_replaced(tmp_path):
+    path = tmp_path / '.bashrc'
+    path.write_text('# {"stavpr-map"')
+    with pytest.raises(OutputTakenError, match='exists and is no map: it is never replaced'):
+        write_output(path, '', MAP, force=True)
+    assert path.read_text() == '# {"stavpr-map"'
+
+
+@pytest.mark.parametrize('mode', [0o600, 0o644, 0o660])
+def test_write_output_keeps_mode_of_the_replaced_file(mode, tmp_path):
+    path = tmp_path / 'a.json'
+    path.write_text('{}')
+    path.chmod(mode)
+    with atomic_output(path, JSON, force=True) as file:
+        assert stat.S_IMODE(os.fstat(file.fileno()).st_mode) == mode  # before there is content
+        file.write(b'[]')
+    assert (stat.S_IMODE(path.stat().st_mode), path.read_text()) == (mode, '[]')
+
+
+@pytest.mark.parametrize('exists', [False, True])
+def test_write_output_symlink_stays_and_its_target_is_written(exists, tmp_path):
+    target, link = tmp_path / 'disk' / 'a.json', tmp_path / 'a.json'
+    target.parent.mkdir()
+    if exists:
+        target.write_text('{}')
+    link.symlink_to('disk/a.json')
+    write_output(link, '[]', JSON, force=exists)
+    assert link.is_symlink()
+    assert (target.read_text(), names(target.parent)) == ('[]', ['a.json'])
+
+
+def test_atomic_output_error_in_the_block_leaves_what_was_there(tmp_path):
+    path = tmp_path / 'a.json'
+    path.write_text('{}')
+
+    def interrupted():
+        with atomic_output(path, JSON, force=True) as file:
+            file.write(b'x')
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert (path.read_text(), names(tmp_path)) == ('{}', ['a.json'])
+
+
+def test_atomic_output_target_that_came_meanwhile_stays(tmp_path):
+    path = tmp_path / 'a.json'
+    file = AtomicFile(path, JSON, force=True)
+    path.write_text('mine')
+    with pytest.raises(OutputTakenError, match='no JSON'):
+        file.commit()
+    file.abandon()
+    assert (path.read_text(), names(tmp_path)) == ('mine', ['a.json'])
+
+
+def test_atomic_output_second_writer_is_refused_until_the_first_is_done(tmp_path):
+    path = tmp_path / 'a.json'
+    with atomic_output(path, JSON) as file:
+        with pytest.raises(OutputTakenError, match='written by another program'):
+            write_output(path, '[]', JSON, force=True)
+        file.write(b'{}')
+    assert path.read_text() == '{}'
+    write_output(path, '[]', JSON, force=True)
+
+
+def test_atomic_output_committed_early_is_locked_until_the_end(tmp_path):
+    path = tmp_path / 'a.json'
+    with atomic_output(path, JSON) as file:
+        file.write(b'[1,')
+        file.commit()
+        assert path.read_bytes() == b'[1,'
+        with pytest.raises(OutputTakenError, match='written by another program'):
+            write_output(path, '[]', JSON, force=True)
+        file.write(b'2]')
+    assert (path.read_bytes(), names(tmp_path)) == (b'[1,2]', ['a.json'])
+
+
+def test_atomic_output_many_writers_at_once_exactly_one_wins_at_a_time(tmp_path):
+    path, done, errors = tmp_path / 'a.json', [], []
+    start = threading.Barrier(8)
+
+    def write(number):
+        start.wait()
+        try:
+            write_output(path, f'[{number}]', JSON, force=False)
+            done.append(number)
+        except OutputTakenError:
+            pass
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=write, args=(number,)) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (errors, len(done)) == ([], 1)
+    assert path.read_text() == f'[{done[0]}]'
+    assert names(tmp_path) == ['a.json']
+
+
+def test_atomic_output_killed_writer_leaves_what_the_next_one_sweeps(writer, tmp_path):
+    path, other = tmp_path / 'a.json', tmp_path / 'b.json'
+    path.write_text('{}')
+    process, living = writer(path), writer(other)
+    process.kill()
+    process.wait()
+    assert path.read_text() == '{}'
+    assert len(names(tmp_path)) == 3
+    write_output(tmp_path / 'c.json', '[]', JSON, force=False)
+    assert len(names(tmp_path)) == 3  # the temporary of the living writer stays
+    write_output(path, '[]', JSON, force=True)
+    with pytest.raises(OutputTakenError, match='written by another program'):
+        write_output(other, '[]', JSON, force=True)
+    assert living.poll() is None
+
+
+def test_atomic_output_file_of_a_full_disk_leaves_what_was_there(tmp_path):
+    """RLIMIT_FSIZE of a process of its own stands for the disk."""
+    program = (
+        'import resource, signal\n'
+        'from stavpr_ros.output_file import JSON, write_output\n'
+        'signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n'
+        'resource.setrlimit(resource.RLIMIT_FSIZE, (10000, 10000))\n'
+        'try:\n'
+        '    write_output("a.json", "[" + " " * 100000, JSON, True)\n'
+        'except Exception as error:\n'
+        '    print(type(error).__name__, error)\n'
+    )
+    (tmp_path / 'a.json').write_text('{}')
+    result = subprocess.run(
+        [sys.executable, '-c', program], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert result.stdout.startswith('OutputError a.json cannot be written (File too large); what')
+    assert result.stderr == ''
+    assert ((tmp_path / 'a.json').read_text(), names(tmp_path)) == ('{}', ['a.json'])
+
+
+def test_require_replaceable_names_what_is_wrong(tmp_path):
+    os.mkfifo(tmp_path / 'fifo')
+    (tmp_path / 'loop').symlink_to('loop')
+    for name, text in (
+        ('', 'is a folder: name a file in it'),
+        ('missing/a', 'does not exist: make it first'),
+        ('fifo', 'is no regular file: it is never replaced'),
+        ('loop', 'cannot be written'),
+    ):
+        with pytest.raises(OutputError, match=text):
+            require_replaceable(tmp_path / name, JSON, force=True)
+    require_replaceable(tmp_path / 'new', JSON)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'content'),
+    [
+        (MAP, b'PK\x03\x04' + b'\0' * 26 + b'manifest.json{"format": "stavpr-map"'),
+        (MAP, b'\x10\0\0\0\0\0\0\0{"__metadata__":{"format":"stavpr-map"}}'),
+        (RECORDING, b'{"stamp": 1, "frame_id": ""}\n'),
+        (JSON, b'\n[1]'),
+        (PNG, b'\x89PNG\r\n'),
+        (HTML, b'<!DOCTYPE html>\n'),
+        (csv_kind(['a', 'b']), b'a,b\r\n1,2'),
+    ],
+)
+def test_file_kind_matches_its_own_and_no_text(kind, content, tmp_path):
+    path = Path(tmp_path / 'file')
+    path.write_bytes(content)
+    require_replaceable(path, kind, force=True)
+    path.write_text('export PATH\n')
+    with pytest.raises(OutputTakenError, match='never replaced'):
+        require_replaceable(path, kind, force=True)

@@ -1,0 +1,63 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The SROS 2 policy allows the node exactly what it does, and others no more than they need."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from rclpy.parameter import Parameter
+from stavpr_ros.ros.node import PlaceRecognitionNode
+
+POLICY = Path(__file__).parents[1] / 'config' / 'sros2_policy.xml'
+BOTH_CAMERAS = {'/image', '/image/compressed'}
+
+
+@pytest.fixture(scope='module')
+def policy():
+    """Return the allowed names by enclave and right, such as ``policy['node']['publish']``."""
+    rules = {}
+    for enclave in ElementTree.parse(POLICY).iter('enclave'):
+        rights = rules.setdefault(enclave.get('path').removeprefix('/stavpr/'), {})
+        for group in enclave.find('profiles/profile'):
+            for right in group.attrib:
+                names = {entry.text.replace('~', '/stavpr') for entry in group}
+                rights[right] = rights.get(right, set()) | names
+    return rules
+
+
+@pytest.mark.parametrize('transport', ['raw', 'compressed'])
+def test_policy_of_the_node_is_what_it_uses(policy, context, transport):
+    given = {'autostart': False, 'operation': 'mapping', 'image_transport': transport}
+    overrides = [Parameter(name, value=value) for name, value in given.items()]
+    node = PlaceRecognitionNode(context=context, parameter_overrides=overrides)
+    try:
+        assert node.trigger_configure() == node.trigger_activate()
+        used = {
+            'publish': node.get_publisher_names_and_types_by_node('stavpr', '/'),
+            'subscribe': node.get_subscriber_names_and_types_by_node('stavpr', '/'),
+            'reply': node.get_service_names_and_types_by_node('stavpr', '/'),
+            'request': node.get_client_names_and_types_by_node('stavpr', '/'),
+        }
+    finally:
+        node.destroy_node()
+    names = {right: {name for name, _ in found} for right, found in used.items()}
+    if names['subscribe'] & BOTH_CAMERAS:  # one of them at a time
+        names['subscribe'] |= BOTH_CAMERAS
+    names['subscribe'].add('/clock')  # with use_sim_time
+    names['publish'] |= {'/tf', '/initialpose'}  # with publish_tf, and for Nav2
+    assert names == {'request': set(), **policy['node']}
+
+
+def test_policy_of_the_others_fits_the_node(policy):
+    node = policy['node']
+    for other in ('operator', 'reader'):
+        assert policy[other]['subscribe'] <= node['publish'] | {'/clock'}
+    assert policy['operator']['request'] <= node['reply']
+    assert 'request' not in policy['reader']
+    assert node['subscribe'] <= policy['sensors']['publish']
+
+
+def test_policy_has_no_comment_that_sros2_takes_for_an_enclave():
+    text = POLICY.read_text(encoding='utf-8')
+    assert '<!--' not in text[text.index('<policy') :]
