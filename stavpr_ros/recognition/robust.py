@@ -40,7 +40,8 @@ class RobustOptions:
     :param query_znorm: z-normalize the distances of an image to all places: some images are far
         from all.
     :param reference_znorm: z-normalize the distances of a place to the latest images, against
-        hubness: some places are near to all images.
+        hubness: some places are near to all images. Off: whitening cures that, and without the
+        memory of latest images detours and starts are recognized sooner.
     :param place_filter: follow place and speed with a Bayes filter that knows of being off the
         map (:mod:`stavpr_ros.recognition.place_filter`) instead of matching each window by LM-DTW,
         where one place may absorb a window.
@@ -49,7 +50,7 @@ class RobustOptions:
     mean_centering: bool = True
     whitening: bool = True
     query_znorm: bool = True
-    reference_znorm: bool = True
+    reference_znorm: bool = False
     place_filter: bool = True
 
     @property
@@ -119,8 +120,8 @@ class FilterSettings:
     """
 
     speeds: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
-    levels: tuple[float, ...] = (-1.0, -2.0, -3.25)
-    weight: float = 0.28
+    levels: tuple[float, ...] = (-1.4, -2.3, -3.4)
+    weight: float = 0.26
     most_change: float = 2.0
     least_change: float = 0.2
     standstill: float = 0.1
