@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 from types import SimpleNamespace
-from typing import Any, TYPE_CHECKING
+from typing import Any, ClassVar, TYPE_CHECKING
 from unittest.mock import patch
 
 import numpy as np
@@ -71,6 +71,7 @@ class Memory:
 class SyntheticSettings:
     """Settings of the synthetic features."""
 
+    resize: ClassVar[str] = 'bilinear'
     d: int
 
 

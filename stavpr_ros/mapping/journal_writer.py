@@ -131,7 +131,7 @@ class JournalWriter:
 
     @property
     def failed(self) -> bool:
-        """The disk is full: the last places are in memory only."""
+        """Return whether the disk is full: the last places are in memory only."""
         return self._problem
 
     def append(self, place: JournalPlace) -> None:

@@ -40,7 +40,7 @@ class RobustOptions:
     :param query_znorm: z-normalize the distances of an image to all places: some images are far
         from all.
     :param reference_znorm: z-normalize the distances of a place to the latest images, against
-        hubness: some places are near to all images. Off: whitening cures that, and without the
+        hubness: some places are near to all images. Off: whitening does that, and without the
         memory of latest images detours and starts are recognized sooner.
     :param place_filter: follow place and speed with a Bayes filter that knows of being off the
         map (:mod:`stavpr_ros.recognition.place_filter`) instead of matching each window by LM-DTW,
