@@ -20,7 +20,15 @@ from stavpr_ros.recognition.loop_closer import (
     LoopCloser,
 )
 from stavpr_ros.recognition.place_filter import CLOSE, FilterSettings, PlaceFilter
-from stavpr_ros.recognition.robust import MEMORY, MIN_DEVIATION, PAPER, PRIOR, ROBUST, THRESHOLD
+from stavpr_ros.recognition.robust import (
+    MEMORY,
+    MIN_DEVIATION,
+    PAPER,
+    PRIOR,
+    ROBUST,
+    RobustOptions,
+    THRESHOLD,
+)
 from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
 from stavpr_ros.recognition.sequence_search import ImageChange
 import torch
@@ -458,7 +466,7 @@ def test_loop_closer_with_invalid_input_is_rejected(laps, small_map):
     with pytest.raises(SettingsError, match='none'):
         LoopCloser(RecognizerSettings(1.0, SpatialSettings('none')), 12, laps.settings)
     with pytest.raises(SettingsError, match='take both or neither'):
-        LoopCloser(settings_of(ROBUST.without('query_znorm')), 12, laps.settings)
+        LoopCloser(settings_of(RobustOptions.only('reference_znorm')), 12, laps.settings)
     closer = LoopCloser(robust, 12, laps.settings)
     with pytest.raises(InputError, match='2 images'):
         closer.update(laps[:2])

@@ -174,15 +174,9 @@ class Whitening:
     """
 
     def __init__(self, strips: torch.Tensor) -> None:
-        samples = strips.double()
-        # of the places with each other: there are fewer of them than dimensions
-        values, vectors = torch.linalg.eigh(samples @ samples.mT)
-        shares = values.clamp(min=0) / values.sum(dim=1, keepdim=True).clamp(min=1e-12)
-        spread = (shares**2).sum(dim=1, keepdim=True).clamp(min=1e-12)
-        gains = torch.rsqrt(1 + STRENGTH * shares / spread)[:, None, -RANK:]
-        directions = samples.mT @ vectors[:, :, -RANK:]
-        directions /= directions.norm(dim=1, keepdim=True).clamp_(min=1e-9)
-        self._directions = directions.mT.float().contiguous()  # (W, rank, d)
+        learned = [_principal_directions(strip) for strip in strips]  # one by one: less memory
+        self._directions = torch.stack([directions for directions, _ in learned])  # (W, rank, d)
+        gains = torch.stack([gains for _, gains in learned])[:, None]
         self._change, self._inverse = (gains - 1).float(), (1 / gains - 1).float()
 
     def __call__(self, strips: torch.Tensor) -> torch.Tensor:
@@ -202,6 +196,18 @@ class Whitening:
         for name in ('_directions', '_change', '_inverse'):
             setattr(self, name, getattr(self, name).to(device))
         return self
+
+
+def _principal_directions(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return those of (m, d), at most ``RANK``, (rank, d), float32, and their gains (rank,)."""
+    samples = features.double()
+    # of the places with each other: there are fewer of them than dimensions
+    values, vectors = torch.linalg.eigh(samples @ samples.T)
+    shares = values.clamp(min=0) / values.sum().clamp(min=1e-12)
+    gains = torch.rsqrt(1 + STRENGTH * shares / (shares**2).sum().clamp(min=1e-12))
+    directions = vectors[:, -RANK:].T @ samples
+    directions /= directions.norm(dim=1, keepdim=True).clamp_(min=1e-9)
+    return directions.float(), gains[-RANK:]
 
 
 class MeanCentering:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Features of a route that grows by one place at a time, centered and whitened, in memory once."""
 
+import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.robust import evenly, unit_norm, Whitening
 import torch
@@ -10,6 +11,7 @@ ROOM = 256  # places that there is room for at first; doubled when they are full
 GROWTH = 1.125  # the mean is updated when the route is so much longer
 SAMPLE = 128  # places that whitening is learned from
 SETTLED = 2000  # places from which on it is not learned again
+AT_ONCE = 64  # places whitened at a time
 PIECE = 512  # places centered at a time: the intermediate results stay in the cache
 
 
@@ -66,7 +68,7 @@ class RouteFeatures:
         """
         n = self.count
         if n and (self._centering or self._whitens):
-            strips = self._centered()
+            strips = self._centered(slice(n))
             for j in range(len(strips)):
                 strips[j] += self._mean[j] * (self._norms[j, :n, None] > 0)
         else:
@@ -111,9 +113,9 @@ class RouteFeatures:
     def _whitened(self, strips: torch.Tensor) -> torch.Tensor:
         return self._whitening(strips) if self._whitening else strips
 
-    def _centered(self) -> torch.Tensor:
-        """Return the features less the mean, not whitened, of their own norm, (W, n, d)."""
-        strips = self.strips[:, : self.count] * self._norms[:, : self.count, None]
+    def _centered(self, places: slice | np.ndarray) -> torch.Tensor:
+        """Return features less the mean, not whitened, of their own norm, (W, m, d)."""
+        strips = self.strips[:, places] * self._norms[:, places, None]
         return self._whitening.inverse(strips) if self._whitening else strips
 
     def _grow(self, d: int) -> None:
@@ -151,12 +153,14 @@ class RouteFeatures:
         self._shift(first, 0, self._whitened((self._mean - mean)[:, None])[:, 0])
         self._mean = mean
         if self._whitens and self.count <= SETTLED:
-            strips = self._centered()
-            some = strips[:, evenly(self.count, SAMPLE)]
-            self._whitening = Whitening(unit_norm(some))
-            strips, norms = self._whitening(strips), self._norms[:, : self.count]
-            norms.copy_(strips.norm(dim=2).clamp_(min=1e-12) * (norms > 0))
-            self.strips[:, : self.count] = unit_norm(strips)
+            some = evenly(self.count, SAMPLE)
+            whitening = Whitening(unit_norm(self._centered(some)))
+            for low in range(0, self.count, AT_ONCE):
+                places = slice(low, min(low + AT_ONCE, self.count))
+                strips, norms = whitening(self._centered(places)), self._norms[:, places]
+                norms.copy_(strips.norm(dim=2).clamp_(min=1e-12) * (norms > 0))
+                self.strips[:, places] = unit_norm(strips)
+            self._whitening = whitening
 
     def _shift(self, first: int, to: int, change: torch.Tensor) -> None:
         """
