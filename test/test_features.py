@@ -10,7 +10,7 @@ from stavpr_ros.errors import (
     SettingsError,
     UnavailableError,
 )
-from stavpr_ros.features import FeatureExtractor, FeatureSettings
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.features.registry import backbone_class, settings_class
 import torch
@@ -25,18 +25,6 @@ def test_extractor_of_unknown_kind_is_rejected():
 def test_gradient_settings_out_of_range_are_rejected(bad):
     with pytest.raises(SettingsError):
         GradientSettings(**bad)
-
-
-def test_feature_settings_survive_json():
-    for settings in (
-        FeatureExtractor().settings,
-        FeatureExtractor(strips=5, projection=32, seed=3).settings,
-    ):
-        assert FeatureSettings.from_json(settings.to_json()) == settings
-    with pytest.raises(SettingsError, match='cannot be read'):
-        FeatureSettings.from_json('{"kind": "gradient", "backbone": {"teleport": 1}, "strips": 7}')
-    with pytest.raises(SettingsError):
-        FeatureSettings.from_json('not json')
 
 
 @pytest.fixture(scope='session')

@@ -6,6 +6,7 @@ import os
 import shlex
 import subprocess
 import sys
+import time
 
 import numpy as np
 from pipelines import process, save, settings_of
@@ -273,15 +274,20 @@ def test_journal_of_a_route_follows_evictions(start, route, target, monkeypatch)
     pipeline = start('loop_closure', exclude_places=1, max_places=24)
     process(pipeline, [route[i % 60] for i in range(130)])
     held = pipeline.snapshot().places
-    size = os.path.getsize(journals(target)[0])
+    (path,) = journals(target)
+    end = time.monotonic() + 20
+    while (
+        os.path.getsize(path) > 600_000
+    ):  # a place takes 9,000; rewritten by the thread that syncs
+        assert time.monotonic() < end
+        time.sleep(0.05)
     killed(pipeline)
-    result = recover(journals(target)[0])
+    result = recover(path)
     found = load_map(result.path)
     n = len(held)
     assert n <= len(found) < 80
     assert found.stamps[-n:].tolist() == held.stamps.tolist()
     assert torch.allclose(found.features.strips[:, -n:], held.features.strips, atol=1e-6)
-    assert size < 2.5 * len(found) / 80 * 130 * 12000
 
 
 def test_operation_changes_keep_the_journal_of_unsaved_places(start, route, target):

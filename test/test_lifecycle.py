@@ -147,7 +147,7 @@ def test_node_at_invalid_transitions_rejects_them(robot, node, map_file):
 
 def with_missing_model(whole: PlaceMap) -> PlaceMap:
     """Return a map whose network has no file."""
-    network = settings_class('torchscript')(model='/nowhere/network.pt')
+    network = settings_class('torchscript')(model='', sha256='0' * 64)
     settings = dataclasses.replace(whole.settings, kind='torchscript', backbone=network)
     return dataclasses.replace(
         whole, features=dataclasses.replace(whole.features, settings=settings)
@@ -161,7 +161,7 @@ def test_node_after_a_failed_configuration_can_be_configured(
     path = tmp_path / f'{fault}.stavpr'
     words = {
         'missing': 'does not exist',
-        'model': "'/nowhere/network.pt' cannot be read",
+        'model': 'copy the file that the map was built with there',
         'xi': 'xi = 8',
     }[fault]
     if fault == 'model':

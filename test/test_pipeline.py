@@ -217,7 +217,7 @@ def test_change_of_operation_keeps_the_places(route, images):
                 names
             )
             if new_route or held:
-                assert stamps_of(pipeline.snapshot('x', True).places) == (new_route or held)
+                assert stamps_of(pipeline.snapshot().places) == (new_route or held)
             state = 'growing' if name != 'localization' else 'loaded' if held else 'none'
             assert pipeline.map_state == state
 
@@ -313,4 +313,4 @@ def test_loop_closure_takes_the_kind_of_features_of_the_map(map_file, route):
     pipeline.change(operation='loop_closure')
     process(pipeline, route[:8])
     assert pipeline.places.features.strips.shape == (7, 8, 64)
-    assert not pipeline.save_state.owns(map_file)
+    assert not pipeline.save_state.owned(map_file)

@@ -168,8 +168,8 @@ def test_match_image_puts_query_and_place_side_by_side(accepted, color):
     query = image(50)
     sheet = match_image(query, image(180, (100, 200)), 'match: place 3', accepted)
     assert sheet.dtype == np.uint8
-    assert np.all(sheet[:48, :64] == 50)
-    assert np.all(sheet[:48, -64:] == 180)
+    assert np.all(sheet[24:48, :64] == 50)  # below the label
+    assert np.all(sheet[24:48, -64:] == 180)
     assert tuple(sheet[-1, 0]) == color
     assert sheet[48:].std() > 5  # the text
     assert np.all(query == 50)
