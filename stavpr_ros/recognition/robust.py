@@ -188,6 +188,10 @@ class Whitening:
         return self._scaled(strips, self._inverse)
 
     def _scaled(self, strips: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
+        if strips.shape[1] == 1 and not strips.is_cuda:  # torch would wake its threads for it
+            strip, directions = strips.numpy(), self._directions.numpy()
+            parts = (strip @ directions.transpose(0, 2, 1)) * change.numpy()
+            return torch.from_numpy(strip + parts @ directions)
         parts = torch.bmm(strips, self._directions.mT) * change
         return torch.baddbmm(strips, parts, self._directions)
 
@@ -296,18 +300,10 @@ def converted(
 
 
 def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
-    """
-    Return unit-norm (W, n, d) less (W, d).
-
-    A piece of one strip after the other, for little memory.
-    """
-    out = torch.empty_like(strips, memory_format=torch.contiguous_format)
-    for j in range(len(strips)):
-        for whole, piece in zip(strips[j].split(PIECE), out[j].split(PIECE), strict=True):
-            torch.sub(whole, mean[j], out=piece)
-            piece.mul_(whole.any(dim=1, keepdim=True))
-            piece.div_(piece.norm(dim=1, keepdim=True).clamp_(min=1e-12))
-    return out
+    """Return unit-norm (W, n, d) less (W, d)."""
+    centered = strips - mean[:, None]
+    centered *= strips.any(dim=2, keepdim=True)
+    return unit_norm(centered)
 
 
 class ZNormalization:
