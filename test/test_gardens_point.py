@@ -55,7 +55,8 @@ def test_node_on_gardens_point_equals_library(
     )
     expected = image_matches(offline, 20)
 
-    parameters = {'map_path': map_path, 'mode': mode} | limit
+    model = {'model_path': settings.model} if settings else {}
+    parameters = {'map_path': map_path, 'mode': mode} | limit | model
     records, _ = run_live(parameters, str(bags / 'day_right'), len(query), tmp_path)
     truth = np.arange(len(query))
     live = evaluate_records(records, 20, threshold, truth, TOLERANCE).matches
