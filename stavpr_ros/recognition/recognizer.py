@@ -211,7 +211,7 @@ class SequenceRecognizer:
         if not standstill:
             self._znorm.observe(normalized)
         place_filter.update(self._znorm.scaled(normalized), change, standstill)
-        if self._buffer.full and not was_full:
+        if self._znorm.reference and self._buffer.full and not was_full:
             known = self._buffer.rows()[:, : self._buffer.known].numpy()
             place_filter.start_again(self._znorm.scaled(known))
 

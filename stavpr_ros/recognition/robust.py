@@ -247,10 +247,10 @@ class MeanCentering:
 
     def places(self, features: LocalFeatures, dtype: torch.dtype = torch.float32) -> LocalFeatures:
         """Return features of the map, or of single images, less the map's mean, whitened."""
-        return converted(features, self._converted, dtype)
+        return converted(features, lambda strips: self._converted(strips, self._mean), dtype)
 
-    def _converted(self, strips: torch.Tensor) -> torch.Tensor:
-        centered = without_mean(strips, self._mean)
+    def _converted(self, strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
+        centered = without_mean(strips, mean)
         return centered if self._whitening is None else unit_norm(self._whitening(centered))
 
     def next_query(self, strips: torch.Tensor) -> torch.Tensor:
@@ -263,10 +263,7 @@ class MeanCentering:
         if self._centering:
             self._sum = self._sum + strips
             self._count += 1
-        centered = without_mean(strips[:, None], (self._sum / self._count).float())
-        if self._whitening is not None:
-            centered = unit_norm(self._whitening(centered))
-        return centered[:, 0]
+        return self._converted(strips[:, None], (self._sum / self._count).float())[:, 0]
 
 
 def evenly(n: int, count: int) -> np.ndarray:
