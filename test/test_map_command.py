@@ -80,8 +80,8 @@ def test_map_convert_writes_the_present_format(folder, capsys):
 
 def test_map_replaces_nothing_unasked(folder, capsys):
     before = (folder / 'night.stavpr').read_bytes()
-    assert main(['convert', 'day.stavpr', 'night.stavpr']) == 2
-    assert 'night.stavpr exists: give --force' in capsys.readouterr().err
+    assert main(['convert', 'day.stavpr', 'night.stavpr']) == 1
+    assert 'night.stavpr exists already' in capsys.readouterr().err
     assert main(['merge', 'day.stavpr', 'day.stavpr', 'night.stavpr', '--force']) == 2
     assert 'is also an input' in capsys.readouterr().err
     assert (folder / 'night.stavpr').read_bytes() == before

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from stavpr_ros.commands import map_recover
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import MapFileError, SettingsError
-from stavpr_ros.output_file import ARRAYS, atomic_output, require_room
+from stavpr_ros.output_file import ARRAYS, atomic_output, MAP, require_replaceable
 
 if TYPE_CHECKING:
     from stavpr_ros.mapping import PlaceMap
@@ -197,14 +197,13 @@ def _recover(arguments: argparse.Namespace) -> int:
 
 
 def _check_output(arguments: argparse.Namespace) -> None:
-    """Reject an output that exists, or that is one of the inputs."""
+    """Reject an output that must not be replaced, or that is one of the inputs."""
     if 'output' not in arguments or arguments.action == 'recover':
         return
-    require_room(arguments.output)
+    kind = ARRAYS if arguments.action == 'export' else MAP
+    require_replaceable(arguments.output, kind, arguments.force)
     output = Path(arguments.output)
     inputs = [arguments.map] if 'map' in arguments else arguments.maps
-    if output.exists() and not arguments.force:
-        raise SettingsError(f'{output} exists: give --force to replace it, or another name')
     if output.exists() and any(Path(path).exists() and output.samefile(path) for path in inputs):
         raise SettingsError(f'{output} is also an input: give another name')
 

@@ -84,6 +84,7 @@ PRESETS: dict[str, tuple[Configuration, ...]] = {
                 robust_options=ROBUST.without(option.name),
             )
             for option in fields(RobustOptions)
+            if getattr(ROBUST, option.name)
         ),
     ),
 }
