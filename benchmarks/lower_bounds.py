@@ -130,11 +130,6 @@ def window_push(sizes: Sizes) -> Work:
     return Work(4 * sizes.n, sizes.n)
 
 
-def reference_znorm(sizes: Sizes) -> Work:
-    """Row, mean, variance and count of each place are read; update (10), shift and scale (3)."""
-    return Work(16 * sizes.n, 13 * sizes.n)
-
-
 def filter_update(sizes: Sizes, settings: FilterSettings) -> Work:
     """
     Advance the filter: states and row are read once; states and their origins are written once.
