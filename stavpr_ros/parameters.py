@@ -111,8 +111,8 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'geometric_check',
             'none',
-            'Verification of matches by keypoints and epipolar geometry: the newest image '
-            'against the thumbnail of its place.',
+            'Verification of matches by keypoints and epipolar geometry: the thumbnail of the '
+            'middle image of the window against that of its place.',
             when='live',
             choices=('none', 'orb', 'sift'),
         ),

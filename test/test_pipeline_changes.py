@@ -22,7 +22,7 @@ from pipelines import (
 )
 import pytest
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, OutputError
-from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.mapping import load_map, save_map, thumbnail_of
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.pipeline import OPERATIONS, Pipeline
 from stavpr_ros.recognition import Status
@@ -94,22 +94,28 @@ def test_geometric_check_accepts_and_rejects(operation, route):
     assert {match.inliers for match in process(pipeline, route[:CERTAIN])} == {-1}
     check = GeometricSettings(min_inliers=100)
     pipeline.change(replace(pipeline.settings, geometric=check))
-    accepted = process(pipeline, route[7:8], first=7)[0]
-    assert (accepted.status, accepted.reason, accepted.newest_index) == (Status.MATCH, '', 7)
+    # the middle of a window of 5: the images until then came without a check
+    unknown = process(pipeline, route[7:9], first=7)
+    accepted = process(pipeline, route[9:10], first=9)[0]
+    if operation == 'localization':
+        assert {match.status for match in unknown} == {Status.NO_MATCH}
+        assert 'it was off when the middle image' in unknown[0].reason
+    assert (accepted.status, accepted.reason, accepted.place_index) == (Status.MATCH, '', 7)
     thumbnail = pipeline.places.thumbnail(7)
-    assert accepted.inliers == GeometricVerifier(check).inliers(route[7], thumbnail) >= 100
+    found = GeometricVerifier(check).inliers(thumbnail_of(route[7]), thumbnail)
+    assert accepted.inliers == found >= 100
     for more, status in ((0, Status.MATCH), (1, Status.NO_MATCH)):  # the same images again
         pipeline.reset()
-        process(pipeline, route[:CERTAIN])
+        process(pipeline, route[: CERTAIN + 2])
         just = replace(check, min_inliers=accepted.inliers + more)
         pipeline.change(replace(pipeline.settings, geometric=just))
-        match = process(pipeline, route[7:8], first=7)[0]
+        match = process(pipeline, route[9:10], first=9)[0]
         assert (match.status, match.inliers) == (status, accepted.inliers)
-    assert (match.place_index, match.sequence.middle % 30) == (-1, 5)
+    assert (match.place_index, match.sequence.middle % 30) == (-1, 7)
     assert f'{match.inliers} inliers are fewer than {match.inliers + 1}' in match.reason
     assert match.candidates[0].place == match.sequence.middle
     pipeline.change(replace(pipeline.settings, geometric=None))
-    assert statuses(process(pipeline, route[8:9])) == [Status.MATCH]
+    assert statuses(process(pipeline, route[10:11], first=10)) == [Status.MATCH]
 
 
 def test_geometric_check_rejects_without_thumbnails(small_map, route, tmp_path):
@@ -146,7 +152,7 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
     pipeline, other = (recorded(route, operation, keyframes=keyframes) for _ in range(2))
     extract = Failing(pipeline.extractor.extract)
     monkeypatch.setattr(pipeline.extractor, 'extract', extract)
-    thumbnail = Failing(lambda image, width: b'')
+    thumbnail = Failing(lambda image: b'')
     monkeypatch.setattr('stavpr_ros.pipeline.operations.encode_thumbnail', thumbnail)
     cut_off = message(route[0])
     object.__setattr__(cut_off, 'data', cut_off.data[:100])

@@ -9,7 +9,11 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.recognition.verification import GeometricSettings, GeometricVerifier
+from stavpr_ros.recognition.verification import (
+    GeometricSettings,
+    GeometricVerifier,
+    PlaceVerifier,
+)
 from stavpr_ros.sources import open_source
 
 METHODS = ['orb', 'sift']
@@ -202,3 +206,27 @@ def test_verifies_separates_real_places(data_folder, name, recall):
     print(f'{name}: {verified[0]:.2f} of right places verified, {verified[1]:.3f} of wrong ones')
     assert verified[0] >= recall
     assert verified[1] <= 0.03
+
+
+class Thumbnails:
+    """Places of which thumbnails are known, and how often each was read."""
+
+    def __init__(self, images):
+        self.images, self.read = images, []
+
+    def thumbnail(self, place):
+        self.read.append(place)
+        return self.images.get(place)
+
+
+def test_place_verifier_keeps_keypoints_of_places_until_map_changes():
+    check = GeometricSettings()
+    verifier, one, other = PlaceVerifier(check), texture(0), texture(100)
+    places = Thumbnails({3: moved(one, VIEWS['shifted']), 4: other})
+    counts = [verifier.inliers(one, places, place) for place in (3, 4, 3)]
+    assert counts[0] == GeometricVerifier(check).inliers(one, places.images[3]) > 100
+    assert counts == [counts[0], GeometricVerifier(check).inliers(one, other), counts[0]]
+    assert places.read == [3, 4]
+    another = Thumbnails({3: other})
+    assert verifier.inliers(one, another, 3) == counts[1]
+    assert verifier.inliers(one, another, 5) is None

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pipeline: from one image message to one match; the map and the operation."""
 
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,16 +13,17 @@ from typing import Any
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, StavprError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping import GrowingMap, PlaceMap, thumbnail_of
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.keyframes import KeyframeSelector
+from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.pipeline.operations import Localization, Mapping, Observation, Operation
 from stavpr_ros.pipeline.save_state import MapSnapshot, OpenJournal, SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.pipeline.start import LoadedMap, start_operation
 from stavpr_ros.recognition import Match, Status
-from stavpr_ros.recognition.verification import GeometricVerifier
+from stavpr_ros.recognition.verification import PlaceVerifier
 from stavpr_ros.sources.encodings import decode_message
 
 NO_MAP = (
@@ -56,8 +58,10 @@ class Pipeline:
         self._name = operation
         self.threshold = settings.applied_threshold
         self._keyframes = KeyframeSelector(settings.keyframes)
-        self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
+        self._verifier = PlaceVerifier(settings.geometric) if settings.geometric else None
         self._last: Match | None = None
+        # of the window, from its middle image on; None = the image came when none was needed
+        self._thumbnails: deque[np.ndarray | None] = deque()
         self.save_state = SaveState()  # of the places in use
         # of the map, where loop closure has places of its own
         self._map_save_state = self.save_state
@@ -145,7 +149,8 @@ class Pipeline:
             self._operation.recognizer.set_threshold(threshold)
         self.settings, self.threshold = settings, threshold
         self._keyframes.settings = settings.keyframes
-        self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
+        if settings.geometric != (self._verifier and self._verifier.settings):
+            self._verifier = PlaceVerifier(settings.geometric) if settings.geometric else None
 
     def snapshot(self) -> MapSnapshot:
         """
@@ -178,6 +183,7 @@ class Pipeline:
         """Empty the window: the next images do not continue those before."""
         self._keyframes.reset()
         self._last = None
+        self._thumbnails.clear()
         if self._operation is not None and self._operation.recognizer:
             self._operation.recognizer.reset()
 
@@ -252,14 +258,16 @@ class Pipeline:
         with _timed(stages, 'extraction'):
             features = operation.extractor.extract([image])
         with _timed(stages, 'matching'):
-            match = operation.update(Observation(features, image, stamp, pose))
+            thumbnail = self._thumbnail(operation, image)
+            match = operation.update(Observation(features, thumbnail, stamp, pose))
+        self._thumbnails.append(thumbnail)
         self._keyframes.accept(stamp, pose, image)
         if not isinstance(operation, Localization):
             self.save_state.record(operation.places, features, self._open_journal)
         if operation.recognizer is None:
             return replace(match, image=image)
         with _timed(stages, 'verification'):
-            match = self._verified(match, image, operation.places)
+            match = self._verified(match, operation.places)
         if self.list_candidates and match.sequence is not None:
             candidates = tuple(operation.recognizer.ranked(self.settings.candidates))
             match = replace(match, candidates=candidates)
@@ -271,18 +279,31 @@ class Pipeline:
         backbone = operation.extractor.settings.backbone
         if backbone.resize != 'area':  # bilinear features are of single pixels
             return None
-        check = self._verifier.settings.width if self._verifier else 0
-        return backbone.size, max(backbone.size, check, self.settings.thumbnail_width)
+        return backbone.size, max(backbone.size, self._thumbnail_width(operation))
 
-    def _verified(self, match: Match, image: np.ndarray, places: PlaceMap | GrowingMap) -> Match:
-        """Verify a match against the thumbnail of its place; reject too few inliers."""
+    def _thumbnail_width(self, operation: Operation) -> int:
+        """Return the width of the thumbnails that are needed, 0 = none is."""
+        width = self.settings.thumbnail_width
+        if isinstance(operation, Localization):
+            return (width or THUMBNAIL_WIDTH) if self._verifier else 0
+        return width
+
+    def _thumbnail(self, operation: Operation, image: np.ndarray) -> np.ndarray | None:
+        width = self._thumbnail_width(operation)
+        return thumbnail_of(image, width) if width else None
+
+    def _verified(self, match: Match, places: PlaceMap | GrowingMap) -> Match:
+        """Verify the middle pair of a match by their thumbnails; reject too few inliers."""
         if self._verifier is None or not match.accepted:
             return match
-        thumbnail = places.thumbnail(match.newest_index)
-        if thumbnail is None:
-            reason = 'geometric check: the map has no thumbnails; build it with thumbnails'
+        query, inliers = self._thumbnails[0], None
+        reason = 'geometric check: the map has no thumbnails; build it with thumbnails'
+        if query is None:
+            reason = 'geometric check: it was off when the middle image of the window came'
+        else:
+            inliers = self._verifier.inliers(query, places, match.place_index)
+        if inliers is None:
             return replace(match, status=Status.NO_MATCH, reason=reason)
-        inliers = self._verifier.inliers(image, thumbnail)
         least = self._verifier.settings.min_inliers
         if inliers >= least:
             return replace(match, inliers=inliers)
@@ -303,6 +324,8 @@ class Pipeline:
         # in mapping, the growing map holds it
         self._map = None if name == 'mapping' else place_map
         self._operation, self._name = operation, name
+        length = settings.sequence.length
+        self._thumbnails = deque(maxlen=length - (length - 1) // 2)
         self._extractor = operation.extractor if operation is not None else extractor
         self._map_save_state = save_state
         self.save_state = SaveState() if name == 'loop_closure' else save_state
