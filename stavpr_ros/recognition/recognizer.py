@@ -16,6 +16,7 @@ from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
 from stavpr_ros.recognition.match import (
     Candidate,
     distinct_places,
+    improbable,
     Match,
     ranked_candidates,
     Status,
@@ -209,8 +210,7 @@ class SequenceRecognizer:
         if not nearest.distance < threshold:
             status = Status.NO_MATCH
             reason = (
-                f'the probability of the best place, {probability:.3f}, is not above '
-                f'{1 - threshold:.3f}'
+                improbable(probability, threshold)
                 if relative
                 else f'nearest distance {nearest.distance:.4f} is not below the threshold '
                 f'{threshold:.4f}'
