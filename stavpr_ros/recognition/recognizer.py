@@ -106,9 +106,7 @@ class SequenceRecognizer:
         self._layout = layout
         columns = places if layout is None else layout.width
         self._buffer = SequenceBuffer(sequence.length, columns, sequence.k)
-        self._filter = (
-            FilterSearch(self._buffer, layout=layout) if options.place_filter else None
-        )
+        self._filter = FilterSearch(self._buffer, layout=layout) if options.place_filter else None
         self._search: Search = self._filter or LmDtwSearch(self._buffer)
         self._window = WindowMatch()  # of the newest image
         self._nearest: SequenceMatch | None = None
@@ -217,8 +215,10 @@ class SequenceRecognizer:
             reason = f'{len(self._buffer)} of {length} images in the window'
             return Match(Status.WARMING_UP, reason, threshold)
         self._window = self._search(self._settings.nms_radius)
-        if self._layout is not None:
-            self._window = self._layout.in_places(self._window)
+        window = self._window
+        if self._layout is not None and window.nearest is not None:
+            in_places = self._layout.in_places(window.nearest, window.path, window.sequences)
+            self._window = WindowMatch(*in_places)
         self._nearest = nearest = self._window.nearest
         if nearest is None:
             return Match(Status.NO_MATCH, 'the map is empty', threshold)

@@ -9,9 +9,8 @@ places in between is learned from the map, so that the query's changes show how 
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numba as nb
 import numpy as np
@@ -21,10 +20,8 @@ from stavpr_ros.checks import no_nan
 from stavpr_ros.compilation import parallel_kernel
 from stavpr_ros.recognition.place_filter import Belief, CLOSE, NEGLIGIBLE, PlaceFilter
 from stavpr_ros.recognition.robust import FilterSettings
+from stavpr_ros.recognition.sessions import Sequences, SessionLayout
 import torch
-
-if TYPE_CHECKING:
-    from stavpr_ros.recognition.sessions import SessionLayout
 
 LEARNED_AT_ONCE = 256  # places
 APART = 5  # places apart up to which the map's changes are learned
@@ -34,8 +31,6 @@ FLOOR = 1e-3  # least relative probability of a speed
 AHEAD = 8  # places within which an unlit stretch may begin
 STRETCH = 4  # places in a row, at least, equal each to the one before: an unlit stretch
 UNLIT = 0.3  # probability of such places above which equal images do not mean standstill
-
-Sequences = tuple[np.ndarray, np.ndarray]
 
 
 class SequenceBuffer:
@@ -208,7 +203,9 @@ class ImageChange:
         self._last: np.ndarray | None = None
         self._latest: deque[float] = deque(maxlen=SMOOTHED)
 
-    def learn(self, strips: torch.Tensor | np.ndarray, firsts: Sequence[int] = (0,)) -> None:
+    def learn(
+        self, strips: torch.Tensor | np.ndarray, firsts: np.ndarray | tuple[int, ...] = (0,)
+    ) -> None:
         """
         Learn from all places of a map.
 
@@ -325,7 +322,7 @@ class FilterSearch:
         self,
         buffer: SequenceBuffer,
         settings: FilterSettings | None = None,
-        layout: 'SessionLayout | None' = None,
+        layout: SessionLayout | None = None,
     ) -> None:
         self.buffer, self._layout = buffer, layout
         settings = settings or FilterSettings()

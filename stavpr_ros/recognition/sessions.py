@@ -6,18 +6,21 @@ Maps of several sessions in matching: no sequence runs from one session into ano
 The searches see a row of columns instead of places: between two sessions lies a gap of columns
 whose distances are +inf. Where a place of one session shows what one of an earlier session shows
 (:attr:`stavpr_ros.mapping.PlaceMap.same_as`), the two are one position: their probabilities add
-up, and neither is a rival of the other.
+up, and neither is the second best of the other.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition.place_filter import Belief
 from stavpr_ros.recognition.match import ranked_candidates
+from stavpr_ros.recognition.place_filter import Belief
 from stavpr_ros.recognition.robust import FilterSettings, z_normalized
-from stavpr_ros.recognition.sequence_search import Sequences, WindowMatch
 import torch
+
+Sequences = tuple[np.ndarray, np.ndarray]
 
 
 class SessionLayout:
@@ -91,21 +94,20 @@ class SessionLayout:
         probabilities[column] = probabilities[best]
         return replace(belief, probabilities=probabilities), column
 
-    def positions(self, places: np.ndarray) -> np.ndarray:
+    def positions(self, places: np.ndarray | int) -> np.ndarray:
         """Return positions: those at most nms_radius apart are neighbors in one session."""
         return self.columns[self._same_as[places]]
 
-    def in_places(self, window: WindowMatch) -> WindowMatch:
-        """Return a match whose columns have become places, with its second best."""
-        nearest = window.nearest
-        if nearest is None:
-            return window
+    def in_places(
+        self, nearest: SequenceMatch, path: np.ndarray, in_columns: Callable[[], Sequences]
+    ) -> tuple[SequenceMatch, np.ndarray, Callable[[], Sequences]]:
+        """Return the fields of a match whose columns have become places, with its second best."""
 
         def sequences() -> Sequences:
-            costs, columns = window.sequences()
+            costs, columns = in_columns()
             return costs, self._places[columns]
 
-        path = window.path.copy()
+        path = path.copy()
         path[:, 1] = self._places[path[:, 1]]
         nearest = replace(
             nearest,
@@ -119,7 +121,7 @@ class SessionLayout:
             second_best_index=second[0].place if second else -1,
             second_best_distance=second[0].distance if second else float('nan'),
         )
-        return WindowMatch(nearest, path, sequences)
+        return nearest, path, sequences
 
 
 def layout_of(place_map: PlaceMap, nms_radius: int) -> SessionLayout | None:
