@@ -11,7 +11,7 @@ from stavpr_ros.mapping.keyframes import (
     small_gray,
 )
 from stavpr_ros.mapping.map_file import is_map, load_map, open_map, save_map, verify_map
-from stavpr_ros.mapping.merging import merge_maps, select_session
+from stavpr_ros.mapping.merging import merge_maps, select_places, select_session
 from stavpr_ros.mapping.place_map import (
     encode_thumbnail,
     Place,
@@ -40,6 +40,7 @@ __all__ = [
     'open_map',
     'rotation',
     'save_map',
+    'select_places',
     'select_session',
     'small_gray',
     'thumbnail_of',

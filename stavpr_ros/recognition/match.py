@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result for one image: its status, the nearest sequence of the map, the matched place."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import enum
 import math
@@ -152,6 +152,7 @@ def ranked_candidates(
     sequences: tuple[np.ndarray, np.ndarray],
     count: int,
     nms_radius: int,
+    positions: Callable[[np.ndarray | int], np.ndarray] = np.asarray,
 ) -> list[Candidate]:
     """
     Rank places by non-maximum suppression: around a place that is taken no other one is.
@@ -163,6 +164,7 @@ def ranked_candidates(
         places, shape (n,), whole numbers, in any order; of equal costs the first is taken.
     :param count: most candidates, at least 0.
     :param nms_radius: candidates are more than so many places from each other.
+    :param positions: of places, between which the distance is measured.
     :raises InputError: count below 0.
     """
     if count < 0:
@@ -170,9 +172,10 @@ def ranked_candidates(
     if nearest is None or not count:
         return []
     costs, places = sequences[0].copy(), sequences[1]
+    at_position = positions(places)
     found = [Candidate(nearest.middle, nearest.distance)]
     while len(found) < count and len(costs):
-        costs[np.abs(places - found[-1].place) <= nms_radius] = np.inf
+        costs[np.abs(at_position - positions(found[-1].place)) <= nms_radius] = np.inf
         at = int(np.argmin(costs))
         cost = float(costs[at])
         if math.isinf(cost):
