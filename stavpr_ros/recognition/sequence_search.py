@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numba as nb
 import numpy as np
+from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.alignment.lm_dtw import padded_width, SequenceMatch
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.checks import no_nan
@@ -204,8 +205,8 @@ class ImageChange:
         self._last: np.ndarray | None = None
         self._latest: deque[float] = deque(maxlen=SMOOTHED)
 
-    def learn(self, strips: torch.Tensor | np.ndarray) -> None:
-        """Learn from all places of a map, unit-norm strips (W, n, d), float32 or float16."""
+    def learn(self, strips: torch.Tensor | np.ndarray | Int8Strips) -> None:
+        """Learn from all places of a map, unit-norm strips (W, n, d), of any precision."""
         n = strips.shape[1]
         changes = np.empty((APART + 1, n), np.float32)
         for low in range(0, n, LEARNED_AT_ONCE):
