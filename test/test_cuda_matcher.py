@@ -13,7 +13,6 @@ from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.features.extractor import FeatureSettings
 from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
-from stavpr_ros.recognition.robust import ZNormalization
 from stavpr_ros.recognition.sequence_search import SequenceBuffer
 import torch
 
@@ -167,7 +166,7 @@ def searches(places, sequence=SHORT):
     from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
     buffer = SequenceBuffer(sequence.length, places, sequence.k)
-    twin = LmDtwSearch(buffer, ZNormalization(places, False, False))
+    twin = LmDtwSearch(buffer)
     return CudaLmDtwSearch(places, sequence), twin
 
 

@@ -25,11 +25,10 @@ from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust import (
     blocks,
     converted,
-    evenly,
     MeanCentering,
     options_of,
     RobustOptions,
-    ZNormalization,
+    z_normalized,
 )
 from stavpr_ros.recognition.sequence_search import (
     FilterSearch,
@@ -38,8 +37,6 @@ from stavpr_ros.recognition.sequence_search import (
     WindowMatch,
 )
 import torch
-
-PLACES_TO_START_FROM = 100  # places whose distances to the map start the z-normalization
 
 
 @dataclass(frozen=True)
@@ -101,10 +98,9 @@ class SequenceRecognizer:
     ) -> None:
         options, sequence = settings.applied_options, settings.sequence
         self._settings, self._feature_settings = settings, feature_settings
-        self._znorm = ZNormalization(places, options.query_znorm, options.reference_znorm)
         self._buffer = SequenceBuffer(sequence.length, places, sequence.k)
         self._filter = FilterSearch(self._buffer) if options.place_filter else None
-        self._search: Search = self._filter or LmDtwSearch(self._buffer, self._znorm)
+        self._search: Search = self._filter or LmDtwSearch(self._buffer)
         self._window = WindowMatch()  # of the newest image
         self._nearest: SequenceMatch | None = None
 
@@ -160,7 +156,7 @@ class SequenceRecognizer:
         :returns: shape (n,), float32; lower is nearer.
         """
         buffer = self._buffer
-        return self._znorm.scaled(buffer.rows()[-1, : buffer.places].cpu().numpy())
+        return buffer.rows()[-1, : buffer.places].cpu().numpy()
 
     def window_rows(self) -> tuple[np.ndarray, int]:
         """
@@ -171,7 +167,7 @@ class SequenceRecognizer:
         """
         buffer = self._buffer
         rows = buffer.rows()[buffer.length - len(buffer) :, : buffer.known].cpu().numpy()
-        return self._znorm.scaled(rows), buffer.first
+        return rows, buffer.first
 
     def _clear_window(self) -> None:
         self._buffer.clear()
@@ -191,30 +187,13 @@ class SequenceRecognizer:
 
         :param strips: the image's features, centered, shape (W, d).
         """
+        if self._settings.applied_options.query_znorm:
+            row = torch.from_numpy(z_normalized(row.cpu().numpy()))
+        self._buffer.push(row.to(self._buffer.memory.device), stamp)
         if self._filter is not None:
-            self._push(row.cpu().numpy(), self._filter, strips.cpu().numpy(), stamp)
-        elif self._znorm.query or self._znorm.reference:
-            normalized = self._znorm.normalized(row.cpu().numpy())
-            self._buffer.push(torch.from_numpy(normalized), stamp)
-            self._znorm.observe(normalized)
-        else:
-            self._buffer.push(row.to(self._buffer.memory.device), stamp)
+            change = self._filter.change.next_query(strips.cpu().numpy())
+            self._filter.update(row.cpu().numpy(), change)
         return replace(self._match_window(), window_stamps=self._buffer.stamps)
-
-    def _push(
-        self, row: np.ndarray, place_filter: FilterSearch, strips: np.ndarray, stamp: int
-    ) -> None:
-        """Push a row and advance the filter; images of a camera that stands are observed once."""
-        normalized, was_full = self._znorm.normalized(row), self._buffer.full
-        self._buffer.push(torch.from_numpy(normalized), stamp)
-        change = place_filter.change.next_query(strips)
-        standstill = place_filter.change.is_standstill(change)
-        if not standstill:
-            self._znorm.observe(normalized)
-        place_filter.update(self._znorm.scaled(normalized), change, standstill)
-        if self._znorm.reference and self._buffer.full and not was_full:
-            known = self._buffer.rows()[:, : self._buffer.known].numpy()
-            place_filter.start_again(self._znorm.scaled(known))
 
     def _match_window(self) -> Match:
         threshold, length = self._settings.threshold, self._settings.sequence.length
@@ -278,8 +257,6 @@ class PlaceRecognizer(SequenceRecognizer):
         held = self._held(features, 'float32' if settings.spatial.vertical else precision)
         backend = choose_backend(backend)
         self._matcher = make_matcher(held, settings.spatial, backend, precision)
-        if options.reference_znorm:
-            self._znorm.start_from(self._distances_to_itself(features))
         if self._filter is not None:
             self._filter.change.learn(held.strips)
         if backend == 'cuda' and not options.any:
@@ -302,19 +279,6 @@ class PlaceRecognizer(SequenceRecognizer):
     def _centered(self, features: LocalFeatures) -> LocalFeatures:
         return features if self._centering is None else self._centering.places(features)
 
-    def _distances_to_itself(self, features: LocalFeatures) -> np.ndarray:
-        """Return the distances of some places to all, shape (m, n); NaN to their neighbors."""
-        n, radius = len(features), self._settings.nms_radius
-        some = evenly(n, PLACES_TO_START_FROM)
-        chosen = features[some]
-        if self._centering is not None:
-            chosen = self._centering.places(chosen)
-        matrix = self._matcher.distance_matrix(chosen.strips, chosen.weights)
-        rows = matrix.cpu().numpy()
-        for row, place in zip(rows, some.tolist(), strict=True):
-            row[max(0, place - radius) : place + radius + 1] = np.nan
-        return rows
-
     @property
     def places(self) -> int:
         """Return the number of places n of the map."""
@@ -323,7 +287,6 @@ class PlaceRecognizer(SequenceRecognizer):
     def reset(self) -> None:
         """Drop the images of the window, and the running statistics of the query."""
         self._clear_window()
-        self._znorm.reset()
         if self._centering is not None:
             self._centering.reset()
 

@@ -315,15 +315,12 @@ class FilterSearch:
         self.change = ImageChange(buffer.places, settings)
         self._speeds = settings.speeds
         self._images: deque[int] = deque(maxlen=buffer.length)  # the filter's image of each
-        # alpha and speed weights of each image until the window is full; None = nothing was added
-        self._first: list[tuple[float, np.ndarray] | None] = []
 
     def reset(self) -> None:
         """Forget the query."""
         self.filter.reset()
         self.change.reset()
         self._images.clear()
-        self._first.clear()
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -335,7 +332,7 @@ class FilterSearch:
         self.filter.evict(count)
         self.change.evict(count)
 
-    def update(self, z: np.ndarray, change: float, standstill: bool) -> None:
+    def update(self, z: np.ndarray, change: float) -> None:
         """
         Advance by an image.
 
@@ -343,32 +340,12 @@ class FilterSearch:
         dark tunnel, it may move: the filter goes on at its speed, without evidence.
 
         :param z: z-normalized distances to the places, (m,), float32.
-        :param change, standstill: of the image, from :class:`ImageChange`.
+        :param change: of the image, from :class:`ImageChange`.
         """
-        still = standstill and self.filter.count > 0
-        evidence: tuple[float, np.ndarray] | None = None
-        if not still:
-            evidence = self.change.weight(change), self._speed_weights(change)
+        if not (self.filter.count and self.change.is_standstill(change)):
+            self.filter.update(z, self.change.weight(change), self._speed_weights(change))
         elif self.change.unlit(self.filter.places_of_states()[: len(z)]):
-            evidence = 0.0, np.ones(len(self._speeds))
-        self._advance(z, evidence)
-        if len(self._first) < self.buffer.length:
-            self._first.append(evidence)
-
-    def start_again(self, rows: np.ndarray) -> None:
-        """
-        Repeat the first window with the z-normalization that is known at its end.
-
-        :param rows: z-normalized distances of the window, (l, n).
-        """
-        self.filter.reset()
-        self._images.clear()
-        for row, evidence in zip(rows, self._first, strict=True):
-            self._advance(row, evidence)
-
-    def _advance(self, z: np.ndarray, evidence: tuple[float, np.ndarray] | None) -> None:
-        if evidence is not None:
-            self.filter.update(z, *evidence)
+            self.filter.update(z, 0.0, np.ones(len(self._speeds)))
         self._images.append(self.filter.count - 1)
 
     def _speed_weights(self, change: float) -> np.ndarray:
