@@ -341,8 +341,9 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'precision',
             'float32',
             'Precision of the features of the map in localization; float16 halves their memory '
-            'and, on large maps, the time. Loop closure rejects float16.',
-            choices=('float32', 'float16'),
+            'and, on large maps, the time, int8 (not with vertical) quarters them. Loop closure '
+            'takes float32.',
+            choices=('float32', 'float16', 'int8'),
         ),
         NodeParameter(
             'threads',
