@@ -29,7 +29,7 @@ from stavpr_ros.sources.bag_file import is_bag
 from stavpr_ros.sources.folder import text_of
 
 IDENTITY_TOLERANCE = 3  # places; a file of accepted pairs includes its tolerance
-DEFAULTS = {'features': 'gradient', 'strips': 7, 'seed': 0}
+DEFAULTS = {'features': 'gradient', 'seed': 0}
 
 
 @dataclass(frozen=True)

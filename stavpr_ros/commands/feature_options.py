@@ -35,8 +35,8 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group('features').add_argument
     kind_help = 'kind of features (%(default)s)'
     add('--features', choices=list(KINDS), default='gradient', help=kind_help)
-    strips = 'vertical strips of an image (%(default)s)'
-    add('--strips', type=int, default=7, metavar='W', help=strips)
+    strips = 'vertical strips of an image (7; 1 if the features are one vector)'
+    add('--strips', type=int, metavar='W', help=strips)
     projection = 'random projection of each strip to D dimensions (none)'
     add('--projection', type=int, metavar='D', help=projection)
     add('--seed', type=int, default=0, help='of the random projection (%(default)s)')

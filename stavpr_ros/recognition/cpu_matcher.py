@@ -5,7 +5,7 @@
 import numpy as np
 from stavpr_ros.alignment.cpu import dot
 from stavpr_ros.alignment.settings import SpatialSettings
-from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
+from stavpr_ros.alignment.spatial import adaptive_weights, image_distances, WINDOW
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 import torch
@@ -39,6 +39,9 @@ class CpuMatcher:
     def __init__(
         self, features: LocalFeatures, spatial: SpatialSettings, precision: str = 'float32'
     ) -> None:
+        W = len(features.strips)
+        if spatial.strategy == 'sliding_window' and W < WINDOW:
+            raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')
         self._spatial = spatial
         self._cells = features.cells if spatial.vertical else None
         strips = features.strips.cpu()
@@ -55,7 +58,6 @@ class CpuMatcher:
             strips = strips.clone()
         self._map = (strips if precision == 'float32' else strips.view(torch.int16)).numpy()
         self._weights = features.weights.cpu()
-        W = len(features.strips)
         self._band = spatial.band(W)
         self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
 
@@ -70,6 +72,10 @@ class CpuMatcher:
 
     def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Return the distances of Q images to every place, (Q, n)."""
+        if len(self._map) == 1:  # one vector an image: its alignment is its cosine distance
+            out = np.empty((strips.shape[1], self.places), np.float32)
+            dot.cosine_distances(self._map[0], strips[0].contiguous().numpy(), out)
+            return torch.from_numpy(out)
         queries = dot.tiled(
             strips if self._cells is None else cut_cells(strips.cpu(), self._cells)
         )
