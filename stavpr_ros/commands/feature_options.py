@@ -73,6 +73,21 @@ def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':
     )
 
 
+def require_descriptors_alone(arguments: argparse.Namespace, path: str) -> None:
+    """
+    Reject options of other features beside descriptors, which come as they are.
+
+    :raises SettingsError: names the option.
+    """
+    given = kind_options(arguments)
+    given |= {'--strips': arguments.strips, '--projection': arguments.projection}
+    for option, value in given.items():
+        if value is not None and not option.startswith('--descriptors-'):
+            raise SettingsError(f'{option}: {path} holds descriptors as they are; leave it out')
+    if arguments.features not in (None, 'gradient', 'descriptors'):
+        raise SettingsError(f'--features {arguments.features}: {path} holds descriptors')
+
+
 def kind_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the values of the options ``--KIND-NAME``, by option; None = not given."""
     return {

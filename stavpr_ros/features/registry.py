@@ -177,6 +177,13 @@ class PublishedSettings(NetworkSettings):
     half: bool = setting(False, help=_HALF_HELP, identity=False)
 
 
+@dataclass(frozen=True, kw_only=True)
+class DescriptorSettings:
+    """Settings of features that another program computed, read from arrays."""
+
+    source: str = setting('', help='what computed the descriptors, such as netvlad')
+
+
 # Settings and class of each kind, the class as MODULE:NAME in this package, imported on use.
 KINDS: dict[str, tuple[type, str]] = {
     'gradient': (GradientSettings, 'gradient:Gradient'),
@@ -184,6 +191,7 @@ KINDS: dict[str, tuple[type, str]] = {
     'torchscript': (TorchScriptSettings, 'torchscript:TorchScript'),
     'densenet161_places365': (PublishedSettings, 'paper_networks:DenseNet161Places365'),
     'vgg16': (PublishedSettings, 'paper_networks:VGG16Pool4'),
+    'descriptors': (DescriptorSettings, 'descriptors:Descriptors'),
 }
 
 
