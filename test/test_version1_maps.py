@@ -102,7 +102,8 @@ def test_version1_map_loads_with_its_settings(name, tmp_path):
         read['backbone']['sha256'] = read['backbone']['sha256'][:16]
     forgotten = {'model': '', 'half': False, 'allow': False}  # nothing that a map may state
     before = getattr(settings_class(kind), 'BEFORE', {})  # settings that there were none of
-    expected = before | backbone | {key: v for key, v in forgotten.items() if key in read['backbone']}
+    forgotten = {key: v for key, v in forgotten.items() if key in read['backbone']}
+    expected = before | backbone | forgotten
     assert (read['kind'], read['backbone'], read['strips']) == (kind, expected, strips)
     assert read['feature_version'] == 1
     assert (place_map.projection is None) is (projection is None)

@@ -178,6 +178,19 @@ class PublishedSettings(NetworkSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class NetVladSettings(NetworkSettings):
+    """Settings of NetVLAD; how its input is normalized is in the file, or as for ImageNet."""
+
+    LEAST_SIZE: ClassVar[int] = 32
+
+    model: str = setting(help='file of the weights, .mat or .pth.tar', identity=False)
+    size: int = setting(480, help='images are resized to size x size pixels')
+    whitening: bool = setting(
+        True, help='PCA whitening as in the file, 4096 dimensions in the published ones'
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class DescriptorSettings:
     """Settings of features that another program computed, read from arrays."""
 
@@ -191,6 +204,8 @@ KINDS: dict[str, tuple[type, str]] = {
     'torchscript': (TorchScriptSettings, 'torchscript:TorchScript'),
     'densenet161_places365': (PublishedSettings, 'paper_networks:DenseNet161Places365'),
     'vgg16': (PublishedSettings, 'paper_networks:VGG16Pool4'),
+    'vgg16_fc6': (PublishedSettings, 'paper_networks:VGG16Fc6'),
+    'netvlad': (NetVladSettings, 'netvlad:NetVlad'),
     'descriptors': (DescriptorSettings, 'descriptors:Descriptors'),
 }
 
