@@ -14,13 +14,12 @@ from types import ModuleType
 
 import numpy as np
 from stavpr_ros.errors import SettingsError, UnavailableError
+from stavpr_ros.features.export import BATCH
 from stavpr_ros.features.extractor import resize_square
 from stavpr_ros.features.outputs import as_maps
 from stavpr_ros.features.registry import OnnxSettings
 from stavpr_ros.features.weights import read_model
 import torch
-
-BATCH = 'stavpr_batch'  # property of a file: '1' = the images of a batch influence each other
 
 
 def _import_extra() -> tuple[ModuleType, ModuleType]:
@@ -105,6 +104,11 @@ class Onnx:
             raise SettingsError(
                 f'{self.settings.model} rejects images of size {self.settings.size}: {error}'
             ) from error
+        if not np.issubdtype(maps.dtype, np.floating):
+            raise SettingsError(
+                f'layer {self.settings.layer!r} is {maps.dtype}, quantized numbers: name the '
+                'output of its DequantizeLinear'
+            )
         output = torch.from_numpy(maps.astype(np.float32)).to(self._device)
         name = f'layer {self.settings.layer!r} of {self.settings.model}'
         return as_maps(output, len(images), self.settings.prefix_tokens, name)
