@@ -34,6 +34,7 @@ def test_as_maps_of_tokens_by_hand():
 def test_as_maps_leaves_maps_and_vectors():
     for shape in ((2, 5, 3, 4), (2, 5)):
         assert as_maps(torch.zeros(shape), 2, 1, 'net').shape == shape
+    assert as_maps(torch.zeros(2, 5, 1, 1), 2, 1, 'net').shape == (2, 5)
 
 
 @pytest.mark.parametrize(
