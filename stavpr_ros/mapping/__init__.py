@@ -11,13 +11,14 @@ from stavpr_ros.mapping.keyframes import (
     small_gray,
 )
 from stavpr_ros.mapping.map_file import is_map, load_map, open_map, save_map, verify_map
-from stavpr_ros.mapping.merging import merge_maps, select_session
+from stavpr_ros.mapping.merging import merge_maps, select_places, select_session
 from stavpr_ros.mapping.place_map import (
     descriptor_map,
     encode_thumbnail,
     Place,
     PlaceMap,
     Session,
+    thumbnail_of,
 )
 from stavpr_ros.mapping.trajectory import distance, rotation, Trajectory
 
@@ -41,7 +42,9 @@ __all__ = [
     'open_map',
     'rotation',
     'save_map',
+    'select_places',
     'select_session',
     'small_gray',
+    'thumbnail_of',
     'verify_map',
 ]
