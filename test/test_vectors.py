@@ -224,6 +224,14 @@ def test_alignment_of_one_strip_is_the_cosine_distance(strategy, precision):
     assert torch.equal(row, matrix[1])
 
 
+def test_alignment_of_one_strip_in_int8_is_near_the_cosine_distance():
+    features, queries = vectors(131, 515), vectors(3, 515, seed=1)
+    matcher = make_matcher(features, SpatialSettings(), 'cpu', 'int8')
+    matrix = matcher.distance_matrix(queries.strips, queries.weights)
+    expected = 1 - queries.strips[0] @ features.strips[0].T
+    torch.testing.assert_close(matrix, expected, rtol=0, atol=0.02)
+
+
 def test_sliding_window_over_one_strip_is_rejected_with_the_map():
     with pytest.raises(InputError, match='W = 1 strips: the sliding window'):
         make_matcher(vectors(5, 4), SpatialSettings('sliding_window'), 'cpu', 'float32')
