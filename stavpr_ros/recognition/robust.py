@@ -305,7 +305,7 @@ def z_normalized(row: np.ndarray, around: int = 0) -> np.ndarray:
 
     :param around: subtract the mean of so many places to either side as well, in which no place
         counts for less than -1, so that the right one counts little. Images of one light are
-        nearer to each other than to all others, which says nothing of their places. 0 = no.
+        nearer to each other than to all others, wherever they were taken. 0 = no.
     """
     known = row[np.isfinite(row)]
     if not known.size:
