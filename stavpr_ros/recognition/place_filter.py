@@ -22,17 +22,22 @@ Recognition for Hierarchical Localization", RA-L 2021, with speeds, levels and s
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
-from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
+from stavpr_ros.alignment.cpu.simd import LANES
+from stavpr_ros.recognition.place_filter_kernels import (
+    advance,
+    BLOCK,
+    BORN,
+    followed_back,
+    PLACES,
+    trace_back,
+)
 from stavpr_ros.recognition.robust import FilterSettings
 
-F = np.float32
-PLACES = 2048  # that a thread takes at a time
-BORN = 9  # origin of a state that came from off the map; others are 3 * step + speed, each 0..2
 TOP = 64  # places whose states are followed back
 NEGLIGIBLE = 1e-3  # of the most probable state: states below are not followed back
 CLOSE = 2  # places: the probability of a place is that of so many to either side, too
+ALL_BORN = BORN | BORN << 4  # two origins
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,20 +45,36 @@ class Belief:
     """
     Where the camera was some images ago.
 
-    :param probabilities: of each place, those close to it included, (n,).
-    :param ways: for each place with a way to it, the most probable state now and the speed then,
-        (n, 4), int: level, speed, place, speed then.
-    :param weights: probability of each place alone, (n,).
+    :param places: places to which a way leads, ascending, (m,).
+    :param weights: probability of each of them alone, (m,).
+    :param ways: the most probable state now and the speed then, (m, 4), int: level, speed, place,
+        speed then.
     """
 
-    probabilities: np.ndarray
+    places: np.ndarray
     weights: np.ndarray
     ways: np.ndarray
+
+    def probabilities(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return the places of n whose probability, that of close ones included, is not 0.
+
+        :returns: places, ascending, (m,), and their probabilities.
+        """
+        near = np.unique(self.places[:, None] + np.arange(-CLOSE, CLOSE + 1))
+        near = near[(near >= 0) & (near < n)]
+        sums = np.concatenate([[0], np.cumsum(self.weights)])
+        low = np.searchsorted(self.places, near - CLOSE)
+        high = np.searchsorted(self.places, near + CLOSE, 'right')
+        return near, np.minimum(sums[high] - sums[low], 1)
 
 
 class PlaceFilter:
     """
     The filter over n places; see the module.
+
+    It holds 4 bytes for each state of a place and half a byte for each image of the lag: 247 bytes
+    a place with the default speeds and levels and a lag of 10.
 
     :param places: places that there is room for.
     :param lag: most images that states are followed back.
@@ -64,20 +85,26 @@ class PlaceFilter:
         self._speeds = np.array(self.settings.speeds, np.float64)
         self._levels = np.array(self.settings.levels, np.float32)
         self._level_changes = self.settings.level_changes()
-        K, V = len(self._levels), len(self._speeds)
-        self._steps = np.zeros((lag, V), np.int64)
-        self._allocate(places, np.zeros((K, V, 0), np.float32), np.zeros((lag, K, V, 0), np.int8))
+        self._steps = np.zeros((lag, len(self._speeds)), np.int64)
+        self._reach = -(-(int(np.ceil(self._speeds.max())) + 2) // LANES) * LANES
+        self._allocate(places)
         self.reset()
 
-    def _allocate(self, room: int, states: np.ndarray, origins: np.ndarray) -> None:
-        shape, n = states.shape[:2], states.shape[2]
-        self._a, self._next = (np.zeros((*shape, room), np.float32) for _ in range(2))
-        self._origins = np.full((len(origins), *shape, room), BORN, np.int8)
-        self._a[:, :, :n], self._origins[..., :n] = states, origins
+    def _allocate(self, room: int) -> None:
+        K, V = len(self._levels), len(self._speeds)
+        self._room, pitch = room, -(-room // LANES) * LANES
+        # not normalized: times scale, the states are probabilities
+        self._a: np.ndarray = np.zeros((K, V, pitch), np.float32)
+        self._by_place: np.ndarray = np.zeros(room, np.float32)  # sum of the states
+        self._maxima: np.ndarray = np.zeros(-(-room // BLOCK), np.float32)  # of it, by block
+        shape = len(self._steps), K, (V + 1) // 2, pitch
+        self._origins: np.ndarray = np.full(shape, ALL_BORN, np.uint8)
+        self._halos: np.ndarray = np.zeros((-(-room // PLACES), K, V, self._reach), np.float32)
 
     def reset(self) -> None:
         """Forget where the camera was."""
-        self._a[:] = self._next[:] = 0
+        self._a[:] = self._by_place[:] = self._maxima[:] = 0
+        self._scale = 1.0
         self._off = np.full(len(self._levels), 1 / len(self._levels))
         self._count = self._known = 0
 
@@ -93,17 +120,26 @@ class PlaceFilter:
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
-        self._allocate(places, self._a, self._origins)
+        a, origins, by_place, n = self._a, self._origins, self._by_place, self._room
+        self._allocate(places)
+        self._a[:, :, :n], self._origins[..., :n] = a[:, :, :n], origins[..., :n]
+        self._set_by_place(by_place)
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
-        for values, none in ((self._a, 0), (self._origins, BORN)):
+        for values, none in ((self._a, 0), (self._origins, ALL_BORN)):
             values[..., :-count] = values[..., count:].copy()
             values[..., -count:] = none
+        self._set_by_place(self._by_place[count:].copy())
+
+    def _set_by_place(self, by_place: np.ndarray) -> None:
+        self._by_place[: len(by_place)], self._by_place[len(by_place) :] = by_place, 0
+        for block in range(len(self._maxima)):
+            self._maxima[block] = self._by_place[block * BLOCK : (block + 1) * BLOCK].max()
 
     def places_of_states(self) -> np.ndarray:
         """Return the probability of each place, (room,), float32."""
-        return self._a.sum(axis=(0, 1))
+        return self._by_place * np.float32(self._scale)
 
     def update(self, z: np.ndarray, weight: float, speed_weights: np.ndarray) -> None:
         """
@@ -120,32 +156,24 @@ class PlaceFilter:
         states = len(self._levels) * len(self._speeds) * max(n, 1)
         if not self._count and n:
             self._a[:, :, :n], self._off[:] = s.start / states, (1 - s.start) / len(self._levels)
-        blocks = -(-n // PLACES)
-        totals = np.zeros((blocks, len(self._levels), 3))
+        if n < self._known:
+            self._a[:, :, n:] = self._by_place[n:] = self._maxima[-(-n // BLOCK) :] = 0
+        totals = np.zeros((-(-n // BLOCK), len(self._levels), 3))
         off = self._off @ self._level_changes
         births = (off * s.enter / (len(self._speeds) * max(n, 1))).astype(np.float32)
         if n:
             advance(
-                self._a, n, self._likelihood(z, weight), self._level_changes,
-                s.speed_changes(speed_weights), self._steps[slot], np.float32(s.spread),
-                np.float32(1 - s.leave), births, self._next, self._origins[slot], totals,
+                self._a, n, np.ascontiguousarray(z), np.float32(weight), self._levels,
+                self._level_changes * np.float32(self._scale), s.speed_changes(speed_weights),
+                self._steps[slot], np.float32(s.spread), np.float32(1 - s.leave), births,
+                self._halos, self._origins[slot], totals, self._by_place, self._maxima,
             )  # fmt: skip
-            self._a, self._next = self._next, self._a
         before, lost, seen = totals.sum(axis=0).T if n else np.zeros((3, len(off)))
         off = off * (1 - s.enter) + (before - lost) * s.leave + lost
         total = float(off.sum() + seen.sum())
-        self._off = off / total
-        self._a[:, :, :n] *= np.float32(1 / total)
-        if n < self._known:
-            self._a[:, :, n:] = self._next[:, :, n:] = 0
+        self._off, self._scale = off / total, 1 / total
         self._known = n
         self._count += 1
-
-    def _likelihood(self, z: np.ndarray, weight: float) -> np.ndarray:
-        if not weight:
-            return np.ones((len(self._levels), len(z)), np.float32)
-        mu = self._levels[:, None]
-        return np.exp(np.float32(weight) * (mu * z - mu * mu / 2))
 
     def belief(self, n: int, images_ago: int) -> Belief:
         """
@@ -154,18 +182,47 @@ class PlaceFilter:
         :param n: places.
         :param images_ago: at most ``lag`` and ``count - 1``.
         """
-        by_place = self._a[:, :, :n].sum(axis=(0, 1))
-        top = np.argpartition(by_place, max(n - TOP, 0))[-TOP:]
-        least = NEGLIGIBLE * float(self._a[:, :, top].max()) if n else 1.0
-        weights, ways = np.zeros(n, np.float32), np.zeros((n, 4), np.int64)
-        middle_probabilities(
-            self._a, np.float32(least), top, self._origins, self._steps,
-            (self._count - 1) % len(self._steps), images_ago, weights, ways,
+        top = self._top(n)
+        least = NEGLIGIBLE * self._a[:, :, top].max(initial=0)
+        most = len(top) * len(self._levels) * len(self._speeds)
+        ways, states = np.empty((most, 5), np.int64), np.empty(most, np.float32)
+        count = followed_back(
+            self._a, np.float32(least or 1), top, self._origins, self._steps,
+            (self._count - 1) % len(self._steps), images_ago, ways, states,
         )  # fmt: skip
-        sums = np.concatenate([[0], np.cumsum(weights, dtype=np.float64)])
-        ends = np.arange(n)
-        high, low = np.minimum(ends + CLOSE + 1, n), np.maximum(ends - CLOSE, 0)
-        return Belief(np.minimum(sums[high] - sums[low], 1), weights, ways)
+        ways, probabilities = ways[:count], states[:count].astype(np.float64) * self._scale
+        order = np.lexsort((-probabilities, ways[:, 0]))  # the most probable first, of each place
+        places, firsts, each = np.unique(ways[order, 0], return_index=True, return_inverse=True)
+        weights = np.bincount(each, probabilities[order], len(places))
+        return Belief(places, weights, ways[order[firsts], 1:])
+
+    def _top(self, n: int) -> np.ndarray:
+        """Return the ``TOP`` most probable places, int64; they lie in blocks with large maxima."""
+        blocks = -(-n // BLOCK)
+        some = np.sort(np.argpartition(self._maxima[:blocks], max(blocks - TOP, 0))[-TOP:])
+        places = (some[:, None] * BLOCK + np.arange(BLOCK)).ravel()
+        places = places[places < n]
+        return places[np.argpartition(self._by_place[places], max(len(places) - TOP, 0))[-TOP:]]
+
+    def most_probable(self, n: int, excluded: np.ndarray) -> tuple[int, float]:
+        """
+        Return the most probable place now and its probability, 0 if all are excluded.
+
+        :param n: places, at least 1.
+        :param excluded: places that do not count.
+        """
+        maxima, by_place = self._maxima[: -(-n // BLOCK)].copy(), self._by_place[:n]
+        touched = np.unique(excluded // BLOCK)
+        pieces = (touched[:, None] * BLOCK + np.arange(BLOCK)).ravel()
+        pieces = np.setdiff1d(pieces[pieces < n], excluded, assume_unique=True)
+        maxima[touched] = 0
+        block = int(np.argmax(maxima))
+        pieces = np.append(pieces, np.arange(block * BLOCK, min((block + 1) * BLOCK, n)))
+        pieces = np.setdiff1d(pieces, excluded)
+        if not pieces.size:
+            return 0, 0.0
+        place = int(pieces[np.argmax(by_place[pieces])])
+        return place, float(by_place[place]) * self._scale
 
     def way(self, state: np.ndarray, images: int) -> np.ndarray:
         """
@@ -179,201 +236,3 @@ class PlaceFilter:
             (self._count - 1) % len(self._steps), images, places,
         )  # fmt: skip
         return places
-
-
-@kernel
-def _mixed(a, k, levels, speeds, low, mixed, source):
-    """
-    Let level and speed change, for the places from ``low`` on.
-
-    :param a: probabilities, (K, V, n or more).
-    :param k: level afterwards; levels: probability of a level by the one before, (K, K).
-    :param speeds: probabilities of the speed to stay, to become a neighbor, to become any one, by
-        the speed before; factor by the speed after: (4, V).
-    :param mixed, source: (V, width), written; where places are below 0, zero. source: 0 = same
-        speed, 1 = the one below, 2 = the one above.
-    :returns: sum of the probabilities with the levels mixed, by position.
-    """
-    (K, V), width = a.shape[:2], mixed.shape[1]
-    skipped = max(0, -low)
-    b = np.zeros((V, width), np.float32)
-    anywhere, total = np.zeros(width, np.float32), np.zeros(width, np.float32)
-    for v in range(V):
-        row = b[v]
-        for j in range(K):
-            g, before = levels[j, k], a[j, v]
-            for i in range(skipped, width):
-                row[i] += g * before[low + i]
-        share = speeds[2, v]
-        for i in range(width):
-            anywhere[i] += row[i] * share
-            total[i] += row[i]
-    for v in range(V):
-        below, above = b[max(v - 1, 0)], b[min(v + 1, V - 1)]
-        stay, after, row = speeds[0, v], speeds[3, v], b[v]
-        up = speeds[1, v - 1] if v > 0 else F(0)
-        down = speeds[1, v + 1] if v < V - 1 else F(0)
-        target, origin = mixed[v], source[v]
-        for i in range(width):
-            same, lower, upper = row[i] * stay, below[i] * up, above[i] * down
-            target[i] = after * (same + lower + upper + anywhere[i])
-            most = same if same > lower else lower
-            origin[i] = np.int8(2) if upper > most else np.int8(lower > same)
-    return total
-
-
-@reassociating_kernel
-def _sum(values):
-    total = np.float32(0)
-    for i in range(len(values)):
-        total += values[i]
-    return total
-
-
-@kernel
-def _lost(mixed, steps, spread):
-    """Return what the last block loses over the end of the map, whose last place is its last."""
-    total = F(0)
-    for v in range(len(steps)):
-        r, row = steps[v], mixed[v]
-        end = len(row)
-        slow = r - 1 if r > 0 else 0
-        total += (F(1) - F(2) * spread) * row[end - r :].sum()
-        total += spread * (row[end - r - 1 :].sum() + row[end - slow :].sum())
-    return total
-
-
-@parallel_kernel
-def advance(
-    a, n, likelihood, levels, speeds, steps, spread, stay_on, births, out, origins, totals
-):
-    """
-    Advance all states by one image.
-
-    :param a: probabilities, (K, V, n or more).
-    :param n: places.
-    :param likelihood: of the image at each place, relative to that off the map, (K, n).
-    :param levels, speeds: see :func:`_mixed`.
-    :param steps: places that each speed moves on, (V,).
-    :param spread: probability of one place more, and of one less, but never back.
-    :param stay_on: probability of staying on the map.
-    :param births: probability of each state of a level to come from off the map, (K,).
-    :param out: written like a, not normalized; origins: (K, V, n or more), int8, written.
-    :param totals: (blocks, K, 3), written: sums before moving, of what moved over the map's end,
-        and with the image.
-    """
-    K, V = a.shape[:2]
-    reach = steps.max() + 1
-    for block in nb.prange((n + PLACES - 1) // PLACES):
-        first = block * PLACES
-        count = min(PLACES, n - first)
-        mixed = np.empty((V, reach + count), np.float32)
-        source = np.empty((V, reach + count), np.int8)
-        for k in range(K):
-            total = _mixed(a, k, levels, speeds, first - reach, mixed, source)
-            totals[block, k, 0] = _sum(total[reach:])
-            if first + count == n:
-                totals[block, k, 1] = _lost(mixed, steps, spread)
-            birth, seen = births[k], likelihood[k, first : first + count]
-            after = F(0)
-            for v in range(V):
-                at = reach - steps[v]
-                target = out[k, v, first : first + count]
-                _move(
-                    mixed[v], source[v], at, at + 1 if steps[v] > 0 else at, spread, stay_on,
-                    birth, seen, target, origins[k, v, first : first + count],
-                )  # fmt: skip
-                after += _sum(target)
-            totals[block, k, 2] = after
-
-
-@kernel
-def _move(row, change, at, slow, spread, stay_on, birth, seen, target, origin):
-    """Move the states of one level and speed on, and weigh them by the image; see advance."""
-    count = len(target)
-    center = F(1) - F(2) * spread
-    straight_row, straight_change = row[at : at + count], change[at : at + count]
-    faster_row, faster_change = row[at - 1 : at - 1 + count], change[at - 1 : at - 1 + count]
-    slower_row, slower_change = row[slow : slow + count], change[slow : slow + count]
-    for i in range(count):
-        straight = center * straight_row[i]
-        faster, slower = spread * faster_row[i], spread * slower_row[i]
-        s = (straight + faster + slower) * stay_on
-        target[i] = (s + birth) * seen[i]
-    for i in range(count):
-        straight = center * straight_row[i]
-        faster, slower = spread * faster_row[i], spread * slower_row[i]
-        s = (straight + faster + slower) * stay_on
-        most = straight if straight > faster else faster
-        code = np.int8(3 + faster_change[i]) if faster > straight else straight_change[i]
-        code = np.int8(6 + slower_change[i]) if slower > most else code
-        origin[i] = code if s > birth else np.int8(BORN)
-
-
-@kernel
-def trace_back(k, v, y, origins, steps, newest, count, places):
-    """
-    Follow the most probable way to a state back.
-
-    :param origins: ring of the last images' origins, (m, K, V, n or more).
-    :param steps: ring of their steps, (m, V).
-    :param newest: slot of the newest image.
-    :param count: images to go back, at most m.
-    :param places: (count + 1,), written: the place at each image, newest first; from where the
-        way came onto the map on, -1.
-    :returns: speed at the last place.
-    """
-    m = len(origins)
-    places[0] = y
-    for i in range(count):
-        slot = (newest - i) % m
-        origin = origins[slot, k, v, y]
-        if origin == BORN:
-            places[i + 1 :] = -1
-            return v
-        step, change = origin // 3, origin % 3
-        r = steps[slot, v]
-        if step == 0:
-            y -= r
-        elif step == 1:
-            y -= r + 1
-        elif r > 0:
-            y -= r - 1
-        if change == 1:
-            v -= 1
-        elif change == 2:
-            v += 1
-        places[i + 1] = y
-    return v
-
-
-@kernel
-def middle_probabilities(a, least, tops, origins, steps, newest, count, found, best):
-    """
-    Sum the probabilities of states by the place where they were some images ago.
-
-    :param a: probabilities, (K, V, n or more).
-    :param least: states below it are left out.
-    :param tops: places whose states count, (m,).
-    :param count: images to go back; other parameters: see :func:`trace_back`.
-    :param found: (n,), zeros, written: probability by place.
-    :param best: (n, 4), written where found > 0: the most probable state (k, v, y) there, and the
-        speed at the place.
-    """
-    places = np.empty(count + 1, np.int32)
-    highest = np.zeros(len(found), np.float32)
-    for y in tops:
-        for k in range(a.shape[0]):
-            for v in range(a.shape[1]):
-                p = a[k, v, y]
-                if p < least:
-                    continue
-                speed = trace_back(k, v, y, origins, steps, newest, count, places)
-                middle = places[count]
-                if middle < 0:
-                    continue
-                found[middle] += p
-                if p > highest[middle]:
-                    highest[middle] = p
-                    best[middle, 0], best[middle, 1] = k, v
-                    best[middle, 2], best[middle, 3] = y, speed
