@@ -11,8 +11,14 @@ import oracle
 import pytest
 from stavpr_ros.alignment.cpu.simd import LANES, load, store
 from stavpr_ros.compilation import kernel
-from stavpr_ros.recognition.place_filter import CLOSE, FilterSettings, NEGLIGIBLE, PlaceFilter, TOP
-from stavpr_ros.recognition.place_filter_kernels import exp
+from stavpr_ros.recognition.place_filter import (
+    CLOSE,
+    exp,
+    FilterSettings,
+    NEGLIGIBLE,
+    PlaceFilter,
+    TOP,
+)
 
 
 @kernel

@@ -18,22 +18,39 @@ predicted from the same change: the map shows how much images of places so far a
 The place of an image is read off a few images later (fixed-lag smoothing): the states of today are
 followed back to where they were. After Xu, Sünderhauf and Milford, "Probabilistic Visual Place
 Recognition for Hierarchical Localization", RA-L 2021, with speeds, levels and smoothing added.
+
+All states advance in one pass over the places, in place and on all lanes. A thread takes ``PLACES``
+places, from the last to the first ``BLOCK`` of them, since states only move up; the last places before
+its own are copied beforehand. States are not normalized: the factor that makes their sum 1 is
+part of the next image's level changes. Where a state came from in speed travels in the lowest two
+bits of its probability, which no answer depends on; two origins share a byte, those of an even
+speed and of the next.
 """
 
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
-from stavpr_ros.alignment.cpu.simd import LANES
-from stavpr_ros.recognition.place_filter_kernels import (
-    advance,
-    BLOCK,
-    BORN,
-    followed_back,
-    PLACES,
-    trace_back,
+from stavpr_ros.alignment.cpu.simd import (
+    bits,
+    from_bits,
+    LANES,
+    load,
+    load_bytes,
+    load_splat,
+    select,
+    splat,
+    store,
+    store_bytes,
 )
+from stavpr_ros.compilation import kernel, parallel_kernel
 from stavpr_ros.recognition.robust import FilterSettings
 
+F, INT = np.float32, np.int32
+PLACES = 2048  # that a thread takes at a time
+BLOCK = 128  # places whose scratch stays in the cache; divides PLACES, a multiple of all LANES
+BORN = 9  # origin of a state that came from off the map; others are 3 * step + speed, each 0..2
+LEAST, MOST = -87.0, 80.0  # exponents that float32 holds
 TOP = 64  # places whose states are followed back
 NEGLIGIBLE = 1e-3  # of the most probable state: states below are not followed back
 CLOSE = 2  # places: the probability of a place is that of so many to either side, too
@@ -236,3 +253,285 @@ class PlaceFilter:
             (self._count - 1) % len(self._steps), images, places,
         )  # fmt: skip
         return places
+
+
+# ------------------------------------------------ kernels
+
+
+@kernel
+def exp(x):
+    """Return e^x, within 2e-7 relative; 0 below LEAST, e^MOST above MOST."""
+    kept = select(splat(F(LEAST)) < x, x, splat(F(LEAST)))
+    kept = select(kept < splat(F(MOST)), kept, splat(F(MOST)))
+    magic = splat(F(12582912))  # 1.5 * 2^23: adding it rounds to whole numbers
+    shifted = kept * splat(F(1.44269504)) + magic
+    whole = shifted - magic
+    rest = kept - whole * splat(F(0.693359375)) - whole * splat(F(-2.12194440e-4))
+    power = splat(F(1.9875691500e-4))
+    power = power * rest + splat(F(1.3981999507e-3))
+    power = power * rest + splat(F(8.3334519073e-3))
+    power = power * rest + splat(F(4.1665795894e-2))
+    power = power * rest + splat(F(1.6666665459e-1))
+    power = power * rest + splat(F(5.0000001201e-1))
+    power = power * rest * rest + rest + splat(F(1))
+    found = from_bits(bits(power) + (bits(shifted) << splat(INT(23))))
+    return select(x < splat(F(LEAST)), splat(F(0)), found)
+
+
+@kernel
+def _see(z, first, count, weight, mu, seen):
+    """Write the likelihood of each level and place into seen (K, BLOCK); 0 from ``count`` on."""
+    K = len(mu)
+    flat = seen.reshape(-1)
+    if weight == 0:
+        seen[:] = 1
+    else:
+        seen[0, :count] = z[first : first + count]
+        seen[0, count:] = 0
+        factor = splat(weight)
+        for x in range(0, BLOCK, LANES):
+            distance = load(flat, x)
+            for k in range(K):
+                level = load_splat(mu, k)
+                off = level * distance - level * level * splat(F(0.5))
+                store(flat, k * BLOCK + x, exp(factor * off))
+    seen[:, count:] = 0
+
+
+@kernel
+def _mix(source, at, pitch, count, levels, speeds, b, mixed, to, width, sums):
+    """
+    Let level and speed change, for ``count`` neighboring places, whole vectors.
+
+    :param source, at, pitch: flat states; level j, speed v begin at + (j V + v) pitch.
+    :param levels: factor by the level before and after, (K, K), neighbors only.
+    :param speeds: factors of the speed to stay, of the one below, of the one above, after any, and
+        of any before, flat (5, V).
+    :param b: (V + 1) LANES, scratch, zero at the end.
+    :param mixed: flat, (K, V, width), written from column ``to`` on.
+    :param sums: K LANES; sums after the change of level are added.
+    """
+    K = len(levels)
+    V = len(b) // LANES - 1
+    changes = levels.reshape(-1)
+    mask = splat(INT(-4))
+    for x in range(0, count, LANES):
+        for k in range(K):
+            anywhere = total = splat(F(0))
+            for v in range(V):
+                state = splat(F(0))
+                for j in range(max(k - 1, 0), min(k + 2, K)):
+                    before = load(source, at + (j * V + v) * pitch + x)
+                    state = state + load_splat(changes, j * K + k) * before
+                store(b, v * LANES, state)
+                anywhere = anywhere + state * load_splat(speeds, 4 * V + v)
+                total = total + state
+            store(sums, k * LANES, load(sums, k * LANES) + total)
+            below, current = splat(F(0)), load(b, 0)
+            for v in range(V):
+                above = load(b, (v + 1) * LANES)
+                same = current * load_splat(speeds, v)
+                lower = below * load_splat(speeds, V + v)
+                upper = above * load_splat(speeds, 2 * V + v)
+                target = (same + lower) + (upper + anywhere * load_splat(speeds, 3 * V + v))
+                from_below = same < lower
+                code = select(from_below, splat(INT(1)), splat(INT(0)))
+                code = select(select(from_below, lower, same) < upper, splat(INT(2)), code)
+                store(mixed, (k * V + v) * width + to + x, from_bits((bits(target) & mask) | code))
+                below, current = current, above
+
+
+@kernel
+def _move(
+    mixed, at, slow, count, spread, stay_on, birth, seen, seen_at, a, to, origins, to_origin, half,
+    places,
+):  # fmt: skip
+    """
+    Move the states of one level and speed on, and weigh them by the image; see advance.
+
+    :param mixed, at: flat; the states that arrive without a place more or less begin there.
+    :param slow: 1 where states may arrive from one place fewer; 0 where that is none.
+    :param half: which half of the origins' bytes is written; 0 comes first.
+    :param places: (BLOCK,), to which the states are added.
+    :returns: sums of the states, by lane.
+    """
+    total = splat(F(0))
+    center, aside = splat(F(1) - F(2) * spread), splat(spread)
+    staying, born = splat(stay_on), splat(birth)
+    three, six, nine = splat(INT(3)), splat(INT(6)), splat(INT(BORN))
+    low = splat(INT(3))
+    for x in range(0, count, LANES):
+        straight_from = load(mixed, at + x)
+        faster_from = load(mixed, at + x - 1)
+        slower_from = load(mixed, at + x + slow)
+        straight = center * straight_from
+        faster, slower = aside * faster_from, aside * slower_from
+        arrived = (straight + faster + slower) * staying
+        state = (arrived + born) * load(seen, seen_at + x)
+        store(a, to + x, state)
+        store(places, x, load(places, x) + state)
+        total = total + state
+        fast = straight < faster
+        most = select(fast, faster, straight)
+        code = select(fast, (bits(faster_from) & low) + three, bits(straight_from) & low)
+        code = select(most < slower, (bits(slower_from) & low) + six, code)
+        code = select(born < arrived, code, nine)
+        if half:
+            code = (code << splat(INT(4))) | load_bytes(origins, to_origin + x)
+        store_bytes(origins, to_origin + x, code)
+    return total
+
+
+@kernel
+def _lost(row, step, spread):
+    """Return what a row, whose last place is the map's last, loses over the end of the map."""
+    end = len(row)
+    slow = step - 1 if step > 0 else 0
+    total = (F(1) - F(2) * spread) * row[end - step :].sum()
+    return total + spread * (row[end - step - 1 :].sum() + row[end - slow :].sum())
+
+
+@kernel
+def _sum_of_lanes(values, at):
+    total = 0.0
+    for lane in range(LANES):
+        total += values[at + lane]
+    return total
+
+
+@parallel_kernel
+def advance(
+    a, n, z, weight, mu, levels, speeds, steps, spread, stay_on, births, halos, origins, totals,
+    by_place, maxima,
+):  # fmt: skip
+    """
+    Advance all states by one image.
+
+    :param a: states, (K, V, pitch), read and written; 0 from place n on.
+    :param n: places, at least 1.
+    :param z, weight, mu: z-normalized distances (n,), alpha, and mean of right places by level.
+    :param levels, speeds: see :func:`_mix`.
+    :param steps: places that each speed moves on, (V,).
+    :param spread: probability of one place more, and of one less, but never back.
+    :param stay_on: probability of staying on the map.
+    :param births: probability of each state of a level to come from off the map, (K,).
+    :param halos: (parts of PLACES, K, V, reach), scratch; reach in whole vectors, more than a step
+        and one place; zeros in the first.
+    :param origins: of this image, (K, (V + 1) // 2, pitch), uint8, written.
+    :param totals: (blocks, K, 3), written: sums before moving, of what moved over the map's end,
+        and with the image.
+    :param by_place: sum of the states of each place, (n or more,), and maxima: the largest of each
+        block, (blocks,); written.
+    """
+    K, V, pitch = a.shape
+    reach, halves, parts = halos.shape[3], origins.shape[1], (n + PLACES - 1) // PLACES
+    width = reach + BLOCK
+    states, flat_halos, flat_origins = a.reshape(-1), halos.reshape(-1), origins.reshape(-1)
+    for part in nb.prange(1, parts):
+        halos[part] = a[:, :, part * PLACES - reach : part * PLACES]
+    for part in nb.prange(parts):
+        mixed = np.empty(K * V * width, np.float32)
+        seen, places = np.empty((K, BLOCK), np.float32), np.empty(BLOCK, np.float32)
+        b = np.zeros((V + 1) * LANES, np.float32)
+        sums, lanes = np.zeros(K * LANES, np.float32), np.empty(LANES, np.float32)
+        blocks = (min(n - part * PLACES, PLACES) + BLOCK - 1) // BLOCK
+        for block in range(blocks - 1, -1, -1):
+            first = part * PLACES + block * BLOCK
+            count, at = min(BLOCK, n - first), first // BLOCK
+            whole = (count + LANES - 1) // LANES * LANES
+            _see(z, first, count, weight, mu, seen)
+            if block:
+                _mix(states, first - reach, pitch, reach, levels, speeds, b, mixed, 0, width, sums)
+            else:
+                _mix(
+                    flat_halos, part * K * V * reach, reach, reach, levels, speeds, b, mixed, 0,
+                    width, sums,
+                )  # fmt: skip
+            sums[:] = 0
+            _mix(states, first, pitch, whole, levels, speeds, b, mixed, reach, width, sums)
+            places[:] = 0
+            for k in range(K):
+                totals[at, k, 0], totals[at, k, 1] = _sum_of_lanes(sums, k * LANES), 0
+                total = splat(F(0))
+                for v in range(V):
+                    row, step = (k * V + v) * width, steps[v]
+                    if first + count == n:
+                        ending = mixed[row : row + reach + count]
+                        totals[at, k, 1] += _lost(ending, step, spread)
+                    total = total + _move(
+                        mixed, row + reach - step, 1 if step > 0 else 0, whole, spread, stay_on,
+                        births[k], seen.reshape(-1), k * BLOCK, states,
+                        (k * V + v) * pitch + first, flat_origins,
+                        (k * halves + v // 2) * pitch + first, v % 2, places,
+                    )  # fmt: skip
+                store(lanes, 0, total)
+                totals[at, k, 2] = _sum_of_lanes(lanes, 0)
+            by_place[first : first + count] = places[:count]
+            maxima[at] = places[:count].max()
+
+
+@kernel
+def trace_back(k, v, y, origins, steps, newest, count, places):
+    """
+    Follow the most probable way to a state back.
+
+    :param origins: ring of the last images' origins, (m, K, (V + 1) // 2, n or more), uint8.
+    :param steps: ring of their steps, (m, V).
+    :param newest: slot of the newest image.
+    :param count: images to go back, at most m.
+    :param places: (count + 1,), written: the place at each image, newest first; from where the
+        way came onto the map on, -1.
+    :returns: speed at the last place.
+    """
+    m = len(origins)
+    places[0] = y
+    for i in range(count):
+        slot = (newest - i) % m
+        origin = (origins[slot, k, v // 2, y] >> (v % 2 * 4)) & 15
+        if origin == BORN:
+            places[i + 1 :] = -1
+            return v
+        step, change = origin // 3, origin % 3
+        r = steps[slot, v]
+        if step == 0:
+            y -= r
+        elif step == 1:
+            y -= r + 1
+        elif r > 0:
+            y -= r - 1
+        if change == 1:
+            v -= 1
+        elif change == 2:
+            v += 1
+        places[i + 1] = y
+    return v
+
+
+@kernel
+def followed_back(a, least, tops, origins, steps, newest, count, ways, probabilities):
+    """
+    Follow states back to where they were some images ago.
+
+    :param a: states, (K, V, n or more).
+    :param least: states below it are left out.
+    :param tops: places whose states count, (m,).
+    :param count: images to go back; other parameters: see :func:`trace_back`.
+    :param ways: (m K V, 5), written: place then, state now (k, v, y), speed then.
+    :param probabilities: (m K V,), written: of these states.
+    :returns: how many were on the map then.
+    """
+    places = np.empty(count + 1, np.int32)
+    found = 0
+    for y in tops:
+        for k in range(a.shape[0]):
+            for v in range(a.shape[1]):
+                p = a[k, v, y]
+                if p < least:
+                    continue
+                speed = trace_back(k, v, y, origins, steps, newest, count, places)
+                if places[count] >= 0:
+                    ways[found, 0], ways[found, 1], ways[found, 2] = places[count], k, v
+                    ways[found, 3], ways[found, 4] = y, speed
+                    probabilities[found] = p
+                    found += 1
+    return found
