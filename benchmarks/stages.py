@@ -232,7 +232,7 @@ def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
 def products(
     run: Run, places: LocalFeatures, queries: LocalFeatures, precision: str
 ) -> list[Peer]:
-    """Return torch's product in float32, and in the float precision of the map unless slower."""
+    """Return torch's product in float32, and in the map's precision unless that is slower."""
     peers, d = [], places.strips.shape[2]
     for dtype in dict.fromkeys(('float32' if precision == 'int8' else precision, 'float32')):
         if reason := slower_than_float32(run.device, dtype):

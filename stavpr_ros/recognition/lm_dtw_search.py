@@ -14,7 +14,8 @@ from stavpr_ros.alignment.lm_dtw import (
     trace_sequence,
 )
 from stavpr_ros.alignment.path import NO_PATH
-from stavpr_ros.recognition.sequence_search import SequenceBuffer, Sequences, WindowMatch
+from stavpr_ros.recognition.sequence_search import SequenceBuffer, WindowMatch
+from stavpr_ros.recognition.sessions import Sequences
 
 
 class LmDtwSearch:

@@ -19,14 +19,15 @@ The place of an image is read off a few images later (fixed-lag smoothing): the 
 followed back to where they were. After Xu, Sünderhauf and Milford, "Probabilistic Visual Place
 Recognition for Hierarchical Localization", RA-L 2021, with speeds, levels and smoothing added.
 
-All states advance in one pass over the places, in place and on all lanes. A thread takes ``PLACES``
-places, from the last to the first ``BLOCK`` of them, since states only move up; the last places before
-its own are copied beforehand. States are not normalized: the factor that makes their sum 1 is
-part of the next image's level changes. Where a state came from in speed travels in the lowest two
-bits of its probability, which no answer depends on; two origins share a byte, those of an even
-speed and of the next.
+All states advance in one pass over the places, in place and on all lanes. A thread takes
+``PLACES`` places, from the last to the first ``BLOCK`` of them, since states only move up; the last
+places before its own are copied beforehand. States are not normalized: the factor that makes their
+sum 1 is part of the next image's level changes. Where a state came from in speed travels in the
+lowest two bits of its probability, which no answer depends on; two origins share a byte, those of
+an even speed and of the next.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numba as nb
@@ -50,6 +51,7 @@ F, INT = np.float32, np.int32
 PLACES = 2048  # that a thread takes at a time
 BLOCK = 128  # places whose scratch stays in the cache; divides PLACES, a multiple of all LANES
 BORN = 9  # origin of a state that came from off the map; others are 3 * step + speed, each 0..2
+NO_PLACE = F(-np.inf)  # z of a gap between sessions, where likelihoods are 1
 LEAST, MOST = -87.0, 80.0  # exponents that float32 holds
 TOP = 64  # places whose states are followed back
 NEGLIGIBLE = 1e-3  # of the most probable state: states below are not followed back
@@ -95,10 +97,18 @@ class PlaceFilter:
 
     :param places: places that there is room for.
     :param lag: most images that states are followed back.
+    :param gaps: places that there are none of, between sessions: who moves there is off the map.
     """
 
-    def __init__(self, places: int, lag: int, settings: FilterSettings | None = None) -> None:
+    def __init__(
+        self,
+        places: int,
+        lag: int,
+        settings: FilterSettings | None = None,
+        gaps: np.ndarray | None = None,
+    ) -> None:
         self.settings = settings or FilterSettings()
+        self._gaps = np.empty(0, np.int64) if gaps is None else gaps
         self._speeds = np.array(self.settings.speeds, np.float64)
         self._levels = np.array(self.settings.levels, np.float32)
         self._level_changes = self.settings.level_changes()
@@ -151,7 +161,10 @@ class PlaceFilter:
 
     def _set_by_place(self, by_place: np.ndarray) -> None:
         self._by_place[: len(by_place)], self._by_place[len(by_place) :] = by_place, 0
-        for block in range(len(self._maxima)):
+        self._find_maxima(range(len(self._maxima)))
+
+    def _find_maxima(self, blocks: Iterable[int]) -> None:
+        for block in blocks:
             self._maxima[block] = self._by_place[block * BLOCK : (block + 1) * BLOCK].max()
 
     def places_of_states(self) -> np.ndarray:
@@ -170,15 +183,20 @@ class PlaceFilter:
         slot = self._count % len(self._steps)
         moved = np.rint(self._speeds * (self._count + 1)) - np.rint(self._speeds * self._count)
         self._steps[slot] = moved
-        states = len(self._levels) * len(self._speeds) * max(n, 1)
+        real = max(n - len(self._gaps), 1)
+        states = len(self._levels) * len(self._speeds) * real
         if not self._count and n:
             self._a[:, :, :n], self._off[:] = s.start / states, (1 - s.start) / len(self._levels)
+            self._a[:, :, self._gaps] = 0
         if n < self._known:
             self._a[:, :, n:] = self._by_place[n:] = self._maxima[-(-n // BLOCK) :] = 0
         totals = np.zeros((-(-n // BLOCK), len(self._levels), 3))
         off = self._off @ self._level_changes
-        births = (off * s.enter / (len(self._speeds) * max(n, 1))).astype(np.float32)
+        births = (off * s.enter / (len(self._speeds) * real)).astype(np.float32)
         if n:
+            if len(self._gaps):
+                z = z.copy()
+                z[self._gaps] = NO_PLACE
             advance(
                 self._a, n, np.ascontiguousarray(z), np.float32(weight), self._levels,
                 self._level_changes * np.float32(self._scale), s.speed_changes(speed_weights),
@@ -186,6 +204,13 @@ class PlaceFilter:
                 self._halos, self._origins[slot], totals, self._by_place, self._maxima,
             )  # fmt: skip
         before, lost, seen = totals.sum(axis=0).T if n else np.zeros((3, len(off)))
+        if len(self._gaps):  # likelihoods are 1 there
+            in_gaps = self._a[:, :, self._gaps].sum(axis=(1, 2), dtype=np.float64)
+            born = births * (len(self._speeds) * len(self._gaps))
+            lost = lost + (in_gaps - born) / (1 - s.leave)
+            seen = seen - in_gaps
+            self._a[:, :, self._gaps] = self._by_place[self._gaps] = 0
+            self._find_maxima(np.unique(self._gaps // BLOCK))
         off = off * (1 - s.enter) + (before - lost) * s.leave + lost
         total = float(off.sum() + seen.sum())
         self._off, self._scale = off / total, 1 / total
@@ -294,7 +319,9 @@ def _see(z, first, count, weight, mu, seen):
             for k in range(K):
                 level = load_splat(mu, k)
                 off = level * distance - level * level * splat(F(0.5))
-                store(flat, k * BLOCK + x, exp(factor * off))
+                likelihood = exp(factor * off)
+                gap = distance < splat(F(-1e30))
+                store(flat, k * BLOCK + x, select(gap, splat(F(1)), likelihood))
     seen[:, count:] = 0
 
 

@@ -17,6 +17,7 @@ from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
 from stavpr_ros.recognition.match import (
     Candidate,
     distinct_places,
+    improbable,
     Match,
     ranked_candidates,
     Status,
@@ -36,6 +37,7 @@ from stavpr_ros.recognition.sequence_search import (
     SequenceBuffer,
     WindowMatch,
 )
+from stavpr_ros.recognition.sessions import layout_of, SessionLayout
 import torch
 
 
@@ -91,15 +93,22 @@ class SequenceRecognizer:
     :param settings: see :class:`RecognizerSettings`.
     :param feature_settings: how the features are made.
     :param places: number of places n.
+    :param layout: of a map of several sessions.
     """
 
     def __init__(
-        self, settings: RecognizerSettings, feature_settings: FeatureSettings, places: int
+        self,
+        settings: RecognizerSettings,
+        feature_settings: FeatureSettings,
+        places: int,
+        layout: SessionLayout | None = None,
     ) -> None:
         options, sequence = settings.applied_options, settings.sequence
         self._settings, self._feature_settings = settings, feature_settings
-        self._buffer = SequenceBuffer(sequence.length, places, sequence.k)
-        self._filter = FilterSearch(self._buffer) if options.place_filter else None
+        self._layout = layout
+        columns = places if layout is None else layout.width
+        self._buffer = SequenceBuffer(sequence.length, columns, sequence.k)
+        self._filter = FilterSearch(self._buffer, layout=layout) if options.place_filter else None
         self._search: Search = self._filter or LmDtwSearch(self._buffer)
         self._window = WindowMatch()  # of the newest image
         self._nearest: SequenceMatch | None = None
@@ -147,6 +156,7 @@ class SequenceRecognizer:
             self._window.sequences(),
             count,
             settings.nms_radius,
+            *(() if self._layout is None else (self._layout.positions,)),
         )
 
     def newest_row(self) -> np.ndarray:
@@ -156,7 +166,7 @@ class SequenceRecognizer:
         :returns: shape (n,), float32; lower is nearer.
         """
         buffer = self._buffer
-        return buffer.rows()[-1, : buffer.places].cpu().numpy()
+        return self._by_place(buffer.rows()[-1, : buffer.places].cpu().numpy())
 
     def window_rows(self) -> tuple[np.ndarray, int]:
         """
@@ -167,7 +177,10 @@ class SequenceRecognizer:
         """
         buffer = self._buffer
         rows = buffer.rows()[buffer.length - len(buffer) :, : buffer.known].cpu().numpy()
-        return rows, buffer.first
+        return self._by_place(rows), buffer.first
+
+    def _by_place(self, rows: np.ndarray) -> np.ndarray:
+        return rows if self._layout is None else rows[..., self._layout.columns[: rows.shape[-1]]]
 
     def _clear_window(self) -> None:
         self._buffer.clear()
@@ -188,7 +201,10 @@ class SequenceRecognizer:
         :param strips: the image's features, centered, shape (W, d).
         """
         if self._settings.applied_options.query_znorm:
-            row = torch.from_numpy(z_normalized(row.cpu().numpy()))
+            normalized = z_normalized if self._layout is None else self._layout.z_normalized
+            row = torch.from_numpy(normalized(row.cpu().numpy()))
+        if self._layout is not None:
+            row = self._layout.spread(row)
         self._buffer.push(row.to(self._buffer.memory.device), stamp)
         if self._filter is not None:
             change = self._filter.change.next_query(strips.cpu().numpy())
@@ -201,6 +217,10 @@ class SequenceRecognizer:
             reason = f'{len(self._buffer)} of {length} images in the window'
             return Match(Status.WARMING_UP, reason, threshold)
         self._window = self._search(self._settings.nms_radius)
+        window = self._window
+        if self._layout is not None and window.nearest is not None:
+            in_places = self._layout.in_places(window.nearest, window.path, window.sequences)
+            self._window = WindowMatch(*in_places)
         self._nearest = nearest = self._window.nearest
         if nearest is None:
             return Match(Status.NO_MATCH, 'the map is empty', threshold)
@@ -210,8 +230,7 @@ class SequenceRecognizer:
         if not nearest.distance < threshold:
             status = Status.NO_MATCH
             reason = (
-                f'the probability of the best place, {probability:.3f}, is not above '
-                f'{1 - threshold:.3f}'
+                improbable(probability, threshold)
                 if relative
                 else f'nearest distance {nearest.distance:.4f} is not below the threshold '
                 f'{threshold:.4f}'
@@ -245,7 +264,8 @@ class PlaceRecognizer(SequenceRecognizer):
         backend: str = 'cpu',
         precision: str = 'float32',
     ) -> None:
-        super().__init__(settings, place_map.settings, len(place_map))
+        layout = layout_of(place_map, settings.nms_radius)
+        super().__init__(settings, place_map.settings, len(place_map), layout)
         features, options = place_map.features, settings.applied_options
         for _, some in blocks(features):
             require_finite(some, 'the map')
@@ -258,11 +278,12 @@ class PlaceRecognizer(SequenceRecognizer):
         backend = choose_backend(backend)
         self._matcher = make_matcher(held, settings.spatial, backend, precision)
         if self._filter is not None:
-            self._filter.change.learn(held.strips)
+            firsts = (0,) if layout is None else layout.firsts
+            self._filter.change.learn(held.strips, firsts)
         if backend == 'cuda' and not options.any:
             from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
-            search = CudaLmDtwSearch(len(place_map), settings.sequence)
+            search = CudaLmDtwSearch(self._buffer.places, settings.sequence)
             self._search, self._buffer = search, search.buffer
 
     def _held(self, features: LocalFeatures, precision: str) -> LocalFeatures | Int8Features:

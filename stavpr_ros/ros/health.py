@@ -199,6 +199,8 @@ def map_finding(health: Health) -> Finding:
     if health.map_info.state == 'full':
         remedy = 'save it with ~/save_map, then raise max_places'
         return warning, f'full: mapping stopped at {places} (max_places); {remedy}'
+    if health.settings.pipeline.geometric and not health.map_info.has_thumbnails:
+        places += ' without thumbnails, so that geometric_check checks no match,'
     return OK, f'{places} of {health.map_path or "a map without a file"}'
 
 
