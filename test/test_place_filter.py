@@ -132,7 +132,7 @@ def test_most_probable_place_equals_that_of_all(n):
     for excluded in (best[:0], best[:1], best[:5], np.arange(min(n, 300)), np.arange(n)):
         left = by_place.copy()
         left[excluded] = 0
-        place, probability = one.most_probable(n, np.sort(excluded))
+        place, probability = one.most_probable(np.sort(excluded))
         assert probability == pytest.approx(left.max(), rel=1e-5)
         assert left[place] == pytest.approx(left.max(), rel=1e-5)
 

@@ -122,8 +122,9 @@ class PlaceFilter:
         self._room, pitch = room, -(-room // LANES) * LANES
         # not normalized: times scale, the states are probabilities
         self._a: np.ndarray = np.zeros((K, V, pitch), np.float32)
-        self._by_place: np.ndarray = np.zeros(room, np.float32)  # sum of the states
-        self._maxima: np.ndarray = np.zeros(-(-room // BLOCK), np.float32)  # of it, by block
+        blocks = max(1, -(-room // BLOCK))
+        self._by_place: np.ndarray = np.zeros(blocks * BLOCK, np.float32)  # sums of the states
+        self._maxima: np.ndarray = np.zeros(blocks, np.float32)  # of these, by block
         shape = len(self._steps), K, (V + 1) // 2, pitch
         self._origins: np.ndarray = np.full(shape, ALL_BORN, np.uint8)
         self._halos: np.ndarray = np.zeros((-(-room // PLACES), K, V, self._reach), np.float32)
@@ -169,7 +170,7 @@ class PlaceFilter:
 
     def places_of_states(self) -> np.ndarray:
         """Return the probability of each place, (room,), float32."""
-        return self._by_place * np.float32(self._scale)
+        return self._by_place[: self._room] * np.float32(self._scale)
 
     def update(self, z: np.ndarray, weight: float, speed_weights: np.ndarray) -> None:
         """
@@ -240,31 +241,27 @@ class PlaceFilter:
 
     def _top(self, n: int) -> np.ndarray:
         """Return the ``TOP`` most probable places, int64; they lie in blocks with large maxima."""
-        blocks = -(-n // BLOCK)
+        blocks = max(1, -(-n // BLOCK))
         some = np.sort(np.argpartition(self._maxima[:blocks], max(blocks - TOP, 0))[-TOP:])
         places = (some[:, None] * BLOCK + np.arange(BLOCK)).ravel()
         places = places[places < n]
         return places[np.argpartition(self._by_place[places], max(len(places) - TOP, 0))[-TOP:]]
 
-    def most_probable(self, n: int, excluded: np.ndarray) -> tuple[int, float]:
+    def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
         """
         Return the most probable place now and its probability, 0 if all are excluded.
 
-        :param n: places, at least 1.
         :param excluded: places that do not count.
         """
-        maxima, by_place = self._maxima[: -(-n // BLOCK)].copy(), self._by_place[:n]
+        maxima, by_block = self._maxima.copy(), self._by_place.reshape(-1, BLOCK)
         touched = np.unique(excluded // BLOCK)
-        pieces = (touched[:, None] * BLOCK + np.arange(BLOCK)).ravel()
-        pieces = np.setdiff1d(pieces[pieces < n], excluded, assume_unique=True)
-        maxima[touched] = 0
+        left = by_block[touched]
+        left[np.searchsorted(touched, excluded // BLOCK), excluded % BLOCK] = 0
+        maxima[touched] = left.max(axis=1)
         block = int(np.argmax(maxima))
-        pieces = np.append(pieces, np.arange(block * BLOCK, min((block + 1) * BLOCK, n)))
-        pieces = np.setdiff1d(pieces, excluded)
-        if not pieces.size:
-            return 0, 0.0
-        place = int(pieces[np.argmax(by_place[pieces])])
-        return place, float(by_place[place]) * self._scale
+        values = by_block[block].copy()
+        values[excluded[excluded // BLOCK == block] % BLOCK] = 0
+        return block * BLOCK + int(np.argmax(values)), float(maxima[block]) * self._scale
 
     def way(self, state: np.ndarray, images: int) -> np.ndarray:
         """

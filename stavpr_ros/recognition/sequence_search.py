@@ -412,7 +412,7 @@ class FilterSearch:
     ) -> tuple[int, float]:
         """Return the most probable place beyond a radius, and its probability, 0 if none."""
         around = np.arange(max(0, middle - radius), min(n, middle + radius + 1))
-        now, faint = self.filter.most_probable(n, np.union1d(around, places))
+        now, faint = self.filter.most_probable(np.union1d(around, places))
         faint *= NEGLIGIBLE
         apart = np.abs(places - middle) > radius
         if apart.any():
@@ -432,7 +432,7 @@ class FilterSearch:
     def _nowhere(self, n: int, first: int) -> WindowMatch:
         """Return the place that is most probable now, with the distance 1."""
         nothing = np.empty(0, np.int64)
-        place = self.filter.most_probable(n, nothing)[0] + first
+        place = self.filter.most_probable(nothing)[0] + first
         match = SequenceMatch(place, place, place, 1.0, -1, float('nan'))
         length = self.buffer.length
         path = np.stack([np.arange(length), np.full(length, place)], axis=1).astype(np.int32)
