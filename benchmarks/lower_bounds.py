@@ -139,10 +139,9 @@ def window_push(sizes: Sizes) -> Work:
 
 def filter_update(sizes: Sizes, settings: FilterSettings) -> Work:
     """
-    Advance the filter: states and row are read once; states and their origins (half a byte each)
-    are written once, and their sum of each place.
+    Advance the filter: states and row are read once; states, origins and sums are written once.
 
-    A likelihood takes an exponential (1), a product and a difference. A state mixes levels (2
+    Half a byte an origin, a sum for each place. A likelihood takes an exponential (1), a product and a difference. A state mixes levels (2
     each) and speeds (9, where it comes from 2), moves (5, 2), is joined by births and weighed (4).
     """
     K = len(settings.levels)
