@@ -141,8 +141,9 @@ def filter_update(sizes: Sizes, settings: FilterSettings) -> Work:
     """
     Advance the filter: states and row are read once; states, origins and sums are written once.
 
-    Half a byte an origin, a sum for each place. A likelihood takes an exponential (1), a product and a difference. A state mixes levels (2
-    each) and speeds (9, where it comes from 2), moves (5, 2), is joined by births and weighed (4).
+    Half a byte an origin, a sum for each place. A likelihood takes an exponential (1), a product
+    and a difference. A state mixes levels (2 each) and speeds (9, where it comes from 2), moves
+    (5, 2), is joined by births and weighed (4).
     """
     K = len(settings.levels)
     states = K * len(settings.speeds)
