@@ -1,0 +1,156 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Estimates edges; keypoints and landmarks of the latest places are kept."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import replace
+import math
+from typing import TypeVar
+
+import numpy as np
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping.camera import Camera
+from stavpr_ros.mapping.place_map import decode_thumbnail
+from stavpr_ros.relative_pose.edge import Edge, Source
+from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View, view_of
+from stavpr_ros.relative_pose.odometry import align
+from stavpr_ros.relative_pose.pair import MatchedPair
+from stavpr_ros.relative_pose.pnp import LEAST_INLIERS, PnpPose, solve_pnp
+from stavpr_ros.relative_pose.transforms import cross_matrices, inverse, matrix_of, pose_of
+
+METHODS = ('auto', 'none', 'aligned', 'pnp')
+VIEWS, LANDMARKS = 64, 32  # places kept: some 300 kB and 100 kB each
+LEAST_BASELINE = 0.05  # meters between the place and a neighbor
+REACH = 2.0  # a query is at most so many times as far from the place as its neighbors
+# The Jacobian misses what all landmarks of a place have in common, such as errors of its odometry:
+# the deviation of an observation in pixels, and what is added in position (m) and rotation (rad).
+NOISE, SHIFT, TURN = 2.0, 0.15, math.radians(0.3)
+
+Value = TypeVar('Value')
+
+
+class EdgeEstimator:
+    """
+    Estimates the relative pose of matched pairs. Belongs to one thread.
+
+    :param method: ``auto``: PnP where it is possible, else aligned by odometry; ``pnp`` and
+        ``aligned``: that alone; ``none``.
+    """
+
+    def __init__(self, method: str = 'auto') -> None:
+        self.method = method
+        self._source: tuple[PlaceMap | GrowingMap, Camera] | None = None
+        self._views: OrderedDict[int, View] = OrderedDict()
+        self._landmarks: OrderedDict[int, tuple[Landmarks, float]] = OrderedDict()
+
+    def estimate(
+        self, pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None
+    ) -> Edge:
+        """
+        Return the edge of a pair.
+
+        :param query_camera, place_camera: of the two images; None = unknown.
+        """
+        if self.method == 'none':
+            return Edge(Source.NONE, 'parameter relative_pose is none')
+        if self.method == 'aligned':
+            return replace(align(pair), reason='parameter relative_pose is aligned')
+        edge = self._pnp(pair, query_camera, place_camera)
+        if edge.source is Source.PNP or self.method == 'pnp':
+            return edge
+        other = align(pair)
+        reason = f'{edge.reason}; {other.reason}' if other.reason else edge.reason
+        return replace(other, reason=reason, inliers=edge.inliers)
+
+    def _pnp(
+        self, pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None
+    ) -> Edge:
+        """Return the edge by PnP; without a pose, and with a reason, where it is impossible."""
+        if query_camera is None or place_camera is None:
+            of = 'the camera' if query_camera is None else 'the camera of the map'
+            return Edge(Source.NONE, f'the intrinsics of {of} are unknown')
+        if pair.query is None or pair.place not in pair.thumbnails:
+            return Edge(Source.NONE, 'no thumbnails of query and place')
+        if np.isnan(pair.pose(pair.place)).any():
+            return Edge(Source.NONE, 'the place has no pose')
+        if self._source is None or self._source[0] is not pair.source or (
+            self._source[1] != place_camera
+        ):
+            self._source = pair.source, place_camera
+            self._views.clear()
+            self._landmarks.clear()
+        try:
+            query = self._view(pair.query, query_camera)
+            landmarks, reach = _kept(
+                self._landmarks, pair.place, LANDMARKS, lambda: self._triangulated(pair)
+            )
+        except InputError as error:
+            return Edge(Source.NONE, str(error))
+        found = solve_pnp(query, landmarks)
+        if found.matrix is None:
+            reason = f'PnP: {found.inliers} inliers of {len(landmarks.points)} landmarks, fewer '
+            return Edge(Source.NONE, f'{reason}than {LEAST_INLIERS}', inliers=found.inliers)
+        if np.linalg.norm(found.matrix[:3, 3]) > reach:
+            reason = f'PnP: more than {reach:.1f} m from the place'
+            return Edge(Source.NONE, reason, inliers=found.inliers)
+        return _edge(found, query_camera, place_camera)
+
+    def _view(self, image: np.ndarray, camera: Camera) -> View:
+        camera.require_fitting(image.shape[1], image.shape[0])
+        return view_of(image, camera)
+
+    def _triangulated(self, pair: MatchedPair) -> tuple[Landmarks, float]:
+        """Return the landmarks of a place, and how far from it they serve, meters."""
+        assert self._source is not None
+        camera = self._source[1]
+        mount, own = matrix_of(np.array(camera.mount)), matrix_of(pair.pose(pair.place))
+        place, neighbors, reach = None, [], 0.0
+        for index, content in pair.thumbnails.items():
+            pose = pair.pose(index)
+            if np.isnan(pose).any():
+                continue
+            image = decode_thumbnail(content)
+            if image is None:
+                continue
+            view = _kept(self._views, index, VIEWS, lambda i=image: self._view(i, camera))
+            if index == pair.place:
+                place = view
+                continue
+            motion = inverse(own @ mount) @ matrix_of(pose) @ mount
+            baseline = float(np.linalg.norm(motion[:3, 3]))
+            if baseline > LEAST_BASELINE:
+                neighbors.append((view, inverse(motion)))
+                reach = max(reach, REACH * baseline)
+        if place is None or not neighbors:
+            raise InputError('PnP: the place has no neighbors with poses and thumbnails')
+        return triangulate(place, neighbors), reach
+
+
+def _kept(
+    values: OrderedDict[int, Value], key: int, most: int, make: Callable[[], Value]
+) -> Value:
+    """Return the value of a key, made if it is not kept; the least recently used one goes."""
+    if key not in values:
+        values[key] = make()
+        if len(values) > most:
+            values.popitem(last=False)
+    values.move_to_end(key)
+    return values[key]
+
+
+def _edge(found: PnpPose, query_camera: Camera, place_camera: Camera) -> Edge:
+    """Return the edge between the bases of the cameras."""
+    assert found.matrix is not None
+    place_mount = matrix_of(np.array(place_camera.mount))
+    to_base = inverse(matrix_of(np.array(query_camera.mount)))
+    turn = place_mount[:3, :3]
+    lever = found.matrix[:3, :3] @ to_base[:3, 3]  # from the query's camera to its base
+    change = np.zeros((6, 6))
+    change[:3, :3] = change[3:, 3:] = turn
+    change[:3, 3:] = -turn @ cross_matrices(lever[None])[0]
+    covariance = NOISE**2 * change @ found.covariance @ change.T
+    covariance += np.diag([SHIFT**2] * 3 + [TURN**2] * 3)
+    pose = pose_of(place_mount @ found.matrix @ to_base)
+    return Edge(Source.PNP, '', pose, covariance, found.inliers, found.error)

@@ -1,0 +1,94 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A matched pair of images, with all that is known of their surroundings."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from stavpr_ros.errors import MapFileError
+from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.recognition import Match
+
+NEIGHBORS = 4  # places before and after the place, that its keypoints are triangulated with
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedPair:
+    """
+    The middle image of a window, and its place; nothing in it changes when the map grows.
+
+    :param source: the map that the place is of.
+    :param place: its index.
+    :param query: thumbnail of the image, RGB (h, w, 3) uint8; None = unknown.
+    :param query_poses: of the base, at the images of the window, shape (l, 7); NaN = unknown.
+    :param middle: position of the image in the window.
+    :param path: warping path, shape (m, 2): position in the window, place.
+    :param first: index of the first of the places around it.
+    :param poses: of the base at those places, shape (k, 7); NaN = unknown.
+    :param thumbnails: of those of them that are at most ``NEIGHBORS`` away, and of the same
+        session, by index: JPEG images, empty = none.
+    """
+
+    source: PlaceMap | GrowingMap
+    place: int
+    query: np.ndarray | None
+    query_poses: np.ndarray
+    middle: int
+    path: np.ndarray
+    first: int
+    poses: np.ndarray
+    thumbnails: dict[int, bytes]
+
+    def pose(self, place: int) -> np.ndarray:
+        """Return the pose of a place near by, shape (7,); NaN = unknown."""
+        return np.asarray(self.poses[place - self.first])
+
+    @property
+    def query_pose(self) -> np.ndarray:
+        """Return the pose of the query, in the frame of the odometry, shape (7,)."""
+        return np.asarray(self.query_poses[self.middle])
+
+    @cached_property
+    def spacing(self) -> float:
+        """Return the median distance between successive places, meters; NaN = unknown."""
+        steps = np.linalg.norm(np.diff(self.poses[:, :3], axis=0), axis=1)
+        steps = steps[np.isfinite(steps)]
+        return float(np.median(steps)) if len(steps) else float('nan')
+
+
+def matched_pair(
+    match: Match,
+    places: PlaceMap | GrowingMap,
+    query: np.ndarray | None,
+    query_poses: np.ndarray,
+) -> MatchedPair:
+    """
+    Take the middle pair of a match out of its map.
+
+    :param query, query_poses: see :class:`MatchedPair`.
+    """
+    place, start = match.place_index, places.first if isinstance(places, GrowingMap) else 0
+    low, high = int(match.path[:, 1].min()), int(match.path[:, 1].max())
+    low = max(start, min(low, place - NEIGHBORS))
+    high = min(start + len(places), max(high, place + NEIGHBORS) + 1)
+    poses = np.full((high - low, 7), np.nan)
+    if places.poses is not None:
+        poses[:] = places.poses[low - start : high - start]
+    session = places.place(place).session
+    thumbnails = {}
+    if len(places.thumbnails):
+        for index in range(max(low, place - NEIGHBORS), min(high, place + NEIGHBORS + 1)):
+            if places.place(index).session == session:
+                thumbnails[index] = _thumbnail(places, index - start)
+    middle = (len(match.window_stamps) - 1) // 2
+    return MatchedPair(
+        places, place, query, query_poses, middle, match.path, low, poses, thumbnails
+    )
+
+
+def _thumbnail(places: PlaceMap | GrowingMap, position: int) -> bytes:
+    try:
+        return places.thumbnails[position]
+    except MapFileError:  # the file has become shorter since it was opened
+        return b''
