@@ -43,8 +43,8 @@ class Camera:
         numbers = (*self.focal, *self.center, *self.distortion)
         if not (min(self.width, self.height) > 0 and min(self.focal) > 0):
             raise InputError(
-                f'camera of {self.width}x{self.height} pixels, focal length {self.focal}: expected '
-                'numbers above 0; calibrate the camera'
+                f'camera of {self.width}x{self.height} pixels, focal length {self.focal}: '
+                'expected numbers above 0; calibrate the camera'
             )
         if not all(map(math.isfinite, numbers)):
             raise InputError(f'intrinsics {numbers} are not finite: calibrate the camera')

@@ -50,6 +50,10 @@ def save_map(
 
 
 def _manifest(place_map: PlaceMap) -> dict[str, Any]:
+    sections = {}
+    if place_map.camera is not None:
+        data = place_map.camera.to_json()
+        sections['intrinsics'] = {'version': 1, 'required': False, 'data': data}
     settings, projection = place_map.settings, place_map.projection
     backbone = {name: getattr(settings.backbone, name) for name in identity_fields(settings.kind)}
     return {
@@ -66,7 +70,7 @@ def _manifest(place_map: PlaceMap) -> dict[str, Any]:
             {row.name: getattr(session, row.name) for row in fields(session)}
             for session in place_map.sessions
         ],
-        'sections': {},
+        'sections': sections,
     }
 
 

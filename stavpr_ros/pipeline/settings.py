@@ -197,6 +197,8 @@ class NodeSettings:
     threads: int
     publish_tf: bool
     publish_initialpose: bool
+    relative_pose: str
+    camera_transform: str
     pipeline: PipelineSettings
 
     def __post_init__(self) -> None:
@@ -209,8 +211,9 @@ class NodeSettings:
 
     @property
     def needs_odometry(self) -> bool:
-        """Whether poses are used: for keyframes, places of a growing map, or the transform."""
+        """Whether poses are used: for keyframes, places of a growing map, transform, or edges."""
         used = self.pipeline.keyframes.needs_poses or self.publish_tf
+        used |= self.relative_pose in ('auto', 'aligned')
         return used or self.operation != 'localization'
 
 

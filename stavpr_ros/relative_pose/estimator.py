@@ -5,6 +5,7 @@
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 import math
 from typing import TypeVar
 
@@ -23,6 +24,8 @@ from stavpr_ros.relative_pose.transforms import cross_matrices, inverse, matrix_
 METHODS = ('auto', 'none', 'aligned', 'pnp')
 VIEWS, LANDMARKS = 64, 32  # places kept: some 300 kB and 100 kB each
 LEAST_BASELINE = 0.05  # meters between the place and a neighbor
+# Places between independent edges: their errors have views, or odometry, in common.
+APART = {Source.PNP: 5, Source.ALIGNED: 10}
 REACH = 2.0  # a query is at most so many times as far from the place as its neighbors
 # The Jacobian misses what all landmarks of a place have in common, such as errors of its odometry:
 # the deviation of an observation in pixels, and what is added in position (m) and rotation (rad).
@@ -42,22 +45,53 @@ class EdgeEstimator:
     def __init__(self, method: str = 'auto') -> None:
         self.method = method
         self._source: tuple[PlaceMap | GrowingMap, Camera] | None = None
+        self._last: tuple[PlaceMap | GrowingMap, np.ndarray] | None = None
         self._views: OrderedDict[int, View] = OrderedDict()
         self._landmarks: OrderedDict[int, tuple[Landmarks, float]] = OrderedDict()
 
     def estimate(
-        self, pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None
+        self,
+        pair: MatchedPair,
+        query_camera: Camera | None,
+        place_camera: Camera | None,
+        in_time: bool = True,
     ) -> Edge:
         """
-        Return the edge of a pair.
+        Return the edge of a pair, and whether it is independent of those before.
 
         :param query_camera, place_camera: of the two images; None = unknown.
+        :param in_time: there is time for PnP.
         """
+        edge = self._estimated(pair, query_camera, place_camera, in_time)
+        return replace(edge, independent=self._is_independent(pair, edge))
+
+    def _is_independent(self, pair: MatchedPair, edge: Edge) -> bool:
+        """Return whether the query has moved far enough since the last independent edge."""
+        if edge.source is Source.NONE:
+            return False
+        base = matrix_of(pair.pose(pair.place)) @ matrix_of(edge.pose)
+        last = self._last
+        if last is not None and last[0] is pair.source:
+            moved = float(np.linalg.norm(base[:3, 3] - last[1]))
+            if moved < APART[edge.source] * pair.spacing:
+                return False
+        self._last = pair.source, base[:3, 3]
+        return True
+
+    def _estimated(
+        self,
+        pair: MatchedPair,
+        query_camera: Camera | None,
+        place_camera: Camera | None,
+        in_time: bool,
+    ) -> Edge:
         if self.method == 'none':
             return Edge(Source.NONE, 'parameter relative_pose is none')
         if self.method == 'aligned':
             return replace(align(pair), reason='parameter relative_pose is aligned')
-        edge = self._pnp(pair, query_camera, place_camera)
+        edge = Edge(Source.NONE, 'PnP: too many closures are waiting')
+        if in_time:
+            edge = self._pnp(pair, query_camera, place_camera)
         if edge.source is Source.PNP or self.method == 'pnp':
             return edge
         other = align(pair)
@@ -70,24 +104,11 @@ class EdgeEstimator:
         """Return the edge by PnP; without a pose, and with a reason, where it is impossible."""
         if query_camera is None or place_camera is None:
             of = 'the camera' if query_camera is None else 'the camera of the map'
-            return Edge(Source.NONE, f'the intrinsics of {of} are unknown')
-        if pair.query is None or pair.place not in pair.thumbnails:
-            return Edge(Source.NONE, 'no thumbnails of query and place')
-        if np.isnan(pair.pose(pair.place)).any():
-            return Edge(Source.NONE, 'the place has no pose')
-        if self._source is None or self._source[0] is not pair.source or (
-            self._source[1] != place_camera
-        ):
-            self._source = pair.source, place_camera
-            self._views.clear()
-            self._landmarks.clear()
+            return Edge(Source.NONE, f'PnP: the intrinsics of {of} are unknown')
         try:
-            query = self._view(pair.query, query_camera)
-            landmarks, reach = _kept(
-                self._landmarks, pair.place, LANDMARKS, lambda: self._triangulated(pair)
-            )
+            query, landmarks, reach = self._seen(pair, query_camera, place_camera)
         except InputError as error:
-            return Edge(Source.NONE, str(error))
+            return Edge(Source.NONE, f'PnP: {error}')
         found = solve_pnp(query, landmarks)
         if found.matrix is None:
             reason = f'PnP: {found.inliers} inliers of {len(landmarks.points)} landmarks, fewer '
@@ -97,14 +118,33 @@ class EdgeEstimator:
             return Edge(Source.NONE, reason, inliers=found.inliers)
         return _edge(found, query_camera, place_camera)
 
+    def _seen(
+        self, pair: MatchedPair, query_camera: Camera, place_camera: Camera
+    ) -> tuple[View, Landmarks, float]:
+        """
+        Return the query, the landmarks of the place, and how far from it they serve, meters.
+
+        :raises InputError: something is missing.
+        """
+        if np.isnan(pair.pose(pair.place)).any():
+            raise InputError('the place has no pose')
+        if pair.query is None or not pair.thumbnails.get(pair.place):
+            raise InputError('query or place has no thumbnail')
+        source = self._source
+        if source is None or source[0] is not pair.source or source[1] != place_camera:
+            self._source = pair.source, place_camera
+            self._views.clear()
+            self._landmarks.clear()
+        make = partial(self._triangulated, pair, place_camera)
+        landmarks, reach = _kept(self._landmarks, pair.place, LANDMARKS, make)
+        return self._view(pair.query, query_camera), landmarks, reach
+
     def _view(self, image: np.ndarray, camera: Camera) -> View:
         camera.require_fitting(image.shape[1], image.shape[0])
         return view_of(image, camera)
 
-    def _triangulated(self, pair: MatchedPair) -> tuple[Landmarks, float]:
+    def _triangulated(self, pair: MatchedPair, camera: Camera) -> tuple[Landmarks, float]:
         """Return the landmarks of a place, and how far from it they serve, meters."""
-        assert self._source is not None
-        camera = self._source[1]
         mount, own = matrix_of(np.array(camera.mount)), matrix_of(pair.pose(pair.place))
         place, neighbors, reach = None, [], 0.0
         for index, content in pair.thumbnails.items():
@@ -114,7 +154,7 @@ class EdgeEstimator:
             image = decode_thumbnail(content)
             if image is None:
                 continue
-            view = _kept(self._views, index, VIEWS, lambda i=image: self._view(i, camera))
+            view = _kept(self._views, index, VIEWS, partial(self._view, image, camera))
             if index == pair.place:
                 place = view
                 continue
@@ -124,7 +164,7 @@ class EdgeEstimator:
                 neighbors.append((view, inverse(motion)))
                 reach = max(reach, REACH * baseline)
         if place is None or not neighbors:
-            raise InputError('PnP: the place has no neighbors with poses and thumbnails')
+            raise InputError('the place has no neighbors with poses and thumbnails')
         return triangulate(place, neighbors), reach
 
 

@@ -16,7 +16,7 @@ RATIO = 0.8  # of the distances to the nearest and the second nearest descriptor
 FEATURES = 600  # most keypoints of a thumbnail
 CONTRAST = 0.02  # of SIFT; thumbnails are small, so that weaker keypoints count
 PIXELS = (6.0, 4.0, 3.0, 2.0)  # how far an observation may be off its landmark, round by round
-MOST_SHIFT = 1.0  # deviation of a landmark in an image one meter away, pixels
+MOST_SHIFT = 2.0  # deviation of a landmark in an image one meter away, pixels
 LEAST_SHARE = 1 / 500  # least inverse depth, 1/m: everything beyond is at infinity
 # Deviations of the odometry between places: of the translation, m and share of it, of the rotation
 SHIFT, TURN = (0.02, 0.02), 0.02
@@ -116,7 +116,9 @@ class _Observations:
     @classmethod
     def of(cls, place: View, neighbors: Sequence[tuple[View, np.ndarray]]) -> '_Observations':
         """Match the place with each neighbor."""
-        pairs = [mutual_matches(place.descriptors, view.descriptors, RATIO) for view, _ in neighbors]
+        pairs = [
+            mutual_matches(place.descriptors, view.descriptors, RATIO) for view, _ in neighbors
+        ]
         keypoint = np.concatenate([mine for mine, _ in pairs]).astype(np.intp)
         neighbor = np.repeat(np.arange(len(pairs)), [len(mine) for mine, _ in pairs])
         rays = np.column_stack([place.rays, np.ones(len(place.rays))])
@@ -140,11 +142,11 @@ class _Observations:
         rho = np.bincount(self.keypoint, weight * (a * b).sum(axis=1), k)
         return np.maximum(rho / np.maximum(information, 1e-12), LEAST_SHARE), information
 
-    def residuals(
-        self, motions: np.ndarray, rho: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def residuals(self, motions: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how far observations are off, (m, 2), and whether they are ahead, (m,)."""
-        direction = self._turned(motions) + rho[self.keypoint, None] * motions[self.neighbor, :3, 3]
+        direction = (
+            self._turned(motions) + rho[self.keypoint, None] * motions[self.neighbor, :3, 3]
+        )
         ahead = direction[:, 2] > 1e-6
         return direction[:, :2] / np.where(ahead, direction[:, 2], 1)[:, None] - self.seen, ahead
 
