@@ -211,9 +211,8 @@ class NodeSettings:
 
     @property
     def needs_odometry(self) -> bool:
-        """Whether poses are used: for keyframes, places of a growing map, transform, or edges."""
+        """Whether poses are used: for keyframes, places of a growing map, or the transform."""
         used = self.pipeline.keyframes.needs_poses or self.publish_tf
-        used |= self.relative_pose in ('auto', 'aligned')
         return used or self.operation != 'localization'
 
 

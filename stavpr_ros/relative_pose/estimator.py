@@ -17,7 +17,7 @@ from stavpr_ros.mapping.place_map import decode_thumbnail
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View, view_of
 from stavpr_ros.relative_pose.odometry import align
-from stavpr_ros.relative_pose.pair import MatchedPair
+from stavpr_ros.relative_pose.pair import BESIDE, MatchedPair, NEIGHBORS
 from stavpr_ros.relative_pose.pnp import LEAST_INLIERS, PnpPose, solve_pnp
 from stavpr_ros.relative_pose.transforms import cross_matrices, inverse, matrix_of, pose_of
 
@@ -29,7 +29,7 @@ APART = {Source.PNP: 5, Source.ALIGNED: 10}
 REACH = 2.0  # a query is at most so many times as far from the place as its neighbors
 # The Jacobian misses what all landmarks of a place have in common, such as errors of its odometry:
 # the deviation of an observation in pixels, and what is added in position (m) and rotation (rad).
-NOISE, SHIFT, TURN = 2.0, 0.15, math.radians(0.3)
+NOISE, SHIFT, TURN = 2.0, 0.2, math.radians(0.4)
 
 Value = TypeVar('Value')
 
@@ -46,8 +46,8 @@ class EdgeEstimator:
         self.method = method
         self._source: tuple[PlaceMap | GrowingMap, Camera] | None = None
         self._last: tuple[PlaceMap | GrowingMap, np.ndarray] | None = None
-        self._views: OrderedDict[int, View] = OrderedDict()
-        self._landmarks: OrderedDict[int, tuple[Landmarks, float]] = OrderedDict()
+        self._views: OrderedDict[int, View | None] = OrderedDict()
+        self._landmarks: OrderedDict[int, tuple[Landmarks, float, list[int]]] = OrderedDict()
 
     def estimate(
         self,
@@ -111,8 +111,8 @@ class EdgeEstimator:
             return Edge(Source.NONE, f'PnP: {error}')
         found = solve_pnp(query, landmarks)
         if found.matrix is None:
-            reason = f'PnP: {found.inliers} inliers of {len(landmarks.points)} landmarks, fewer '
-            return Edge(Source.NONE, f'{reason}than {LEAST_INLIERS}', inliers=found.inliers)
+            reason = f'PnP: {found.inliers} inliers are fewer than {LEAST_INLIERS}'
+            return Edge(Source.NONE, reason, inliers=found.inliers)
         if np.linalg.norm(found.matrix[:3, 3]) > reach:
             reason = f'PnP: more than {reach:.1f} m from the place'
             return Edge(Source.NONE, reason, inliers=found.inliers)
@@ -120,9 +120,9 @@ class EdgeEstimator:
 
     def _seen(
         self, pair: MatchedPair, query_camera: Camera, place_camera: Camera
-    ) -> tuple[View, Landmarks, float]:
+    ) -> tuple[View, list[Landmarks], float]:
         """
-        Return the query, the landmarks of the place, and how far from it they serve, meters.
+        Return the query, landmarks in the frame of the place, and how far they serve (m).
 
         :raises InputError: something is missing.
         """
@@ -135,37 +135,55 @@ class EdgeEstimator:
             self._source = pair.source, place_camera
             self._views.clear()
             self._landmarks.clear()
-        make = partial(self._triangulated, pair, place_camera)
-        landmarks, reach = _kept(self._landmarks, pair.place, LANDMARKS, make)
+        own, reach, neighbors = self._landmarks_of(pair, pair.place, place_camera)
+        landmarks = [own]
+        for motion, index in zip(own.motions, neighbors, strict=True):
+            if abs(index - pair.place) <= BESIDE:
+                beside, _, _ = self._landmarks_of(pair, index, place_camera)
+                landmarks.append(beside.seen_from(inverse(motion)))
         return self._view(pair.query, query_camera), landmarks, reach
+
+    def _landmarks_of(
+        self, pair: MatchedPair, place: int, camera: Camera
+    ) -> tuple[Landmarks, float, list[int]]:
+        make = partial(self._triangulated, pair, place, camera)
+        return _kept(self._landmarks, place, LANDMARKS, make)
 
     def _view(self, image: np.ndarray, camera: Camera) -> View:
         camera.require_fitting(image.shape[1], image.shape[0])
         return view_of(image, camera)
 
-    def _triangulated(self, pair: MatchedPair, camera: Camera) -> tuple[Landmarks, float]:
-        """Return the landmarks of a place, and how far from it they serve, meters."""
-        mount, own = matrix_of(np.array(camera.mount)), matrix_of(pair.pose(pair.place))
-        place, neighbors, reach = None, [], 0.0
-        for index, content in pair.thumbnails.items():
-            pose = pair.pose(index)
-            if np.isnan(pose).any():
+    def _triangulated(
+        self, pair: MatchedPair, place: int, camera: Camera
+    ) -> tuple[Landmarks, float, list[int]]:
+        """Return the landmarks of a place, how far from it they serve (m), and its neighbors."""
+        mount, own = matrix_of(np.array(camera.mount)), matrix_of(pair.pose(place))
+        neighbors, indices, reach = [], [], 0.0
+        for index in range(place - NEIGHBORS, place + NEIGHBORS + 1):
+            if index == place or not pair.thumbnails.get(index):
                 continue
-            image = decode_thumbnail(content)
-            if image is None:
+            pose, view = pair.pose(index), self._view_of(pair, index, camera)
+            if view is None or np.isnan(pose).any():
                 continue
-            view = _kept(self._views, index, VIEWS, partial(self._view, image, camera))
-            if index == pair.place:
-                place = view
-                continue
-            motion = inverse(own @ mount) @ matrix_of(pose) @ mount
+            motion = inverse(matrix_of(pose) @ mount) @ own @ mount
             baseline = float(np.linalg.norm(motion[:3, 3]))
             if baseline > LEAST_BASELINE:
-                neighbors.append((view, inverse(motion)))
+                neighbors.append((view, motion))
+                indices.append(index)
                 reach = max(reach, REACH * baseline)
-        if place is None or not neighbors:
+        view = self._view_of(pair, place, camera)
+        if view is None or not neighbors:
             raise InputError('the place has no neighbors with poses and thumbnails')
-        return triangulate(place, neighbors), reach
+        return triangulate(view, neighbors), reach, indices
+
+    def _view_of(self, pair: MatchedPair, index: int, camera: Camera) -> View | None:
+        """Return the view of a place; None if its thumbnail is damaged."""
+
+        def make() -> View | None:
+            image = decode_thumbnail(pair.thumbnails[index])
+            return None if image is None else self._view(image, camera)
+
+        return _kept(self._views, index, VIEWS, make)
 
 
 def _kept(

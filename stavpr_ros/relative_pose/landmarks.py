@@ -3,7 +3,7 @@
 """Points of a place in three dimensions: its keypoints, triangulated with its neighbors."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -44,10 +44,17 @@ class Landmarks:
 
     :param points: shape (m, 3), meters, float64.
     :param descriptors: of the place's keypoints, shape (m, 128), float32.
+    :param motions: from that frame to those of the neighbors, refined, shape (neighbors, 4, 4).
     """
 
     points: np.ndarray
     descriptors: np.ndarray
+    motions: np.ndarray
+
+    def seen_from(self, motion: np.ndarray) -> 'Landmarks':
+        """Return the points in another frame, to which this one has the transform (4, 4)."""
+        points = self.points @ motion[:3, :3].T + motion[:3, 3]
+        return replace(self, points=points)
 
 
 def view_of(image: np.ndarray, camera: Camera) -> View:
@@ -81,8 +88,6 @@ def triangulate(place: View, neighbors: Sequence[tuple[View, np.ndarray]]) -> La
     """
     seen = _Observations.of(place, neighbors)
     k = len(place.rays)
-    if not len(seen.keypoint):
-        return Landmarks(np.empty((0, 3)), np.empty((0, 128), np.float32))
     motions = np.array([motion for _, motion in neighbors])
     prior = motions.copy()
     use = np.ones(len(seen.keypoint), bool)
@@ -96,7 +101,7 @@ def triangulate(place: View, neighbors: Sequence[tuple[View, np.ndarray]]) -> La
             motions = seen.refined(motions, prior, rho, use, place.focal)
     good = information * MOST_SHIFT**2 > 1
     rays = np.column_stack([place.rays, np.ones(k)])
-    return Landmarks(rays[good] / rho[good, None], place.descriptors[good])
+    return Landmarks(rays[good] / rho[good, None], place.descriptors[good], motions)
 
 
 @dataclass(frozen=True, eq=False)

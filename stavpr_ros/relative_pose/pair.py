@@ -10,7 +10,9 @@ from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.recognition import Match
 
-NEIGHBORS = 4  # places before and after the place, that its keypoints are triangulated with
+NEIGHBORS = 4  # places before and after a place that its keypoints are triangulated with
+BESIDE = 1  # places before and after the place whose landmarks are used as well
+AROUND = NEIGHBORS + BESIDE
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +28,7 @@ class MatchedPair:
     :param path: warping path, shape (m, 2): position in the window, place.
     :param first: index of the first of the places around it.
     :param poses: of the base at those places, shape (k, 7); NaN = unknown.
-    :param thumbnails: of those of them that are at most ``NEIGHBORS`` away, and of the same
+    :param thumbnails: of those of them that are at most ``AROUND`` away, and of the same
         session, by index: JPEG images, empty = none.
     """
 
@@ -70,15 +72,15 @@ def matched_pair(
     """
     place, start = match.place_index, places.first if isinstance(places, GrowingMap) else 0
     low, high = int(match.path[:, 1].min()), int(match.path[:, 1].max())
-    low = max(start, min(low, place - NEIGHBORS))
-    high = min(start + len(places), max(high, place + NEIGHBORS) + 1)
+    low = max(start, min(low, place - AROUND))
+    high = min(start + len(places), max(high, place + AROUND) + 1)
     poses = np.full((high - low, 7), np.nan)
     if places.poses is not None:
         poses[:] = places.poses[low - start : high - start]
     session = places.place(place).session
     thumbnails = {}
     if len(places.thumbnails):
-        for index in range(max(low, place - NEIGHBORS), min(high, place + NEIGHBORS + 1)):
+        for index in range(max(low, place - AROUND), min(high, place + AROUND + 1)):
             if places.place(index).session == session:
                 thumbnails[index] = _thumbnail(places, index - start)
     middle = (len(match.window_stamps) - 1) // 2

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pose of a query by keypoints that it shares with the landmarks of a place."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -10,7 +11,7 @@ from stavpr_ros.recognition.verification import mutual_matches
 from stavpr_ros.relative_pose.landmarks import Landmarks, RATIO, View
 from stavpr_ros.relative_pose.transforms import cross_matrices, inverse
 
-LEAST_INLIERS = 12  # pairs of wrong places had at most 7
+LEAST_INLIERS = 12  # keypoints of the query; pairs of wrong places had at most 8
 PIXELS = 2.5  # of an inlier, off its landmark
 ITERATIONS, CONFIDENCE = 500, 0.999
 
@@ -36,12 +37,20 @@ class PnpPose:
 NOTHING = PnpPose(None, np.full((6, 6), np.nan), 0, float('nan'))
 
 
-def solve_pnp(query: View, landmarks: Landmarks) -> PnpPose:
-    """Find the pose of a query: EPnP in RANSAC, and its refinement with the inliers."""
-    mine, theirs = mutual_matches(query.descriptors, landmarks.descriptors, RATIO)
-    if len(mine) < LEAST_INLIERS:
+def solve_pnp(query: View, landmarks: Sequence[Landmarks]) -> PnpPose:
+    """
+    Find the pose of a query: EPnP in RANSAC, and its refinement with the inliers.
+
+    :param landmarks: of the place, and of others near by in its frame: a point that several of
+        them have is an inlier once.
+    """
+    pairs = [mutual_matches(query.descriptors, each.descriptors, RATIO) for each in landmarks]
+    mine = np.concatenate([own for own, _ in pairs])
+    if len(np.unique(mine)) < LEAST_INLIERS:
         return NOTHING
-    points = landmarks.points[theirs]
+    points = np.concatenate(
+        [each.points[theirs] for each, (_, theirs) in zip(landmarks, pairs, strict=True)]
+    )
     pixels = np.ascontiguousarray(query.rays[mine] * query.focal)
     matrix = np.diag([query.focal, query.focal, 1.0])
     try:
@@ -51,8 +60,9 @@ def solve_pnp(query: View, landmarks: Landmarks) -> PnpPose:
         )  # fmt: skip
     except cv2.error:  # points in a line
         return NOTHING
-    if not found or inliers is None or len(inliers) < LEAST_INLIERS:
-        return PnpPose(None, NOTHING.covariance, 0 if inliers is None else len(inliers), np.nan)
+    if not found or inliers is None:
+        return NOTHING
+    count = 0
     for _ in range(2):  # the second time with the inliers of the refined pose
         chosen = inliers.ravel()
         turn, shift = cv2.solvePnPRefineLM(
@@ -64,12 +74,14 @@ def solve_pnp(query: View, landmarks: Landmarks) -> PnpPose:
         ahead = points @ motion[2, :3] + motion[2, 3] > 0
         distances = np.linalg.norm(off, axis=1)
         inliers = np.flatnonzero(ahead & (distances < PIXELS))
-        if len(inliers) < LEAST_INLIERS:
-            return PnpPose(None, NOTHING.covariance, len(inliers), np.nan)
+        count = len(np.unique(mine[inliers]))
+        if count < LEAST_INLIERS:
+            return PnpPose(None, NOTHING.covariance, count, np.nan)
     pose = inverse(motion)
     error = float(np.sqrt(np.mean(distances[inliers] ** 2)))
-    covariance = _covariance(pose, points[inliers], query.focal)
-    return PnpPose(pose, covariance, len(inliers), error)
+    # observations of one keypoint are not independent
+    covariance = _covariance(pose, points[inliers], query.focal) * len(inliers) / count
+    return PnpPose(pose, covariance, count, error)
 
 
 def _covariance(pose: np.ndarray, points: np.ndarray, focal: float) -> np.ndarray:

@@ -111,7 +111,7 @@ def input_findings(health: Health) -> list[Finding]:
     if health.odometry in ('stale', 'never') and (
         health.odometry_required or health.odometry_fault
     ):
-        need = 'required by a parameter' if health.odometry_required else 'for poses and edges'
+        need = 'required by a parameter' if health.odometry_required else 'for poses of the map'
         state = 'was never received' if health.odometry == 'never' else 'has stopped'
         remedy = health.odometry_fault or 'start it, compare its topic and its stamps'
         findings.append((WARN, f'odometry, {need}, {state}: {remedy}'))

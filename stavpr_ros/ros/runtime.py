@@ -190,7 +190,12 @@ class Runtime:
 
     def _update_odometry(self) -> None:
         """Subscribe to odometry while it is needed."""
-        needed = self.settings.needs_odometry
+        places, settings = self.pipeline.places, self.settings
+        needed = settings.needs_odometry or (  # edges to places of a map
+            settings.relative_pose in ('auto', 'aligned')
+            and isinstance(places, PlaceMap)
+            and places.has_poses
+        )
         if needed and self.odometry is None:
             self.odometry = OdometryInput(self._node, self.settings.odometry_timeout)
         elif not needed and self.odometry is not None:
@@ -231,6 +236,8 @@ class Runtime:
             loaded = self._read_in_time(path)
             with lock or nullcontext():
                 self.worker.run(lambda: self.pipeline.change(loaded=loaded))
+                if self.images is not None:
+                    self._update_odometry()
             self.worker.call(self._publish_route)
         places = loaded.places
         self._node.get_logger().info(
