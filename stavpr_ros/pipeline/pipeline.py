@@ -218,7 +218,7 @@ class Pipeline:
             return None
         unknown = np.full(7, np.nan)
         poses = np.array([unknown if pose is None else pose for pose in self._poses])
-        return matched_pair(match, places, self._thumbnails[0], poses)
+        return matched_pair(match, places, self._thumbnails[0], poses, self.window_distances())
 
     def window_distances(self) -> tuple[np.ndarray, int]:
         """

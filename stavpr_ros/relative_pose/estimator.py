@@ -73,7 +73,7 @@ class EdgeEstimator:
         last = self._last
         if last is not None and last[0] is pair.source:
             moved = float(np.linalg.norm(base[:3, 3] - last[1]))
-            if moved < APART[edge.source] * pair.spacing:
+            if moved < (APART[edge.source] - 0.5) * pair.spacing:
                 return False
         self._last = pair.source, base[:3, 3]
         return True

@@ -5,13 +5,16 @@
 import math
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from stavpr_ros.mapping.trajectory import interpolate
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.pair import MatchedPair
 from stavpr_ros.relative_pose.transforms import inverse, matrix_of, pose_of
 
-INNER = 0.5  # share of the window around its middle whose pairs count
-LEAST_PAIRS = 3
+FARTHEST, STEP = 4.0, 0.05  # offsets that are tried, and between two of them, places
+NEAR = 0.5  # of the least sum: where a parabola is fitted, places
+LEAST_IMAGES = 3
+LEAST_STEP = 0.01  # meters
 # Deviations: along the track, in places, and at least (m); across it (m); of the rotation (rad).
 ALONG, LEAST_ALONG, ACROSS, TURN = 0.5, 0.1, 1.25, math.radians(3)
 
@@ -20,23 +23,32 @@ def align(pair: MatchedPair) -> Edge:
     """
     Place the query on the track of the places.
 
-    Each pair of the path says where on the track the query's middle image is: where its place is,
-    less the distance that the query moved between. The median of them is free of calibration, and
-    of single wrong pairs. The offset to the side is unknown, and its variance says so.
+    Odometry has the places of the images of the window relative to each other. So the window is
+    moved along the track as a whole, to where the sum of its image distances is least. Unlike the
+    path of the recognizer, which moves at one of a few speeds, this has no bias. The offset to the
+    side is unknown, and has a variance accordingly.
     """
     if np.isnan(pair.pose(pair.place)).any():
         return Edge(Source.NONE, 'the place has no pose: record maps and routes with odometry')
     if np.isnan(pair.query_pose).any():
         return Edge(Source.NONE, 'no odometry at the middle image of the window')
     track, driven = _lengths(pair.poses), _lengths(pair.query_poses)
-    inner = np.abs(pair.path[:, 0] - pair.middle) <= INNER * len(driven) / 2
-    images, places = pair.path[inner].T
-    ahead = track[places - pair.first] - driven[images] + driven[pair.middle]
-    ahead = ahead[np.isfinite(ahead)]
-    if len(ahead) < LEAST_PAIRS:
-        return Edge(Source.NONE, 'the odometry of query or places has gaps in the window')
-    at = float(np.median(ahead))
-    known = np.flatnonzero(np.isfinite(track))
+    known, images = np.flatnonzero(np.isfinite(track)), np.flatnonzero(np.isfinite(driven))
+    apart = known[np.diff(track[known], prepend=-1) > LEAST_STEP]  # not where the robot stood
+    if min(len(images), len(apart)) < LEAST_IMAGES or not pair.spacing > 0:
+        reason = 'the odometry of query or places has gaps, or no motion, in the window'
+        return Edge(Source.NONE, reason)
+    offsets = np.arange(-FARTHEST, FARTHEST + STEP, STEP) * pair.spacing
+    start = float(track[pair.place - pair.first])
+    total = np.zeros(len(offsets))
+    rows = np.array([_finite(pair.distances[image, apart]) for image in images])
+    # smooth: between places, linear interpolation would pull all images to the same side
+    grid = np.arange(track[apart[0]], track[apart[-1]], STEP * pair.spacing)
+    smooth = CubicSpline(track[apart], rows.T)(grid)
+    for column, image in enumerate(images):
+        at = start + offsets + driven[image] - driven[pair.middle]
+        total += np.interp(at, grid, smooth[:, column])
+    at = start + _least(offsets, total)
     place = matrix_of(pair.pose(pair.place))
     pose = pose_of(inverse(place) @ matrix_of(_on_track(pair.poses[known], track[known], at)))
     direction = _direction(pair, place)
@@ -44,6 +56,24 @@ def align(pair: MatchedPair) -> Edge:
     covariance = np.diag([ACROSS**2] * 3 + [TURN**2] * 3)
     covariance[:3, :3] += (along**2 - ACROSS**2) * np.outer(direction, direction)
     return Edge(Source.ALIGNED, '', pose, covariance)
+
+
+def _finite(row: np.ndarray) -> np.ndarray:
+    """Return distances (k,); places that are not compared are as far as the farthest."""
+    compared = np.isfinite(row)
+    farthest = float(row[compared].max()) if compared.any() else 0.0
+    return np.where(compared, row, farthest)
+
+
+def _least(offsets: np.ndarray, total: np.ndarray) -> float:
+    """Return the offset at the vertex of the parabola around the least sum."""
+    least = int(np.argmin(total))
+    width = round(NEAR / STEP)
+    near = slice(max(0, least - width), least + width + 1)
+    a, b, _ = np.polyfit(offsets[near], total[near], 2)
+    if not a > 0:
+        return float(offsets[least])
+    return float(np.clip(-b / (2 * a), offsets[near][0], offsets[near][-1]))
 
 
 def _lengths(poses: np.ndarray) -> np.ndarray:

@@ -25,7 +25,8 @@ class MatchedPair:
     :param query: thumbnail of the image, RGB (h, w, 3) uint8; None = unknown.
     :param query_poses: of the base, at the images of the window, shape (l, 7); NaN = unknown.
     :param middle: position of the image in the window.
-    :param path: warping path, shape (m, 2): position in the window, place.
+    :param distances: of the images of the window to the places around, shape (l, k); +inf = not
+        compared.
     :param first: index of the first of the places around it.
     :param poses: of the base at those places, shape (k, 7); NaN = unknown.
     :param thumbnails: of those of them that are at most ``AROUND`` away, and of the same
@@ -37,7 +38,7 @@ class MatchedPair:
     query: np.ndarray | None
     query_poses: np.ndarray
     middle: int
-    path: np.ndarray
+    distances: np.ndarray
     first: int
     poses: np.ndarray
     thumbnails: dict[int, bytes]
@@ -64,19 +65,26 @@ def matched_pair(
     places: PlaceMap | GrowingMap,
     query: np.ndarray | None,
     query_poses: np.ndarray,
+    window: tuple[np.ndarray, int],
 ) -> MatchedPair:
     """
     Take the middle pair of a match out of its map.
 
     :param query, query_poses: see :class:`MatchedPair`.
+    :param window: distances of the images in the window, shape (l, n), +inf = not compared, and
+        the index of the first place.
     """
     place, start = match.place_index, places.first if isinstance(places, GrowingMap) else 0
     low, high = int(match.path[:, 1].min()), int(match.path[:, 1].max())
-    low = max(start, min(low, place - AROUND))
-    high = min(start + len(places), max(high, place + AROUND) + 1)
+    low = max(start, min(low, place) - AROUND)
+    high = min(start + len(places), max(high, place) + AROUND + 1)
     poses = np.full((high - low, 7), np.nan)
     if places.poses is not None:
         poses[:] = places.poses[low - start : high - start]
+    rows, origin = window
+    distances = np.full((len(rows), high - low), np.inf, np.float32)
+    some = rows[:, low - origin : high - origin]
+    distances[:, : some.shape[1]] = some
     session = places.place(place).session
     thumbnails = {}
     if len(places.thumbnails):
@@ -85,7 +93,7 @@ def matched_pair(
                 thumbnails[index] = _thumbnail(places, index - start)
     middle = (len(match.window_stamps) - 1) // 2
     return MatchedPair(
-        places, place, query, query_poses, middle, match.path, low, poses, thumbnails
+        places, place, query, query_poses, middle, distances, low, poses, thumbnails
     )
 
 
