@@ -92,8 +92,8 @@ def test_triangulate_corrects_the_rotation_of_the_odometry():
     points = points_ahead(300)
     views = views_of(points, poses, noise=0.2)
     around = [0, 1, 3, 4]
-    neighbors = list(zip([views[i] for i in around], motions([measured[i] for i in around], measured[2]),
-                         strict=True))  # fmt: skip
+    wrong = motions([measured[i] for i in around], measured[2])
+    neighbors = list(zip([views[i] for i in around], wrong, strict=True))
     landmarks = triangulate(views[2], neighbors)
     assert len(landmarks.points) > 200
     true = motions([poses[i] for i in around], poses[2])

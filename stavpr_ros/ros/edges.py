@@ -18,7 +18,7 @@ from stavpr_ros.relative_pose.pair import MatchedPair
 from stavpr_ros.ros.input import Worker
 from stavpr_ros.ros.output import relative_pose_message
 
-MOST_WAITING = 16  # closures; while there are more, edges are aligned only
+MOST_WAITING = 64  # closures; while there are more, edges are aligned only
 
 
 @dataclass(frozen=True)
