@@ -99,7 +99,15 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'features',
             'gradient',
             'Kind of the features of a map that is recorded without map_path.',
-            choices=('gradient', 'onnx', 'torchscript', 'densenet161_places365', 'vgg16'),
+            choices=(
+                'gradient',
+                'onnx',
+                'torchscript',
+                'densenet161_places365',
+                'vgg16',
+                'vgg16_fc6',
+                'netvlad',
+            ),
         ),
         NodeParameter(
             'exclude_places',
@@ -357,8 +365,9 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'precision',
             'float32',
             'Precision of the features of the map in localization; float16 halves their memory '
-            'and, on large maps, the time. Loop closure rejects float16.',
-            choices=('float32', 'float16'),
+            'and, on large maps, the time, int8 (not with vertical) quarters them. Loop closure '
+            'takes float32.',
+            choices=('float32', 'float16', 'int8'),
         ),
         NodeParameter(
             'threads',

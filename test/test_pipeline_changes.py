@@ -6,6 +6,7 @@ from dataclasses import replace
 import itertools
 import os
 
+import cv2
 import numpy as np
 from pipelines import (
     LENGTH,
@@ -26,7 +27,11 @@ from stavpr_ros.mapping import load_map, save_map, thumbnail_of
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.pipeline import OPERATIONS, Pipeline
 from stavpr_ros.recognition import Status
-from stavpr_ros.recognition.verification import GeometricSettings, GeometricVerifier
+from stavpr_ros.recognition.verification import (
+    GeometricEvidence,
+    GeometricSettings,
+    GeometricVerifier,
+)
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 
@@ -89,17 +94,14 @@ def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
 
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
-def test_geometric_check_accepts_and_rejects(operation, route):
-    pipeline = recorded(route, operation, candidates=2)
+def test_geometric_check_in_mode_paper_accepts_and_rejects(operation, route):
+    pipeline = recorded(route, operation, candidates=2, mode='paper', threshold=1.0)
     assert {match.inliers for match in process(pipeline, route[:CERTAIN])} == {-1}
     check = GeometricSettings(min_inliers=100)
     pipeline.change(replace(pipeline.settings, geometric=check))
     # the middle of a window of 5: the images until then came without a check
-    unknown = process(pipeline, route[7:9], first=7)
+    process(pipeline, route[7:9], first=7)
     accepted = process(pipeline, route[9:10], first=9)[0]
-    if operation == 'localization':
-        assert {match.status for match in unknown} == {Status.NO_MATCH}
-        assert 'it was off when the middle image' in unknown[0].reason
     assert (accepted.status, accepted.reason, accepted.place_index) == (Status.MATCH, '', 7)
     thumbnail = pipeline.places.thumbnail(7)
     found = GeometricVerifier(check).inliers(thumbnail_of(route[7]), thumbnail)
@@ -118,12 +120,35 @@ def test_geometric_check_accepts_and_rejects(operation, route):
     assert statuses(process(pipeline, route[10:11], first=10)) == [Status.MATCH]
 
 
-def test_geometric_check_rejects_without_thumbnails(small_map, route, tmp_path):
+@pytest.mark.parametrize('least', [8, 100_000])
+def test_geometric_check_in_mode_robust_weighs_doubtful_matches(map_file, route, least):
+    rng = np.random.default_rng(0)
+    noisy = [
+        cv2.addWeighted(x, 0.7, rng.integers(0, 256, x.shape, np.uint8), 0.3, 0) for x in route
+    ]
+    plain = process(localizing(map_file, candidates=2), noisy[:LENGTH])[-1]
+    limit = plain.probability  # just not above itself
+    check = GeometricSettings(min_inliers=least)
+    pipeline = localizing(map_file, geometric=check, min_probability=limit, candidates=2)
+    match = process(pipeline, noisy[:LENGTH])[-1]
+    assert 0.1 < plain.probability < 0.99
+    assert match.inliers >= 8
+    expected = GeometricEvidence().updated(plain.probability, least == 8)
+    assert match.probability == pytest.approx(expected)
+    assert match.status is (Status.MATCH if least == 8 else Status.NO_MATCH)
+    assert bool(match.reason) == (least != 8)
+    assert match.distance == match.candidates[0].distance == 1 - match.probability
+    assert match.sequence.middle == plain.sequence.middle == match.candidates[0].place
+
+
+@pytest.mark.parametrize(
+    'mode', [{}, {'mode': 'paper', 'threshold': 1.0}], ids=['robust', 'paper']
+)
+def test_geometric_check_without_thumbnails_changes_nothing(small_map, route, tmp_path, mode):
     save_map(replace(small_map, thumbnails=()), tmp_path / 'blind.stavpr')
-    pipeline = localizing(str(tmp_path / 'blind.stavpr'), geometric=GeometricSettings())
-    match = process(pipeline, route[:LENGTH])[-1]
-    assert (match.status, match.inliers) == (Status.NO_MATCH, -1)
-    assert 'no thumbnails' in match.reason
+    pipeline = localizing(str(tmp_path / 'blind.stavpr'), geometric=GeometricSettings(), **mode)
+    match = process(pipeline, route[:CERTAIN])[-1]
+    assert (match.status, match.inliers) == (Status.MATCH, -1)
 
 
 # ------------------------------------------------ errors, resets, relocalization

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.recognition.verification import (
+    GeometricEvidence,
     GeometricSettings,
     GeometricVerifier,
     PlaceVerifier,
@@ -230,3 +231,24 @@ def test_place_verifier_keeps_keypoints_of_places_until_map_changes():
     another = Thumbnails({3: other})
     assert verifier.inliers(one, another, 3) == counts[1]
     assert verifier.inliers(one, another, 5) is None
+
+
+# ------------------------------------------------ as evidence
+
+
+def test_evidence_checks_doubtful_matches_and_each_tenth_certain_one():
+    evidence = GeometricEvidence()
+    assert [evidence.wants(p) for p in (0.05, 0.3, 0.98)] == [False, True, True]
+    assert [evidence.wants(0.999) for _ in range(21)] == [True, *[False] * 9] * 2 + [True]
+
+
+@pytest.mark.parametrize(('passing', 'right'), [(30, 31 / 34), (0, 1 / 34)])
+def test_evidence_is_the_share_of_certain_matches_that_pass(passing, right):
+    """Where none passes, as by night, a failed check is next to no evidence."""
+    evidence = GeometricEvidence()
+    for i in range(30):
+        assert evidence.updated(0.999, i < passing) == 0.999
+    odds = (1 - right) / 0.9 if passing else 1.0
+    assert evidence.updated(0.5, False) == pytest.approx(odds / (1 + odds))
+    odds = max(right, 0.3) / 0.1
+    assert evidence.updated(0.5, True) == pytest.approx(odds / (1 + odds))

@@ -11,8 +11,9 @@ from stavpr_ros.mapping.keyframes import (
     small_gray,
 )
 from stavpr_ros.mapping.map_file import is_map, load_map, open_map, save_map, verify_map
-from stavpr_ros.mapping.merging import merge_maps, select_session
+from stavpr_ros.mapping.merging import merge_maps, select_places, select_session
 from stavpr_ros.mapping.place_map import (
+    descriptor_map,
     encode_thumbnail,
     Place,
     PlaceMap,
@@ -30,6 +31,7 @@ __all__ = [
     'Session',
     'Trajectory',
     'build_map',
+    'descriptor_map',
     'distance',
     'encode_thumbnail',
     'extract_features',
@@ -40,6 +42,7 @@ __all__ = [
     'open_map',
     'rotation',
     'save_map',
+    'select_places',
     'select_session',
     'small_gray',
     'thumbnail_of',

@@ -50,10 +50,12 @@ def save_map(
 
 
 def _manifest(place_map: PlaceMap) -> dict[str, Any]:
-    sections = {}
+    sections: dict[str, Any] = {}
     if place_map.camera is not None:
         data = place_map.camera.to_json()
         sections['intrinsics'] = {'version': 1, 'required': False, 'data': data}
+    if place_map.same_as is not None:
+        sections['same_places'] = {'version': 1, 'required': False, 'data': None}
     settings, projection = place_map.settings, place_map.projection
     backbone = {name: getattr(settings.backbone, name) for name in identity_fields(settings.kind)}
     return {
@@ -106,6 +108,8 @@ def _parts(place_map: PlaceMap, storage: str) -> dict[str, NewPart]:
         add_texts('thumbnails', 'thumbnail_ends', place_map.thumbnails)
     if place_map.session_index is not None:
         add('session', place_map.session_index)
+    if place_map.same_as is not None:
+        add('same_places/same_as', place_map.same_as)
     return parts
 
 

@@ -70,6 +70,8 @@ class PlaceMap:
     :param sessions: the drives that the places are of; empty = one drive, nothing known of it.
     :param session_index: number of each place's session, shape (n,), int32; None without sessions.
     :param camera: of its images; None = unknown.
+    :param same_as: of each place, itself, or the place of an earlier session that shows the same,
+        shape (n,), int32; None = unknown: see :func:`stavpr_ros.recognition.same_places`.
     :param map_id: first 16 hexadecimal digits of the hash of its file's content, '' = it was not
         read from a file.
     """
@@ -83,6 +85,7 @@ class PlaceMap:
     sessions: tuple[Session, ...] = ()
     session_index: np.ndarray | None = None
     camera: Camera | None = None
+    same_as: np.ndarray | None = None
     map_id: str = ''
 
     def __post_init__(self) -> None:
@@ -113,6 +116,7 @@ class PlaceMap:
             raise InputError('a stamp is out of range: expected ns of at most 2**31 seconds')
         _require_texts(self.ids)
         _require_sessions(self.sessions, self.session_index, n)
+        _require_same_as(self.same_as, n)
         require_projection(self.projection, self.settings)
 
     def __len__(self) -> int:
@@ -176,6 +180,16 @@ class PlaceMap:
             return None
 
 
+def descriptor_map(features: LocalFeatures, poses: np.ndarray | None = None) -> PlaceMap:
+    """
+    Make a map of features whose images are unknown, such as descriptors from a file.
+
+    :param poses: shape (n, 7), see :class:`PlaceMap`.
+    """
+    n = len(features)
+    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n, poses)
+
+
 def require_projection(projection: Projection | None, settings: FeatureSettings) -> None:
     """
     Reject another projection than that of the features.
@@ -233,6 +247,17 @@ def _require_sessions(sessions: tuple[Session, ...], index: np.ndarray | None, n
     ids = [session.id for session in sessions]
     if not all(ids) or len(set(ids)) < len(ids):
         raise InputError(f'sessions have the ids {ids[:8]}: expected different ones, none empty')
+
+
+def _require_same_as(same_as: np.ndarray | None, n: int) -> None:
+    if same_as is None:
+        return
+    if same_as.dtype != np.int32 or same_as.shape != (n,):
+        raise InputError(f'same_as is {same_as.dtype} {same_as.shape}: expected int32 ({n},)')
+    if n and (same_as.min() < 0 or (same_as > np.arange(n)).any()):
+        raise InputError('same_as: expected of each place itself or an earlier one')
+    if (same_as[same_as] != same_as).any():
+        raise InputError('same_as names a place that is the same as another one, not as itself')
 
 
 def thumbnail_of(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> np.ndarray:

@@ -24,7 +24,7 @@ from stavpr_ros.pipeline.save_state import MapSnapshot, OpenJournal, SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.pipeline.start import LoadedMap, start_operation
 from stavpr_ros.recognition import Match, Status
-from stavpr_ros.recognition.verification import PlaceVerifier
+from stavpr_ros.recognition.verification import GeometricEvidence, PlaceVerifier
 from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair
 from stavpr_ros.sources.encodings import decode_message
 
@@ -61,6 +61,7 @@ class Pipeline:
         self.threshold = settings.applied_threshold
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._verifier = PlaceVerifier(settings.geometric) if settings.geometric else None
+        self._evidence = GeometricEvidence()
         self._last: Match | None = None
         # of the window, from its middle image on; None = the image came when none was needed
         self._thumbnails: deque[np.ndarray | None] = deque()
@@ -189,6 +190,7 @@ class Pipeline:
         self._last = None
         self._thumbnails.clear()
         self._poses.clear()
+        self._evidence = GeometricEvidence()
         if self._operation is not None and self._operation.recognizer:
             self._operation.recognizer.reset()
 
@@ -209,7 +211,7 @@ class Pipeline:
             raise InputError(
                 f'{self.window_fill} of {self.settings.sequence.length} images in the window'
             )
-        return replace(self._last, candidates=tuple(recognizer.ranked(count)))
+        return self._last.with_candidates(recognizer.ranked(count))
 
     def matched_pair(self, match: Match) -> MatchedPair | None:
         """Return the middle pair of the newest match, for its edge; None without a match."""
@@ -285,8 +287,8 @@ class Pipeline:
         with _timed(stages, 'verification'):
             match = self._verified(match, operation.places)
         if self.list_candidates and match.sequence is not None:
-            candidates = tuple(operation.recognizer.ranked(self.settings.candidates))
-            match = replace(match, candidates=candidates)
+            ranked = operation.recognizer.ranked(self.settings.candidates)
+            match = match.with_candidates(ranked)
         self._last = replace(match, image=image)
         return self._last
 
@@ -309,24 +311,33 @@ class Pipeline:
         return thumbnail_of(image, width) if width else None
 
     def _verified(self, match: Match, places: PlaceMap | GrowingMap) -> Match:
-        """Verify the middle pair of a match by their thumbnails; reject too few inliers."""
-        if self._verifier is None or not match.accepted:
+        """
+        Check the middle pair of a match by their thumbnails; without these, nothing changes.
+
+        Mode robust weighs the result (:class:`GeometricEvidence`), where the match is doubtful;
+        mode paper rejects matches with too few inliers.
+        """
+        if self._verifier is None or match.sequence is None:
             return match
-        query, inliers = self._thumbnails[0], None
-        reason = 'geometric check: the map has no thumbnails; build it with thumbnails'
-        if query is None:
-            reason = 'geometric check: it was off when the middle image of the window came'
-        else:
-            inliers = self._verifier.inliers(query, places, match.place_index)
+        checked = self._evidence.wants(match.probability) if match.relative else match.accepted
+        query = self._thumbnails[0]
+        if not checked or query is None:
+            return match
+        inliers = self._verifier.inliers(query, places, match.sequence.middle)
         if inliers is None:
-            return replace(match, status=Status.NO_MATCH, reason=reason)
+            return match
         least = self._verifier.settings.min_inliers
+        match = replace(match, inliers=inliers)
+        if match.relative:
+            return match.with_probability(
+                self._evidence.updated(match.probability, inliers >= least)
+            )
         if inliers >= least:
-            return replace(match, inliers=inliers)
+            return match
         reason = (
             f'geometric check: {inliers} inliers are fewer than {least} (parameter min_inliers)'
         )
-        return replace(match, status=Status.NO_MATCH, reason=reason, inliers=inliers)
+        return replace(match, status=Status.NO_MATCH, reason=reason)
 
     def _start(self, name: str, settings: PipelineSettings, loaded: LoadedMap | None) -> None:
         """Start an operation; an error changes nothing."""

@@ -23,6 +23,11 @@ ITERATIONS = 2000
 CONFIDENCE = 0.999
 LOWEST = 32  # rows of an image below which keypoints have no room, and some detectors fail
 TALLEST = 4  # an image is brought to at most so many times its width
+IMPROBABLE, CERTAIN = 0.1, 0.99  # probabilities between which a match is checked
+EACH = 10  # of so many certain matches one is checked
+WRONG_PASSED = 0.1  # share of wrong pairs that pass: doubtful ones look alike
+PRIOR_PASSED, PRIOR_CHECKED = 1.0, 4.0  # right pairs before the first is checked
+LEAST_PASSED = 0.3  # r of a pair that has passed: right pairs do pass on this drive
 CACHED = 256  # places whose keypoints are kept, some 40 kB each
 
 
@@ -208,6 +213,42 @@ class PlaceVerifier:
                 self._known.popitem(last=False)
         self._known.move_to_end(place)
         return self._verifier.common(self._verifier.query_keypoints(query), self._known[place])
+
+
+class GeometricEvidence:
+    """
+    The probability of a match in mode robust, after the check of its pair.
+
+    With the share r of right pairs that pass the check, and f of wrong ones, a check multiplies
+    the odds by r / f if it is passed, and by (1 - r) / (1 - f) if not. r is learned on the drive
+    from pairs that are certain without a check, and starts low: by night, where hardly any right
+    pair passes, a failed check is no evidence.
+    """
+
+    def __init__(self) -> None:
+        self._passed, self._checked = PRIOR_PASSED, PRIOR_CHECKED
+        self._certain = 0  # pairs since the last one that was checked
+
+    def wants(self, probability: float) -> bool:
+        """Return whether to check a pair: it is doubtful, or one of many certain ones."""
+        if probability < CERTAIN:
+            return probability > IMPROBABLE
+        self._certain += 1
+        return self._certain % EACH == 1
+
+    def updated(self, probability: float, passed: bool) -> float:
+        """Return the probability of a match whose pair has passed the check, or not."""
+        if probability >= CERTAIN:
+            self._passed += passed
+            self._checked += 1
+            return probability
+        right, wrong = self._passed / self._checked, WRONG_PASSED
+        if passed:
+            factor = max(right, LEAST_PASSED) / wrong
+        else:
+            factor = min((1 - right) / (1 - wrong), 1.0)
+        odds = probability / (1 - probability) * factor
+        return odds / (1 + odds)
 
 
 def _detector(settings: GeometricSettings) -> Any:
