@@ -87,8 +87,8 @@ def test_triangulate_of_exact_views_returns_the_points():
 def test_triangulate_corrects_the_rotation_of_the_odometry():
     """A degree is 3.5 pixels; the distance, which only odometry knows, stays."""
     poses = [pose(x) for x in (-2, -1, 0, 1, 2)]
-    measured = [pose(each[0], yaw=math.radians(turn)) for each, turn in
-            zip(poses, (1, -1, 0, 1, -1), strict=True)]  # fmt: skip
+    turns = np.radians([1, -1, 0, 1, -1])
+    measured = [pose(each[0], yaw=turn) for each, turn in zip(poses, turns, strict=True)]
     points = points_ahead(300)
     views = views_of(points, poses, noise=0.2)
     around = [0, 1, 3, 4]
