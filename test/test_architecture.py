@@ -14,7 +14,9 @@ import stavpr_ros
 PACKAGE = Path(__file__).resolve().parents[1] / 'stavpr_ros'
 ROS = {'rclpy', 'ament_index_python', 'stavpr_msgs', 'rcl_interfaces', 'builtin_interfaces'}
 ROS |= {f'{name}_msgs' for name in ('std', 'sensor', 'geometry', 'nav', 'diagnostic', 'lifecycle')}
-CORE = ('alignment', 'sources', 'features', 'mapping', 'recognition', 'pipeline')
+CORE = (
+    *('alignment', 'sources', 'features', 'mapping', 'recognition', 'relative_pose', 'pipeline'),
+)
 """Each of these may import the ones before it, and features and sources not each other."""
 MAY_IMPORT = {
     'alignment': set(),
@@ -22,7 +24,8 @@ MAY_IMPORT = {
     'features': set(),
     'mapping': {'alignment', 'sources', 'features'},
     'recognition': {'alignment', 'features', 'mapping'},
-    'pipeline': set(CORE[:5]),
+    'relative_pose': {'alignment', 'features', 'mapping', 'recognition'},
+    'pipeline': set(CORE[:6]),
     'evaluation': set(CORE[:5]),
     'demonstration': {'evaluation', *CORE},
     'ros': set(CORE),
