@@ -234,7 +234,7 @@ def products(
 ) -> list[Peer]:
     """Return torch's product in float32, and in the map's precision unless that is slower."""
     peers, d = [], places.strips.shape[2]
-    for dtype in dict.fromkeys((precision, 'float32')):
+    for dtype in dict.fromkeys(('float32' if precision == 'int8' else precision, 'float32')):
         if reason := slower_than_float32(run.device, dtype):
             run.skip(f'torch {dtype}', 0, 0, reason)
             continue

@@ -119,6 +119,23 @@ def distances(query: Array, reference: Array, dtype: type = np.float64) -> Array
     return d
 
 
+def whole_number_distances(
+    query: Array, reference: Array, query_lengths: Array, lengths: Array
+) -> Array:
+    """d[i, j, y] of rounded strips, (W, d) and (W, n, d) of whole numbers: exact sums."""
+    W, n, _ = reference.shape
+    d: Array = np.empty((W, W, n), np.float32)
+    for i in range(W):
+        for j in range(W):
+            for y in range(n):
+                total = 0
+                for left, right in zip(query[i].tolist(), reference[j, y].tolist(), strict=True):
+                    total += left * right
+                cosine = np.float32(total) * lengths[j, y] * query_lengths[i]
+                d[i, j, y] = np.float32(1) - cosine
+    return d
+
+
 def holistic_distance(query: Array, reference: Array, dtype: type = np.float64) -> Any:
     """No alignment: cosine distance of the whole flattened maps, (W, d) each."""
     return cosine_distance(query.reshape(-1), reference.reshape(-1), dtype)

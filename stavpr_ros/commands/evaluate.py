@@ -165,7 +165,7 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     add('--nms-radius', type=int, default=20, metavar='PLACES', help=radius)
     add('--backend', choices=('auto', 'cpu', 'cuda'), default='cpu', help='(%(default)s)')
     precision = 'of the map (%(default)s)'
-    add('--precision', choices=('float32', 'float16'), default='float32', help=precision)
+    add('--precision', choices=('float32', 'float16', 'int8'), default='float32', help=precision)
 
 
 def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:

@@ -12,7 +12,13 @@ from stavpr_ros.mapping.keyframes import (
 )
 from stavpr_ros.mapping.map_file import is_map, load_map, open_map, save_map, verify_map
 from stavpr_ros.mapping.merging import merge_maps, select_places, select_session
-from stavpr_ros.mapping.place_map import encode_thumbnail, Place, PlaceMap, Session
+from stavpr_ros.mapping.place_map import (
+    encode_thumbnail,
+    Place,
+    PlaceMap,
+    Session,
+    thumbnail_of,
+)
 from stavpr_ros.mapping.trajectory import distance, rotation, Trajectory
 
 __all__ = [
@@ -37,5 +43,6 @@ __all__ = [
     'select_places',
     'select_session',
     'small_gray',
+    'thumbnail_of',
     'verify_map',
 ]

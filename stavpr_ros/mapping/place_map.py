@@ -247,9 +247,9 @@ def _require_same_as(same_as: np.ndarray | None, n: int) -> None:
         raise InputError('same_as names a place that is the same as another one, not as itself')
 
 
-def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
+def thumbnail_of(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> np.ndarray:
     """
-    Return a small JPEG of an image.
+    Return an image at the size of a thumbnail.
 
     :param image: RGB (h, w, 3) uint8.
     :param width: pixels; narrower images keep their size.
@@ -257,7 +257,12 @@ def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
     most = math.sqrt(MOST_PIXELS / 2 / (image.shape[0] * image.shape[1]))
     scale = min(1.0, width / image.shape[1], most)
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
+    """Return :func:`thumbnail_of` an image as a JPEG."""
+    small = thumbnail_of(image, width)
     done, encoded = cv2.imencode(
         '.jpg', cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85]
     )

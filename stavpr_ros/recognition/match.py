@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result for one image: its status, the nearest sequence of the map, the matched place."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 import enum
 import math
 
@@ -115,10 +115,36 @@ class Match:
             return math.inf
         return self.sequence.distance
 
+    def with_probability(self, probability: float) -> 'Match':
+        """Return the match of mode robust with another probability, accepted or not by it."""
+        if self.sequence is None:
+            return self
+        sequence = replace(self.sequence, distance=1 - probability)
+        accepted = sequence.distance < self.threshold
+        return replace(
+            self,
+            status=Status.MATCH if accepted else Status.NO_MATCH,
+            reason='' if accepted else improbable(probability, self.threshold),
+            sequence=sequence,
+            probability=1 - sequence.distance,
+        )
+
+    def with_candidates(self, ranked: Sequence[Candidate]) -> 'Match':
+        """Return the match with its ranked places; the first is the match itself."""
+        own = [replace(first, distance=self.distance) for first in ranked[:1]]
+        return replace(self, candidates=(*own, *ranked[1:]))
+
     @property
     def first_image_index(self) -> int:
         """Place of the window's first image on a route that grows with every image, -1 = none."""
         return self.image_index - len(self.window_stamps) + 1 if self.image_index >= 0 else -1
+
+
+def improbable(probability: float, threshold: float) -> str:
+    """Return the reason of mode robust for no match."""
+    return (
+        f'the probability of the best place, {probability:.3f}, is not above {1 - threshold:.3f}'
+    )
 
 
 def ranked_candidates(

@@ -12,10 +12,12 @@ from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition.int8_features import Int8Features, rounded
 from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
 from stavpr_ros.recognition.match import (
     Candidate,
     distinct_places,
+    improbable,
     Match,
     ranked_candidates,
     Status,
@@ -228,8 +230,7 @@ class SequenceRecognizer:
         if not nearest.distance < threshold:
             status = Status.NO_MATCH
             reason = (
-                f'the probability of the best place, {probability:.3f}, is not above '
-                f'{1 - threshold:.3f}'
+                improbable(probability, threshold)
                 if relative
                 else f'nearest distance {nearest.distance:.4f} is not below the threshold '
                 f'{threshold:.4f}'
@@ -249,8 +250,8 @@ class PlaceRecognizer(SequenceRecognizer):
     :param settings: see :class:`RecognizerSettings`.
     :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``. In mode robust, image
         distances are computed there and sequences on the CPU.
-    :param precision: of the map's features in the matcher, ``float32`` or ``float16``; see
-        :func:`stavpr_ros.recognition.matcher.make_matcher`.
+    :param precision: of the map's features in the matcher, ``float32``, ``float16`` or ``int8``;
+        see :func:`stavpr_ros.recognition.matcher.make_matcher`.
     :raises UnavailableError: no such backend here.
     :raises SettingsError: settings that do not fit the map (xi > W).
     :raises InputError: features of the map are not finite.
@@ -273,8 +274,7 @@ class PlaceRecognizer(SequenceRecognizer):
         if options.mean_centering or options.whitening:
             self._centering = MeanCentering(features, options.mean_centering, options.whitening)
         # cells are made of float32 strips
-        half = precision == 'float16' and not settings.spatial.vertical
-        held = self._held(features, torch.float16 if half else torch.float32)
+        held = self._held(features, 'float32' if settings.spatial.vertical else precision)
         backend = choose_backend(backend)
         self._matcher = make_matcher(held, settings.spatial, backend, precision)
         if self._filter is not None:
@@ -286,13 +286,19 @@ class PlaceRecognizer(SequenceRecognizer):
             search = CudaLmDtwSearch(self._buffer.places, settings.sequence)
             self._search, self._buffer = search, search.buffer
 
-    def _held(self, features: LocalFeatures, dtype: torch.dtype) -> LocalFeatures:
+    def _held(self, features: LocalFeatures, precision: str) -> LocalFeatures | Int8Features:
         """Return the features for the matcher, in memory once; those of a map are not copied."""
+        if precision == 'int8':
+            return rounded(features, self._centered)
+        dtype = torch.float16 if precision == 'float16' else torch.float32
         if self._centering is not None:
             return self._centering.places(features, dtype)
         if dtype == torch.float32:
             return features[:]
         return converted(features, lambda strips: strips, dtype)
+
+    def _centered(self, features: LocalFeatures) -> LocalFeatures:
+        return features if self._centering is None else self._centering.places(features)
 
     @property
     def places(self) -> int:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numba as nb
 import numpy as np
+from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.alignment.lm_dtw import padded_width, SequenceMatch
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.checks import no_nan
@@ -204,12 +205,14 @@ class ImageChange:
         self._latest: deque[float] = deque(maxlen=SMOOTHED)
 
     def learn(
-        self, strips: torch.Tensor | np.ndarray, firsts: np.ndarray | tuple[int, ...] = (0,)
+        self,
+        strips: torch.Tensor | np.ndarray | Int8Strips,
+        firsts: np.ndarray | tuple[int, ...] = (0,),
     ) -> None:
         """
         Learn from all places of a map.
 
-        :param strips: unit-norm, (W, n, d), float32 or float16.
+        :param strips: unit-norm, (W, n, d), of any precision.
         :param firsts: first place of each session.
         """
         n = strips.shape[1]
