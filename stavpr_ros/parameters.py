@@ -99,7 +99,15 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'features',
             'gradient',
             'Kind of the features of a map that is recorded without map_path.',
-            choices=('gradient', 'onnx', 'torchscript', 'densenet161_places365', 'vgg16'),
+            choices=(
+                'gradient',
+                'onnx',
+                'torchscript',
+                'densenet161_places365',
+                'vgg16',
+                'vgg16_fc6',
+                'netvlad',
+            ),
         ),
         NodeParameter(
             'exclude_places',

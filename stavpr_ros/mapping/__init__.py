@@ -13,6 +13,7 @@ from stavpr_ros.mapping.keyframes import (
 from stavpr_ros.mapping.map_file import is_map, load_map, open_map, save_map, verify_map
 from stavpr_ros.mapping.merging import merge_maps, select_places, select_session
 from stavpr_ros.mapping.place_map import (
+    descriptor_map,
     encode_thumbnail,
     Place,
     PlaceMap,
@@ -30,6 +31,7 @@ __all__ = [
     'Session',
     'Trajectory',
     'build_map',
+    'descriptor_map',
     'distance',
     'encode_thumbnail',
     'extract_features',

@@ -177,6 +177,16 @@ class PlaceMap:
             return None
 
 
+def descriptor_map(features: LocalFeatures, poses: np.ndarray | None = None) -> PlaceMap:
+    """
+    Make a map of features whose images are unknown, such as descriptors from a file.
+
+    :param poses: shape (n, 7), see :class:`PlaceMap`.
+    """
+    n = len(features)
+    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n, poses)
+
+
 def require_projection(projection: Projection | None, settings: FeatureSettings) -> None:
     """
     Reject another projection than that of the features.

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from stavpr_ros.alignment.cpu import dot, int8
 from stavpr_ros.alignment.settings import SpatialSettings
-from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
+from stavpr_ros.alignment.spatial import adaptive_weights, image_distances, WINDOW
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.int8_features import Int8Features, rounded
@@ -45,10 +45,13 @@ class CpuMatcher:
         spatial: SpatialSettings,
         precision: str = 'float32',
     ) -> None:
+        W = len(features.strips)
+        if spatial.strategy == 'sliding_window' and W < WINDOW:
+            raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')
         self._spatial = spatial
         self._cells = features.cells if spatial.vertical else None
         self._weights = features.weights.cpu()
-        W, self._places = self._weights.shape
+        self._places = self._weights.shape[1]
         self._band = spatial.band(W)
         self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
         self._map: np.ndarray | tuple[np.ndarray, np.ndarray]
@@ -82,9 +85,13 @@ class CpuMatcher:
 
     def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Return the distances of Q images to every place, (Q, n)."""
+        out = np.empty((strips.shape[1], self.places), np.float32)
+        if not isinstance(self._map, tuple) and len(self._map) == 1:
+            # one vector an image: its alignment is its cosine distance
+            dot.cosine_distances(self._map[0], strips[0].contiguous().numpy(), out)
+            return torch.from_numpy(out)
         strips = strips if self._cells is None else cut_cells(strips.cpu(), self._cells)
         queries = int8.tiled(strips) if isinstance(self._map, tuple) else dot.tiled(strips)
-        out = np.empty((strips.shape[1], self.places), np.float32)
         if self._cells is not None:
             dot.vertical_image_distances(
                 self._map, queries, self._cell_a, self._a, self._band, out

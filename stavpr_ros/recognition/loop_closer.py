@@ -179,9 +179,11 @@ class LoopCloser(SequenceRecognizer):
         if self._places < LEAST_PLACES:
             return np.empty(0, np.float32)
         out = np.empty((1, self._places), np.float32)
-        dot.image_distances(
-            self._route.strips.numpy(), dot.tiled(self._route.newest), self._a, self._band, out
-        )
+        strips, newest = self._route.strips.numpy(), self._route.newest
+        if len(strips) == 1:
+            dot.cosine_distances(strips[0], newest[0].numpy(), out)
+            return out[0]
+        dot.image_distances(strips, dot.tiled(newest), self._a, self._band, out)
         return out[0]
 
 

@@ -78,6 +78,32 @@ def _dots(y, q, sums):
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6] = s0, s1, s2, s3, s4, s5, s6
 
 
+@reassociating_kernel
+def _dot(y, q):
+    """Multiply a vector of the map (d,) by one of the query (d,)."""
+    total = np.float32(0)
+    for t in range(y.shape[0]):
+        total += q[t] * widened(y[t])
+    return total
+
+
+@parallel_kernel
+def cosine_distances(features, queries, out):
+    """
+    Distances 1 - <x, y> of images that are one vector each (W = 1).
+
+    :param features: the map's unit-norm vectors, shape (n, d), float32 or the bits of float16.
+    :param queries: those of Q images, shape (Q, d), float32.
+    :param out: shape (Q, m), written; m <= n: only so many map images are looked at.
+    """
+    n = out.shape[1]
+    for block in nb.prange((n + FEW_IMAGES - 1) // FEW_IMAGES):
+        first = block * FEW_IMAGES
+        for x in range(queries.shape[0]):
+            for y in range(first, min(n, first + FEW_IMAGES)):
+                out[x, y] = np.float32(1) - _dot(features[y], queries[x])
+
+
 def _block_distances(features, queries, x, first, count, d):
     """Fill d (rows, W, .): strips of query x against ``count`` map images from ``first``."""
 
