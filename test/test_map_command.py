@@ -66,7 +66,7 @@ def test_map_info_plots_a_map_with_and_without_poses(folder, name):
     assert main(['info', name, '--plot', name, '--force']) == 1
 
 
-def test_map_compact_says_what_it_drops(folder, drive, capsys):
+def test_map_compact_prints_what_it_drops(folder, drive, capsys):
     assert main(['compact', 'day.stavpr', 'small.stavpr', '--drop-thumbnails']) == 0
     shown = capsys.readouterr().out
     assert 'thumbnails of 0.0 MB dropped' in shown
