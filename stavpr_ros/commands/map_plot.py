@@ -3,7 +3,7 @@
 """``map info --plot``: the route with its poses, thumbnails, and the map compared with itself."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.evaluation.plots import color_bar, page, QUIET, SCALE
@@ -24,7 +24,8 @@ def plot_map(place_map: PlaceMap, path: Path) -> None:
     with page(path, 13, 7.4) as figure:
         left, right = figure.subfigures(1, 2, width_ratios=(1, 1.2))
         if place_map.has_poses:
-            top, bottom = left.subfigures(2, 1, squeeze=False, height_ratios=(1.3, 1))[:, 0]
+            parts: Any = left.subfigures(2, 1, height_ratios=(1.3, 1))
+            top, bottom = parts
             _draw_route(top.subplots(), place_map)
             _draw_thumbnails(bottom, place_map, 4)
         else:
