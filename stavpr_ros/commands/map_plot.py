@@ -22,10 +22,10 @@ SHOWN = 8  # thumbnails
 def plot_map(place_map: PlaceMap, path: Path) -> None:
     """Draw an opened map to a PNG file; of a long map, some places evenly."""
     with page(path, 13, 7.4) as figure:
-        left, right = figure.subfigures(1, 2, width_ratios=(1, 1.2))
+        halves: Any = figure.subfigures(1, 2, width_ratios=(1, 1.2))
+        left, right = halves
         if place_map.has_poses:
-            parts: Any = left.subfigures(2, 1, height_ratios=(1.3, 1))
-            top, bottom = parts
+            top, bottom = left.subfigures(2, 1, height_ratios=(1.3, 1))
             _draw_route(top.subplots(), place_map)
             _draw_thumbnails(bottom, place_map, 4)
         else:
