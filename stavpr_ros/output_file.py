@@ -11,6 +11,7 @@ import io
 import os
 from pathlib import Path
 import re
+import shutil
 import stat
 from typing import NamedTuple
 
@@ -44,6 +45,7 @@ JSON = FileKind('JSON file', lambda head: head.lstrip()[:1] in (b'{', b'['))
 PNG = FileKind('PNG image', lambda head: head.startswith(b'\x89PNG'))
 NPY = FileKind('NumPy array', lambda head: head.startswith(b'\x93NUMPY'))
 ARRAYS = FileKind('file of NumPy arrays', lambda head: head.startswith(b'PK\x03\x04'))
+ANY = FileKind('file', lambda head: True)
 ONNX = FileKind('ONNX file', lambda head: head[:1] == b'\x08')  # its first field: the version
 HTML = FileKind('HTML page', lambda head: head.lstrip().lower().startswith(b'<!doctype html'))
 
@@ -216,6 +218,66 @@ def _busy(path: str | Path) -> OutputTakenError:
     )
 
 
+def _temporary_of(target: Path) -> Path:
+    name = hashlib.sha256(os.fsencode(target.name)).hexdigest()[:12]
+    return target.parent / f'.stavpr-{name}'
+
+
+@contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+    """
+    Make a folder of files; when the block ends it is complete under its name, or not there.
+
+    The block makes the folder that is yielded, of the same name in a temporary one, which is
+    locked like the temporaries of :func:`atomic_output`. Files and folders are synced.
+
+    :raises OutputTakenError: there is something of this name already, or it is being written.
+    :raises OutputError: it cannot be written.
+    """
+    target = Path(os.path.abspath(path))
+    temporary, made = _temporary_of(target), target.name
+    with _explained(path):
+        _require_new(target, path)
+        lock = _locked_folder(temporary, target)
+        try:
+            yield temporary / made
+            for file in (temporary / made).iterdir():
+                _sync(file)
+            _sync(temporary / made)
+            _require_new(target, path)
+            os.rename(temporary / made, target)
+            sync_folder(target.parent)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+            os.close(lock)
+
+
+def _require_new(target: Path, path: str | Path) -> None:
+    require_room(target.parent / f'{target.name}.new')
+    if os.path.lexists(target):
+        raise OutputTakenError(
+            f'{path} exists already: expected a new folder; remove it or choose another name'
+        )
+
+
+def _locked_folder(temporary: Path, target: Path) -> int:
+    """Make the temporary folder of a target, and lock it; that of a killed writer is deleted."""
+    while True:
+        with suppress(FileExistsError):
+            temporary.mkdir()
+        lock = os.open(temporary, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(lock)
+            raise _busy(target) from error
+        if os.path.lexists(temporary) and os.path.samestat(os.fstat(lock), os.lstat(temporary)):
+            for stale in temporary.iterdir():
+                shutil.rmtree(stale)
+            return lock
+        os.close(lock)
+
+
 def create_temporary(target: Path) -> tuple[Path, int]:
     """
     Create and lock the temporary file of a target; one that a killed writer left is deleted.
@@ -223,8 +285,7 @@ def create_temporary(target: Path) -> tuple[Path, int]:
     :returns: its path, and its descriptor.
     :raises OutputTakenError: another program writes the target.
     """
-    name = hashlib.sha256(os.fsencode(target.name)).hexdigest()[:12]
-    temporary = target.parent / f'.stavpr-{name}'
+    temporary = _temporary_of(target)
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
     while True:
         try:
@@ -271,7 +332,11 @@ def _delete_stale(temporary: Path) -> bool:
 
 def sync_folder(folder: Path) -> None:
     """Write the names in a folder to the disk."""
-    file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    _sync(folder)
+
+
+def _sync(path: Path) -> None:
+    file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(file)
     finally:

@@ -5,6 +5,7 @@
 from dataclasses import replace
 import shutil
 
+import cv2
 from map_examples import example_map, VERSION1
 import numpy as np
 import pytest
@@ -16,8 +17,10 @@ from stavpr_ros.mapping import (
     merge_maps,
     open_map,
     save_map,
+    select_places,
     select_session,
 )
+from stavpr_ros.recognition.near_duplicates import without_duplicates
 import torch
 
 
@@ -49,6 +52,49 @@ def test_map_info_shows_what_a_map_holds(folder, capsys):
         'a route of 23 m', '1970-01-01 00:00:24 UTC',
     ):  # fmt: skip
         assert text in shown
+
+
+@pytest.mark.parametrize('name', ['both.stavpr', 'night.stavpr'])
+def test_map_info_plots_a_map_with_and_without_poses(folder, name):
+    save_map(example_map(), 'both.stavpr')
+    assert main(['info', name, '--plot', 'map.png']) == 0
+    image = cv2.imread('map.png')
+    assert image.shape == (1110, 1950, 3)
+    assert len(np.unique(image)) > 100
+    assert main(['info', name, '--plot', 'map.png']) == 1
+    assert main(['info', name, '--plot', 'map.png', '--force']) == 0
+    assert main(['info', name, '--plot', name, '--force']) == 1
+
+
+def test_map_compact_prints_what_it_drops(folder, drive, capsys):
+    assert main(['compact', 'day.stavpr', 'small.stavpr', '--drop-thumbnails']) == 0
+    shown = capsys.readouterr().out
+    assert 'thumbnails of 0.0 MB dropped' in shown
+    assert 'features: float32 becomes float16' in shown
+    small = load_map('small.stavpr')
+    assert (len(small), small.features.strips.dtype, small.thumbnails) == (24, torch.float32, ())
+    assert open_map('small.stavpr').features.storage == 'float16'
+    stops = np.array([0, *[1] * 9, *range(2, 24), *[23] * 5])
+    standing = replace(select_places(drive, stops), poses=None)
+    twice = merge_maps([standing, standing], ['day', 'night'])
+    same_as = np.arange(len(twice), dtype=np.int32)
+    same_as[len(stops) + 8] = 5  # the stop of one session is that of the other
+    save_map(replace(twice, same_as=same_as), 'stops.stavpr')
+    assert main(['compact', 'stops.stavpr', 'driven.stavpr', '--drop-duplicates']) == 0
+    assert '26 of 74 places dropped' in capsys.readouterr().out
+    driven = load_map('driven.stavpr')
+    assert driven.ids == drive.ids + drive.ids
+    assert [session.id for session in driven.sessions] == ['day', 'night']
+
+
+def test_duplicates_where_the_robot_moved_are_kept(drive):
+    stops = np.array([0, *[1] * 9, *range(2, 24)])
+    dark = select_places(drive, stops)
+    poses = np.zeros((len(stops), 7))
+    poses[:, 6], poses[:, 0] = 1, np.arange(len(stops))
+    assert len(without_duplicates(replace(dark, poses=poses))) == len(stops)
+    poses[2:6, 0] = poses[1, 0] + 0.02
+    assert len(without_duplicates(replace(dark, poses=poses))) == len(stops) - 4
 
 
 def test_map_verify_names_the_damaged_ones(folder, capsys):
@@ -156,7 +202,9 @@ def test_maps_that_do_not_fit_are_not_merged(drive):
         select_session(merge_maps([drive], ['a']), 'a', keep=False)
 
 
-@pytest.mark.parametrize('action', ['info', 'verify', 'convert', 'export', 'merge', 'sessions'])
+@pytest.mark.parametrize(
+    'action', ['info', 'verify', 'convert', 'compact', 'export', 'merge', 'sessions', 'recover']
+)
 def test_every_action_has_help(action, capsys):
     with pytest.raises(SystemExit) as caught:
         main([action, '--help'])

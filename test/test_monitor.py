@@ -14,7 +14,7 @@ from processes import Process, TIMEOUT
 import pytest
 from robot import LENGTH
 from stavpr_ros.errors import StavprError, UnavailableError
-from stavpr_ros.ros.monitor import encode_row, History, KEPT, Monitor
+from stavpr_ros.ros.monitor import encode_row, History, KEPT, Monitor, span_of
 from stavpr_ros.ros.monitor_server import MonitorServer
 
 
@@ -55,6 +55,13 @@ def test_history_when_closed_wakes_those_who_wait(history):
     history.close()
     waiting.join(TIMEOUT)
     assert not waiting.is_alive()
+
+
+def test_row_spans_the_places_of_its_columns():
+    assert span_of(np.array([0.0])) == (0, 1)
+    assert span_of(np.arange(7.0)) == (0, 7)
+    assert span_of(np.arange(40.0, 70)) == (40, 70)
+    assert span_of(np.array([100.0, 104, 108])) == (100, 112)
 
 
 def test_encode_row_by_hand():

@@ -112,7 +112,7 @@ def test_save_map_over_a_file_that_is_no_map_is_refused(robot, start, tmp_path):
 
 def test_services_without_a_map_return_the_reason(robot, start, route, map_file, tmp_path):
     """Images too, until a map is loaded."""
-    start(map_path='')
+    start(map_path='', robot_id='r1')
     info = robot.until_map(state='none')
     assert (info.operation, info.path, info.places) == ('localization', '', 0)
     assert 'no map' in robot.drive(route[:1])[0].reason
@@ -130,6 +130,7 @@ def test_services_without_a_map_return_the_reason(robot, start, route, map_file,
     indices = 'place_index', 'newest_index', 'sequence_middle', 'second_best_index', 'inliers'
     assert {getattr(match, name) for name in indices} == {-1}
     assert (match.status, 'no map' in match.reason) == (PlaceMatch.NOT_READY, True)
+    assert match.robot_id == 'r1'
     logged = [line for line in robot.log if 'relocalize failed' in line]
     assert len(logged) == 1, logged
     assert robot.does(Trigger, 'reset').message

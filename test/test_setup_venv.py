@@ -17,15 +17,17 @@ import pytest
 import setup_venv
 
 ROOT = Path(__file__).resolve().parent.parent
-GROUPS = (*setup_venv.REQUIRED, *setup_venv.EXTRAS)
+GROUPS = ('torch', 'cuda', *(f'locked/{name}' for name in ('base', *setup_venv.LOCKED_EXTRAS)))
+LOCKED = setup_venv.LOCKED_EXTRAS
+EXACT = re.compile(r'^([\w.-]+)(?:\[\w+\])?==([\w.]+)', re.MULTILINE)
 BUILT_ON = '/opt/python/cp312-cp312'
 
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Make a checkout in which nothing is installed and every requirement is ``fake``."""
-    for name in ('requirements', 'stavpr_msgs', 'stavpr_ros'):
-        (tmp_path / name).mkdir()
+    for name in ('requirements/locked', 'stavpr_msgs', 'stavpr_ros'):
+        (tmp_path / name).mkdir(parents=True)
     for name in GROUPS:
         (tmp_path / 'requirements' / f'{name}.txt').write_text('fake==1\n')
     (tmp_path / 'requirements' / 'constraints.txt').touch()
@@ -118,21 +120,40 @@ def test_machine_without_tools_lists_all_of_them(tmp_path, monkeypatch):
 
 def test_extras_are_added_and_kept(recorder):
     recorder.run('build', '--with', 'onnx')
-    assert recorder.run('build', '--with', 'dev') == ['pip']
-    installed = re.findall(r'(\w+)\.txt', recorder.commands['pip'])
-    assert installed == [*setup_venv.REQUIRED, 'onnx', 'dev', 'constraints']
+    assert recorder.run('build', '--with', 'dev') == ['torch', 'pip']
+    assert '--require-hashes' in recorder.commands['pip']
+    installed = re.findall(r'locked/(\w+)\.txt', recorder.commands['pip'])
+    assert installed == ['base', 'onnx', 'dev']
+    assert recorder.run('build', '--with', 'cuda') == ['torch', 'pip', 'cuda']
     assert recorder.run('build', '--with', 'dev', 'onnx') == recorder.run('build') == []
 
 
 def test_changed_requirement_is_installed_in_place(recorder, checkout):
     recorder.run('build')
-    (checkout / 'requirements' / 'runtime.txt').write_text('fake==2\n')
-    assert recorder.run('build') == ['pip']
-    for name in ('ros', 'constraints'):
-        (checkout / 'requirements' / f'{name}.txt').write_text('fake==2\n')
-        assert recorder.run('build') == ['pip', 'stavpr_msgs', 'stavpr_ros']
-    (checkout / 'requirements' / 'onnx.txt').write_text('fake==2\n')
+    (checkout / 'requirements' / 'torch.txt').write_text('fake==2\n')
+    assert recorder.run('build') == ['torch', 'pip']
+    (checkout / 'requirements' / 'locked' / 'base.txt').write_text('fake==2\n')
+    assert recorder.run('build') == ['torch', 'pip', 'stavpr_msgs', 'stavpr_ros']
+    (checkout / 'requirements' / 'locked' / 'onnx.txt').write_text('fake==2\n')
     assert recorder.run('build') == []
+
+
+def test_lock_has_every_requirement_of_every_python_with_a_hash():
+    folder = ROOT / 'requirements'
+    base = (folder / 'locked' / 'base.txt').read_text()
+    files = {extra: (folder / 'locked' / f'{extra}.txt').read_text() for extra in LOCKED}
+    for name in (*setup_venv.BASE, *LOCKED):
+        locked = dict(EXACT.findall(base + files.get(name, '')))
+        for package, version in EXACT.findall((folder / f'{name}.txt').read_text()):
+            assert locked[package.lower().replace('_', '-')] == version
+    for text in (base, *files.values()):
+        entries = text.replace(' \\\n', ' ').splitlines()[1:]
+        assert all(re.search(r' --hash=sha256:[0-9a-f]{64}( |$)', entry) for entry in entries)
+    found = dict(EXACT.findall(base))
+    pins = dict(EXACT.findall((folder / 'constraints.txt').read_text()))
+    assert {name: found[name] for name in pins if name in found} == {
+        name: version for name, version in pins.items() if name in found
+    }
 
 
 def test_changed_source_builds_its_package_from_nothing(recorder, checkout):
@@ -168,7 +189,7 @@ def test_changed_interpreter_or_folder_starts_anew(recorder, checkout, monkeypat
     else:
         stamp = checkout / '.venv' / 'setup.json'
         stamp.write_text(json.dumps({**json.loads(stamp.read_text()), 'folder': '/other'}))
-    assert recorder.run('setup') == ['venv', 'pip']
+    assert recorder.run('setup') == ['venv', 'torch', 'pip']
     assert '--clear' in recorder.commands['venv']
 
 
@@ -180,11 +201,11 @@ def test_interrupted_installation_starts_anew(recorder, checkout, step):
     recorder.fails, recorder.failure = step, KeyboardInterrupt()
     assert setup_venv.main(['setup']) == 130
     recorder.fails = ''
-    assert recorder.run('setup') == ['venv', 'pip']
+    assert recorder.run('setup') == ['venv', 'torch', 'pip']
     recorder.fails = 'pip'
-    assert recorder.run('setup', '--with', 'dev') == ['pip']
+    assert recorder.run('setup', '--with', 'dev') == ['torch', 'pip']
     recorder.fails = ''
-    assert recorder.run('setup') == ['venv', 'pip']
+    assert recorder.run('setup') == ['venv', 'torch', 'pip']
 
 
 # Commands and their environment
@@ -259,7 +280,7 @@ def test_build_offline_with_real_environment(checkout, monkeypatch, capsys):
     assert setup_venv.main(['build']) == 0
     assert capsys.readouterr().out == ''
 
-    (checkout / 'requirements' / 'dev.txt').write_text('missing==1\n')
+    (checkout / 'requirements' / 'locked' / 'dev.txt').write_text('missing==1 --hash=sha256:0\n')
     assert setup_venv.main(['build', '--with', 'dev']) == 1
     assert '  | ERROR: No matching distribution found for missing==1' in capsys.readouterr().err
 
@@ -280,7 +301,7 @@ def test_build_offline_with_real_environment(checkout, monkeypatch, capsys):
 
 
 def test_requirements_are_pinned_exactly():
-    for name in (*GROUPS, 'constraints'):
+    for name in ('torch', 'cuda', *setup_venv.BASE, *LOCKED, 'constraints'):
         text = (ROOT / 'requirements' / f'{name}.txt').read_text(encoding='utf-8')
         pins = re.sub('#.*', '', text).split()
         assert pins
@@ -294,8 +315,8 @@ def test_requirements_are_pinned_exactly():
         (['demo', 'MAP=a', 'QUERY=b', 'ARGS=-v'], r'/demo --map "\$MAP" --query "\$QUERY" +-v$'),
         (['evaluate', 'EXTRAS=onnx', 'MAP=a', 'QUERY=b'], r'--with onnx evaluation\n'),
         (['setup', 'TORCH_INDEX=file:///cpu'], r"--torch-index 'file:///cpu' --with *$"),
-        (['test', 'ARGS=-x'], r'sphinx-build .*-W(.|\n)* -n 2 .* test -m .not long. -x$'),
-        (['test-long'], r' pytest .* test -m long *$'),
+        (['test', 'ARGS=-x'], r'sphinx-build .*-W(.|\n)* pytest .*test -m .not long. -x$'),
+        (['test-long'], r' pytest .*test -m long *$'),
         (['setup', 'PYTHON=python3.12'], r'^python3.12 -E tools/setup_venv.py setup '),
     ],
 )

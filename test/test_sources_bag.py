@@ -11,7 +11,8 @@ from bags import SECOND, TEXT, writing
 import cv2
 import numpy as np
 import pytest
-from stavpr_ros.errors import ImageError, SettingsError, SourceError
+from stavpr_ros import output_file
+from stavpr_ros.errors import ImageError, OutputError, SettingsError, SourceError
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import BagSource, COMPRESSED, RAW
 from stavpr_ros.sources.bag_file import open_bag
@@ -42,6 +43,23 @@ def write_mixed(path, ros1=False, bad=()):
             bag.write('/small', COMPRESSED, record.time_ns, header, 'png', png)
             bag.write('/text', TEXT, record.time_ns, 'hello')
     return path
+
+
+def test_bag_is_written_by_one_writer_and_over_what_a_killed_one_left(tmp_path):
+    path = tmp_path / 'drive'
+
+    def others():
+        with pytest.raises(OutputError, match='is being written'):
+            write_bag(path, '/image', records())
+        yield from records()
+        assert not path.exists()
+
+    stale = output_file._temporary_of(path)
+    (stale / 'drive').mkdir(parents=True)  # a killed writer left it
+    (stale / 'drive' / 'drive.db3').write_bytes(b'old')
+    assert write_bag(path, '/image', others()) == 5
+    assert [file.name for file in tmp_path.iterdir()] == ['drive']
+    assert sorted(file.name for file in path.iterdir()) == ['drive.db3', 'metadata.yaml']
 
 
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
@@ -217,9 +235,9 @@ def test_write_bag_never_overwrites_nor_leaves_parts(tmp_path):
 
     with pytest.raises(ImageError, match='the third one'):
         write_bag(tmp_path / 'bag', '/image', broken())
-    assert not (tmp_path / 'bag').exists()
+    assert not list(tmp_path.iterdir())
     write_bag(tmp_path / 'bag', '/image', records())
-    with pytest.raises(SourceError, match='exists already'):
+    with pytest.raises(OutputError, match='exists already'):
         write_bag(tmp_path / 'bag', '/image', records())
     with pytest.raises(SettingsError, match="'zip': expected one of sqlite3, mcap"):
         write_bag(tmp_path / 'other', '/image', records(), 'zip')

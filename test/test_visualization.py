@@ -159,8 +159,9 @@ def test_visualization_of_distances_is_the_newest_row(localized):
     views, publishers = views_of('distances', 'window_image', 'match_image/compressed')
     views.publish(header(), match, pipeline, 'map')
     (row,) = publishers.messages('distances')
-    assert (row.encoding, row.height, row.width, row.step) == ('32FC1', 1, 60, 240)
-    values = np.frombuffer(row.data, np.float32)
+    assert (row.encoding, row.height, row.width, row.step) == ('32FC2', 1, 60, 480)
+    values, numbers = np.frombuffer(row.data, np.float32).reshape(-1, 2).T
+    assert numbers.tolist() == list(range(60))
     rows, first = pipeline.window_distances()
     assert first == 0
     np.testing.assert_array_equal(values, rows[-1])
@@ -171,6 +172,18 @@ def test_visualization_of_distances_is_the_newest_row(localized):
     expected = draw_match(match, pipeline.places).astype(int)
     error, swapped = (np.abs(drawn[..., ::step] - expected).mean() for step in (-1, 1))
     assert error < 10 < swapped
+
+
+def test_visualization_of_distances_states_the_places_after_an_eviction(localized, monkeypatch):
+    pipeline, match = localized
+    views, publishers = views_of('distances')
+    row = np.arange(1200, dtype=np.float32)[None]
+    monkeypatch.setattr(pipeline, 'window_distances', lambda: (row, 3000))
+    views.publish(header(), match, pipeline, 'map')
+    (message,) = publishers.messages('distances')
+    values, numbers = np.frombuffer(message.data, np.float32).reshape(-1, 2).T
+    assert (message.width, numbers[0]) == (512, 3000)
+    np.testing.assert_array_equal(numbers, values + 3000)
 
 
 def test_window_rows_of_a_window_that_fills_are_those_of_its_images(map_file, route):

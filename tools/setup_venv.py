@@ -28,8 +28,11 @@ SUPPORTED = ('3.11', '3.12', '3.13')
 PYTHON_VERSION = '{}.{}'.format(*sys.version_info)
 LAST_LINES = 25  # of the log of a failed command
 
-# Names of files requirements/NAME.txt; torch has its own file, since it may have its own index.
-REQUIRED = ('torch', 'runtime', 'ros', 'build')
+# Names of files requirements/NAME.txt. tools/lock_requirements.py makes requirements/locked of
+# them: base.txt, and a file for each extra. Those are installed, and their hashes compared.
+# torch and cuda are not locked: their builds depend on the index and on the driver.
+BASE = ('runtime', 'ros', 'build')
+LOCKED_EXTRAS = ('onnx', 'faiss', 'evaluation', 'bench', 'dev', 'docs')
 EXTRAS = ('onnx', 'faiss', 'cuda', 'evaluation', 'bench', 'dev', 'docs')
 
 # The files that a package is built from, in build order: stavpr_ros depends on stavpr_msgs.
@@ -212,9 +215,12 @@ def install(extras: list, torch_index: str) -> None:
         'torch_index': torch_index or before.get('torch_index', ''),
     }
     extras = [name for name in EXTRAS if name in extras or name in before.get('extras', [])]
-    files = [ROOT / 'requirements' / f'{name}.txt' for name in (*REQUIRED, *extras)]
-    constraints = ROOT / 'requirements' / 'constraints.txt'
-    wanted = {**place, 'extras': extras, 'files': digest([*files, constraints])}
+    requirements = ROOT / 'requirements'
+    locked = ['base', *(name for name in extras if name in LOCKED_EXTRAS)]
+    files = [requirements / 'locked' / f'{name}.txt' for name in locked]
+    unlocked = [requirements / f'{name}.txt' for name in ('torch', 'cuda')]
+    unlocked = unlocked if 'cuda' in extras else unlocked[:1]
+    wanted = {**place, 'extras': extras, 'files': digest([*files, *unlocked])}
     if before == wanted:
         return
     problems = machine_problems()
@@ -230,12 +236,15 @@ def install(extras: list, torch_index: str) -> None:
             # The base executable, since `make shell` runs this program by .venv's own Python.
             command = [sys._base_executable, '-m', 'venv', '--clear', venv]
             run_logged('venv', 'Creating .venv', command)
-        if place['torch_index']:
-            index = ['--index-url', place['torch_index'], '-r', files[0]]
-            run_logged('torch', f'Installing torch from {place["torch_index"]}', [*pip, *index])
+        index = ['--index-url', place['torch_index']] if place['torch_index'] else []
+        title = ' '.join(['Installing torch', *(['from', place['torch_index']] if index else [])])
+        run_logged('torch', title, [*pip, *index, '-r', unlocked[0]])
         options = [part for file in files for part in ('-r', file)]
-        title = f'Installing {", ".join([*REQUIRED, *extras])}: a few minutes the first time'
-        run_logged('pip', title, [*pip, *options, '-c', constraints])
+        title = f'Installing {", ".join(locked)}: a few minutes the first time'
+        run_logged('pip', title, [*pip, '--require-hashes', *options])
+        if unlocked[1:]:
+            constraints = ['-c', requirements / 'constraints.txt']
+            run_logged('cuda', 'Installing cuda', [*pip, '-r', unlocked[1], *constraints])
     except SetupError:
         if not is_new:
             # pip rolls a failed installation back.
@@ -248,7 +257,7 @@ def install(extras: list, torch_index: str) -> None:
 def build() -> None:
     """Build both packages from nothing, unless they were built from the same sources."""
     python = ROOT / '.venv' / 'bin' / 'python3'
-    requirements = [f'requirements/{name}.txt' for name in ('ros', 'build', 'constraints')]
+    requirements = ['requirements/locked/base.txt']
     for package, sources in SOURCES.items():
         stamp = ROOT / 'install' / package / '.setup.sha256'
         # pyvenv.cfg names the Python and the folder of .venv; extras have no effect on a build.

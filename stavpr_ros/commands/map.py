@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run stavpr_ros map``: show, check, convert, export, merge and recover maps."""
+"""``ros2 run stavpr_ros map``: show, check, convert, compact, export, merge, recover maps."""
 
 import argparse
 from datetime import datetime, UTC
@@ -11,16 +11,17 @@ from typing import TYPE_CHECKING
 from stavpr_ros.commands import map_recover
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import MapFileError, SettingsError
-from stavpr_ros.output_file import ARRAYS, atomic_output, MAP, require_replaceable
+from stavpr_ros.output_file import ARRAYS, atomic_output, MAP, PNG, require_replaceable
 
 if TYPE_CHECKING:
     from stavpr_ros.mapping import PlaceMap
 
 EPILOG = """
 examples:
-  map info route.stavpr
+  map info route.stavpr --plot route.png
   map verify *.stavpr
   map convert old.stavpr new.stavpr --storage float16
+  map compact route.stavpr small.stavpr --drop-duplicates
   map export route.stavpr arrays.npz
   map merge both.stavpr day.stavpr night.stavpr
   map sessions both.stavpr day.stavpr --keep day
@@ -31,7 +32,9 @@ exit codes: 0 done, or all maps are sound; 1 not (the reason is printed); 2 usag
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = make_parser('map', 'Show, check, convert, export, merge and recover maps.', EPILOG)
+    parser = make_parser(
+        'map', 'Show, check, convert, compact, export, merge and recover maps.', EPILOG
+    )
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
 
     def add(name: str, text: str, *files: str, output: bool = False) -> argparse.ArgumentParser:
@@ -44,11 +47,36 @@ def _parser() -> argparse.ArgumentParser:
             )
         return action
 
-    add('info', 'Show what a map holds.', 'map')
+    action = add('info', 'Show what a map holds.', 'map')
+    action.add_argument(
+        '--plot',
+        metavar='PNG',
+        help='also draw the route with its poses, thumbnails, and the distances of places to '
+        'each other',
+    )
+    action.add_argument('--force', action='store_true', help='replace an existing plot')
     action = add('verify', 'Compare all of a map with its hashes, and check every value.')
     action.add_argument('maps', nargs='+', metavar='MAP')
     action = add('convert', 'Write a map in the present format.', 'map', 'output', output=True)
     _add_storage(action)
+    action = add('compact', 'Write a map in less memory.', 'map', 'output', output=True)
+    action.add_argument(
+        '--storage',
+        choices=('float32', 'float16'),
+        default='float16',
+        help='of the features; float16 is half of float32 (%(default)s)',
+    )
+    action.add_argument(
+        '--drop-duplicates',
+        action='store_true',
+        help='without places that show what the one before shows, where the camera stood; of a '
+        'map without poses, also those of a drive through the dark',
+    )
+    action.add_argument(
+        '--drop-thumbnails',
+        action='store_true',
+        help='without the images of the places, which the geometric check and viewers need',
+    )
     add('export', 'Write the arrays of a map for NumPy.', 'map', 'output', output=True)
     action = add('merge', 'Make one map of several: each is a session of it.', output=True)
     action.add_argument('output', metavar='OUTPUT')
@@ -84,7 +112,13 @@ def _add_storage(action: argparse.ArgumentParser) -> None:
 def _info(arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import open_map
 
-    print(describe(open_map(arguments.map), Path(arguments.map)))
+    place_map = open_map(arguments.map)
+    print(describe(place_map, Path(arguments.map)))
+    if arguments.plot:
+        from stavpr_ros.commands.map_plot import plot_map
+
+        plot_map(place_map, Path(arguments.plot))
+        print(f'plot       {arguments.plot}')
 
 
 def describe(place_map: 'PlaceMap', path: Path) -> str:
@@ -154,6 +188,29 @@ def _convert(arguments: argparse.Namespace) -> None:
     _write(place_map, arguments)
 
 
+def _compact(arguments: argparse.Namespace) -> None:
+    from dataclasses import replace
+
+    from stavpr_ros.mapping import open_map, verify_map
+    from stavpr_ros.mapping.stored_features import StoredFeatures
+    from stavpr_ros.recognition.near_duplicates import without_duplicates
+
+    place_map = open_map(arguments.map)
+    verify_map(place_map)
+    assert isinstance(place_map.features, StoredFeatures)
+    stored, n = place_map.features.storage, len(place_map)
+    if arguments.drop_duplicates:
+        place_map = without_duplicates(place_map, progress=True)
+        print(f'{n - len(place_map)} of {n} places dropped: they show what the one before shows')
+    if arguments.drop_thumbnails:
+        size = sum(map(len, place_map.thumbnails)) / 1e6
+        place_map = replace(place_map, thumbnails=())
+        print(f'thumbnails of {size:.1f} MB dropped')
+    if arguments.storage != stored:
+        print(f'features: {stored} becomes {arguments.storage}')
+    _write(place_map, arguments)
+
+
 def _merge(arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import merge_maps, open_map, verify_map
     from stavpr_ros.recognition.same_places import with_same_places
@@ -212,6 +269,8 @@ def _recover(arguments: argparse.Namespace) -> int:
 
 def _check_output(arguments: argparse.Namespace) -> None:
     """Reject an output that must not be replaced, or that is one of the inputs."""
+    if arguments.action == 'info' and arguments.plot:
+        require_replaceable(arguments.plot, PNG, arguments.force)
     if 'output' not in arguments or arguments.action == 'recover':
         return
     kind = ARRAYS if arguments.action == 'export' else MAP
@@ -230,7 +289,7 @@ def main(args: list[str] | None = None) -> int:
         _check_output(arguments)
         actions = {
             'info': _info, 'verify': _verify, 'convert': _convert, 'export': _export,
-            'merge': _merge, 'sessions': _sessions, 'recover': _recover,
+            'compact': _compact, 'merge': _merge, 'sessions': _sessions, 'recover': _recover,
         }  # fmt: skip
         return actions[arguments.action](arguments)
 

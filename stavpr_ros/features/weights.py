@@ -11,13 +11,13 @@ import io
 import os
 from pathlib import Path
 import re
-import tempfile
 from typing import Any, BinaryIO, IO
 import urllib.request
 
 import numpy as np
-from stavpr_ros.errors import FeatureMismatchError, UnavailableError
+from stavpr_ros.errors import FeatureMismatchError, OutputError, UnavailableError
 from stavpr_ros.features.registry import CACHED
+from stavpr_ros.output_file import ANY, atomic_output, write_output
 from stavpr_ros.regular_file import open_regular
 import torch
 from torch import nn
@@ -171,26 +171,25 @@ def download(address: str, path: Path, sha256: str) -> None:
     :raises UnavailableError: the download fails, is incomplete or has another hash.
     """
     advice = f'download it by other means and give its path, or copy it to {path}'
-    partial = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(
-            dir=path.parent, prefix=f'{path.name}.', delete=False
-        ) as file:
-            partial = Path(file.name)
-            digest = _fetch(address, file, path.name)
-        if digest != sha256:
-            raise UnavailableError(
-                f'the file from {address} has sha256 {digest}, expected {sha256}: it was changed '
-                f'or damaged on its way; try again, or {advice}'
-            )
-        _hash_file(path).write_text(f'{digest}  {path.name}\n')
-        partial.replace(path)
+        with atomic_output(path, ANY, force=True) as file:
+            digest = _fetched(address, file, path, advice)
+            if digest != sha256:
+                raise UnavailableError(
+                    f'the file from {address} has sha256 {digest}, expected {sha256}: it was '
+                    f'changed or damaged on its way; try again, or {advice}'
+                )
+            write_output(_hash_file(path), f'{digest}  {path.name}\n', ANY, force=True)
+    except (OSError, OutputError) as error:
+        raise UnavailableError(f'{address} cannot be downloaded ({error}): {advice}') from error
+
+
+def _fetched(address: str, file: IO[bytes], path: Path, advice: str) -> str:
+    try:
+        return _fetch(address, file, path.name)
     except (OSError, http.client.HTTPException) as error:
         raise UnavailableError(f'{address} cannot be downloaded ({error}): {advice}') from error
-    finally:
-        if partial is not None:
-            partial.unlink(missing_ok=True)
 
 
 class _Redirects(urllib.request.HTTPRedirectHandler):

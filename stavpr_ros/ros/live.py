@@ -21,6 +21,7 @@ from stavpr_ros.errors import StavprError, UnavailableError
 START_TIMEOUT = 180.0  # seconds for the node to load the map and to compile
 END_TIMEOUT = 20.0  # seconds for a process to end, or for the last record
 POLL_SECONDS = 0.05
+REFUSED = 'cannot configure: '  # in the log of the node
 
 Process = subprocess.Popen[bytes]
 Records = list[dict[str, Any]]
@@ -150,9 +151,17 @@ def _wait_until(
                 raise StavprError(
                     f'{name} ended with {process.returncode}, see {folder / name}.log'
                 )
+        if reason := _refusal(folder / 'node.log'):
+            raise StavprError(f'the node cannot start: {reason}')
         if time.monotonic() > end:
             raise StavprError(f'{event} did not come in {seconds:g} s, see the logs in {folder}')
         time.sleep(POLL_SECONDS)
+
+
+def _refusal(log: Path) -> str:
+    """Return why the node, which then waits for another try, could not be configured; or ''."""
+    _, _, rest = log.read_text().partition(REFUSED)
+    return rest.partition('\n')[0] if '\n' in rest else ''
 
 
 def _is_recording(log: Path) -> bool:

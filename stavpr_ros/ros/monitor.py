@@ -127,6 +127,7 @@ class Monitor:
         self._node, self._name, self.history = node, name, history
         self._full_name = node.resolve_topic_name(name)
         self._row = ''  # distances of the last image
+        self._span = 0.0, 1.0  # place at the start of its first column, and at the end of the last
         self._places = 0
         self._images: Subscription | None = None
         self._state_request: tuple[Future, float] | None = None
@@ -238,11 +239,13 @@ class Monitor:
                 'places': self._places,
                 # of the image before, where the messages have overtaken each other
                 'row': self._row if message.status in WITH_ROW else '',
+                'span': self._span,
             }
         )
 
     def _on_distances(self, message: Image) -> None:
-        self._row = encode_row(np.frombuffer(message.data, np.float32))
+        distances, places = np.frombuffer(message.data, np.float32).reshape(-1, 2).T
+        self._row, self._span = encode_row(distances), span_of(places)
 
     def _on_map_info(self, message: MapInfo) -> None:
         self._places = message.places
@@ -275,6 +278,12 @@ class Monitor:
 
     def _on_image(self, message: CompressedImage) -> None:
         self.history.show(bytes(message.data))
+
+
+def span_of(places: np.ndarray) -> tuple[float, float]:
+    """Return where a row begins and ends, of the first place of each of its columns."""
+    first, last = float(places[0]), float(places[-1])
+    return first, last + max((last - first) / max(len(places) - 1, 1), 1)
 
 
 def encode_row(row: np.ndarray) -> str:

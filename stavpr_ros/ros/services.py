@@ -83,10 +83,17 @@ class Services:
             self._faults[name] = response.message
             response.success = False
             if name == 'relocalize':  # indices of -1, where the default 0 would be a place
-                response.match = match_message(Header(), Match(Status.NOT_READY, response.message))
+                match = Match(Status.NOT_READY, response.message)
+                response.match = match_message(Header(), match, robot_id=self._robot_id())
             return response
 
         return callback
+
+    def _robot_id(self) -> str:
+        try:
+            return self._runtime().settings.robot_id
+        except StavprError:  # not configured: the parameter is not read
+            return ''
 
     def _load_map(self, runtime: Runtime, request: Any, response: Any) -> str:
         if not request.path:

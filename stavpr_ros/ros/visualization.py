@@ -128,10 +128,13 @@ class Visualization:
         if self._is_requested(self._distances):
             missing = max(0, len(pipeline.places or ()) - rows.shape[1])
             row = np.pad(rows[-1:], ((0, 0), (0, missing)), constant_values=np.inf)
-            row = least_of_each(row, COLUMNS).astype(np.float32)
-            message = Image(header=header, height=1, width=row.size, encoding='32FC1')
-            message.step = row.size * 4
-            message.data = array.array('B', row.tobytes())
+            places = np.arange(first, first + row.size)[None]
+            columns = np.stack(
+                [least_of_each(row, COLUMNS)[0], least_of_each(places, COLUMNS)[0]], axis=1
+            ).astype(np.float32)
+            message = Image(header=header, height=1, width=len(columns), encoding='32FC2')
+            message.step = columns.nbytes
+            message.data = array.array('B', columns.tobytes())
             self._distances.publish(message)
 
     def _note(self, header: Header, match: Match, places: Places) -> None:

@@ -4,14 +4,14 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-import shutil
 
 import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
-from stavpr_ros.errors import SettingsError, SourceError
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.output_file import atomic_folder
 from stavpr_ros.sources.bag import RAW, SECOND
 from stavpr_ros.sources.frame import ImageRecord
 
@@ -27,41 +27,31 @@ def write_bag(
     storage: str = 'sqlite3',
 ) -> int:
     """
-    Write a bag with one topic of raw images; on an error the folder is removed.
+    Write a bag with one topic of raw images, all of it or nothing.
 
     :param path: the bag's folder, which must not exist yet.
     :param records: the images, in the order of their times of recording.
     :param storage: ``sqlite3`` or ``mcap``.
     :returns: number of images written.
-    :raises SourceError: the folder exists, or cannot be written.
+    :raises OutputError: the folder exists, or cannot be written.
     """
-    path = Path(path)
     plugin = STORAGES.get(storage)
     if plugin is None:
         raise SettingsError(f'storage {storage!r}: expected one of {", ".join(STORAGES)}')
-    if path.exists():
-        raise SourceError(
-            f'{path} exists already: expected a new folder; remove it or choose another name'
-        )
     typestore = get_typestore(Stores.ROS2_JAZZY)
     count = 0
-    try:
-        with Writer(
-            path,
+    with (
+        atomic_folder(path) as folder,
+        Writer(
+            folder,
             version=VERSION,  # type: ignore[arg-type]
             storage_plugin=plugin,
-        ) as writer:
-            connection = writer.add_connection(topic, RAW, typestore=typestore)
-            for record in records:
-                _write(writer, connection, typestore, record)
-                count += 1
-    except BaseException as error:
-        shutil.rmtree(path, ignore_errors=True)
-        if isinstance(error, OSError):
-            raise SourceError(
-                f'{path} cannot be written: {error}; check permissions and space'
-            ) from error
-        raise
+        ) as writer,
+    ):
+        connection = writer.add_connection(topic, RAW, typestore=typestore)
+        for record in records:
+            _write(writer, connection, typestore, record)
+            count += 1
     return count
 
 

@@ -1,0 +1,107 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Write requirements/locked/NAME.txt: every package with its version and the hashes of its files.
+
+Usage: ``python3 tools/lock_requirements.py python3.11 python3.12 python3.13``
+
+Each Python resolves requirements/NAME.txt for itself. torch and the extra ``cuda`` are not locked:
+their builds depend on the package index and on the driver. ``base.txt`` is what is always
+installed; the files of the extras hold what they add.
+"""
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+from typing import Any
+
+from pip._vendor.packaging.requirements import Requirement
+from pip._vendor.packaging.utils import canonicalize_name
+from setup_venv import BASE, LOCKED_EXTRAS
+
+FOLDER = Path(__file__).resolve().parent.parent / 'requirements'
+HEAD = '# Written by tools/lock_requirements.py.\n'
+
+
+def resolve(python: str) -> dict[str, Any]:
+    """Return pip's report of what it would install of all requirements."""
+    command = [python, '-m', 'pip', 'install', '--dry-run', '--quiet', '--ignore-installed']
+    command += ['--report', '-', '-c', str(FOLDER / 'constraints.txt')]
+    for name in (*BASE, *LOCKED_EXTRAS):
+        command += ['-r', str(FOLDER / f'{name}.txt')]
+    result = subprocess.run(command, stdout=subprocess.PIPE, check=True)
+    report: dict[str, Any] = json.loads(result.stdout)
+    return report
+
+
+def requirements(*names: str) -> list[Requirement]:
+    """Return the requirements in requirements/NAME.txt."""
+    lines = [
+        line.partition(' #')[0].strip()
+        for name in names
+        for line in (FOLDER / f'{name}.txt').read_text(encoding='utf-8').splitlines()
+    ]
+    return [Requirement(line) for line in lines if line and not line.startswith('#')]
+
+
+def closure(wanted: list[Requirement], report: dict[str, Any]) -> set[str]:
+    """Return the names of the packages that some requirements need, of a report."""
+    packages = {canonicalize_name(row['metadata']['name']): row for row in report['install']}
+    seen: set[tuple[str, str]] = set()
+    todo = [(canonicalize_name(one.name), extra) for one in wanted for extra in ('', *one.extras)]
+    while todo:
+        name, extra = todo.pop()
+        if (name, extra) in seen:
+            continue
+        seen.add((name, extra))
+        for text in packages[name]['metadata'].get('requires_dist', ()):
+            one = Requirement(text)
+            environment = report['environment'] | {'extra': extra}
+            if one.marker is None or one.marker.evaluate(environment):
+                key = canonicalize_name(one.name)
+                todo += [(key, more) for more in ('', *one.extras)]
+    return {name for name, _ in seen}
+
+
+def locked(reports: dict[str, dict[str, Any]], names: dict[str, set[str]]) -> str:
+    """Return the lines of a lock file: packages by name, of each Python version (3.11, ...)."""
+    found: dict[tuple[str, str], dict[str, str]] = {}  # hash by Python version
+    for version, report in reports.items():
+        for row in report['install']:
+            name = canonicalize_name(row['metadata']['name'])
+            if name in names[version]:
+                hashes = row['download_info']['archive_info']['hashes']
+                key = name, row['metadata']['version']
+                found.setdefault(key, {})[version] = hashes['sha256']
+    lines = []
+    for (name, release), hashes in sorted(found.items()):
+        some = [f"python_version == '{version}'" for version in hashes]
+        marker = '' if len(hashes) == len(reports) else f' ; {" or ".join(some)}'
+        options = ''.join(
+            f' \\\n    --hash=sha256:{value}' for value in sorted({*hashes.values()})
+        )
+        lines.append(f'{name}=={release}{marker}{options}\n')
+    return HEAD + ''.join(lines)
+
+
+def main(pythons: list[str]) -> None:
+    """Write all lock files."""
+    reports = {}
+    for python in pythons:
+        report = resolve(python)
+        reports[report['environment']['python_version']] = report
+    base = {version: closure(requirements(*BASE), report) for version, report in reports.items()}
+    folder = FOLDER / 'locked'
+    folder.mkdir(exist_ok=True)
+    (folder / 'base.txt').write_text(locked(reports, base), encoding='utf-8')
+    for extra in LOCKED_EXTRAS:
+        added = {
+            version: closure(requirements(extra), report) - base[version]
+            for version, report in reports.items()
+        }
+        (folder / f'{extra}.txt').write_text(locked(reports, added), encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main(sys.argv[1:])
