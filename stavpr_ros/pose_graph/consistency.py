@@ -18,7 +18,7 @@ from stavpr_ros.pose_graph.odometry import KeyframeChain, OdometryNoise
 from stavpr_ros.pose_graph.transforms import angles, inverse
 
 LIMIT = 9.0  # squared deviations
-NEAR = 60.0  # meters travelled between two clusters that confirm each other
+CLOSURE_FACTORS = (0.05, 0.2, 1.0)  # on the covariances of closures that are tried
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class ConsistencySettings:
     span: float = 20.0
     support: int = 3
     join_support: int = 8
-    break_support: int = 26
-    break_distance: float = 40.0
+    break_support: int = 32
+    break_distance: float = 50.0
 
 
 @dataclass(eq=False)
@@ -122,9 +122,10 @@ class Cycles:
         """
         Return the factor on the errors of the odometry that the cycles have most probably.
 
-        Student's t with 4 degrees of freedom: few wrong closures do not decide.
+        Student's t with 4 degrees of freedom: few wrong closures do not decide. The covariances of
+        the closures may be too large or too small: the most probable of some factors is taken.
         """
-        likelihood = np.zeros(len(scales))
+        likelihood = np.zeros((len(CLOSURE_FACTORS), len(scales)))
         for i in range(len(self.Z)):
             same = self.query_session == self.query_session[i]
             same &= self.place_session == self.place_session[i]
@@ -132,15 +133,23 @@ class Cycles:
             same &= (driven > 30) & (driven < 400) & (np.arange(len(same)) > i)
             if not same.any():
                 continue
+            still = OdometryNoise(0.0, 0.0)
+            position, angle, measured, measured_angle = (
+                values[same] for values in self._errors(i, still)
+            )
+            along = np.abs(self.place_at - self.place_at[i])[same]
             for k, scale in enumerate(scales):
                 own = OdometryNoise(noise.translation * scale, noise.rotation * scale)
-                position, angle, variance, angle_variance = (
-                    values[same] for values in self._errors(i, own)
-                )
-                for error, of, dof in ((position, variance, 2), (angle, angle_variance, 1)):
-                    heavy = (4 + dof) / 2 * np.log1p(error**2 / (4 * of))
-                    likelihood[k] -= (heavy + dof / 2 * np.log(of)).sum()
-        return float(scales[np.argmax(likelihood)])
+                moved = own.position_variance(along) + own.position_variance(driven[same])
+                turned = own.angle_variance(along) + own.angle_variance(driven[same])
+                for j, factor in enumerate(CLOSURE_FACTORS):
+                    for error, of, dof in (
+                        (position, factor * measured + moved, 2),
+                        (angle, factor * measured_angle + turned, 1),
+                    ):
+                        heavy = (4 + dof) / 2 * np.log1p(error**2 / (4 * of))
+                        likelihood[j, k] -= (heavy + dof / 2 * np.log(of)).sum()
+        return float(scales[np.argmax(likelihood.max(axis=0))])
 
 
 def grow(

@@ -32,14 +32,12 @@ class GraphSettings:
     Settings of a :class:`PoseGraph`.
 
     :param noise: errors of the odometry; their factor is estimated if ``adapt``.
-    :param edge_distance: meters that the query travels between two edges of the solution.
     """
 
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     noise: OdometryNoise = field(default_factory=OdometryNoise)
     consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
     adapt: bool = True
-    edge_distance: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,6 +237,9 @@ class PoseGraph:
                 agreeing = self._agreeing(run)
                 if not agreeing:
                     continue
+                between = run[run.index(agreeing[0]) : run.index(agreeing[-1]) + 1]
+                if len(between) > 1.2 * len(agreeing):
+                    continue
                 weight = sum(self._clusters[i].weight for i in agreeing)
                 start = self._clusters[agreeing[0]].members[0]
                 end = self._clusters[agreeing[-1]].members[-1]
@@ -409,10 +410,8 @@ class PoseGraph:
             cluster = self._clusters[i]
             edge = cluster.representative
             a, b = sorted((int(session[edge.query]), int(session[edge.place])))
-            if a != b and (a, b) not in joins:
-                continue
-            for each in independent(cluster, self.settings.edge_distance):
-                chosen[each.number] = each
+            if a == b or (a, b) in joins:
+                chosen |= {each.number: each for each in independent(cluster)}
         return chosen
 
     def _is_far(self, edges: dict[int, ResolvedClosure], initial: np.ndarray) -> bool:
@@ -477,14 +476,10 @@ class PoseGraph:
         return to_poses(self.solved[node] @ inverse(self.chain.transforms[node]))
 
 
-def independent(cluster: Cluster, distance: float) -> list[ResolvedClosure]:
+def independent(cluster: Cluster) -> list[ResolvedClosure]:
     """Return the closures of a cluster whose errors do not correlate; at least the best one."""
     marked = [each for each in cluster.members if each.is_independent]
-    found: list[ResolvedClosure] = []
-    for each in marked:
-        if not found or each.at - found[-1].at >= distance:
-            found.append(each)
-    return found or [cluster.representative]
+    return marked or [cluster.representative]
 
 
 def _medoid(votes: np.ndarray, transforms: np.ndarray) -> int:
