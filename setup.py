@@ -25,6 +25,7 @@ EXECUTABLES = (
     'demo',
     'record',
     'monitor',
+    'pose_graph',
     'evaluate',
     'experiments',
 )
@@ -87,6 +88,7 @@ setup(
         'docs': ['myst-parser>=2.0', 'sphinx>=7.2'],
         'evaluation': EVALUATION,
         'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
+        'slam': ['evo>=1.31', 'gtsam>=4.2'],
         'test': TEST,
     },
     zip_safe=False,

@@ -13,7 +13,7 @@ import stavpr_ros
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'stavpr_ros'
 ROS = {'rclpy', 'ament_index_python', 'stavpr_msgs', 'rcl_interfaces', 'builtin_interfaces'}
-ROS |= {f'{name}_msgs' for name in ('std', 'sensor', 'geometry', 'nav', 'diagnostic', 'lifecycle')}
+ROS |= {f'{name}_msgs' for name in ('std', 'sensor', 'geometry', 'nav', 'diagnostic', 'lifecycle', 'visualization')}
 CORE = ('alignment', 'sources', 'features', 'mapping', 'recognition', 'pipeline')
 """Each of these may import the ones before it, and features and sources not each other."""
 MAY_IMPORT = {
@@ -23,10 +23,11 @@ MAY_IMPORT = {
     'mapping': {'alignment', 'sources', 'features'},
     'recognition': {'alignment', 'features', 'mapping'},
     'pipeline': set(CORE[:5]),
+    'pose_graph': {'mapping'},
     'evaluation': set(CORE[:5]),
-    'demonstration': {'evaluation', *CORE},
-    'ros': set(CORE),
-    'commands': {'ros', 'demonstration', 'evaluation', *CORE},
+    'demonstration': {'evaluation', 'pose_graph', *CORE},
+    'ros': {'pose_graph', *CORE},
+    'commands': {'ros', 'demonstration', 'evaluation', 'pose_graph', *CORE},
 }
 # On an image's way as well, but not traced: compiled code does not report its calls, and these
 # files of the node run before and after the pipeline, in the executor's and the worker's thread.

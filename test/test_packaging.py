@@ -39,7 +39,7 @@ ROSDEP_KEYS = {
     'tqdm': 'python3-tqdm',
     'yaml': 'python3-yaml',
 }
-NO_ROSDEP_KEY = {'llvmlite', 'onnx', 'onnxruntime', 'rosbags', 'torch'}
+NO_ROSDEP_KEY = {'evo', 'gtsam', 'llvmlite', 'onnx', 'onnxruntime', 'rosbags', 'torch'}
 ROS = re.compile(r'\w+_(msgs|srvs|interfaces)|rclpy|launch|launch_ros|ament_index_python')
 
 
@@ -100,7 +100,8 @@ def declared(*tags: str) -> set[str]:
 
 def test_every_imported_distribution_is_required(setup_arguments):
     required = distribution_names(setup_arguments['install_requires'])
-    required |= distribution_names(setup_arguments['extras_require']['onnx'])
+    for extra in ('onnx', 'slam'):
+        required |= distribution_names(setup_arguments['extras_require'][extra])
     needed = {name for name in imported(PACKAGE) if not ROS.fullmatch(name)}
     assert needed  # the search works
     assert {DISTRIBUTIONS.get(name, name).lower() for name in needed} - required == set()

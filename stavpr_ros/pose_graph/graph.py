@@ -17,7 +17,7 @@ from stavpr_ros.pose_graph.consistency import (
     largest_consistent,
 )
 from stavpr_ros.pose_graph.odometry import KeyframeChain, KeyframeSettings, OdometryNoise
-from stavpr_ros.pose_graph.solver import Solver
+from stavpr_ros.pose_graph.solver import CAUCHY, Solver, WIDE
 from stavpr_ros.pose_graph.transforms import body_covariance, inverse, matrices, to_poses
 
 MAX_PENDING = 1000  # closures that wait for their odometry
@@ -178,12 +178,19 @@ class PoseGraph:
         if self._changed:
             self._decide()
         joins, links = self._join()
-        initial, moved = self._initial(joins, links)
+        moved = joins != self._joins or not self._links.items() <= links.items()
+        initial = self._place_all(joins, links) if moved else self._extended(links)
         edges = self._select(joins)
-        anew = moved or self._is_far(edges, initial)
-        if final or anew:
-            # edges far from the estimate would have no influence on a robust solution
-            initial = self._solver.solve(self.chain, initial, edges, self.noise, links)
+        if not moved and (far := self._far(edges, initial)):
+            # such edges would have no influence on the robust solution
+            moved = True
+            self._solver.restart()
+            session = self.chain.session
+            if any(session[edge.query] != session[edge.place] for edge in far):
+                initial = self._place_all(joins, links)
+        if final or moved:
+            kernels = (WIDE, CAUCHY) if moved else (CAUCHY,)
+            initial = self._solver.solve(self.chain, initial, edges, self.noise, links, kernels)
         if not final:
             initial = self._solver.update(self.chain, initial, edges, self.noise, links)
         self.solved, self._joins, self._links, self._edges = initial, joins, links, edges
@@ -320,36 +327,35 @@ class PoseGraph:
                 return node
         return -1
 
-    def _initial(
+    def _extended(self, links: dict[int, int]) -> np.ndarray:
+        """Return the last estimate, and for later nodes what the odometry adds to it."""
+        T, previous, known = self.chain.transforms, self.chain.previous, len(self.solved)
+        result = np.empty((len(self.chain), 4, 4))
+        result[:known] = self.solved
+        for node in range(known, len(self.chain)):
+            before = int(previous[node])
+            if before >= 0:
+                result[node] = result[before] @ inverse(T[before]) @ T[node]
+            else:
+                result[node] = self._start(node, result, links)
+        return result
+
+    def _place_all(
         self, joins: frozenset[tuple[int, int]], links: dict[int, int]
-    ) -> tuple[np.ndarray, bool]:
-        """Return first transforms of all nodes, and whether known ones have moved."""
-        chain = self.chain
-        known = len(self.solved)
-        moved = joins != self._joins or not self._links.items() <= links.items()
-        T, session, previous = chain.transforms, chain.session, chain.previous
-        result = np.empty((len(chain), 4, 4))
-        if not moved:
-            result[:known] = self.solved
-            for node in range(known, len(chain)):
-                before = int(previous[node])
-                if before >= 0:
-                    result[node] = result[before] @ inverse(T[before]) @ T[node]
-                else:
-                    result[node] = self._start(node, result, links)
-            return result, False
+    ) -> np.ndarray:
+        """Return the odometry of all nodes, each session moved to where its closures vote for."""
+        T, session = self.chain.transforms, self.chain.session
+        result = np.empty((len(self.chain), 4, 4))
         self._solver.restart()
-        placed: dict[int, np.ndarray] = {}
+        placed: set[int] = set()
         for number in self._order(joins, links):
             own = session == number
             if number == KeyframeChain.FIXED:
                 result[own] = T[own]
-            elif number == 0 and 0 not in [int(session[n]) for n, to in links.items() if to >= 0]:
-                result[own] = self._voted(number, placed, result) @ T[own]
             else:
                 result[own] = self._voted(number, placed, result, links) @ T[own]
-            placed[number] = own
-        return result, True
+            placed.add(number)
+        return result
 
     def _order(
         self, joins: frozenset[tuple[int, int]], links: dict[int, int]
@@ -379,9 +385,8 @@ class PoseGraph:
         return self.chain.transforms[node] if link < 0 else result[link]
 
     def _voted(
-        self, number: int, placed: dict[int, np.ndarray], result: np.ndarray,
-        links: dict[int, int] | None = None,
-    ) -> np.ndarray:  # fmt: skip
+        self, number: int, placed: set[int], result: np.ndarray, links: dict[int, int]
+    ) -> np.ndarray:
         """Return the transform of a session into the map that its closures agree on best."""
         chain, votes = self.chain, []
         for i in np.flatnonzero(self._accepted):
@@ -395,8 +400,6 @@ class PoseGraph:
                 votes.append(pose @ inverse(chain.transforms[edge.place]))
         if votes:
             return votes[_medoid(np.array(votes), chain.transforms[chain.session == number])]
-        if not links:
-            return np.eye(4)
         node = int(np.flatnonzero(chain.session == number)[0])
         at = self._start(node, result, links)
         turned: np.ndarray = at @ inverse(chain.transforms[node])
@@ -414,16 +417,19 @@ class PoseGraph:
                 chosen |= {each.number: each for each in independent(cluster)}
         return chosen
 
-    def _is_far(self, edges: dict[int, ResolvedClosure], initial: np.ndarray) -> bool:
-        """Return whether a new edge is far from the estimate."""
+    def _far(
+        self, edges: dict[int, ResolvedClosure], initial: np.ndarray
+    ) -> list[ResolvedClosure]:
+        """Return the new edges that are far from the estimate."""
         new = [edge for number, edge in edges.items() if number not in self._edges]
         if not new:
-            return False
+            return []
         query, place = [e.query for e in new], [e.place for e in new]
         error = inverse(np.array([e.transform for e in new]))
         error = error @ inverse(initial[place]) @ initial[query]
         deviation = np.sqrt([np.diag(e.covariance)[3:].max() for e in new])
-        return bool((np.linalg.norm(error[:, :3, 3], axis=1) > FAR * deviation).any())
+        far = np.linalg.norm(error[:, :3, 3], axis=1) > FAR * deviation
+        return [edge for edge, is_far in zip(new, far, strict=True) if is_far]
 
     # results
 

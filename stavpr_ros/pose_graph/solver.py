@@ -11,6 +11,7 @@ from stavpr_ros.pose_graph.odometry import KeyframeChain, OdometryNoise
 from stavpr_ros.pose_graph.transforms import inverse
 
 CAUCHY = 2.5  # whitened deviations from which the influence of a closure falls
+WIDE = 40.0  # the same, of a first solution from afar
 ANCHOR = 1e-4  # deviation of the pose of the first node, rad and m
 LOOSE_ANGLE, LOOSE_POSITION = 3.0, 1e3  # of a session that nothing joins to the others
 RELINEARIZE = 0.05
@@ -44,7 +45,6 @@ class Solver:
         self._isam: Any = None
         self._count = 0
         self._factors: dict[int, int] = {}  # number of a closure: index of its factor
-        self.transforms = np.zeros((0, 4, 4))
 
     def restart(self) -> None:
         """Forget everything: the next update builds the graph anew."""
@@ -64,8 +64,8 @@ class Solver:
 
         :param initial: of all nodes; those of known nodes do not matter, shape (N, 4, 4).
         :param edges: the accepted closures by their numbers.
-        :param links: first node of a session that no edge joins: node that it is tied to loosely;
-            -1 = it is the anchor.
+        :param links: first node of each session that no edge joins to others: the node that it is
+            tied to loosely; -1 = it is the anchor.
         :returns: transforms of all nodes in the map, shape (N, 4, 4).
         """
         gtsam = self._gtsam
@@ -88,8 +88,7 @@ class Solver:
             self._factors[number] = indices[first + i]
         for _ in range(3 if added or removed else 0):
             self._isam.update()
-        self.transforms = _matrices(gtsam, self._isam.calculateEstimate(), len(chain))
-        return self.transforms
+        return _matrices(gtsam, self._isam.calculateEstimate(), len(chain))
 
     def solve(
         self,
@@ -98,21 +97,30 @@ class Solver:
         edges: dict[int, ResolvedClosure],
         noise: OdometryNoise,
         links: dict[int, int],
+        kernels: tuple[float, ...],
     ) -> np.ndarray:
-        """Return the estimate of all nodes by Levenberg-Marquardt; arguments as in `update`."""
+        """
+        Return the estimate of all nodes by Levenberg-Marquardt; arguments as in `update`.
+
+        :param kernels: of Cauchy, one solution after the other: a narrow one does not pull edges
+            from afar.
+        """
         gtsam = self._gtsam
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        base, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._count = 0
-        self._add_nodes(graph, values, chain, initial, noise, links)
-        for edge in edges.values():
-            graph.add(self._edge(edge))
+        self._add_nodes(base, values, chain, initial, noise, links)
         options = gtsam.LevenbergMarquardtParams()
         options.setLinearSolverType('MULTIFRONTAL_QR')
         options.setMaxIterations(100)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, options)
+        options.setRelativeErrorTol(1e-8)  # drift along a chain vanishes in small steps
+        options.setAbsoluteErrorTol(1e-8)
+        for kernel in kernels:
+            graph = gtsam.NonlinearFactorGraph(base)
+            for edge in edges.values():
+                graph.add(self._edge(edge, kernel))
+            values = gtsam.LevenbergMarquardtOptimizer(graph, values, options).optimize()
         self.restart()
-        self.transforms = _matrices(gtsam, optimizer.optimize(), len(chain))
-        return self.transforms
+        return _matrices(gtsam, values, len(chain))
 
     def _add_nodes(
         self, graph: Any, values: Any, chain: KeyframeChain, initial: np.ndarray,
@@ -135,22 +143,22 @@ class Solver:
                 graph.add(
                     gtsam.BetweenFactorPose3(before, node, gtsam.Pose3(step), diagonal(sigmas))
                 )
-            elif chain.session[node] < 0 or links.get(node, -1) < 0:
+            elif chain.session[node] < 0 or links.get(node) == -1:
                 graph.add(gtsam.PriorFactorPose3(node, pose, tight))
-            else:
+            elif node in links:
                 link = links[node]
                 step = inverse(initial[link]) @ initial[node]
                 graph.add(gtsam.BetweenFactorPose3(link, node, gtsam.Pose3(step), loose))
         self._count = len(chain)
 
-    def _edge(self, edge: ResolvedClosure) -> Any:
+    def _edge(self, edge: ResolvedClosure, kernel: float = CAUCHY) -> Any:
         gtsam = self._gtsam
-        robust = gtsam.noiseModel.Robust.Create(
-            gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY),
+        model = gtsam.noiseModel.Robust.Create(
+            gtsam.noiseModel.mEstimator.Cauchy.Create(kernel),
             gtsam.noiseModel.Gaussian.Covariance(edge.covariance),
         )
         measured = gtsam.Pose3(edge.transform)
-        return gtsam.BetweenFactorPose3(edge.place, edge.query, measured, robust)
+        return gtsam.BetweenFactorPose3(edge.place, edge.query, measured, model)
 
 
 def _matrices(gtsam: Any, values: Any, count: int) -> np.ndarray:
