@@ -306,10 +306,18 @@ class PoseGraphNode(ManagedNode):
             if not request.path:
                 raise StavprError("path = '' is no file: set a name that ends in .g2o or .tum")
             path = inside(self._folder, request.path)
+            with self._wake:
+                inbox, self._inbox = self._inbox, []
             with self._lock:
+                for message in inbox:
+                    self._take(message)
+                self._graph.update()
+                self._graph.update(final=True)
                 if not len(self._graph.solved):
                     raise StavprError('the graph is empty: there was no odometry')
                 response.places = save_graph(self._graph, path, request.overwrite)
+            if self.state == 'active':
+                self._publish_graph()
             response.success, response.message = True, f'{response.places} nodes to {path}'
         except StavprError as error:
             response.success, response.message = False, str(error)
