@@ -18,7 +18,7 @@ export MAP QUERY LOOP SLAM
 SETUP = $(PYTHON) -E tools/setup_venv.py
 RUN = $(SETUP) run
 OPTIONS = --torch-index '$(TORCH_INDEX)' --with
-TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN) pytest test
+TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN) pytest -n 2 --dist loadfile test
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 
 .PHONY: help setup build demo evaluate test test-long lint docs bench bench-quick accuracy off-map \

@@ -21,6 +21,7 @@ EXECUTABLES = (
     'build_map',
     'map',
     'weights',
+    'export_model',
     'replay',
     'demo',
     'record',

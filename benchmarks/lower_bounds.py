@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from stavpr_ros.recognition.place_filter import FilterSettings
 
 ITEM_BYTES = {'float32': 4, 'bfloat16': 2, 'float16': 2}
+INT8_BYTES = 1
 BEYOND_CACHES = 2**28  # bytes; below, a stage may read faster than memory
 
 # Operations of one inner cell. LM-DTW: three sums x + S, two minima, two selections of the path's
@@ -103,7 +104,13 @@ def bound_seconds(works: Sequence[Work], peaks: Peaks) -> float:
 
 
 def product(sizes: Sizes, dtype: str, frames: int = 1) -> Work:
-    """Product of all pairs of strips of ``frames`` images with the map."""
+    """
+    Product of all pairs of strips of ``frames`` images with the map.
+
+    In int8, reading the map alone: torch has no product whose rate could be a bound.
+    """
+    if dtype == 'int8':
+        return Work(sizes.W * sizes.n * sizes.d * INT8_BYTES, 0)
     map_bytes = sizes.W * sizes.n * sizes.d * ITEM_BYTES[dtype]
     return Work(map_bytes, 2 * frames * sizes.W**2 * sizes.n * sizes.d, dtype)
 
@@ -128,11 +135,6 @@ def query_znorm(sizes: Sizes) -> Work:
 def window_push(sizes: Sizes) -> Work:
     """Copy of a row into the window, and the sum that finds NaN."""
     return Work(4 * sizes.n, sizes.n)
-
-
-def reference_znorm(sizes: Sizes) -> Work:
-    """Row, mean, variance and count of each place are read; update (10), shift and scale (3)."""
-    return Work(16 * sizes.n, 13 * sizes.n)
 
 
 def filter_update(sizes: Sizes, settings: FilterSettings) -> Work:

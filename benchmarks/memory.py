@@ -35,6 +35,7 @@ SIZES = {'localization': (20_000, 512), 'loop_closure': (800, 4_096)}
 CASES = (
     ('localization', 'robust', 'float32'),
     ('localization', 'robust', 'float16'),
+    ('localization', 'robust', 'int8'),
     ('loop_closure', 'robust', 'float32'),
 )
 IMAGES = 30  # processed in localization: a full window and more
@@ -116,7 +117,7 @@ def measure_memory(operation: str, mode: str, precision: str, n: int = 0, d: int
         done = subprocess.run(
             command, env=os.environ | variables, stdout=subprocess.PIPE, text=True, check=True
         )
-    item = 2 if precision == 'float16' else 4
+    item = {'float32': 4, 'float16': 2, 'int8': 1}[precision]
     return Memory(operation, mode, precision, n, d, item * n * d * STRIPS, int(done.stdout))
 
 

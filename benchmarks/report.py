@@ -15,7 +15,6 @@ ROBUST_STAGES = (
     'image_distances',
     'query_znorm',
     'window_push',
-    'reference_znorm',
     'filter_update',
     'filter_belief',
 )

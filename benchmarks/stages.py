@@ -28,7 +28,7 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.place_filter import FilterSettings, PlaceFilter
-from stavpr_ros.recognition.robust import MeanCentering, ZNormalization
+from stavpr_ros.recognition.robust import MeanCentering, z_normalized
 from stavpr_ros.recognition.sequence_search import SequenceBuffer
 from timing import measure, synchronizer, timed
 import torch
@@ -60,22 +60,16 @@ def robust_stages(run: Run, n: int, seed: int) -> None:
     """Measure the stages of mode robust that follow the image distances."""
     add = partial(run.measure, size=(n, 0), mode='robust')
     rows = make_window(SEQUENCE.length, n, seed)
-    znorm, buffer = ZNormalization(n), SequenceBuffer(SEQUENCE.length, n, SEQUENCE.k)
+    buffer = SequenceBuffer(SEQUENCE.length, n, SEQUENCE.k)
     for row in rows:
-        normalized = znorm.normalized(row)
-        znorm.observe(normalized)
+        normalized = z_normalized(row)
         buffer.push(torch.from_numpy(normalized))
     sizes = Sizes(n, 0, l=SEQUENCE.length)
-    add('query_znorm', call=lambda: znorm.normalized(rows[-1]), works=[bounds.query_znorm(sizes)])
+    add('query_znorm', call=lambda: z_normalized(rows[-1]), works=[bounds.query_znorm(sizes)])
     newest = torch.from_numpy(normalized)
     add('window_push', call=lambda: buffer.push(newest), works=[bounds.window_push(sizes)])
 
-    def reference_znorm() -> None:
-        znorm.observe(normalized)
-        znorm.shift_and_scale(n)
-
-    add('reference_znorm', call=reference_znorm, works=[bounds.reference_znorm(sizes)])
-    window = znorm.scaled(buffer.rows().numpy()[:, :n])
+    window = buffer.rows().numpy()[:, :n]
     middle = (SEQUENCE.length - 1) // 2
     lag = SEQUENCE.length - 1 - middle
     place_filter = PlaceFilter(n, lag, FILTER)
@@ -231,9 +225,8 @@ def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
     works += [bounds.window_push(sizes)]
     if mode == 'paper':
         return [*works, bounds.lm_dtw(sizes), bounds.selection(sizes)]
-    znorms = [bounds.query_znorm(sizes), bounds.reference_znorm(sizes)]
     filters = [bounds.filter_update(sizes, FILTER), bounds.filter_belief(sizes, FILTER)]
-    return [bounds.mean_centering(sizes), *works, *znorms, *filters]
+    return [bounds.mean_centering(sizes), *works, bounds.query_znorm(sizes), *filters]
 
 
 def products(
@@ -241,7 +234,7 @@ def products(
 ) -> list[Peer]:
     """Return torch's product in float32, and in the map's precision unless that is slower."""
     peers, d = [], places.strips.shape[2]
-    for dtype in dict.fromkeys((precision, 'float32')):
+    for dtype in dict.fromkeys(('float32' if precision == 'int8' else precision, 'float32')):
         if reason := slower_than_float32(run.device, dtype):
             run.skip(f'torch {dtype}', 0, 0, reason)
             continue

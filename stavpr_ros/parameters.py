@@ -99,7 +99,15 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'features',
             'gradient',
             'Kind of the features of a map that is recorded without map_path.',
-            choices=('gradient', 'onnx', 'torchscript', 'densenet161_places365', 'vgg16'),
+            choices=(
+                'gradient',
+                'onnx',
+                'torchscript',
+                'densenet161_places365',
+                'vgg16',
+                'vgg16_fc6',
+                'netvlad',
+            ),
         ),
         NodeParameter(
             'exclude_places',
@@ -111,8 +119,8 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'geometric_check',
             'none',
-            'Verification of matches by keypoints and epipolar geometry: the newest image '
-            'against the thumbnail of its place.',
+            'Verification of matches by keypoints and epipolar geometry: the thumbnail of the '
+            'middle image of the window against that of its place.',
             when='live',
             choices=('none', 'orb', 'sift'),
         ),
@@ -341,8 +349,9 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'precision',
             'float32',
             'Precision of the features of the map in localization; float16 halves their memory '
-            'and, on large maps, the time. Loop closure rejects float16.',
-            choices=('float32', 'float16'),
+            'and, on large maps, the time, int8 (not with vertical) quarters them. Loop closure '
+            'takes float32.',
+            choices=('float32', 'float16', 'int8'),
         ),
         NodeParameter(
             'threads',

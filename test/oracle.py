@@ -119,6 +119,23 @@ def distances(query: Array, reference: Array, dtype: type = np.float64) -> Array
     return d
 
 
+def whole_number_distances(
+    query: Array, reference: Array, query_lengths: Array, lengths: Array
+) -> Array:
+    """d[i, j, y] of rounded strips, (W, d) and (W, n, d) of whole numbers: exact sums."""
+    W, n, _ = reference.shape
+    d: Array = np.empty((W, W, n), np.float32)
+    for i in range(W):
+        for j in range(W):
+            for y in range(n):
+                total = 0
+                for left, right in zip(query[i].tolist(), reference[j, y].tolist(), strict=True):
+                    total += left * right
+                cosine = np.float32(total) * lengths[j, y] * query_lengths[i]
+                d[i, j, y] = np.float32(1) - cosine
+    return d
+
+
 def holistic_distance(query: Array, reference: Array, dtype: type = np.float64) -> Any:
     """No alignment: cosine distance of the whole flattened maps, (W, d) each."""
     return cosine_distance(query.reshape(-1), reference.reshape(-1), dtype)
@@ -312,11 +329,12 @@ class PlaceFilter:
     Bayes filter over level k, speed v and place y, in plain loops over states.
 
     An image: the level changes; the speed changes, to likely ones sooner; the camera moves; it may
-    leave the map, over its end or elsewhere, or return to it, anywhere; the image is seen.
+    leave the map, over the end of a session or elsewhere, or return to it, anywhere; the image is
+    seen. Sessions begin at the places ``firsts``.
     """
 
-    def __init__(self, settings: Any) -> None:
-        self.settings = settings
+    def __init__(self, settings: Any, firsts: tuple[int, ...] = (0,)) -> None:
+        self.settings, self.firsts = settings, firsts
         self.K, self.V = len(settings.levels), len(settings.speeds)
         self.a: Array = np.zeros((self.K, self.V, 0))
         self.off = [1 / self.K] * self.K
@@ -380,7 +398,8 @@ class PlaceFilter:
                 steps = [(1 - 2 * s.spread, step[v]), (s.spread, step[v] + 1)]
                 steps.append((s.spread, max(step[v] - 1, 0)))
                 for y in range(n):
-                    from_places = [(p * m[v][y - r], y - r) for p, r in steps if y >= r]
+                    first = max(place for place in self.firsts if place <= y)
+                    from_places = [(p * m[v][y - r], y - r) for p, r in steps if y - r >= first]
                     arrived = sum(p for p, _ in from_places)
                     moved += arrived
                     new[k, v, y] = (1 - s.leave) * arrived + birth

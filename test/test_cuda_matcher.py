@@ -8,11 +8,11 @@ import numpy as np
 import oracle
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
+from stavpr_ros.alignment.cpu.int8 import Int8Strips, rounded_queries
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.features.extractor import FeatureSettings
 from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
-from stavpr_ros.recognition.robust import ZNormalization
 from stavpr_ros.recognition.sequence_search import SequenceBuffer
 import torch
 
@@ -55,9 +55,18 @@ def features(n, seed=0, strips=W, zero=()):
     )
 
 
-def rounded(x, precision):
+def rounded(x, precision, of_map=False):
     """Return the features rounded to a precision, in float32."""
-    return LocalFeatures(x.strips.to(getattr(torch, precision)).float(), x.weights, x.settings)
+    if precision == 'int8' and of_map:
+        strips = Int8Strips(*x.strips.shape)
+        strips.write(0, x.strips)
+        strips = strips[:, :]
+    elif precision == 'int8':
+        whole, lengths = rounded_queries(x.strips)
+        strips = torch.from_numpy(whole * lengths[:, :, None]).transpose(0, 1)
+    else:
+        strips = x.strips.to(getattr(torch, precision)).float()
+    return LocalFeatures(strips, x.weights, x.settings)
 
 
 def expected_row(reference, query, i, settings):
@@ -80,6 +89,8 @@ def expected_row(reference, query, i, settings):
         ('vanilla', 2, 'float32'),
         ('sliding_window', 2, 'float32'),
         ('none', None, 'float16'),
+        ('adaptive', 2, 'int8'),
+        ('none', None, 'int8'),
     ],
 )
 def test_distances_of_every_strategy_equal_oracle(matcher_class, strategy, xi, precision):
@@ -89,7 +100,7 @@ def test_distances_of_every_strategy_equal_oracle(matcher_class, strategy, xi, p
     assert matcher.places == 7
     matrix = matcher.distance_matrix(query.strips, query.weights)
     assert matrix.dtype == torch.float32
-    kept = rounded(reference, precision)
+    kept = rounded(reference, precision, of_map=True)
     for i in range(3):
         expected = expected_row(kept, rounded(query, precision), i, settings)
         np.testing.assert_allclose(matrix[i].cpu().numpy(), expected, rtol=0, atol=TOLERANCE)
@@ -113,7 +124,7 @@ def test_distances_in_pieces_are_equal(matcher_class, monkeypatch):
     np.testing.assert_allclose(got, expected, rtol=0, atol=TOLERANCE)
     holistic = matcher_class(reference, SpatialSettings('none'), precision)
     row = holistic.distances(query.strips[:, 0], query.weights[:, 0]).cpu().numpy()
-    kept = rounded(reference, precision)
+    kept = rounded(reference, precision, of_map=True)
     expected = expected_row(kept, rounded(query, precision), 0, SpatialSettings('none'))
     np.testing.assert_allclose(row, expected, rtol=0, atol=TOLERANCE)
 
@@ -155,7 +166,7 @@ def searches(places, sequence=SHORT):
     from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
     buffer = SequenceBuffer(sequence.length, places, sequence.k)
-    twin = LmDtwSearch(buffer, ZNormalization(places, False, False))
+    twin = LmDtwSearch(buffer)
     return CudaLmDtwSearch(places, sequence), twin
 
 
@@ -199,7 +210,7 @@ def test_cuda_matcher_with_invalid_settings_is_rejected(matcher_class):
 
 
 @pytest.mark.skipif(SIMULATOR, reason='sizes of a real map take a real device')
-@pytest.mark.parametrize('precision', ['float32', 'float16'])
+@pytest.mark.parametrize('precision', ['float32', 'float16', 'int8'])
 def test_distances_of_large_map_on_device_equal_cpu(matcher_class, monkeypatch, precision):
     from stavpr_ros.alignment.cuda import dtw, lm_dtw
     from stavpr_ros.recognition.cpu_matcher import CpuMatcher
@@ -212,7 +223,8 @@ def test_distances_of_large_map_on_device_equal_cpu(matcher_class, monkeypatch, 
     twin = CpuMatcher(reference, settings, precision)
     search, twin_search = searches(len(reference), sequence)
     matrix = matcher.distance_matrix(query.strips, query.weights)
-    expected = twin.distance_matrix(rounded(query, precision).strips, query.weights)
+    queries = query if precision == 'int8' else rounded(query, precision)
+    expected = twin.distance_matrix(queries.strips, query.weights)
     apart = (matrix.cpu() - expected).abs() > TOLERANCE
     assert apart.float().mean() < 1e-4  # near-ties
     for row in matrix:

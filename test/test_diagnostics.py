@@ -274,8 +274,8 @@ CASES = {
     'processing': [
         (OK, FAST, {}),
         (OK, 'no image in the last 10 s', NEW),
-        (WARN, f'{TOO_SLOW}, precision float16, a smaller map', SLOW),
-        (WARN, f'{TOO_SLOW}, a smaller map', SLOW | {'precision': 'float16'}),
+        (WARN, f'{TOO_SLOW}, precision int8, a smaller map', SLOW),
+        (WARN, f'{TOO_SLOW}, a smaller map', SLOW | {'precision': 'int8'}),
         (
             WARN,
             f'{DROPPED}, one takes 11.5 ms, which is fast enough: they arrive in bursts; '

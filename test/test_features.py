@@ -69,9 +69,15 @@ def test_onnx_inner_layer_by_hand(tiny_onnx):
 
 
 def test_extractor_of_features_not_finite_fails(tiny_onnx):
-    extractor = FeatureExtractor('onnx', onnx_settings(tiny_onnx, scale=1e36), strips=2)
+    """Sums of 1.2e38 at 255, more than float32 holds where all four pixels are bright."""
+    extractor = FeatureExtractor('onnx', onnx_settings(tiny_onnx, scale=1.5e35), strips=2)
     with pytest.raises(ImageError, match='not finite'):
         extractor.extract([np.full((16, 16, 3), 255, np.uint8)])
+
+
+def test_extractor_of_network_never_finite_is_rejected(tiny_onnx):
+    with pytest.raises(SettingsError, match='test image are not finite'):
+        FeatureExtractor('onnx', onnx_settings(tiny_onnx, scale=1e38), strips=2)
 
 
 def test_onnx_errors_name_file_and_layer(tiny_onnx, tmp_path):

@@ -121,7 +121,7 @@ def test_standing_start_is_one_image(route):
     for search, images in zip(searches, (1, 100), strict=True):
         search.change.learn(features_of(route[:, :50]).strips.numpy())
         for i in range(images):
-            search.update(row, 1.0 if i == 0 else 0.0, standstill=i > 0)
+            search.update(row, 1.0 if i == 0 else 0.0)
     one, other = (search.filter for search in searches)
     assert one.count == other.count == 1
     np.testing.assert_array_equal(one.places_of_states(), other.places_of_states())
@@ -137,7 +137,7 @@ def test_equal_images_in_dark_stretch_of_map_move_on(route):
     for i in range(images):
         z = np.where(np.abs(at - i) < 2, -4, 0).astype(np.float32)
         lit = i < 18
-        search.update(z if lit else np.zeros_like(z), search.change.curve[1] * lit, not lit)
+        search.update(z if lit else np.zeros_like(z), search.change.curve[1] * lit)
     assert search.filter.count == images
     mean = search.filter.places_of_states() @ at / search.filter.places_of_states().sum()
     assert 25 < mean < 34
@@ -165,29 +165,12 @@ def test_drive_in_reverse_is_not_matched_wrongly(recognizer, route):
         assert not answer.accepted or abs(answer.place_index - there) <= LENGTH
 
 
-def test_start_again_repeats_window_from_its_first_image(route):
-    searches = [FilterSearch(SequenceBuffer(5, 50, 10)) for _ in range(2)]
-    rng = np.random.default_rng(0)
-    rows = rng.standard_normal((2, 5, 50)).astype(np.float32)
-    changes = [1.0, 0.3, 0.0, 0.5, 0.4]
-    for search, known in zip(searches, rows, strict=True):
-        search.change.learn(features_of(route[:, :50]).strips.numpy())
-        for row, change in zip(known, changes, strict=True):
-            search.update(row, change, standstill=not change)
-    searches[0].start_again(rows[1])
-    one, other = (search.filter for search in searches)
-    assert one.count == other.count == 4
-    np.testing.assert_array_equal(one.places_of_states(), other.places_of_states())
-    searches[0].reset()
-    assert one.count == 0
-
-
 def test_search_over_no_places_has_no_match():
     buffer = SequenceBuffer(3, 0, 6)
     search = FilterSearch(buffer)
     for _ in range(3):
         buffer.push(torch.empty(0))
-        search.update(np.empty(0, np.float32), 1.0, standstill=False)
+        search.update(np.empty(0, np.float32), 1.0)
     found = search(5)
     assert found.nearest is None
     assert found.path.shape == (0, 2)
@@ -210,7 +193,7 @@ def test_search_counts_places_from_first_ever():
             if number and i >= 8:
                 seen = row[4:]
             buffer.push(torch.from_numpy(seen))
-            search.update(seen, 1.0, standstill=False)
+            search.update(seen, 1.0)
     one, other = (search(3) for search in searches)
     assert one.nearest.middle == other.nearest.middle == 18
     assert one.path.tolist() == other.path.tolist()

@@ -21,12 +21,9 @@ from stavpr_ros.recognition.loop_closer import (
 )
 from stavpr_ros.recognition.place_filter import CLOSE, FilterSettings, PlaceFilter
 from stavpr_ros.recognition.robust import (
-    MEMORY,
     MIN_DEVIATION,
     PAPER,
-    PRIOR,
     ROBUST,
-    RobustOptions,
     THRESHOLD,
 )
 from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
@@ -88,12 +85,9 @@ class PlainCloser:
     """
 
     def __init__(self, settings, exclude, features):
-        n = len(features)
         W = len(features.strips)
         self.settings, self.exclude, self.all = settings, exclude, features.strips.contiguous()
         self.a = adaptive_weights(W, settings.spatial, np.dtype(np.float32))
-        self.mean, self.variance = np.zeros(n, np.float32), np.ones(n, np.float32)
-        self.seen = np.full(n, PRIOR, np.float32)
         self.rows = []
 
     def distances(self, image, last):
@@ -116,15 +110,7 @@ class PlainCloser:
         live = self.distances(image, last)[first:]
         if self.settings.applied_options.query_znorm:
             live = (live - live.mean()) / np.float32(max(live.std(), MIN_DEVIATION))
-        if self.settings.applied_options.reference_znorm:
-            self.learn(slice(first, last), live)
         return live
-
-    def seen_row(self, image, first, last):
-        """Return it z-normalized by place, too."""
-        row = self.normalized(image, first, last)
-        live = slice(first, first + len(row))
-        return (row - self.mean[live]) / np.sqrt(np.maximum(self.variance[live], 1e-6))
 
     def add(self, image, first, last):
         """Return the sequence of an image that may be matched with places first..last-1."""
@@ -136,21 +122,7 @@ class PlainCloser:
             return None
         window = np.stack(self.rows)
         window[:, :first] = np.inf
-        return self.match(window)
-
-    def learn(self, live, row):
-        self.seen[live] = np.minimum(self.seen[live] + 1, MEMORY)
-        off = row - self.mean[live]
-        self.mean[live] += off / self.seen[live]
-        self.variance[live] += (off * (row - self.mean[live]) - self.variance[live]) / self.seen[
-            live
-        ]
-
-    def match(self, window):
-        scale = np.ones_like(self.mean)
-        if self.settings.applied_options.reference_znorm:
-            scale = 1 / np.sqrt(np.maximum(self.variance, 1e-6))
-        found = match_sequence((window - self.mean) * scale, self.settings.sequence)
+        found = match_sequence(window, self.settings.sequence)
         return best_match(found, self.settings.nms_radius)
 
 
@@ -289,12 +261,11 @@ def test_route_features_are_centered_by_recent_mean(laps):
 
 def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
     """Rows as they are matched with LM-DTW, images' changes, and one filter over all of them."""
-    options, exclude, l = ROBUST.without('mean_centering', 'whitening'), 12, SHORT.length
+    options, exclude = ROBUST.without('mean_centering', 'whitening'), 12
     closer = LoopCloser(settings_of(options), exclude, laps.settings, limit=90)
     plain = PlainCloser(settings_of(options), exclude, laps)
     s = FilterSettings()
     change, filtered, first = ImageChange(300, s), PlaceFilter(300, 2, s), 0
-    rows, known = [], []
     for i in range(len(laps)):
         answer = closer.update(laps[i : i + 1])
         if closer.first > first:
@@ -304,17 +275,11 @@ def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
         strips = laps.strips[:, first : i + 1].contiguous().numpy()
         change.learn_newest(strips)
         places = max(0, i + 1 - first - exclude)
-        z = plain.seen_row(i, first, first + places)
+        z = plain.normalized(i, first, first + places)
         seen = change.next_query(strips[:, -1])
         assert not change.is_standstill(seen)
         speeds = change.speed_weights(seen) if i else np.ones(len(s.speeds))
-        evidence = change.weight(seen), speeds
-        filtered.update(z, *evidence)
-        rows, known = [*rows, z], [*known, evidence]
-        if i + 1 == l:  # the first window again; it has no places, and so no rows
-            filtered.reset()
-            for row, one in zip(rows, known, strict=True):
-                filtered.update(row, *one)
+        filtered.update(z, change.weight(seen), speeds)
         if answer.sequence is None:
             assert not len(z)
             continue
@@ -465,8 +430,6 @@ def test_loop_closer_with_invalid_input_is_rejected(laps, small_map):
         LoopCloser(robust, 0, laps.settings)
     with pytest.raises(SettingsError, match='none'):
         LoopCloser(RecognizerSettings(1.0, SpatialSettings('none')), 12, laps.settings)
-    with pytest.raises(SettingsError, match='take both or neither'):
-        LoopCloser(settings_of(RobustOptions.only('reference_znorm')), 12, laps.settings)
     closer = LoopCloser(robust, 12, laps.settings)
     with pytest.raises(InputError, match='2 images'):
         closer.update(laps[:2])

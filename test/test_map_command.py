@@ -110,12 +110,18 @@ def test_map_export_is_read_by_numpy(folder, drive):
         ]  # fmt: skip
 
 
-def test_merged_drives_are_sessions_that_can_be_taken_out_again(folder, drive):
+def test_merged_drives_are_sessions_that_can_be_taken_out_again(folder, drive, capsys):
     assert main(['merge', 'both.stavpr', 'day.stavpr', 'night.stavpr', 'day.stavpr']) == 0
     both = load_map('both.stavpr')
     assert [session.id for session in both.sessions] == ['day', 'night', 'day-2']
     assert both.sessions[0].start == drive.stamps[0]
     assert both.session_index.tolist() == [0] * 24 + [1] * 24 + [2] * 24
+    assert both.same_as[48:].tolist() == list(range(24))  # the same drive again
+    assert main(['info', 'both.stavpr']) == 0
+    assert ' day-2, day: 24 places, 24 of them in earlier ones' in capsys.readouterr().out
+    apart = ['merge', 'apart.stavpr', 'day.stavpr', 'night.stavpr', '--different-routes']
+    assert main(apart) == 0
+    assert load_map('apart.stavpr').same_as is None
     assert torch.equal(both.features[24:48].strips, drive.features.strips)
     assert (both.pose(5) is not None, both.pose(30)) == (True, None)
     assert (both.thumbnail(30), both.ids[30], both.ids[50]) == (None, '', 'place 2')

@@ -22,7 +22,6 @@ from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
 from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.recognition.robust import ZNormalization
 from stavpr_ros.recognition.sequence_search import SequenceBuffer
 import torch
 
@@ -106,7 +105,7 @@ def window_and_search(n):
     """Return an empty window over n places, and its search without z-normalization."""
     sequence = SequenceSettings(5)
     buffer = SequenceBuffer(5, n, sequence.k)
-    return buffer, LmDtwSearch(buffer, ZNormalization(n, False, False))
+    return buffer, LmDtwSearch(buffer)
 
 
 @pytest.mark.parametrize('n', [1, 7, 100])

@@ -6,6 +6,7 @@ from dataclasses import replace
 import itertools
 import os
 
+import cv2
 import numpy as np
 from pipelines import (
     LENGTH,
@@ -22,11 +23,15 @@ from pipelines import (
 )
 import pytest
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, OutputError
-from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.mapping import load_map, save_map, thumbnail_of
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.pipeline import OPERATIONS, Pipeline
 from stavpr_ros.recognition import Status
-from stavpr_ros.recognition.verification import GeometricSettings, GeometricVerifier
+from stavpr_ros.recognition.verification import (
+    GeometricEvidence,
+    GeometricSettings,
+    GeometricVerifier,
+)
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 
@@ -89,35 +94,61 @@ def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
 
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
-def test_geometric_check_accepts_and_rejects(operation, route):
-    pipeline = recorded(route, operation, candidates=2)
+def test_geometric_check_in_mode_paper_accepts_and_rejects(operation, route):
+    pipeline = recorded(route, operation, candidates=2, mode='paper', threshold=1.0)
     assert {match.inliers for match in process(pipeline, route[:CERTAIN])} == {-1}
     check = GeometricSettings(min_inliers=100)
     pipeline.change(replace(pipeline.settings, geometric=check))
-    accepted = process(pipeline, route[7:8], first=7)[0]
-    assert (accepted.status, accepted.reason, accepted.newest_index) == (Status.MATCH, '', 7)
+    # the middle of a window of 5: the images until then came without a check
+    process(pipeline, route[7:9], first=7)
+    accepted = process(pipeline, route[9:10], first=9)[0]
+    assert (accepted.status, accepted.reason, accepted.place_index) == (Status.MATCH, '', 7)
     thumbnail = pipeline.places.thumbnail(7)
-    assert accepted.inliers == GeometricVerifier(check).inliers(route[7], thumbnail) >= 100
+    found = GeometricVerifier(check).inliers(thumbnail_of(route[7]), thumbnail)
+    assert accepted.inliers == found >= 100
     for more, status in ((0, Status.MATCH), (1, Status.NO_MATCH)):  # the same images again
         pipeline.reset()
-        process(pipeline, route[:CERTAIN])
+        process(pipeline, route[: CERTAIN + 2])
         just = replace(check, min_inliers=accepted.inliers + more)
         pipeline.change(replace(pipeline.settings, geometric=just))
-        match = process(pipeline, route[7:8], first=7)[0]
+        match = process(pipeline, route[9:10], first=9)[0]
         assert (match.status, match.inliers) == (status, accepted.inliers)
-    assert (match.place_index, match.sequence.middle % 30) == (-1, 5)
+    assert (match.place_index, match.sequence.middle % 30) == (-1, 7)
     assert f'{match.inliers} inliers are fewer than {match.inliers + 1}' in match.reason
     assert match.candidates[0].place == match.sequence.middle
     pipeline.change(replace(pipeline.settings, geometric=None))
-    assert statuses(process(pipeline, route[8:9])) == [Status.MATCH]
+    assert statuses(process(pipeline, route[10:11], first=10)) == [Status.MATCH]
 
 
-def test_geometric_check_rejects_without_thumbnails(small_map, route, tmp_path):
+@pytest.mark.parametrize('least', [8, 100_000])
+def test_geometric_check_in_mode_robust_weighs_doubtful_matches(map_file, route, least):
+    rng = np.random.default_rng(0)
+    noisy = [
+        cv2.addWeighted(x, 0.7, rng.integers(0, 256, x.shape, np.uint8), 0.3, 0) for x in route
+    ]
+    plain = process(localizing(map_file, candidates=2), noisy[:LENGTH])[-1]
+    limit = plain.probability  # just not above itself
+    check = GeometricSettings(min_inliers=least)
+    pipeline = localizing(map_file, geometric=check, min_probability=limit, candidates=2)
+    match = process(pipeline, noisy[:LENGTH])[-1]
+    assert 0.1 < plain.probability < 0.99
+    assert match.inliers >= 8
+    expected = GeometricEvidence().updated(plain.probability, least == 8)
+    assert match.probability == pytest.approx(expected)
+    assert match.status is (Status.MATCH if least == 8 else Status.NO_MATCH)
+    assert bool(match.reason) == (least != 8)
+    assert match.distance == match.candidates[0].distance == 1 - match.probability
+    assert match.sequence.middle == plain.sequence.middle == match.candidates[0].place
+
+
+@pytest.mark.parametrize(
+    'mode', [{}, {'mode': 'paper', 'threshold': 1.0}], ids=['robust', 'paper']
+)
+def test_geometric_check_without_thumbnails_changes_nothing(small_map, route, tmp_path, mode):
     save_map(replace(small_map, thumbnails=()), tmp_path / 'blind.stavpr')
-    pipeline = localizing(str(tmp_path / 'blind.stavpr'), geometric=GeometricSettings())
-    match = process(pipeline, route[:LENGTH])[-1]
-    assert (match.status, match.inliers) == (Status.NO_MATCH, -1)
-    assert 'no thumbnails' in match.reason
+    pipeline = localizing(str(tmp_path / 'blind.stavpr'), geometric=GeometricSettings(), **mode)
+    match = process(pipeline, route[:CERTAIN])[-1]
+    assert (match.status, match.inliers) == (Status.MATCH, -1)
 
 
 # ------------------------------------------------ errors, resets, relocalization
@@ -146,7 +177,7 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
     pipeline, other = (recorded(route, operation, keyframes=keyframes) for _ in range(2))
     extract = Failing(pipeline.extractor.extract)
     monkeypatch.setattr(pipeline.extractor, 'extract', extract)
-    thumbnail = Failing(lambda image, width: b'')
+    thumbnail = Failing(lambda image: b'')
     monkeypatch.setattr('stavpr_ros.pipeline.operations.encode_thumbnail', thumbnail)
     cut_off = message(route[0])
     object.__setattr__(cut_off, 'data', cut_off.data[:100])

@@ -18,7 +18,6 @@ from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.place_filter import CLOSE
 from stavpr_ros.recognition.robust import (
     MeanCentering,
-    MEMORY,
     options_of,
     PAPER,
     PRIOR,
@@ -27,7 +26,7 @@ from stavpr_ros.recognition.robust import (
     STRENGTH,
     THRESHOLD,
     Whitening,
-    ZNormalization,
+    z_normalized,
 )
 from stavpr_ros.sources import open_source
 import torch
@@ -47,7 +46,7 @@ def test_robust_options_by_name():
     assert options_of('robust') == ROBUST == RobustOptions()
     assert options_of('paper') == PAPER
     assert not PAPER.any
-    assert RobustOptions.only('place_filter') == RobustOptions(False, False, False, False, True)
+    assert RobustOptions.only('place_filter') == RobustOptions(False, False, False, True)
     assert not ROBUST.without('mean_centering', 'place_filter').mean_centering
     assert ROBUST.without('mean_centering').place_filter
     for wrong in (
@@ -139,39 +138,15 @@ def test_mean_centering_of_long_query_keeps_precision():
     torch.testing.assert_close(last, first, rtol=0, atol=1e-4)
 
 
-def test_znorm_equals_plain_recursion():
-    """Prior rows, then every row with weight 1 / count, at least 1 / MEMORY."""
-    rng = np.random.default_rng(0)
-    start, rows = rng.normal(3, 2, (6, 9)), rng.normal(1, 4, (MEMORY + 40, 9)).astype(np.float32)
-    start[2, 2:5] = np.nan
-    znorm = ZNormalization(9)
-    znorm.start_from(start)
-
-    normal = (start - np.nanmean(start, 1)[:, None]) / np.nanstd(start, 1)[:, None]
-    mean, variance = np.nanmean(normal, 0), np.nanvar(normal, 0)
-    count = float(PRIOR)
-    for came in rows:
-        row = (came.astype(float) - came.mean()) / came.std()
-        count = min(count + 1, MEMORY)
-        off = row - mean
-        mean = mean + off / count
-        variance = variance + (off * (row - mean) - variance) / count
-        found = znorm.normalized(rows[0])
-        znorm.observe(row.astype(np.float32))
-    np.testing.assert_allclose(found, (rows[0] - rows[0].mean()) / rows[0].std(), atol=1e-5)
-    shift, scale = znorm.shift_and_scale(9)
-    np.testing.assert_allclose(shift, mean, atol=1e-4)
-    np.testing.assert_allclose(scale, 1 / np.sqrt(variance), rtol=1e-4)
-    znorm.reset()
-    np.testing.assert_allclose(znorm.shift_and_scale(9)[0], np.nanmean(normal, 0), atol=1e-6)
-
-
-def test_znorm_of_small_map_starts_neutral():
-    znorm = ZNormalization(3)
-    znorm.start_from(np.full((3, 3), np.nan))
-    np.testing.assert_array_equal(znorm.shift_and_scale(3), ([0, 0, 0], [1, 1, 1]))
-    flat = znorm.normalized(np.full(3, 0.5, np.float32))
-    np.testing.assert_array_equal(flat, [0, 0, 0])
+def test_z_normalized_row_has_mean_0_and_deviation_1_of_finite_entries():
+    row = np.random.default_rng(0).normal(3, 2, 9).astype(np.float32)
+    row[4] = np.inf
+    found = z_normalized(row)
+    known = np.delete(row, 4).astype(float)
+    expected = np.insert((known - known.mean()) / known.std(), 4, np.inf)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_array_equal(z_normalized(np.full(3, 0.5, np.float32)), [0, 0, 0])
+    assert len(z_normalized(row[:0])) == 0
 
 
 # ------------------------------------------------ the recognizer
@@ -217,7 +192,6 @@ def test_robust_recognizer_at_chance_level_does_not_match(small_map, route):
         '',
         'mean_centering',
         'query_znorm',
-        'reference_znorm',
         'place_filter',
     ],
 )

@@ -13,7 +13,6 @@ from stavpr_ros.errors import ImageError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map
 from stavpr_ros.pipeline import LoadedMap, Pipeline
-from stavpr_ros.recognition.verification import GeometricSettings
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.encodings import decode_image, decode_message
 from stavpr_ros.sources.files import reduction
@@ -125,7 +124,6 @@ def test_decode_of_large_image_cut_off_is_rejected(image):
     ('resize', 'changes', 'rows'),
     [
         ('area', {}, 270),
-        ('area', {'geometric': GeometricSettings(width=500)}, 540),
         ('area', {'thumbnail_width': 960}, 540),
         ('bilinear', {}, 1080),  # its features are of single pixels
     ],

@@ -172,8 +172,8 @@ def test_torchscript_errors_name_file_and_layer(file, tmp_path):
         SettingsError, match=r"the layer 'body\.block\.unused', but calls it .* not at all"
     ):
         FeatureExtractor('torchscript', settings(file, layer='body.block.unused'))
-    with pytest.raises(SettingsError, match=r'returns \(1, 10\) for 1 images: expected a map'):
-        FeatureExtractor('torchscript', settings(file)).extract(images(1))
+    with pytest.raises(SettingsError, match=r'one vector of 10 numbers .* W = 1 .* not 7'):
+        FeatureExtractor('torchscript', settings(file), strips=7)
     with pytest.raises(SettingsError, match='must be'):
         settings(file, channels='hsv')
     with pytest.raises(SettingsError, match='sha256'):

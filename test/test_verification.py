@@ -9,7 +9,12 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.recognition.verification import GeometricSettings, GeometricVerifier
+from stavpr_ros.recognition.verification import (
+    GeometricEvidence,
+    GeometricSettings,
+    GeometricVerifier,
+    PlaceVerifier,
+)
 from stavpr_ros.sources import open_source
 
 METHODS = ['orb', 'sift']
@@ -202,3 +207,48 @@ def test_verifies_separates_real_places(data_folder, name, recall):
     print(f'{name}: {verified[0]:.2f} of right places verified, {verified[1]:.3f} of wrong ones')
     assert verified[0] >= recall
     assert verified[1] <= 0.03
+
+
+class Thumbnails:
+    """Places of which thumbnails are known, and how often each was read."""
+
+    def __init__(self, images):
+        self.images, self.read = images, []
+
+    def thumbnail(self, place):
+        self.read.append(place)
+        return self.images.get(place)
+
+
+def test_place_verifier_keeps_keypoints_of_places_until_map_changes():
+    check = GeometricSettings()
+    verifier, one, other = PlaceVerifier(check), texture(0), texture(100)
+    places = Thumbnails({3: moved(one, VIEWS['shifted']), 4: other})
+    counts = [verifier.inliers(one, places, place) for place in (3, 4, 3)]
+    assert counts[0] == GeometricVerifier(check).inliers(one, places.images[3]) > 100
+    assert counts == [counts[0], GeometricVerifier(check).inliers(one, other), counts[0]]
+    assert places.read == [3, 4]
+    another = Thumbnails({3: other})
+    assert verifier.inliers(one, another, 3) == counts[1]
+    assert verifier.inliers(one, another, 5) is None
+
+
+# ------------------------------------------------ as evidence
+
+
+def test_evidence_checks_doubtful_matches_and_each_tenth_certain_one():
+    evidence = GeometricEvidence()
+    assert [evidence.wants(p) for p in (0.05, 0.3, 0.98)] == [False, True, True]
+    assert [evidence.wants(0.999) for _ in range(21)] == [True, *[False] * 9] * 2 + [True]
+
+
+@pytest.mark.parametrize(('passing', 'right'), [(30, 31 / 34), (0, 1 / 34)])
+def test_evidence_is_the_share_of_certain_matches_that_pass(passing, right):
+    """Where none passes, as by night, a failed check is next to no evidence."""
+    evidence = GeometricEvidence()
+    for i in range(30):
+        assert evidence.updated(0.999, i < passing) == 0.999
+    odds = (1 - right) / 0.9 if passing else 1.0
+    assert evidence.updated(0.5, False) == pytest.approx(odds / (1 + odds))
+    odds = max(right, 0.3) / 0.1
+    assert evidence.updated(0.5, True) == pytest.approx(odds / (1 + odds))

@@ -50,6 +50,11 @@ def strip_distances(
         return similarity.neg_().add_(1).view(W, W, n)
     from stavpr_ros.alignment.cpu import dot
 
+    if W == 1:
+        distances = np.empty((1, 1, n), np.float32)
+        vector = query.contiguous().numpy()
+        dot.cosine_distances(reference[0].contiguous().numpy(), vector, distances[0])
+        return torch.from_numpy(distances)
     rows = dot.tiled(query[:, None])[0]
     distances = np.empty((len(rows), W, n), np.float32)
     dot.strip_distances(reference.contiguous().numpy(), rows, distances)

@@ -29,6 +29,7 @@ examples:
   build_map --input drive.bag --topic /camera/image_raw --output route.stavpr
   build_map --input drive.bag --output route.stavpr --odometry /odom \\
       --keyframe-distance 1 --keyframe-angle 15
+  build_map --input netvlad.mat:features --output route.stavpr --descriptors-source netvlad
   build_map --input drive/ --output route.stavpr --projection 512 --features onnx \\
       --onnx-model squeezenet.onnx --onnx-layer fire6/concat_1
 
@@ -46,7 +47,10 @@ def _parser() -> argparse.ArgumentParser:
         'build_map', 'Build a reference map: one place for each image or keyframe.', EPILOG
     )
     parser.add_argument(
-        '--input', required=True, metavar='FOLDER|BAG', help='images, or a ROS 1 or ROS 2 bag'
+        '--input',
+        required=True,
+        metavar='FOLDER|BAG|ARRAY',
+        help='images, a ROS 1 or ROS 2 bag, or descriptors: .npy .npz .csv .mat, or FILE:NAME',
     )
     parser.add_argument('--output', required=True, metavar='MAP', help='the file to write')
     parser.add_argument('--force', action='store_true', help='replace an existing map')
@@ -221,6 +225,31 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     return place_map, journal
 
 
+def _build_of_descriptors(arguments: argparse.Namespace) -> 'PlaceMap':
+    """Return a map of descriptors that another program computed."""
+    import numpy as np
+    from stavpr_ros.commands.feature_options import require_descriptors_alone
+    from stavpr_ros.features.descriptors import read_descriptors
+    from stavpr_ros.mapping import descriptor_map
+
+    require_replaceable(arguments.output, MAP, arguments.force)
+    require_descriptors_alone(arguments, arguments.input)
+    images = ('topic', 'odometry', 'thumbnail_width', 'skip_bad_images')
+    keyframes = tuple(f'keyframe_{rule}' for rule in ('interval', 'distance', 'angle', 'change'))
+    for name in (*images, *keyframes):
+        if getattr(arguments, name):
+            raise SettingsError(
+                f'--{name.replace("_", "-")}: {arguments.input} holds descriptors, not images; '
+                'leave it out'
+            )
+    if arguments.every < 1:
+        raise SettingsError(f'--every {arguments.every} must be at least 1')
+    features = read_descriptors(arguments.input, arguments.descriptors_source or '')
+    poses = _poses(arguments, len(features))
+    assert poses is None or isinstance(poses, np.ndarray)
+    return descriptor_map(features[:: arguments.every], poses)
+
+
 def _source_of(arguments: argparse.Namespace) -> str:
     """Describe the images and the options: only the same are continued after an interruption."""
     given = vars(arguments) | {'input': str(Path(arguments.input).resolve())}
@@ -259,12 +288,17 @@ def main(args: list[str] | None = None) -> int:
     def work() -> None:
         nonlocal state
         arguments = _parser().parse_args(args)
+        from stavpr_ros.features.descriptors import is_descriptors
         from stavpr_ros.mapping import save_map
 
-        state = 'nothing was written; the same command continues the work'
-        place_map, journal = _build(arguments)
+        if is_descriptors(arguments.input):
+            place_map, journal = _build_of_descriptors(arguments), None
+        else:
+            state = 'nothing was written; the same command continues the work'
+            place_map, journal = _build(arguments)
         save_map(place_map, arguments.output, force=arguments.force)
-        journal.unlink()
+        if journal is not None:
+            journal.unlink()
         state = f'{arguments.output} is written, without a suggested threshold'
         _report(place_map, arguments.output)
 

@@ -10,7 +10,7 @@ from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import SourceError
-from stavpr_ros.output_file import HTML, JSON, require_replaceable
+from stavpr_ros.output_file import HTML, JSON, NPY, require_replaceable
 from stavpr_ros.parameters import BY_NAME
 
 if TYPE_CHECKING:
@@ -31,6 +31,9 @@ JSON, CSV, plots and an HTML page.
 """
 
 EPILOG = """
+traverses: images, a bag, a saved map, or an array of descriptors that any program computed, .npy
+.npz .csv .mat, or FILE:NAME for one of several: (n, D), one vector an image, or (n, W, D)
+
 ground truth (--truth):
   identity     image i of the query shows place i of the map (the default); --tolerance is 3 then
   poses        places within --meters and --degrees of the query's pose
@@ -53,6 +56,8 @@ examples:
   evaluate --map monday/ --query tuesday/ --unknown another_town/ --output report/
   evaluate --map monday/ --query tuesday/ --remove-from-map 40:90 --remove-from-map 200:260
   evaluate --query loop/ --loop-closure --exclude-places 50 --truth closures.png
+  evaluate --map summer.csv --query netvlad.mat:winter --tolerance 2
+  evaluate --map summer/ --query winter/ --export arrays/
   evaluate --dataset gardens_point=data/gardens_point --strategy vanilla
 
 exit codes: 0 done, 1 failed (the reason is printed), 2 usage, 130 interrupted
@@ -64,13 +69,13 @@ def _parser() -> argparse.ArgumentParser:
 
     parser = make_parser('evaluate', DESCRIPTION, EPILOG)
     add = parser.add_argument_group('sequences').add_argument
-    add('--map', metavar='FOLDER|BAG|MAP', help='first traverse: images, a bag or a saved map')
-    add('--query', metavar='FOLDER|BAG|MAP', help='second traverse: the same')
+    add('--map', metavar='FOLDER|BAG|MAP|ARRAY', help='first traverse, see below')
+    add('--query', metavar='FOLDER|BAG|MAP|ARRAY', help='second traverse: the same')
     add('--dataset', metavar='NAME=FOLDER', help='map, query and ground truth of a known data set')
     add('--topic', help='image topic of the bags, if they have several')
     add(
         '--unknown',
-        metavar='FOLDER|BAG|MAP',
+        metavar='FOLDER|BAG|MAP|ARRAY',
         help='a traverse of places that are not in the map, for the rate of false alarms',
     )
     add('--loop-closure', action='store_true', help="the map is the query's own past: no --map")
@@ -94,7 +99,9 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument_group('output').add_argument
     add('--json', metavar='FILE', help='write the numbers')
     add('--output', metavar='FOLDER', help=f'write a report ({OUTPUT} without --json)')
-    add('--force', action='store_true', help='replace earlier numbers and reports')
+    export = 'write the features of map and query as map.npy and query.npy'
+    add('--export', metavar='FOLDER', help=export)
+    add('--force', action='store_true', help='replace earlier numbers, reports and arrays')
     add('--window', type=int, metavar='I', help='plot the warping path around query image I')
     add_feature_options(parser)
     return parser
@@ -165,7 +172,7 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     add('--nms-radius', type=int, default=20, metavar='PLACES', help=radius)
     add('--backend', choices=('auto', 'cpu', 'cuda'), default='cpu', help='(%(default)s)')
     precision = 'of the map (%(default)s)'
-    add('--precision', choices=('float32', 'float16'), default='float32', help=precision)
+    add('--precision', choices=('float32', 'float16', 'int8'), default='float32', help=precision)
 
 
 def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
@@ -344,6 +351,17 @@ def _print_metrics(report: 'Report') -> None:
     )
 
 
+def _export(report: 'Report', folder: Path, force: bool) -> None:
+    from stavpr_ros.features.descriptors import write_descriptors
+
+    traverses = {'query': report.query}
+    if report.reference is not report.query:
+        traverses['map'] = report.reference
+    for name, place_map in traverses.items():
+        write_descriptors(place_map.features, folder / f'{name}.npy', force)
+    print(f'arrays: {folder}')
+
+
 def _run(arguments: argparse.Namespace) -> None:
     from stavpr_ros.evaluation.extra import import_extra
     from stavpr_ros.evaluation.report import chosen_window
@@ -358,9 +376,15 @@ def _run(arguments: argparse.Namespace) -> None:
             raise SourceError(f'{folder} is a file: --output takes a folder')
         if Path(folder).is_dir():
             require_replaceable(Path(folder) / PAGE, HTML, arguments.force)
+    if arguments.export:
+        Path(arguments.export).mkdir(parents=True, exist_ok=True)
+        for name in ('map', 'query'):
+            require_replaceable(Path(arguments.export) / f'{name}.npy', NPY, arguments.force)
     report = _report(arguments)
     chosen_window(report.evaluation, arguments.window)  # an invalid image fails before writing
     _print_metrics(report)
+    if arguments.export:
+        _export(report, Path(arguments.export), arguments.force)
     if arguments.json:
         write_json(report, Path(arguments.json), arguments.force)
         print(f'numbers: {arguments.json}')

@@ -8,7 +8,11 @@ from pathlib import Path
 import time
 
 import numpy as np
-from stavpr_ros.commands.feature_options import kind_options, make_extractor
+from stavpr_ros.commands.feature_options import (
+    kind_options,
+    make_extractor,
+    require_descriptors_alone,
+)
 from stavpr_ros.devices import choose_device
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.evaluation.drive import Drive, DriveChanges
@@ -23,13 +27,18 @@ from stavpr_ros.evaluation.warp import (
     warp_changes,
 )
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map, is_map, load_map, PlaceMap
+from stavpr_ros.features.descriptors import (
+    is_descriptors,
+    read_descriptors,
+    require_comparable,
+)
+from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag_file import is_bag
 from stavpr_ros.sources.folder import text_of
 
 IDENTITY_TOLERANCE = 3  # places; a file of accepted pairs includes its tolerance
-DEFAULTS = {'features': 'gradient', 'strips': 7, 'seed': 0}
+DEFAULTS = {'features': 'gradient', 'seed': 0}
 
 
 @dataclass(frozen=True)
@@ -71,7 +80,7 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
         paths = {'map': arguments.map, 'query': arguments.query, 'unknown': arguments.unknown}
         opened = {
             name: loader.load(name, path)
-            for name, path in sorted(paths.items(), key=lambda item: not is_saved_map(item[1]))
+            for name, path in sorted(paths.items(), key=_decides_features)
             if path is not None
         }
         sequences = _of_paths(arguments, opened, loader.times)
@@ -81,6 +90,11 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
 def is_saved_map(path: str | None) -> bool:
     """Return whether a path is a map file, by its content; False for an unreadable path."""
     return path is not None and Path(path).is_file() and is_map(path)
+
+
+def _decides_features(item: tuple[str, str | None]) -> int:
+    """Order saved maps first, then descriptors."""
+    return 0 if is_saved_map(item[1]) else 1 if is_descriptors(item[1]) else 2
 
 
 class _Loader:
@@ -93,16 +107,17 @@ class _Loader:
         self.times: dict[str, float] = {}
 
     def load(self, name: str, path: str) -> PlaceMap:
-        """Open a folder, a bag or a saved map."""
-        if is_saved_map(path):
+        """Open a folder, a bag, a saved map or descriptors."""
+        if is_saved_map(path) or is_descriptors(path):
             crop = 'crop_map' if name == 'map' else 'crop_query'
             unusable = (crop, 'mirror') if name == 'query' else (crop,)
             for option in unusable:
                 if getattr(self._arguments, option):
                     raise SettingsError(
-                        f'--{option.replace("_", "-")}: {path} is a saved map, which has no images'
+                        f'--{option.replace("_", "-")}: {path} is a saved map or an array, which '
+                        'has no images'
                     )
-            return self._load_map(path)
+            return self._read(path) if is_descriptors(path) else self._load_map(path)
         if Path(path).suffix == '.stavpr':
             return load_map(path)  # raises the reason why it is none
         source = open_source(path, self._arguments.topic if is_bag(Path(path)) else None)
@@ -123,6 +138,20 @@ class _Loader:
         self.times[f'describing_{name}_ms_per_image'] = milliseconds / len(extracted)
         return extracted
 
+    def _read(self, path: str) -> PlaceMap:
+        """Read descriptors; those of the map and the query must be comparable."""
+        require_descriptors_alone(self._arguments, path)
+        source = self._arguments.descriptors_source
+        first = self._saved
+        if source is None and first is not None and first.settings.kind == 'descriptors':
+            source = first.settings.backbone.source
+        features = read_descriptors(path, source or '')
+        if first is not None:
+            require_comparable(features, first.settings, first.dimension)
+        found = descriptor_map(features)
+        self._saved = first or found
+        return found
+
     def _load_map(self, path: str) -> PlaceMap:
         """Load a saved map, and refuse options that contradict its features."""
         found = load_map(path)
@@ -142,7 +171,11 @@ class _Loader:
         model = f'--{found.settings.kind}-model'  # a map does not state where it is
         options = {'--projection': given.projection, '--seed': given.seed, **kind_options(given)}
         for option, value in options.items():
-            if value is not None and option not in (model, '--torchscript-allow'):
+            if value is not None and option not in (
+                model,
+                '--torchscript-allow',
+                '--descriptors-source',
+            ):
                 raise SettingsError(f'{option}: the map {path} has its own or none; leave it out')
         self._saved = found
         return found

@@ -108,9 +108,7 @@ def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset]':
 
 def _check_features(options: argparse.Namespace) -> None:
     """Reject options of features that the experiment sets itself."""
-    from stavpr_ros.evaluation.paper.experiments import W
-
-    if options.strips != W or options.projection is not None or options.seed:
+    if options.strips is not None or options.projection is not None or options.seed:
         raise SettingsError(
             '--strips, --projection, --seed: the experiment sets them; leave them out'
         )

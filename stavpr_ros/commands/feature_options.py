@@ -35,8 +35,8 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group('features').add_argument
     kind_help = 'kind of features (%(default)s)'
     add('--features', choices=list(KINDS), default='gradient', help=kind_help)
-    strips = 'vertical strips of an image (%(default)s)'
-    add('--strips', type=int, default=7, metavar='W', help=strips)
+    strips = 'vertical strips of an image (7; 1 if the features are one vector)'
+    add('--strips', type=int, metavar='W', help=strips)
     projection = 'random projection of each strip to D dimensions (none)'
     add('--projection', type=int, metavar='D', help=projection)
     add('--seed', type=int, default=0, help='of the random projection (%(default)s)')
@@ -71,6 +71,21 @@ def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':
         arguments.seed,
         choose_device(arguments.device),
     )
+
+
+def require_descriptors_alone(arguments: argparse.Namespace, path: str) -> None:
+    """
+    Reject options of other features beside descriptors, which come as they are.
+
+    :raises SettingsError: names the option.
+    """
+    given = kind_options(arguments)
+    given |= {'--strips': arguments.strips, '--projection': arguments.projection}
+    for option, value in given.items():
+        if value is not None and not option.startswith('--descriptors-'):
+            raise SettingsError(f'{option}: {path} holds descriptors as they are; leave it out')
+    if arguments.features not in (None, 'gradient', 'descriptors'):
+        raise SettingsError(f'--features {arguments.features}: {path} holds descriptors')
 
 
 def kind_options(arguments: argparse.Namespace) -> dict[str, Any]:

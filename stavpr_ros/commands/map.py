@@ -53,6 +53,12 @@ def _parser() -> argparse.ArgumentParser:
     action = add('merge', 'Make one map of several: each is a session of it.', output=True)
     action.add_argument('output', metavar='OUTPUT')
     action.add_argument('maps', nargs='+', metavar='MAP')
+    action.add_argument(
+        '--different-routes',
+        action='store_true',
+        help='do not look for places that several sessions show; it takes the time of driving '
+        'each session once on a map of those before it',
+    )
     _add_storage(action)
     action = add(
         'sessions', 'Write some sessions of a map to another map.', 'map', 'output', output=True
@@ -114,7 +120,11 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
         places = np.count_nonzero(place_map.session_index == number)
         named = ''.join(f', {text}' for text in (session.name, session.robot) if text)
         start = f', {_time(session.start)}' if session.start else ''
-        lines.append(f'session    {session.id}{named}: {places} places{start}')
+        same = ''
+        if place_map.same_as is not None:
+            own = np.flatnonzero(place_map.session_index == number)
+            same = f', {np.count_nonzero(place_map.same_as[own] != own)} of them in earlier ones'
+        lines.append(f'session    {session.id}{named}: {places} places{same}{start}')
     return '\n'.join(lines)
 
 
@@ -146,11 +156,15 @@ def _convert(arguments: argparse.Namespace) -> None:
 
 def _merge(arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import merge_maps, open_map, verify_map
+    from stavpr_ros.recognition.same_places import with_same_places
 
     maps = [open_map(path) for path in arguments.maps]
     for place_map in maps:
         verify_map(place_map)
-    _write(merge_maps(maps, [Path(path).stem for path in arguments.maps]), arguments)
+    merged = merge_maps(maps, [Path(path).stem for path in arguments.maps])
+    if not arguments.different_routes:
+        merged = with_same_places(merged, progress=True)
+    _write(merged, arguments)
 
 
 def _sessions(arguments: argparse.Namespace) -> None:

@@ -11,6 +11,7 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
+import numpy as np
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.output_file import atomic_output, AtomicFile, RECORDING
 
@@ -62,7 +63,7 @@ def _plain(value: Any) -> Any:
         return int(value.sec) * 10**9 + int(value.nanosec)
     if hasattr(value, 'get_fields_and_field_types'):
         return [_plain(getattr(value, name)) for name in value.get_fields_and_field_types()]
-    if isinstance(value, Sequence) and not isinstance(value, str):
+    if isinstance(value, np.ndarray | Sequence) and not isinstance(value, str):
         return [_plain(item) for item in value]
     return None if isinstance(value, float) and math.isnan(value) else value
 

@@ -15,6 +15,7 @@ COMMANDS = {
     'build_map': 'build a reference map from a folder of images or a bag',
     'map': 'show, check, convert, export, merge and recover maps',
     'weights': 'download the published weights of a network',
+    'export_model': 'make one ONNX file of a network of vectors and maps',
     'evaluate': 'evaluate the recognition of one traverse on the map of another',
     'experiments': "reproduce the paper's tables on local data sets",
     'node': 'run the place-recognition node (ROS 2)',
@@ -29,7 +30,7 @@ NEED_ROS = ('node', 'replay', 'record', 'monitor', 'pose_graph', 'demo')
 
 def usage() -> str:
     """Return the help text."""
-    rows = ''.join(f'  {name:<12}{summary}\n' for name, summary in COMMANDS.items())
+    rows = ''.join(f'  {name:<14}{summary}\n' for name, summary in COMMANDS.items())
     return (
         'usage: stavpr COMMAND [OPTION ...]\n'
         '       stavpr COMMAND --help | --help | --version\n\n'

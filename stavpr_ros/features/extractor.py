@@ -12,8 +12,17 @@ import cv2
 import numpy as np
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, SettingsError
 from stavpr_ros.features.projection import Projection
-from stavpr_ros.features.registry import Backbone, backbone_class, settings_class
+from stavpr_ros.features.registry import (
+    Backbone,
+    backbone_class,
+    NetworkSettings,
+    settings_class,
+)
 import torch
+
+STRIPS = 7  # of a feature map, as in the paper; a vector is one strip
+GEM_EXPONENT = 3
+TEST_SIDE = 64  # pixels of the image that a network is tried on
 
 
 @dataclass(frozen=True)
@@ -23,7 +32,7 @@ class FeatureSettings:
 
     :param kind: name in the table of kinds, such as ``gradient``.
     :param backbone: the settings of that kind, its frozen dataclass.
-    :param strips: number of vertical strips W.
+    :param strips: number of vertical strips W; 1 for features that are one vector.
     :param projection: identity of the random projection, None without one.
     :param feature_version: version of the computation: another one gives other features.
     """
@@ -109,20 +118,23 @@ class FeatureExtractor:
     """
     Turns images into local features.
 
+    A network is tried on one image first, so that unusable ones fail before any work.
+
     :param kind: name in :data:`stavpr_ros.features.registry.KINDS`.
     :param backbone: settings of that kind; None for its defaults.
-    :param strips: number of vertical strips W.
+    :param strips: number of vertical strips W; None = 7, or 1 if an image has one vector.
     :param projection: number of dimensions of a new Gaussian projection, a :class:`Projection`,
         or None.
     :param seed: of a new projection.
     :param device: ``cpu`` or ``cuda``.
+    :raises SettingsError: the network's output cannot be used.
     """
 
     def __init__(
         self,
         kind: str = 'gradient',
         backbone: Any = None,
-        strips: int = 7,
+        strips: int | None = None,
         projection: int | Projection | None = None,
         seed: int = 0,
         device: str = 'cpu',
@@ -131,10 +143,22 @@ class FeatureExtractor:
             backbone = settings_class(kind)()
         self._backbone: Backbone = backbone_class(kind)(backbone, device)
         self.projection: Projection | None = None
+        tried = None
+        if isinstance(backbone, NetworkSettings) or isinstance(projection, int):
+            image = np.random.default_rng(0).integers(0, 256, (TEST_SIDE, TEST_SIDE, 3), np.uint8)
+            tried = self._backbone.feature_maps([image])
+            if not bool(torch.isfinite(tried).all()):
+                raise SettingsError(
+                    f'features {kind} of a test image are not finite: the network is damaged, or '
+                    f'its input out of range; its settings are {self._backbone.settings}'
+                )
+        if strips is None:
+            strips = 1 if tried is not None and tried.ndim == 2 else STRIPS
         plain = FeatureSettings(kind, self._backbone.settings, strips)
         self.settings = plain
+        if tried is not None:
+            dimension = self._cut(tried)[0].shape[2]
         if isinstance(projection, int):
-            dimension = self.extract([np.zeros((64, 64, 3), np.uint8)]).strips.shape[2]
             projection = Projection.gaussian(dimension, projection, seed)
         if projection is not None:
             self.projection = projection
@@ -181,9 +205,7 @@ class FeatureExtractor:
         :returns: local features of shape (W, len(images), d).
         :raises ImageError: the features are not finite.
         """
-        maps = self._backbone.feature_maps(images)
-        strips = cut_strips(maps, self.settings.strips)
-        cells: tuple[int, int] | None = (maps.shape[2], maps.shape[3] // self.settings.strips)
+        strips, cells = self._cut(self._backbone.feature_maps(images))
         if not bool(torch.isfinite(strips).all()):
             raise ImageError(
                 'the features of an image are not finite: the network or its input is out of '
@@ -193,6 +215,19 @@ class FeatureExtractor:
         if self.projection is not None:
             strips, cells = self.projection.apply(strips), None
         return LocalFeatures(*normalize(strips), self.settings, cells)
+
+    def _cut(self, maps: torch.Tensor) -> tuple[torch.Tensor, tuple[int, int] | None]:
+        """Return strips (W, n, d), not normalized, and the cells of each."""
+        W, pooling = self.settings.strips, getattr(self._backbone.settings, 'pooling', 'flatten')
+        if maps.ndim == 2:
+            if W != 1 or pooling != 'flatten':
+                raise SettingsError(
+                    f'features {self.settings.kind} are one vector of {maps.shape[1]} numbers an '
+                    f'image: expected W = 1 strip and pooling flatten, not {W} and {pooling}'
+                )
+            return maps.float()[None], (1, 1)
+        cells = (maps.shape[2], maps.shape[3] // W) if pooling == 'flatten' else (1, 1)
+        return cut_strips(maps, W, pooling), cells
 
 
 def resize_square(image: np.ndarray, size: int, method: str) -> np.ndarray:
@@ -210,15 +245,19 @@ def resize_square(image: np.ndarray, size: int, method: str) -> np.ndarray:
     return cv2.resize(image, (size, size), interpolation=interpolation)
 
 
-def cut_strips(feature_maps: torch.Tensor, W: int) -> torch.Tensor:
+def cut_strips(feature_maps: torch.Tensor, W: int, pooling: str = 'flatten') -> torch.Tensor:
     """
-    Cut feature maps into W vertical strips and flatten each (section 1 of the method).
+    Cut feature maps into W vertical strips and flatten each (section 1 of the method), or pool it.
 
     Of the r = Wf mod W surplus columns, floor(r / 2) are dropped on the left, the others on the
     right; every strip is floor(Wf / W) columns wide.
 
     :param feature_maps: shape (n, C, H, Wf).
-    :returns: local features, shape (W, n, C * H * floor(Wf / W)), float32, not normalized.
+    :param pooling: ``flatten``; or over the cells of a strip ``mean``, or ``gem``, the generalized
+        mean with exponent 3 (Radenovic et al., "Fine-tuning CNN image retrieval with no human
+        annotation", PAMI 2019), where values below 1e-6 count as that.
+    :returns: local features, shape (W, n, d), float32, not normalized; d is C * H * floor(Wf / W),
+        or C if they are pooled.
     :raises InputError: fewer columns than strips, or not four axes.
     """
     if feature_maps.ndim != 4:
@@ -234,7 +273,12 @@ def cut_strips(feature_maps: torch.Tensor, W: int) -> torch.Tensor:
     left = (Wf % W) // 2
     kept = feature_maps[..., left : left + W * width].float()
     strips = kept.reshape(n, channels, height, W, width).permute(3, 0, 1, 2, 4)
-    return strips.reshape(W, n, channels * height * width)
+    if pooling == 'flatten':
+        return strips.reshape(W, n, channels * height * width)
+    cells = strips.flatten(3)
+    if pooling == 'mean':
+        return cells.mean(3)
+    return cells.clamp(min=1e-6).pow(GEM_EXPONENT).mean(3).pow(1 / GEM_EXPONENT)
 
 
 def normalize(strips: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

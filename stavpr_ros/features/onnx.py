@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Features of any convolutional network in an ONNX file, the output of a named inner layer.
+Features of any network in an ONNX file, the output of a named inner layer.
 
 Requires the extra ``onnx`` (packages onnx and onnxruntime). The file is data: weights and
 operators of the ONNX standard; nothing in it is executed as Python.
@@ -14,7 +14,9 @@ from types import ModuleType
 
 import numpy as np
 from stavpr_ros.errors import SettingsError, UnavailableError
+from stavpr_ros.features.export import BATCH
 from stavpr_ros.features.extractor import resize_square
+from stavpr_ros.features.outputs import as_maps
 from stavpr_ros.features.registry import OnnxSettings
 from stavpr_ros.features.weights import read_model
 import torch
@@ -33,7 +35,7 @@ def _import_extra() -> tuple[ModuleType, ModuleType]:
 
 
 class Onnx:
-    """Feature maps of one layer of a network, float32."""
+    """Feature maps, or vectors, of one layer of a network, float32."""
 
     def __init__(self, settings: OnnxSettings, device: str = 'cpu') -> None:
         onnx, onnxruntime = _import_extra()
@@ -43,6 +45,8 @@ class Onnx:
         self.settings = replace(settings, sha256=digest)
         self._device = torch.device(device)
         model = self._with_output(onnx, content)
+        properties = {row.key: row.value for row in model.metadata_props}
+        self._one_by_one = properties.get(BATCH) == '1'
         providers = ['CPUExecutionProvider']
         on_gpu = self._device.type == 'cuda'
         if on_gpu and 'CUDAExecutionProvider' in onnxruntime.get_available_providers():
@@ -87,9 +91,12 @@ class Onnx:
         Compute the feature maps of a batch of images.
 
         :param images: RGB, each (h, w, 3) uint8, of any size; resized without keeping the aspect.
-        :returns: shape (n, C, H, Wf), float32.
-        :raises SettingsError: the network rejects this size, or the layer has not four axes.
+        :returns: maps (n, C, H, Wf) or vectors (n, D), float32.
+        :raises SettingsError: the network rejects this size, or the layer is neither maps nor
+            tokens nor vectors.
         """
+        if self._one_by_one and len(images) > 1:
+            return torch.cat([self.feature_maps([image]) for image in images])
         batch = np.stack([self._prepare(image) for image in images]).astype(self._dtype)
         try:
             maps = self._session.run([self.settings.layer], {self._input.name: batch})[0]
@@ -97,12 +104,14 @@ class Onnx:
             raise SettingsError(
                 f'{self.settings.model} rejects images of size {self.settings.size}: {error}'
             ) from error
-        if maps.ndim != 4:
+        if not np.issubdtype(maps.dtype, np.floating):
             raise SettingsError(
-                f'layer {self.settings.layer!r} has shape {maps.shape}: expected a map '
-                '(n, C, H, W); name a layer before the pooling'
+                f'layer {self.settings.layer!r} is {maps.dtype}, quantized numbers: name the '
+                'output of its DequantizeLinear'
             )
-        return torch.from_numpy(maps.astype(np.float32)).to(self._device)
+        output = torch.from_numpy(maps.astype(np.float32)).to(self._device)
+        name = f'layer {self.settings.layer!r} of {self.settings.model}'
+        return as_maps(output, len(images), self.settings.prefix_tokens, name)
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         """Resize, order the channels, scale and shift: (3, size, size), float32."""

@@ -8,7 +8,8 @@ CVPR 2017, growth rate 48, with the Places365 weights of Zhou et al., "Places: a
 database for scene recognition", PAMI 2017; its layer denseblock4.denselayer10.relu1.
 
 VGG16: configuration D of Simonyan, Zisserman, "Very deep convolutional networks for large-scale
-image recognition", ICLR 2015, with torchvision's ImageNet weights; its fourth pooling layer.
+image recognition", ICLR 2015, with torchvision's ImageNet weights; its fourth pooling layer, and
+its first fully connected layer fc6.
 """
 
 from collections.abc import Sequence
@@ -87,7 +88,8 @@ class PublishedNetwork:
         Compute the feature maps of a batch of images.
 
         :param images: RGB, each (h, w, 3) uint8, of any size; resized without keeping the aspect.
-        :returns: shape (n, C, H, Wf), >= 0, float32, or float16 with ``half`` on a GPU.
+        :returns: maps (n, C, H, Wf), or vectors (n, D), >= 0, float32, or float16 with ``half`` on
+            a GPU.
         :raises UnavailableError: the device has too little memory.
         """
         try:
@@ -143,6 +145,17 @@ class VGG16Pool4(PublishedNetwork):
         """Keep the layers up to the fourth pooling: 29 of the 528 MB of weights."""
         assert isinstance(network, VGG16)
         return network.features[: POOL4 + 1]
+
+
+class VGG16Fc6(VGG16Pool4):
+    """Vectors of 4096 numbers: the first fully connected layer, after its ReLU."""
+
+    @staticmethod
+    def up_to_layer(network: nn.Module) -> nn.Module:
+        """Keep the layers up to fc6; maps of other sizes are averaged to 7 x 7 first."""
+        features, classifier = network.features, network.classifier
+        pool = nn.AdaptiveAvgPool2d(7)
+        return nn.Sequential(features, pool, nn.Flatten(), classifier[:2])  # type: ignore
 
 
 class DenseLayer(nn.Module):

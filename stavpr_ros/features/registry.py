@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 MOST_PIXELS = 4096  # on a side of the resized image
 RESIZE_METHODS = ('bilinear', 'area')
+POOLINGS = ('flatten', 'mean', 'gem')
 IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of R, G, B in 0..1: torchvision's networks are trained so
 IMAGENET_STD = (0.229, 0.224, 0.225)
 CACHED = 'cached'  # stands for a published file instead of a path
@@ -87,14 +88,22 @@ class NetworkSettings:
     """Settings that all networks share."""
 
     LEAST_SIZE: ClassVar[int] = 8
+    BEFORE: ClassVar[dict[str, Any]] = {'pooling': 'flatten'}
 
     model: str = setting(help='file of the network', identity=False)
     size: int = setting(224, help='images are resized to size x size pixels')
     resize: str = setting('bilinear', help=_RESIZE_HELP)
     sha256: str = setting('', help='expected hash of the file; empty: not checked')
+    pooling: str = setting(
+        'flatten',
+        help='a strip of a feature map: all its cells (flatten), their mean, or their generalized '
+        'mean with exponent 3 (gem), which have as many dimensions as the map has channels',
+    )
 
     def __post_init__(self) -> None:
         _check_resize(self.resize, self.size)
+        if self.pooling not in POOLINGS:
+            raise SettingsError(f'pooling = {self.pooling!r} must be one of {", ".join(POOLINGS)}')
         if self.sha256 and (len(self.sha256) != 64 or set(self.sha256) - set('0123456789abcdef')):
             raise SettingsError(f'sha256 = {self.sha256!r} must be empty or 64 digits 0-9 a-f')
         if self.size < self.LEAST_SIZE:
@@ -105,14 +114,21 @@ class NetworkSettings:
 class OnnxSettings(NetworkSettings):
     """Settings of the ONNX features; mean and std are in units of scale * (0..255)."""
 
+    BEFORE: ClassVar[dict[str, Any]] = {**NetworkSettings.BEFORE, 'prefix_tokens': 1}
+
     model: str = setting(help='the ONNX file', identity=False)
-    layer: str = setting(help='inner output (tensor) to use, of shape (n, C, H, W)')
+    layer: str = setting(
+        help='inner output (tensor) to use: maps (n, C, H, W), tokens (n, T, C) or vectors (n, D)'
+    )
     channels: str = setting('rgb', help='order of the input channels, rgb or bgr')
     scale: float = setting(1 / 255, help='factor on the pixel values 0..255, before the mean')
     mean: tuple[float, ...] = setting(
         IMAGENET_MEAN, help='subtracted, in the order of the channels'
     )
     std: tuple[float, ...] = setting(IMAGENET_STD, help='divided by, in the order of the channels')
+    prefix_tokens: int = setting(
+        1, help='of layers (n, T, C): leading tokens that are no patches (class token, registers)'
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -124,18 +140,23 @@ class OnnxSettings(NetworkSettings):
             raise SettingsError(
                 f'mean {self.mean} and std {self.std} must be three numbers each, std not 0'
             )
+        if self.prefix_tokens < 0:
+            raise SettingsError(f'prefix_tokens = {self.prefix_tokens} must be at least 0')
 
 
 @dataclass(frozen=True, kw_only=True)
 class TorchScriptSettings(OnnxSettings):
     """Settings of the TorchScript features: those of ONNX, and the precision."""
 
+    BEFORE: ClassVar[dict[str, Any]] = {**OnnxSettings.BEFORE, 'output': '0'}
+
     model: str = setting(help='the TorchScript file', identity=False)
     layer: str = setting(
         '',
-        help='module to use the output of, such as features.23, of shape (n, C, H, W); empty: '
-        "the network's output",
+        help='module to use the output of, such as features.23: maps (n, C, H, W), tokens '
+        "(n, T, C) or vectors (n, D); empty: the network's output",
     )
+    output: str = setting('0', help='which one of several outputs: its number, or its key')
     half: bool = setting(False, help=_HALF_HELP, identity=False)
     allow: bool = setting(
         False, help='permit to run this file: TorchScript is a program', identity=False
@@ -156,6 +177,26 @@ class PublishedSettings(NetworkSettings):
     half: bool = setting(False, help=_HALF_HELP, identity=False)
 
 
+@dataclass(frozen=True, kw_only=True)
+class NetVladSettings(NetworkSettings):
+    """Settings of NetVLAD; how its input is normalized is in the file, or as for ImageNet."""
+
+    LEAST_SIZE: ClassVar[int] = 32
+
+    model: str = setting(help='file of the weights, .mat or .pth.tar', identity=False)
+    size: int = setting(480, help='images are resized to size x size pixels')
+    whitening: bool = setting(
+        True, help='PCA whitening as in the file, 4096 dimensions in the published ones'
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescriptorSettings:
+    """Settings of features that another program computed, read from arrays."""
+
+    source: str = setting('', help='what computed the descriptors, such as netvlad')
+
+
 # Settings and class of each kind, the class as MODULE:NAME in this package, imported on use.
 KINDS: dict[str, tuple[type, str]] = {
     'gradient': (GradientSettings, 'gradient:Gradient'),
@@ -163,6 +204,9 @@ KINDS: dict[str, tuple[type, str]] = {
     'torchscript': (TorchScriptSettings, 'torchscript:TorchScript'),
     'densenet161_places365': (PublishedSettings, 'paper_networks:DenseNet161Places365'),
     'vgg16': (PublishedSettings, 'paper_networks:VGG16Pool4'),
+    'vgg16_fc6': (PublishedSettings, 'paper_networks:VGG16Fc6'),
+    'netvlad': (NetVladSettings, 'netvlad:NetVlad'),
+    'descriptors': (DescriptorSettings, 'descriptors:Descriptors'),
 }
 
 
@@ -176,7 +220,11 @@ class Backbone(Protocol):
     settings: Any
 
     def feature_maps(self, images: 'Sequence[np.ndarray]') -> 'torch.Tensor':
-        """Compute feature maps (n, C, H, Wf), float, of RGB images (h, w, 3), uint8."""
+        """
+        Compute feature maps (n, C, H, Wf), or vectors (n, D), float, of RGB images.
+
+        :param images: each (h, w, 3), uint8.
+        """
         ...
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Features of any convolutional network in a TorchScript file: its output or that of an inner layer.
+Features of any network in a TorchScript file: its output or that of an inner layer.
 
 A TorchScript file is a program that torch interprets. It holds no Python, but a malicious one may
 reach files through torch's operators: it runs only with permission, after its hash was checked.
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from stavpr_ros.errors import SettingsError, UnavailableError
+from stavpr_ros.features.outputs import as_maps, one_of
 from stavpr_ros.features.preprocessing import BatchMaker
 from stavpr_ros.features.registry import TorchScriptSettings
 from stavpr_ros.features.weights import expected_hash, last_line, read_model
@@ -22,7 +23,7 @@ import torch
 
 
 class TorchScript:
-    """Feature maps of a network, float32 (float16 with ``half`` on a GPU)."""
+    """Feature maps or vectors of a network, float32 (float16 with ``half`` on a GPU)."""
 
     def __init__(self, settings: TorchScriptSettings, device: str = 'cpu') -> None:
         self._device = torch.device(device)
@@ -62,8 +63,9 @@ class TorchScript:
         Compute the feature maps of a batch of images.
 
         :param images: RGB, each (h, w, 3) uint8, of any size; resized without keeping the aspect.
-        :returns: shape (n, C, H, Wf), float32, or float16 with ``half`` on a GPU.
-        :raises SettingsError: the network rejects the batch, or the layer has not four axes.
+        :returns: maps (n, C, H, Wf) or vectors (n, D), float32, or float16 with ``half`` on a GPU.
+        :raises SettingsError: the network rejects the batch, or the layer returns neither maps nor
+            tokens nor vectors.
         """
         settings = self.settings
         try:
@@ -74,15 +76,9 @@ class TorchScript:
                 f'{settings.model} rejects {len(images)} images of size {settings.size}: '
                 f'{last_line(error)}'
             ) from error
-        if not isinstance(maps, torch.Tensor) or maps.ndim != 4 or len(maps) != len(images):
-            tensor = isinstance(maps, torch.Tensor)
-            returned = tuple(maps.shape) if tensor else f'type {type(maps).__name__}'
-            raise SettingsError(
-                f'layer {settings.layer!r} of {settings.model} returns {returned} for '
-                f'{len(images)} images: expected a map (n, C, H, W); name a layer before the '
-                'pooling'
-            )
-        return maps
+        name = f'layer {settings.layer!r} of {settings.model}'
+        maps = one_of(maps, settings.output, name)
+        return as_maps(maps, len(images), settings.prefix_tokens, name)
 
 
 def up_to_module(

@@ -3,6 +3,7 @@
 """Files of models: paths, downloads, hashes; and checkpoints into networks."""
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 import hashlib
 import http.client
@@ -234,7 +235,8 @@ def read_checkpoint(file: BinaryIO, name: str) -> dict[str, torch.Tensor]:
     :raises UnavailableError: it is damaged, no checkpoint, or requires code to be executed.
     """
     try:
-        content = torch.load(file, map_location='cpu', weights_only=True)
+        with _numbers_of_numpy():
+            content = torch.load(file, map_location='cpu', weights_only=True)
     except Exception as error:  # damaged files raise errors of any type
         reason = last_line(error)
         blocked = re.search(r'GLOBAL (\S+)', str(error))
@@ -253,6 +255,16 @@ def read_checkpoint(file: BinaryIO, name: str) -> dict[str, torch.Tensor]:
                 f'{name} holds {_kind(value)} as {key!r}: expected parameters by name'
             )
     return {key.removeprefix('module.'): value for key, value in content.items()}
+
+
+def _numbers_of_numpy() -> AbstractContextManager[None]:
+    """Permit numbers of NumPy beside the weights, such as the accuracy of each epoch."""
+    if not hasattr(torch.serialization, 'safe_globals'):  # torch before 2.5
+        return nullcontext()
+    types = [type(np.dtype(name)) for name in ('float32', 'float64', 'int32', 'int64')]
+    scalar: Any = np.float64(0).__reduce__()[0]
+    names: list[Any] = [(scalar, f'numpy.{core}.multiarray.scalar') for core in ('core', '_core')]
+    return torch.serialization.safe_globals([*types, np.dtype, *names])
 
 
 def last_line(error: Exception) -> str:

@@ -11,8 +11,15 @@ from stavpr_ros.mapping.keyframes import (
     small_gray,
 )
 from stavpr_ros.mapping.map_file import is_map, load_map, open_map, save_map, verify_map
-from stavpr_ros.mapping.merging import merge_maps, select_session
-from stavpr_ros.mapping.place_map import encode_thumbnail, Place, PlaceMap, Session
+from stavpr_ros.mapping.merging import merge_maps, select_places, select_session
+from stavpr_ros.mapping.place_map import (
+    descriptor_map,
+    encode_thumbnail,
+    Place,
+    PlaceMap,
+    Session,
+    thumbnail_of,
+)
 from stavpr_ros.mapping.trajectory import distance, rotation, Trajectory
 
 __all__ = [
@@ -24,6 +31,7 @@ __all__ = [
     'Session',
     'Trajectory',
     'build_map',
+    'descriptor_map',
     'distance',
     'encode_thumbnail',
     'extract_features',
@@ -34,7 +42,9 @@ __all__ = [
     'open_map',
     'rotation',
     'save_map',
+    'select_places',
     'select_session',
     'small_gray',
+    'thumbnail_of',
     'verify_map',
 ]

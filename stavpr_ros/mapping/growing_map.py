@@ -61,6 +61,7 @@ class GrowingMap:
         self._poses = np.empty((0, 7))
         self.sessions: tuple[Session, ...] = ()  # of the map that is continued
         self._session_index: np.ndarray | None = None
+        self._same_as: np.ndarray | None = None
         self.ids: list[str] = []  # '' = none
         self.thumbnails: list[bytes] = []  # small JPEGs, an empty one = none
 
@@ -87,6 +88,7 @@ class GrowingMap:
         growing._stamps[:n] = place_map.stamps
         growing._poses[:n] = np.nan if place_map.poses is None else place_map.poses
         growing.sessions, growing._session_index = place_map.sessions, place_map.session_index
+        growing._same_as = place_map.same_as
         growing.ids = list(place_map.ids)
         growing.thumbnails = list(place_map.thumbnails) or [b''] * n
         growing._count = n
@@ -201,7 +203,12 @@ class GrowingMap:
             strips, weights = features.strips.clone(), features.weights.clone()
             features = dataclasses.replace(features, strips=strips, weights=weights)
         sessions, session_index = self._with_session()
+        same_as = self._same_as
+        if same_as is not None:
+            added = np.arange(len(same_as), self._count, dtype=np.int32)
+            same_as = np.concatenate([same_as, added])
         return PlaceMap(
+            same_as=same_as,
             sessions=sessions,
             session_index=session_index,
             features=features,

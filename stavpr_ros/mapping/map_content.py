@@ -31,6 +31,7 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
     'thumbnails': (('U8',), ('bytes',)),
     'thumbnail_ends': (('I64',), ('n',)),
     'session': (('I32',), ('n',)),
+    'same_places/same_as': (('I32',), ('n',)),
 }
 _TOGETHER = (('ids', 'id_ends'), ('thumbnails', 'thumbnail_ends'))
 
@@ -73,6 +74,7 @@ def map_content(file: MapFile) -> PlaceMap:
         thumbnails=_thumbnails(file, arrays.get('thumbnail_ends')),
         sessions=tuple(Session(**session) for session in manifest['sessions']),
         session_index=arrays.get('session'),
+        same_as=arrays.get('same_places/same_as'),
         map_id=file.map_id,
     )
 
@@ -102,9 +104,9 @@ def _require_shapes(
         if (one in parts) is not (other in parts):
             raise ValueError(f'of the parts {one} and {other}, one is missing')
     sizes: dict[str, int] = {'W': settings.strips}
-    for name in parts.keys() - PARTS.keys():
+    for name in parts:
         section, slash, _ = name.partition('/')
-        if section not in sections:
+        if (slash or name not in PARTS) and section not in sections:
             raise ValueError(f'part {name[:80]} is {"of no section" if slash else "unknown"}')
     for name, (types, axes) in PARTS.items():
         if name not in parts:

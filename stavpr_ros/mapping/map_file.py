@@ -66,7 +66,9 @@ def _manifest(place_map: PlaceMap) -> dict[str, Any]:
             {row.name: getattr(session, row.name) for row in fields(session)}
             for session in place_map.sessions
         ],
-        'sections': {},
+        'sections': {}
+        if place_map.same_as is None
+        else {'same_places': {'version': 1, 'required': False, 'data': None}},
     }
 
 
@@ -102,6 +104,8 @@ def _parts(place_map: PlaceMap, storage: str) -> dict[str, NewPart]:
         add_texts('thumbnails', 'thumbnail_ends', place_map.thumbnails)
     if place_map.session_index is not None:
         add('session', place_map.session_index)
+    if place_map.same_as is not None:
+        add('same_places/same_as', place_map.same_as)
     return parts
 
 

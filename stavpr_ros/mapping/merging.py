@@ -39,7 +39,7 @@ def merge_maps(maps: Sequence[PlaceMap], names: Sequence[str]) -> PlaceMap:
         index.append(numbers + np.int32(len(sessions)))
         for session in own:
             sessions.append(replace(session, id=_free_id(session.id, sessions)))
-    return _joined(maps, tuple(sessions), np.concatenate(index))
+    return _joined(maps, tuple(sessions), np.concatenate(index), _joined_same_as(maps))
 
 
 def select_session(place_map: PlaceMap, session_id: str, keep: bool = True) -> PlaceMap:
@@ -56,20 +56,37 @@ def select_session(place_map: PlaceMap, session_id: str, keep: bool = True) -> P
     chosen = (place_map.session_index == number) == keep
     if not chosen.any():
         raise InputError(f'without session {session_id!r} no place is left')
-    left = [i for i in range(len(ids)) if (i == number) == keep]
-    renumbered = np.full(len(ids), -1, np.int32)
-    renumbered[left] = np.arange(len(left))
-    places = np.flatnonzero(chosen).tolist()
-    thumbnails = tuple(place_map.thumbnails[i] for i in places) if place_map.thumbnails else ()
+    return select_places(place_map, np.flatnonzero(chosen))
+
+
+def select_places(place_map: PlaceMap, places: np.ndarray) -> PlaceMap:
+    """
+    Return a map of some places.
+
+    A place that is the same as one left out is the same as itself only.
+
+    :param places: ascending, (m,), int64.
+    """
+    chosen, index, same_as = places.tolist(), place_map.session_index, place_map.same_as
+    sessions = place_map.sessions
+    if index is not None:
+        numbers, index = np.unique(index[places], return_inverse=True)
+        sessions, index = tuple(sessions[i] for i in numbers), index.astype(np.int32)
+    if same_as is not None:
+        renumbered = np.full(len(place_map), -1, np.int32)
+        renumbered[places] = np.arange(len(places))
+        same_as = renumbered[same_as[places]]
+        same_as = np.where(same_as < 0, np.arange(len(places), dtype=np.int32), same_as)
     return replace(
         place_map,
-        features=place_map.features[np.array(places)],
+        features=place_map.features[places],
         stamps=place_map.stamps[places],
-        ids=tuple(place_map.ids[i] for i in places),
+        ids=tuple(place_map.ids[i] for i in chosen),
         poses=None if place_map.poses is None else place_map.poses[places],
-        thumbnails=thumbnails,
-        sessions=tuple(place_map.sessions[i] for i in left),
-        session_index=renumbered[place_map.session_index[places]],
+        thumbnails=tuple(place_map.thumbnails[i] for i in chosen) if place_map.thumbnails else (),
+        sessions=sessions,
+        session_index=index,
+        same_as=same_as,
         map_id='',
     )
 
@@ -81,8 +98,22 @@ def _free_id(wanted: str, sessions: list[Session]) -> str:
     return next(name for name in names if name not in taken)
 
 
+def _joined_same_as(maps: Sequence[PlaceMap]) -> np.ndarray | None:
+    if all(each.same_as is None for each in maps):
+        return None
+    joined, first = [], 0
+    for each in maps:
+        own = np.arange(len(each)) if each.same_as is None else each.same_as
+        joined.append(own + first)
+        first += len(each)
+    return np.concatenate(joined).astype(np.int32)
+
+
 def _joined(
-    maps: Sequence[PlaceMap], sessions: tuple[Session, ...], index: np.ndarray
+    maps: Sequence[PlaceMap],
+    sessions: tuple[Session, ...],
+    index: np.ndarray,
+    same_as: np.ndarray | None,
 ) -> PlaceMap:
     poses = [
         np.full((len(each), 7), np.nan) if each.poses is None else each.poses for each in maps
@@ -99,4 +130,5 @@ def _joined(
         else (),
         sessions=sessions,
         session_index=index,
+        same_as=same_as,
     )

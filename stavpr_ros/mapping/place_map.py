@@ -68,6 +68,8 @@ class PlaceMap:
         place; empty = none kept.
     :param sessions: the drives that the places are of; empty = one drive, nothing known of it.
     :param session_index: number of each place's session, shape (n,), int32; None without sessions.
+    :param same_as: of each place, itself, or the place of an earlier session that shows the same,
+        shape (n,), int32; None = unknown: see :func:`stavpr_ros.recognition.same_places`.
     :param map_id: first 16 hexadecimal digits of the hash of its file's content, '' = it was not
         read from a file.
     """
@@ -80,6 +82,7 @@ class PlaceMap:
     thumbnails: Sequence[bytes] = field(default=(), repr=False)
     sessions: tuple[Session, ...] = ()
     session_index: np.ndarray | None = None
+    same_as: np.ndarray | None = None
     map_id: str = ''
 
     def __post_init__(self) -> None:
@@ -110,6 +113,7 @@ class PlaceMap:
             raise InputError('a stamp is out of range: expected ns of at most 2**31 seconds')
         _require_texts(self.ids)
         _require_sessions(self.sessions, self.session_index, n)
+        _require_same_as(self.same_as, n)
         require_projection(self.projection, self.settings)
 
     def __len__(self) -> int:
@@ -173,6 +177,16 @@ class PlaceMap:
             return None
 
 
+def descriptor_map(features: LocalFeatures, poses: np.ndarray | None = None) -> PlaceMap:
+    """
+    Make a map of features whose images are unknown, such as descriptors from a file.
+
+    :param poses: shape (n, 7), see :class:`PlaceMap`.
+    """
+    n = len(features)
+    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n, poses)
+
+
 def require_projection(projection: Projection | None, settings: FeatureSettings) -> None:
     """
     Reject another projection than that of the features.
@@ -232,9 +246,20 @@ def _require_sessions(sessions: tuple[Session, ...], index: np.ndarray | None, n
         raise InputError(f'sessions have the ids {ids[:8]}: expected different ones, none empty')
 
 
-def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
+def _require_same_as(same_as: np.ndarray | None, n: int) -> None:
+    if same_as is None:
+        return
+    if same_as.dtype != np.int32 or same_as.shape != (n,):
+        raise InputError(f'same_as is {same_as.dtype} {same_as.shape}: expected int32 ({n},)')
+    if n and (same_as.min() < 0 or (same_as > np.arange(n)).any()):
+        raise InputError('same_as: expected of each place itself or an earlier one')
+    if (same_as[same_as] != same_as).any():
+        raise InputError('same_as names a place that is the same as another one, not as itself')
+
+
+def thumbnail_of(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> np.ndarray:
     """
-    Return a small JPEG of an image.
+    Return an image at the size of a thumbnail.
 
     :param image: RGB (h, w, 3) uint8.
     :param width: pixels; narrower images keep their size.
@@ -242,7 +267,12 @@ def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
     most = math.sqrt(MOST_PIXELS / 2 / (image.shape[0] * image.shape[1]))
     scale = min(1.0, width / image.shape[1], most)
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
+    """Return :func:`thumbnail_of` an image as a JPEG."""
+    small = thumbnail_of(image, width)
     done, encoded = cv2.imencode(
         '.jpg', cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85]
     )

@@ -18,13 +18,13 @@ class Observation:
     One image and its features.
 
     :param features: of one image.
-    :param image: RGB, uint8, shape (h, w, 3).
+    :param thumbnail: RGB, uint8, shape (h, w, 3); None where none is needed.
     :param stamp: ns, 0 = unknown.
     :param pose: shape (7,), or None.
     """
 
     features: LocalFeatures
-    image: np.ndarray
+    thumbnail: np.ndarray | None
     stamp: int
     pose: np.ndarray | None
 
@@ -45,21 +45,16 @@ class Localization:
 
 @dataclass(eq=False)
 class Mapping:
-    """
-    Adds every image to a growing map as a place.
-
-    :param thumbnail_width: pixels, 0 = no thumbnails.
-    """
+    """Adds every image to a growing map as a place, with its thumbnail if it has one."""
 
     name: ClassVar[str] = 'mapping'
     extractor: FeatureExtractor
     places: GrowingMap
-    thumbnail_width: int
     recognizer: None = None
 
     def update(self, observation: Observation) -> Match:
         """Add an image as a place."""
-        thumbnail = make_thumbnail(observation.image, self.thumbnail_width)
+        thumbnail = _encoded(observation)
         return Match(Status.MAPPED, image_index=_add(self.places, observation, thumbnail))
 
 
@@ -69,19 +64,17 @@ class LoopClosing:
     Recognizes places that the route has passed before; a full route evicts its oldest places.
 
     :param places: the route, with the places of the recognizer.
-    :param thumbnail_width: pixels, 0 = no thumbnails.
     """
 
     name: ClassVar[str] = 'loop_closure'
     extractor: FeatureExtractor
     places: GrowingMap
     recognizer: LoopCloser
-    thumbnail_width: int
 
     def update(self, observation: Observation) -> Match:
         """Add an image as a place, and match the window that ends with it."""
         # first, since it may fail: recognizer and route stay in step
-        thumbnail = make_thumbnail(observation.image, self.thumbnail_width)
+        thumbnail = _encoded(observation)
         match = self.recognizer.update(observation.features, observation.stamp)
         self.places.forget(self.recognizer.first - self.places.first)
         return replace(match, image_index=_add(self.places, observation, thumbnail))
@@ -90,9 +83,9 @@ class LoopClosing:
 Operation = Localization | Mapping | LoopClosing
 
 
-def make_thumbnail(image: np.ndarray, width: int) -> bytes:
-    """Return a thumbnail as JPEG; empty for width 0."""
-    return encode_thumbnail(image, width) if width else b''
+def _encoded(observation: Observation) -> bytes:
+    """Return the thumbnail as JPEG; empty = none."""
+    return b'' if observation.thumbnail is None else encode_thumbnail(observation.thumbnail)
 
 
 def _add(places: GrowingMap, observation: Observation, thumbnail: bytes) -> int:

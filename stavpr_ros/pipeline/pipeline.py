@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pipeline: from one image message to one match; the map and the operation."""
 
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,16 +13,17 @@ from typing import Any
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, StavprError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping import GrowingMap, PlaceMap, thumbnail_of
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.keyframes import KeyframeSelector
+from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.pipeline.operations import Localization, Mapping, Observation, Operation
 from stavpr_ros.pipeline.save_state import MapSnapshot, OpenJournal, SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.pipeline.start import LoadedMap, start_operation
 from stavpr_ros.recognition import Match, Status
-from stavpr_ros.recognition.verification import GeometricVerifier
+from stavpr_ros.recognition.verification import GeometricEvidence, PlaceVerifier
 from stavpr_ros.sources.encodings import decode_message
 
 NO_MAP = (
@@ -56,8 +58,11 @@ class Pipeline:
         self._name = operation
         self.threshold = settings.applied_threshold
         self._keyframes = KeyframeSelector(settings.keyframes)
-        self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
+        self._verifier = PlaceVerifier(settings.geometric) if settings.geometric else None
+        self._evidence = GeometricEvidence()
         self._last: Match | None = None
+        # of the window, from its middle image on; None = the image came when none was needed
+        self._thumbnails: deque[np.ndarray | None] = deque()
         self.save_state = SaveState()  # of the places in use
         # of the map, where loop closure has places of its own
         self._map_save_state = self.save_state
@@ -145,7 +150,8 @@ class Pipeline:
             self._operation.recognizer.set_threshold(threshold)
         self.settings, self.threshold = settings, threshold
         self._keyframes.settings = settings.keyframes
-        self._verifier = GeometricVerifier(settings.geometric) if settings.geometric else None
+        if settings.geometric != (self._verifier and self._verifier.settings):
+            self._verifier = PlaceVerifier(settings.geometric) if settings.geometric else None
 
     def snapshot(self) -> MapSnapshot:
         """
@@ -178,6 +184,8 @@ class Pipeline:
         """Empty the window: the next images do not continue those before."""
         self._keyframes.reset()
         self._last = None
+        self._thumbnails.clear()
+        self._evidence = GeometricEvidence()
         if self._operation is not None and self._operation.recognizer:
             self._operation.recognizer.reset()
 
@@ -198,7 +206,7 @@ class Pipeline:
             raise InputError(
                 f'{self.window_fill} of {self.settings.sequence.length} images in the window'
             )
-        return replace(self._last, candidates=tuple(recognizer.ranked(count)))
+        return self._last.with_candidates(recognizer.ranked(count))
 
     def window_distances(self) -> tuple[np.ndarray, int]:
         """
@@ -252,17 +260,19 @@ class Pipeline:
         with _timed(stages, 'extraction'):
             features = operation.extractor.extract([image])
         with _timed(stages, 'matching'):
-            match = operation.update(Observation(features, image, stamp, pose))
+            thumbnail = self._thumbnail(operation, image)
+            match = operation.update(Observation(features, thumbnail, stamp, pose))
+        self._thumbnails.append(thumbnail)
         self._keyframes.accept(stamp, pose, image)
         if not isinstance(operation, Localization):
             self.save_state.record(operation.places, features, self._open_journal)
         if operation.recognizer is None:
             return replace(match, image=image)
         with _timed(stages, 'verification'):
-            match = self._verified(match, image, operation.places)
+            match = self._verified(match, operation.places)
         if self.list_candidates and match.sequence is not None:
-            candidates = tuple(operation.recognizer.ranked(self.settings.candidates))
-            match = replace(match, candidates=candidates)
+            ranked = operation.recognizer.ranked(self.settings.candidates)
+            match = match.with_candidates(ranked)
         self._last = replace(match, image=image)
         return self._last
 
@@ -271,25 +281,47 @@ class Pipeline:
         backbone = operation.extractor.settings.backbone
         if backbone.resize != 'area':  # bilinear features are of single pixels
             return None
-        check = self._verifier.settings.width if self._verifier else 0
-        return backbone.size, max(backbone.size, check, self.settings.thumbnail_width)
+        return backbone.size, max(backbone.size, self._thumbnail_width(operation))
 
-    def _verified(self, match: Match, image: np.ndarray, places: PlaceMap | GrowingMap) -> Match:
-        """Verify a match against the thumbnail of its place; reject too few inliers."""
-        if self._verifier is None or not match.accepted:
+    def _thumbnail_width(self, operation: Operation) -> int:
+        """Return the width of the thumbnails that are needed, 0 = none is."""
+        width = self.settings.thumbnail_width
+        if isinstance(operation, Localization):
+            return (width or THUMBNAIL_WIDTH) if self._verifier else 0
+        return width
+
+    def _thumbnail(self, operation: Operation, image: np.ndarray) -> np.ndarray | None:
+        width = self._thumbnail_width(operation)
+        return thumbnail_of(image, width) if width else None
+
+    def _verified(self, match: Match, places: PlaceMap | GrowingMap) -> Match:
+        """
+        Check the middle pair of a match by their thumbnails; without these, nothing changes.
+
+        Mode robust weighs the result (:class:`GeometricEvidence`), where the match is doubtful;
+        mode paper rejects matches with too few inliers.
+        """
+        if self._verifier is None or match.sequence is None:
             return match
-        thumbnail = places.thumbnail(match.newest_index)
-        if thumbnail is None:
-            reason = 'geometric check: the map has no thumbnails; build it with thumbnails'
-            return replace(match, status=Status.NO_MATCH, reason=reason)
-        inliers = self._verifier.inliers(image, thumbnail)
+        checked = self._evidence.wants(match.probability) if match.relative else match.accepted
+        query = self._thumbnails[0]
+        if not checked or query is None:
+            return match
+        inliers = self._verifier.inliers(query, places, match.sequence.middle)
+        if inliers is None:
+            return match
         least = self._verifier.settings.min_inliers
+        match = replace(match, inliers=inliers)
+        if match.relative:
+            return match.with_probability(
+                self._evidence.updated(match.probability, inliers >= least)
+            )
         if inliers >= least:
-            return replace(match, inliers=inliers)
+            return match
         reason = (
             f'geometric check: {inliers} inliers are fewer than {least} (parameter min_inliers)'
         )
-        return replace(match, status=Status.NO_MATCH, reason=reason, inliers=inliers)
+        return replace(match, status=Status.NO_MATCH, reason=reason)
 
     def _start(self, name: str, settings: PipelineSettings, loaded: LoadedMap | None) -> None:
         """Start an operation; an error changes nothing."""
@@ -303,6 +335,8 @@ class Pipeline:
         # in mapping, the growing map holds it
         self._map = None if name == 'mapping' else place_map
         self._operation, self._name = operation, name
+        length = settings.sequence.length
+        self._thumbnails = deque(maxlen=length - (length - 1) // 2)
         self._extractor = operation.extractor if operation is not None else extractor
         self._map_save_state = save_state
         self.save_state = SaveState() if name == 'loop_closure' else save_state

@@ -80,7 +80,7 @@ def start_operation(
             if place_map is None
             else GrowingMap.from_map(place_map, settings.max_places)
         )
-        return Mapping(extractor, growing, settings.thumbnail_width)
+        return Mapping(extractor, growing)
     closer = _loop_closer(settings, settings.exclude_places, extractor)
     # a closer that excludes next to nothing needs few images to warm up
     _warm_up(_loop_closer(settings, 1, extractor), extractor, settings.sequence.length + 8)
@@ -90,7 +90,7 @@ def start_operation(
         settings.max_places,
         held_features=closer.features,
     )
-    return LoopClosing(extractor, route, closer, settings.thumbnail_width)
+    return LoopClosing(extractor, route, closer)
 
 
 def _loop_closer(

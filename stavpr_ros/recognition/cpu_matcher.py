@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The matcher on the CPU: one pass over the map for each image, on all cores."""
 
+from typing import Any
+
 import numpy as np
-from stavpr_ros.alignment.cpu import dot
+from stavpr_ros.alignment.cpu import dot, int8
 from stavpr_ros.alignment.settings import SpatialSettings
-from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
+from stavpr_ros.alignment.spatial import adaptive_weights, image_distances, WINDOW
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.recognition.int8_features import Int8Features, rounded
 import torch
 
 CACHE_LINE = 64  # bytes; vectors across two of them are read at half the speed
@@ -32,15 +35,31 @@ class CpuMatcher:
     """
     See :class:`stavpr_ros.recognition.matcher.Matcher`.
 
-    :param features: those of the map. Contiguous float32 ones whose memory begins with a cache
-        line are shared, not copied.
+    :param features: those of the map, for int8 rounded or not. Contiguous float32 ones whose
+        memory begins with a cache line are shared, not copied.
     """
 
     def __init__(
-        self, features: LocalFeatures, spatial: SpatialSettings, precision: str = 'float32'
+        self,
+        features: LocalFeatures | Int8Features,
+        spatial: SpatialSettings,
+        precision: str = 'float32',
     ) -> None:
+        W = len(features.strips)
+        if spatial.strategy == 'sliding_window' and W < WINDOW:
+            raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')
         self._spatial = spatial
         self._cells = features.cells if spatial.vertical else None
+        self._weights = features.weights.cpu()
+        self._places = self._weights.shape[1]
+        self._band = spatial.band(W)
+        self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
+        self._map: np.ndarray | tuple[np.ndarray, np.ndarray]
+        if precision == 'int8' and isinstance(features, LocalFeatures):
+            features = rounded(features, lambda some: some)
+        if isinstance(features, Int8Features):
+            self._map = features.strips.kernel_arguments()
+            return
         strips = features.strips.cpu()
         if spatial.vertical:
             if features.cells is None:
@@ -54,15 +73,11 @@ class CpuMatcher:
         if strips.data_ptr() % CACHE_LINE:
             strips = strips.clone()
         self._map = (strips if precision == 'float32' else strips.view(torch.int16)).numpy()
-        self._weights = features.weights.cpu()
-        W = len(features.strips)
-        self._band = spatial.band(W)
-        self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
 
     @property
     def places(self) -> int:
         """Return the number of places n."""
-        return self._map.shape[1]
+        return self._places
 
     def distances(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Return the distances of one image to every place, (n,)."""
@@ -70,10 +85,13 @@ class CpuMatcher:
 
     def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Return the distances of Q images to every place, (Q, n)."""
-        queries = dot.tiled(
-            strips if self._cells is None else cut_cells(strips.cpu(), self._cells)
-        )
-        out = np.empty((len(queries), self.places), np.float32)
+        out = np.empty((strips.shape[1], self.places), np.float32)
+        if not isinstance(self._map, tuple) and len(self._map) == 1:
+            # one vector an image: its alignment is its cosine distance
+            dot.cosine_distances(self._map[0], strips[0].contiguous().numpy(), out)
+            return torch.from_numpy(out)
+        strips = strips if self._cells is None else cut_cells(strips.cpu(), self._cells)
+        queries = int8.tiled(strips) if isinstance(self._map, tuple) else dot.tiled(strips)
         if self._cells is not None:
             dot.vertical_image_distances(
                 self._map, queries, self._cell_a, self._a, self._band, out
@@ -81,15 +99,18 @@ class CpuMatcher:
         elif self._spatial.strategy in ('adaptive', 'vanilla'):
             dot.image_distances(self._map, queries, self._a, self._band, out)
         else:
-            for x, query in enumerate(queries):
-                out[x] = self._without_dtw(query, weights[:, x])
+            for x in range(len(out)):
+                out[x] = self._without_dtw(queries, x, weights[:, x])
         return torch.from_numpy(out)
 
-    def _without_dtw(self, query: np.ndarray, weights: torch.Tensor) -> np.ndarray:
-        """Return the distances of one image without DTW, (n,)."""
-        W, n, _ = self._map.shape
-        d = np.empty((len(query), W, n), np.float32)
-        dot.strip_distances(self._map, query, d)
+    def _without_dtw(self, queries: Any, x: int, weights: torch.Tensor) -> np.ndarray:
+        """Return the distances of image x without DTW, (n,)."""
+        W, n = self._weights.shape
+        d = np.empty((-(-W // dot.TILE) * dot.TILE, W, n), np.float32)
+        if isinstance(self._map, tuple):
+            int8.strip_distances(self._map, queries, x, d)
+        else:
+            dot.strip_distances(self._map, queries[x], d)
         if self._spatial.strategy == 'sliding_window':
             return image_distances(d[:W], self._spatial)
         similarity = 1 - torch.from_numpy(d).diagonal()[:, :W]  # (n, W)

@@ -5,12 +5,14 @@
 from typing import Any
 
 import numpy as np
+from stavpr_ros.alignment.cpu.int8 import rounded_queries
 from stavpr_ros.alignment.cuda.compilation import runtime
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.alignment.similarity import holistic_distances
 from stavpr_ros.alignment.spatial import WINDOW
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.recognition.int8_features import Int8Features, rounded
 import torch
 
 BLOCK_WORDS = 2**26  # most words of products that lie in memory at a time: 256 MiB
@@ -30,21 +32,34 @@ class CudaMatcher:
     :param features: those of the map, on any device; unit norm, strips (W, n, d), weights (W, n).
     :param spatial: how two images are compared.
     :param precision: ``float32``, or ``float16``: the map is held in half width and the query is
-        rounded to it; products are summed up in float32.
+        rounded to it; products are summed up in float32. ``int8``: both are rounded to it;
+        strip distances are those of the CPU, bit for bit.
     :raises UnavailableError: no CUDA device here, or the package numba-cuda is missing.
     :raises SettingsError: xi > W.
     :raises InputError: fewer strips than the sliding window has.
     """
 
     def __init__(
-        self, features: LocalFeatures, spatial: SpatialSettings, precision: str = 'float32'
+        self,
+        features: LocalFeatures | Int8Features,
+        spatial: SpatialSettings,
+        precision: str = 'float32',
     ) -> None:
         self._runtime = runtime()
         device = self._runtime.torch_device
-        self._strips = features.strips.to(device, getattr(torch, precision)).contiguous()
+        if precision == 'int8' and isinstance(features, LocalFeatures):
+            features = rounded(features, lambda some: some)
+        self._reciprocals: torch.Tensor | None = None
+        if isinstance(features, Int8Features):
+            lengths = features.strips.reciprocals[:, : len(features)]
+            self._strips = features.strips.rounded().to(device)
+            self._reciprocals = torch.from_numpy(lengths).to(device)
+        else:
+            self._strips = features.strips.to(device, getattr(torch, precision)).contiguous()
         self._weights = features.weights.to(device)
         self._half = precision != 'float32'
-        self._in_pieces = self._half and not self._runtime.half_products
+        # products of whole numbers and their sums are exact in float32
+        self._in_pieces = precision == 'int8' or (self._half and not self._runtime.half_products)
         self._workspace: tuple[torch.Tensor, Any] | None = None
         self._choose_kernel(spatial)
         if self.places:
@@ -109,19 +124,32 @@ class CudaMatcher:
     def _align(self, queries: torch.Tensor, first_query: int, out: Any) -> None:
         """Write the rows of some queries, a piece of the map at a time: products stay small."""
         W, n, _ = self._strips.shape
-        vectors = queries.reshape(len(queries) * W, -1).to(self._strips.dtype)
+        vectors, lengths = self._rounded(queries)
         places = min(n, max(1, BLOCK_WORDS // (len(vectors) * W)))
         if self._in_pieces:
             places = min(places, PLACES_IN_PIECES)
         for first in range(0, n, places):
             last = min(first + places, n)
-            products = self._products(vectors, first, last)
+            products = self._products(vectors, lengths, first, last)
             grid = (-(-(last - first) // self._block), len(queries))
             self._runtime.launch(
                 self._kernel, grid, self._block, products, self._sigma, first_query, first, out
             )
 
-    def _products(self, vectors: torch.Tensor, first: int, last: int) -> Any:
+    def _rounded(self, queries: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Return queries (Q, W, d) in the map's type, (Q W, d), and their reciprocal lengths."""
+        rows, d = queries.shape[0] * queries.shape[1], queries.shape[2]
+        if self._reciprocals is None:
+            return queries.reshape(rows, d).to(self._strips.dtype), None
+        whole, lengths = (
+            torch.from_numpy(part).to(queries.device)
+            for part in rounded_queries(queries.transpose(0, 1))
+        )
+        return whole.reshape(rows, d), lengths.reshape(rows)
+
+    def _products(
+        self, vectors: torch.Tensor, lengths: torch.Tensor | None, first: int, last: int
+    ) -> Any:
         """Multiply query strips by those of some places: (Q W, W, last - first), for kernels."""
         W, n, d = self._strips.shape
         rows = len(vectors)
@@ -136,6 +164,8 @@ class CudaMatcher:
         block, view = self._space((W, rows, last - first), (1, 0, 2))
         references = self._strips[:, first:last].transpose(1, 2)
         self._multiply(torch.bmm, vectors.expand(W, rows, d), references, block)
+        if self._reciprocals is not None and lengths is not None:
+            block.mul_(self._reciprocals[:, None, first:last]).mul_(lengths[:, None])
         return view
 
     def _space(self, shape: tuple[int, ...], order: tuple[int, ...]) -> tuple[torch.Tensor, Any]:
@@ -162,7 +192,8 @@ class CudaMatcher:
         if not self._half:
             return holistic_distances(query, weights, self._strips, self._weights)
         W, n, _ = self._strips.shape
-        vectors, places = query.to(self._strips.dtype)[:, :, None], n
+        vectors, lengths = self._rounded(query[None])
+        vectors, places = vectors[:, :, None], n
         similarity = torch.empty((W, n, 1), device=self._strips.device)
         if self._in_pieces:
             places = PLACES_IN_PIECES
@@ -171,4 +202,6 @@ class CudaMatcher:
             part = torch.empty_like(similarity[:, piece], memory_format=torch.contiguous_format)
             self._multiply(torch.bmm, self._strips[:, piece], vectors, part)
             similarity[:, piece] = part
+        if self._reciprocals is not None and lengths is not None:
+            similarity.mul_(self._reciprocals[:, :, None]).mul_(lengths[:, None, None])
         return 1 - (similarity[:, :, 0] * weights[:, None] * self._weights).sum(dim=0)

@@ -7,7 +7,8 @@ from typing import Any
 from stavpr_ros.alignment.cuda.compilation import runtime
 from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch, trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings
-from stavpr_ros.recognition.sequence_search import SequenceBuffer, Sequences, WindowMatch
+from stavpr_ros.recognition.sequence_search import SequenceBuffer, WindowMatch
+from stavpr_ros.recognition.sessions import Sequences
 import torch
 
 

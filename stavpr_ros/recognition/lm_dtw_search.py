@@ -14,8 +14,8 @@ from stavpr_ros.alignment.lm_dtw import (
     trace_sequence,
 )
 from stavpr_ros.alignment.path import NO_PATH
-from stavpr_ros.recognition.robust import ZNormalization
-from stavpr_ros.recognition.sequence_search import SequenceBuffer, Sequences, WindowMatch
+from stavpr_ros.recognition.sequence_search import SequenceBuffer, WindowMatch
+from stavpr_ros.recognition.sessions import Sequences
 
 
 class LmDtwSearch:
@@ -23,19 +23,18 @@ class LmDtwSearch:
     LM-DTW on the CPU (section 4 of the paper).
 
     :param buffer: the window.
-    :param znorm: applied to the distances.
     """
 
-    def __init__(self, buffer: SequenceBuffer, znorm: ZNormalization) -> None:
-        self.buffer, self._znorm = buffer, znorm
+    def __init__(self, buffer: SequenceBuffer) -> None:
+        self.buffer = buffer
 
     def __call__(self, nms_radius: int) -> WindowMatch:
         buffer = self.buffer
         n, k, first = buffer.known, buffer.k, buffer.first
         window = buffer.rows().numpy()
-        if self._znorm.reference or n < buffer.places:
+        if n < buffer.places:
             costs = np.full((buffer.length, padded_width(n, k)), np.inf, np.float32)
-            costs[:, :n] = self._znorm.scaled(window[:, :n])
+            costs[:, :n] = window[:, :n]
             window = costs
         matches = match_padded(window, n, k)
         nearest = best_match(matches, nms_radius)

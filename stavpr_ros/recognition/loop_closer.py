@@ -14,7 +14,6 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.match import Match, Status
 from stavpr_ros.recognition.recognizer import RecognizerSettings, SequenceRecognizer
-from stavpr_ros.recognition.robust import ZNormalization
 from stavpr_ros.recognition.route_features import RouteFeatures
 from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
 import torch
@@ -162,10 +161,10 @@ class LoopCloser(SequenceRecognizer):
         self._young.append(stamp)
         self._places = max(0, route.count - max(self._exclude, self._count_young(stamp)))
 
-    def _parts(self) -> list[SequenceBuffer | ZNormalization | FilterSearch]:
+    def _parts(self) -> list[SequenceBuffer | FilterSearch]:
         """Return what has an entry for each place."""
         own = [self._filter] if self._filter is not None else []
-        return [self._buffer, self._znorm, *own]
+        return [self._buffer, *own]
 
     def _count_young(self, stamp: int) -> int:
         """Count the latest places, the newest included, that are too young for this stamp."""
@@ -180,9 +179,11 @@ class LoopCloser(SequenceRecognizer):
         if self._places < LEAST_PLACES:
             return np.empty(0, np.float32)
         out = np.empty((1, self._places), np.float32)
-        dot.image_distances(
-            self._route.strips.numpy(), dot.tiled(self._route.newest), self._a, self._band, out
-        )
+        strips, newest = self._route.strips.numpy(), self._route.newest
+        if len(strips) == 1:
+            dot.cosine_distances(strips[0], newest[0].numpy(), out)
+            return out[0]
+        dot.image_distances(strips, dot.tiled(newest), self._a, self._band, out)
         return out[0]
 
 
@@ -210,10 +211,4 @@ def _require_fitting(
         raise SettingsError(
             f'strategy {settings.spatial.strategy!r}, vertical {settings.spatial.vertical}: '
             'take adaptive or vanilla, without vertical alignment'
-        )
-    options = settings.applied_options
-    if options.reference_znorm and not options.query_znorm:
-        raise SettingsError(
-            'reference_znorm without query_znorm: a new place starts at mean 0 and deviation 1, '
-            'which only fits z-normalized rows; take both or neither'
         )

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result for one image: its status, the nearest sequence of the map, the matched place."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 import enum
 import math
 
@@ -115,10 +115,36 @@ class Match:
             return math.inf
         return self.sequence.distance
 
+    def with_probability(self, probability: float) -> 'Match':
+        """Return the match of mode robust with another probability, accepted or not by it."""
+        if self.sequence is None:
+            return self
+        sequence = replace(self.sequence, distance=1 - probability)
+        accepted = sequence.distance < self.threshold
+        return replace(
+            self,
+            status=Status.MATCH if accepted else Status.NO_MATCH,
+            reason='' if accepted else improbable(probability, self.threshold),
+            sequence=sequence,
+            probability=1 - sequence.distance,
+        )
+
+    def with_candidates(self, ranked: Sequence[Candidate]) -> 'Match':
+        """Return the match with its ranked places; the first is the match itself."""
+        own = [replace(first, distance=self.distance) for first in ranked[:1]]
+        return replace(self, candidates=(*own, *ranked[1:]))
+
     @property
     def first_image_index(self) -> int:
         """Place of the window's first image on a route that grows with every image, -1 = none."""
         return self.image_index - len(self.window_stamps) + 1 if self.image_index >= 0 else -1
+
+
+def improbable(probability: float, threshold: float) -> str:
+    """Return the reason of mode robust for no match."""
+    return (
+        f'the probability of the best place, {probability:.3f}, is not above {1 - threshold:.3f}'
+    )
 
 
 def ranked_candidates(
@@ -126,6 +152,7 @@ def ranked_candidates(
     sequences: tuple[np.ndarray, np.ndarray],
     count: int,
     nms_radius: int,
+    positions: Callable[[np.ndarray | int], np.ndarray] = np.asarray,
 ) -> list[Candidate]:
     """
     Rank places by non-maximum suppression: around a place that is taken no other one is.
@@ -137,6 +164,7 @@ def ranked_candidates(
         places, shape (n,), whole numbers, in any order; of equal costs the first is taken.
     :param count: most candidates, at least 0.
     :param nms_radius: candidates are more than so many places from each other.
+    :param positions: of places, between which the distance is measured.
     :raises InputError: count below 0.
     """
     if count < 0:
@@ -144,9 +172,10 @@ def ranked_candidates(
     if nearest is None or not count:
         return []
     costs, places = sequences[0].copy(), sequences[1]
+    at_position = positions(places)
     found = [Candidate(nearest.middle, nearest.distance)]
     while len(found) < count and len(costs):
-        costs[np.abs(places - found[-1].place) <= nms_radius] = np.inf
+        costs[np.abs(at_position - positions(found[-1].place)) <= nms_radius] = np.inf
         at = int(np.argmin(costs))
         cost = float(costs[at])
         if math.isinf(cost):

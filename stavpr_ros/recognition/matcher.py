@@ -7,9 +7,10 @@ from typing import Protocol
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.recognition.int8_features import Int8Features
 import torch
 
-PRECISIONS = ('float32', 'float16')
+PRECISIONS = ('float32', 'float16', 'int8')
 
 
 class Matcher(Protocol):
@@ -43,18 +44,20 @@ class Matcher(Protocol):
 
 
 def make_matcher(
-    features: LocalFeatures, spatial: SpatialSettings, backend: str, precision: str
+    features: LocalFeatures | Int8Features, spatial: SpatialSettings, backend: str, precision: str
 ) -> Matcher:
     """
     Put a map's features on a backend.
 
     :param backend: ``cpu`` or ``cuda``.
+    :param features: of the map; rounded already, for ``int8``, or not.
     :param precision: of the map's features in memory: ``float32``, or ``float16``, half the memory
         and half the time to read it; sums are float32 in both. The query's features are rounded as
         well on ``cuda``. Image distances of the backends differ by 1e-5 at most, except where a
-        tie of two strips is decided otherwise.
-    :raises SettingsError: no such precision, or settings that do not fit the map (xi > W) or the
-        backend.
+        tie of two strips is decided otherwise. ``int8``: a quarter, the query's features rounded
+        as well (:mod:`stavpr_ros.alignment.cpu.int8`); strip distances of the backends are equal.
+    :raises SettingsError: no such precision, or settings that do not fit the map (xi > W), the
+        backend or the precision.
     :raises InputError: vertical alignment of features whose cells are not known.
     :raises UnavailableError: the backend is not available.
     """
@@ -65,6 +68,8 @@ def make_matcher(
     spatial.band(features.settings.strips)
     if backend == 'cuda' and spatial.vertical:
         raise SettingsError("backend 'cuda' has no vertical alignment: take 'cpu'")
+    if precision == 'int8' and spatial.vertical:
+        raise SettingsError("precision 'int8' has no vertical alignment: take float32 or float16")
     if backend == 'cuda':
         from stavpr_ros.recognition.cuda_matcher import CudaMatcher
 

@@ -57,10 +57,18 @@ class PlaceFilter:
 
     :param places: places that there is room for.
     :param lag: most images that states are followed back.
+    :param gaps: places that there are none of, between sessions: who moves there is off the map.
     """
 
-    def __init__(self, places: int, lag: int, settings: FilterSettings | None = None) -> None:
+    def __init__(
+        self,
+        places: int,
+        lag: int,
+        settings: FilterSettings | None = None,
+        gaps: np.ndarray | None = None,
+    ) -> None:
         self.settings = settings or FilterSettings()
+        self._gaps = np.empty(0, np.int64) if gaps is None else gaps
         self._speeds = np.array(self.settings.speeds, np.float64)
         self._levels = np.array(self.settings.levels, np.float32)
         self._level_changes = self.settings.level_changes()
@@ -117,13 +125,15 @@ class PlaceFilter:
         slot = self._count % len(self._steps)
         moved = np.rint(self._speeds * (self._count + 1)) - np.rint(self._speeds * self._count)
         self._steps[slot] = moved
-        states = len(self._levels) * len(self._speeds) * max(n, 1)
+        real = max(n - len(self._gaps), 1)
+        states = len(self._levels) * len(self._speeds) * real
         if not self._count and n:
             self._a[:, :, :n], self._off[:] = s.start / states, (1 - s.start) / len(self._levels)
+            self._a[:, :, self._gaps] = 0
         blocks = -(-n // PLACES)
         totals = np.zeros((blocks, len(self._levels), 3))
         off = self._off @ self._level_changes
-        births = (off * s.enter / (len(self._speeds) * max(n, 1))).astype(np.float32)
+        births = (off * s.enter / (len(self._speeds) * real)).astype(np.float32)
         if n:
             advance(
                 self._a, n, self._likelihood(z, weight), self._level_changes,
@@ -132,6 +142,12 @@ class PlaceFilter:
             )  # fmt: skip
             self._a, self._next = self._next, self._a
         before, lost, seen = totals.sum(axis=0).T if n else np.zeros((3, len(off)))
+        if len(self._gaps):  # likelihoods are 1 there
+            in_gaps = self._a[:, :, self._gaps].sum(axis=(1, 2), dtype=np.float64)
+            born = births * (len(self._speeds) * len(self._gaps))
+            lost = lost + (in_gaps - born) / (1 - s.leave)
+            seen = seen - in_gaps
+            self._a[:, :, self._gaps] = 0
         off = off * (1 - s.enter) + (before - lost) * s.leave + lost
         total = float(off.sum() + seen.sum())
         self._off = off / total
@@ -145,7 +161,9 @@ class PlaceFilter:
         if not weight:
             return np.ones((len(self._levels), len(z)), np.float32)
         mu = self._levels[:, None]
-        return np.exp(np.float32(weight) * (mu * z - mu * mu / 2))
+        likelihood = np.exp(np.float32(weight) * (mu * z - mu * mu / 2))
+        likelihood[:, self._gaps] = 1
+        return likelihood
 
     def belief(self, n: int, images_ago: int) -> Belief:
         """

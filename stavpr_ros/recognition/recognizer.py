@@ -12,10 +12,12 @@ from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition.int8_features import Int8Features, rounded
 from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
 from stavpr_ros.recognition.match import (
     Candidate,
     distinct_places,
+    improbable,
     Match,
     ranked_candidates,
     Status,
@@ -24,11 +26,10 @@ from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust import (
     blocks,
     converted,
-    evenly,
     MeanCentering,
     options_of,
     RobustOptions,
-    ZNormalization,
+    z_normalized,
 )
 from stavpr_ros.recognition.sequence_search import (
     FilterSearch,
@@ -36,9 +37,8 @@ from stavpr_ros.recognition.sequence_search import (
     SequenceBuffer,
     WindowMatch,
 )
+from stavpr_ros.recognition.sessions import layout_of, SessionLayout
 import torch
-
-PLACES_TO_START_FROM = 100  # places whose distances to the map start the z-normalization
 
 
 @dataclass(frozen=True)
@@ -93,17 +93,23 @@ class SequenceRecognizer:
     :param settings: see :class:`RecognizerSettings`.
     :param feature_settings: how the features are made.
     :param places: number of places n.
+    :param layout: of a map of several sessions.
     """
 
     def __init__(
-        self, settings: RecognizerSettings, feature_settings: FeatureSettings, places: int
+        self,
+        settings: RecognizerSettings,
+        feature_settings: FeatureSettings,
+        places: int,
+        layout: SessionLayout | None = None,
     ) -> None:
         options, sequence = settings.applied_options, settings.sequence
         self._settings, self._feature_settings = settings, feature_settings
-        self._znorm = ZNormalization(places, options.query_znorm, options.reference_znorm)
-        self._buffer = SequenceBuffer(sequence.length, places, sequence.k)
-        self._filter = FilterSearch(self._buffer) if options.place_filter else None
-        self._search: Search = self._filter or LmDtwSearch(self._buffer, self._znorm)
+        self._layout = layout
+        columns = places if layout is None else layout.width
+        self._buffer = SequenceBuffer(sequence.length, columns, sequence.k)
+        self._filter = FilterSearch(self._buffer, layout=layout) if options.place_filter else None
+        self._search: Search = self._filter or LmDtwSearch(self._buffer)
         self._window = WindowMatch()  # of the newest image
         self._nearest: SequenceMatch | None = None
 
@@ -150,6 +156,7 @@ class SequenceRecognizer:
             self._window.sequences(),
             count,
             settings.nms_radius,
+            *(() if self._layout is None else (self._layout.positions,)),
         )
 
     def newest_row(self) -> np.ndarray:
@@ -159,7 +166,7 @@ class SequenceRecognizer:
         :returns: shape (n,), float32; lower is nearer.
         """
         buffer = self._buffer
-        return self._znorm.scaled(buffer.rows()[-1, : buffer.places].cpu().numpy())
+        return self._by_place(buffer.rows()[-1, : buffer.places].cpu().numpy())
 
     def window_rows(self) -> tuple[np.ndarray, int]:
         """
@@ -170,7 +177,10 @@ class SequenceRecognizer:
         """
         buffer = self._buffer
         rows = buffer.rows()[buffer.length - len(buffer) :, : buffer.known].cpu().numpy()
-        return self._znorm.scaled(rows), buffer.first
+        return self._by_place(rows), buffer.first
+
+    def _by_place(self, rows: np.ndarray) -> np.ndarray:
+        return rows if self._layout is None else rows[..., self._layout.columns[: rows.shape[-1]]]
 
     def _clear_window(self) -> None:
         self._buffer.clear()
@@ -190,30 +200,16 @@ class SequenceRecognizer:
 
         :param strips: the image's features, centered, shape (W, d).
         """
+        if self._settings.applied_options.query_znorm:
+            normalized = z_normalized if self._layout is None else self._layout.z_normalized
+            row = torch.from_numpy(normalized(row.cpu().numpy()))
+        if self._layout is not None:
+            row = self._layout.spread(row)
+        self._buffer.push(row.to(self._buffer.memory.device), stamp)
         if self._filter is not None:
-            self._push(row.cpu().numpy(), self._filter, strips.cpu().numpy(), stamp)
-        elif self._znorm.query or self._znorm.reference:
-            normalized = self._znorm.normalized(row.cpu().numpy())
-            self._buffer.push(torch.from_numpy(normalized), stamp)
-            self._znorm.observe(normalized)
-        else:
-            self._buffer.push(row.to(self._buffer.memory.device), stamp)
+            change = self._filter.change.next_query(strips.cpu().numpy())
+            self._filter.update(row.cpu().numpy(), change)
         return replace(self._match_window(), window_stamps=self._buffer.stamps)
-
-    def _push(
-        self, row: np.ndarray, place_filter: FilterSearch, strips: np.ndarray, stamp: int
-    ) -> None:
-        """Push a row and advance the filter; images of a camera that stands are observed once."""
-        normalized, was_full = self._znorm.normalized(row), self._buffer.full
-        self._buffer.push(torch.from_numpy(normalized), stamp)
-        change = place_filter.change.next_query(strips)
-        standstill = place_filter.change.is_standstill(change)
-        if not standstill:
-            self._znorm.observe(normalized)
-        place_filter.update(self._znorm.scaled(normalized), change, standstill)
-        if self._znorm.reference and self._buffer.full and not was_full:
-            known = self._buffer.rows()[:, : self._buffer.known].numpy()
-            place_filter.start_again(self._znorm.scaled(known))
 
     def _match_window(self) -> Match:
         threshold, length = self._settings.threshold, self._settings.sequence.length
@@ -221,6 +217,10 @@ class SequenceRecognizer:
             reason = f'{len(self._buffer)} of {length} images in the window'
             return Match(Status.WARMING_UP, reason, threshold)
         self._window = self._search(self._settings.nms_radius)
+        window = self._window
+        if self._layout is not None and window.nearest is not None:
+            in_places = self._layout.in_places(window.nearest, window.path, window.sequences)
+            self._window = WindowMatch(*in_places)
         self._nearest = nearest = self._window.nearest
         if nearest is None:
             return Match(Status.NO_MATCH, 'the map is empty', threshold)
@@ -230,8 +230,7 @@ class SequenceRecognizer:
         if not nearest.distance < threshold:
             status = Status.NO_MATCH
             reason = (
-                f'the probability of the best place, {probability:.3f}, is not above '
-                f'{1 - threshold:.3f}'
+                improbable(probability, threshold)
                 if relative
                 else f'nearest distance {nearest.distance:.4f} is not below the threshold '
                 f'{threshold:.4f}'
@@ -251,8 +250,8 @@ class PlaceRecognizer(SequenceRecognizer):
     :param settings: see :class:`RecognizerSettings`.
     :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``. In mode robust, image
         distances are computed there and sequences on the CPU.
-    :param precision: of the map's features in the matcher, ``float32`` or ``float16``; see
-        :func:`stavpr_ros.recognition.matcher.make_matcher`.
+    :param precision: of the map's features in the matcher, ``float32``, ``float16`` or ``int8``;
+        see :func:`stavpr_ros.recognition.matcher.make_matcher`.
     :raises UnavailableError: no such backend here.
     :raises SettingsError: settings that do not fit the map (xi > W).
     :raises InputError: features of the map are not finite.
@@ -265,7 +264,8 @@ class PlaceRecognizer(SequenceRecognizer):
         backend: str = 'cpu',
         precision: str = 'float32',
     ) -> None:
-        super().__init__(settings, place_map.settings, len(place_map))
+        layout = layout_of(place_map, settings.nms_radius)
+        super().__init__(settings, place_map.settings, len(place_map), layout)
         features, options = place_map.features, settings.applied_options
         for _, some in blocks(features):
             require_finite(some, 'the map')
@@ -274,40 +274,31 @@ class PlaceRecognizer(SequenceRecognizer):
         if options.mean_centering or options.whitening:
             self._centering = MeanCentering(features, options.mean_centering, options.whitening)
         # cells are made of float32 strips
-        half = precision == 'float16' and not settings.spatial.vertical
-        held = self._held(features, torch.float16 if half else torch.float32)
+        held = self._held(features, 'float32' if settings.spatial.vertical else precision)
         backend = choose_backend(backend)
         self._matcher = make_matcher(held, settings.spatial, backend, precision)
-        if options.reference_znorm:
-            self._znorm.start_from(self._distances_to_itself(features))
         if self._filter is not None:
-            self._filter.change.learn(held.strips)
+            firsts = (0,) if layout is None else layout.firsts
+            self._filter.change.learn(held.strips, firsts)
         if backend == 'cuda' and not options.any:
             from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
-            search = CudaLmDtwSearch(len(place_map), settings.sequence)
+            search = CudaLmDtwSearch(self._buffer.places, settings.sequence)
             self._search, self._buffer = search, search.buffer
 
-    def _held(self, features: LocalFeatures, dtype: torch.dtype) -> LocalFeatures:
+    def _held(self, features: LocalFeatures, precision: str) -> LocalFeatures | Int8Features:
         """Return the features for the matcher, in memory once; those of a map are not copied."""
+        if precision == 'int8':
+            return rounded(features, self._centered)
+        dtype = torch.float16 if precision == 'float16' else torch.float32
         if self._centering is not None:
             return self._centering.places(features, dtype)
         if dtype == torch.float32:
             return features[:]
         return converted(features, lambda strips: strips, dtype)
 
-    def _distances_to_itself(self, features: LocalFeatures) -> np.ndarray:
-        """Return the distances of some places to all, shape (m, n); NaN to their neighbors."""
-        n, radius = len(features), self._settings.nms_radius
-        some = evenly(n, PLACES_TO_START_FROM)
-        chosen = features[some]
-        if self._centering is not None:
-            chosen = self._centering.places(chosen)
-        matrix = self._matcher.distance_matrix(chosen.strips, chosen.weights)
-        rows = matrix.cpu().numpy()
-        for row, place in zip(rows, some.tolist(), strict=True):
-            row[max(0, place - radius) : place + radius + 1] = np.nan
-        return rows
+    def _centered(self, features: LocalFeatures) -> LocalFeatures:
+        return features if self._centering is None else self._centering.places(features)
 
     @property
     def places(self) -> int:
@@ -317,7 +308,6 @@ class PlaceRecognizer(SequenceRecognizer):
     def reset(self) -> None:
         """Drop the images of the window, and the running statistics of the query."""
         self._clear_window()
-        self._znorm.reset()
         if self._centering is not None:
             self._centering.reset()
 

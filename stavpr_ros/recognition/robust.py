@@ -20,7 +20,6 @@ MIN_PROBABILITY = 0.5  # above which mode robust matches a window
 THRESHOLD = 1 - MIN_PROBABILITY  # of the distance, 1 less the probability
 PRIOR = 20  # images that the statistics of the map count for in those of the query
 PIECE = 256  # images read or centered at a time
-MEMORY = 150  # rows after which old ones fade
 RANK = 64  # directions that whitening shrinks, at most
 SAMPLE = 256  # places that whitening is learned from
 STRENGTH = 1.5  # of whitening: c in the gains of its directions
@@ -37,11 +36,8 @@ class RobustOptions:
         places.
     :param whitening: shrink the directions in which the map's places vary most
         (:class:`Whitening`): what many places share distinguishes few of them.
-    :param query_znorm: z-normalize the distances of an image to all places: some images are far
-        from all.
-    :param reference_znorm: z-normalize the distances of a place to the latest images, against
-        hubness: some places are near to all images. Off: whitening does that, and without the
-        memory of latest images detours and starts are recognized sooner.
+    :param query_znorm: z-normalize the distances of an image to all places (:func:`z_normalized`):
+        some images are far from all.
     :param place_filter: follow place and speed with a Bayes filter that knows of being off the
         map (:mod:`stavpr_ros.recognition.place_filter`) instead of matching each window by LM-DTW,
         where one place may absorb a window.
@@ -50,7 +46,6 @@ class RobustOptions:
     mean_centering: bool = True
     whitening: bool = True
     query_znorm: bool = True
-    reference_znorm: bool = False
     place_filter: bool = True
 
     @property
@@ -84,7 +79,7 @@ class RobustOptions:
         return RobustOptions(**values)
 
 
-PAPER = RobustOptions(False, False, False, False, False)
+PAPER = RobustOptions(False, False, False, False)
 ROBUST = RobustOptions()
 
 
@@ -303,112 +298,9 @@ def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
     return unit_norm(centered)
 
 
-class ZNormalization:
-    """
-    Z-normalization of image distances, over the map (query) and over time (reference).
-
-    Query z-normalization brings a row, the distances of one image to all places, to mean 0 and
-    standard deviation 1. Reference z-normalization does the same for each place over the latest
-    rows; its running mean and variance start from the distances of the map to itself.
-
-    :param places: number of places n.
-    :param query: normalize rows.
-    :param reference: normalize places.
-    """
-
-    def __init__(self, places: int, query: bool = True, reference: bool = True) -> None:
-        self.query, self.reference = query, reference
-        self._start = np.zeros(places, np.float32), np.ones(places, np.float32)
-        self.reset()
-
-    def start_from(self, rows: np.ndarray) -> None:
-        """
-        Start from the distances of the map to itself.
-
-        :param rows: distances of some places to all, shape (m, n), float32; NaN where they are
-            neighbors. Written over: copies of all of them would stay in the heap of the process.
-        """
-        n = len(self._mean)
-        count, total, squares = np.zeros(n, np.int64), np.zeros(n, np.float32), np.zeros(n)
-        for row in rows:
-            row[:] = self.normalized(row)
-            count += np.isfinite(row)
-            total += np.nan_to_num(row, posinf=0, neginf=0)
-        usable = count > 1
-        if not usable.any():
-            return
-        mean = total / np.maximum(count, 1)
-        if not usable.all():
-            known = rows[np.isfinite(rows)]
-            mean[~usable] = known.mean()
-        for row in rows:
-            squares += np.where(np.isfinite(row), (row - mean) ** 2, 0)
-        variance = squares / np.maximum(count, 1)
-        if not usable.all():
-            variance[~usable] = known.var()
-        variance[variance <= 0] = 1
-        self._start = mean.astype(np.float32), variance.astype(np.float32)
-        self.reset()
-
-    def reset(self) -> None:
-        """Drop the rows observed so far; the start stays."""
-        self._mean, self._variance = (values.copy() for values in self._start)
-        self._count = np.full(len(self._mean), PRIOR, np.float32)
-
-    def grow(self, places: int) -> None:
-        """Make room for more places, which start with mean 0 and deviation 1."""
-        more = places - len(self._mean)
-        self._change_each(
-            lambda values, start: np.append(values, np.full(more, start, np.float32))
-        )
-
-    def evict(self, count: int) -> None:
-        """Drop the oldest places; the others move up, and new ones have room behind them."""
-        self._change_each(
-            lambda values, start: np.append(values[count:], np.full(count, start, np.float32))
-        )
-
-    def _change_each(self, change: Callable[[np.ndarray, float], np.ndarray]) -> None:
-        """Change every array of one value a place; ``start`` is the value of a new place."""
-        self._start = change(self._start[0], 0), change(self._start[1], 1)
-        self._mean, self._variance = change(self._mean, 0), change(self._variance, 1)
-        self._count = change(self._count, PRIOR)
-
-    def normalized(self, row: np.ndarray) -> np.ndarray:
-        """Return a row with mean 0 and deviation 1 of its finite entries, shape (n,), float32."""
-        known = row[np.isfinite(row)] if self.query else row[:0]
-        if not known.size:
-            return row
-        return (row - known.mean()) / np.float32(max(known.std(), MIN_DEVIATION))
-
-    def observe(self, row: np.ndarray) -> None:
-        """Add a row, normalized if rows are, to the statistics of the first m <= n places."""
-        if not self.reference:
-            return
-        n = len(row)
-        mean, variance, count = self._mean[:n], self._variance[:n], self._count[:n]
-        np.minimum(count + 1, MEMORY, out=count)
-        off = row - mean
-        mean += off / count
-        variance += (off * (row - mean) - variance) / count
-
-    def shift_and_scale(self, places: int) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return mean and reciprocal deviation of the first places.
-
-        :returns: shape (places,) each; the mean is a view.
-        """
-        if not self.reference:
-            return np.zeros(places, np.float32), np.ones(places, np.float32)
-        return self._mean[:places], 1 / np.sqrt(np.maximum(self._variance[:places], 1e-6))
-
-    def scaled(self, rows: np.ndarray) -> np.ndarray:
-        """
-        Return rows with reference z-normalization, if it is on.
-
-        :param rows: of the first m places, shape (..., m); the same is returned.
-        """
-        if not self.reference:
-            return rows
-        shift, scale = self.shift_and_scale(rows.shape[-1])
-        return (rows - shift) * scale
+def z_normalized(row: np.ndarray) -> np.ndarray:
+    """Return a row with mean 0 and deviation 1 of its finite entries, shape (n,), float32."""
+    known = row[np.isfinite(row)]
+    if not known.size:
+        return row
+    return (row - known.mean()) / np.float32(max(known.std(), MIN_DEVIATION))

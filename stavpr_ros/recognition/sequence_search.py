@@ -14,12 +14,14 @@ from dataclasses import dataclass, field
 
 import numba as nb
 import numpy as np
+from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.alignment.lm_dtw import padded_width, SequenceMatch
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.checks import no_nan
 from stavpr_ros.compilation import parallel_kernel
 from stavpr_ros.recognition.place_filter import Belief, CLOSE, NEGLIGIBLE, PlaceFilter
 from stavpr_ros.recognition.robust import FilterSettings
+from stavpr_ros.recognition.sessions import Sequences, SessionLayout
 import torch
 
 LEARNED_AT_ONCE = 256  # places
@@ -30,8 +32,6 @@ FLOOR = 1e-3  # least relative probability of a speed
 AHEAD = 8  # places within which an unlit stretch may begin
 STRETCH = 4  # places in a row, at least, equal each to the one before: an unlit stretch
 UNLIT = 0.3  # probability of such places above which equal images do not mean standstill
-
-Sequences = tuple[np.ndarray, np.ndarray]
 
 
 class SequenceBuffer:
@@ -204,8 +204,17 @@ class ImageChange:
         self._last: np.ndarray | None = None
         self._latest: deque[float] = deque(maxlen=SMOOTHED)
 
-    def learn(self, strips: torch.Tensor | np.ndarray) -> None:
-        """Learn from all places of a map, unit-norm strips (W, n, d), float32 or float16."""
+    def learn(
+        self,
+        strips: torch.Tensor | np.ndarray | Int8Strips,
+        firsts: np.ndarray | tuple[int, ...] = (0,),
+    ) -> None:
+        """
+        Learn from all places of a map.
+
+        :param strips: unit-norm, (W, n, d), of any precision.
+        :param firsts: first place of each session.
+        """
         n = strips.shape[1]
         changes = np.empty((APART + 1, n), np.float32)
         for low in range(0, n, LEARNED_AT_ONCE):
@@ -216,9 +225,14 @@ class ImageChange:
                 _changes(block, apart, out)
                 changes[apart, low:high] = out[low - first :]
         for apart in range(1, min(APART, n - 1) + 1):
+            crossing = np.zeros(n, bool)
+            for first in firsts:
+                crossing[first : first + apart] = True
+            changes[apart, crossing] = 0
             self._sums[apart] = changes[apart, apart:].sum(dtype=np.float64)
-            self._counts[apart] = n - apart
+            self._counts[apart] = n - np.count_nonzero(crossing)
         self._from_before[1:] = changes[1, 1:]
+        self._from_before[list(firsts)] = 1
 
     def learn_newest(self, strips: np.ndarray) -> None:
         """Learn from the newest place of a route, (W, n, d) of all its places."""
@@ -304,25 +318,31 @@ class FilterSearch:
     The distance of a match is 1 less the probability that its place is right.
 
     :param buffer: the window.
+    :param layout: of the places of several sessions in the columns of the buffer.
     """
 
-    def __init__(self, buffer: SequenceBuffer, settings: FilterSettings | None = None) -> None:
-        self.buffer = buffer
+    def __init__(
+        self,
+        buffer: SequenceBuffer,
+        settings: FilterSettings | None = None,
+        layout: SessionLayout | None = None,
+    ) -> None:
+        self.buffer, self._layout = buffer, layout
         settings = settings or FilterSettings()
         self._middle = (buffer.length - 1) // 2
-        self.filter = PlaceFilter(buffer.places, buffer.length - 1 - self._middle, settings)
-        self.change = ImageChange(buffer.places, settings)
+        gaps, places = None, buffer.places
+        if layout is not None:
+            gaps, places = layout.gaps, len(layout.columns)
+        self.filter = PlaceFilter(buffer.places, buffer.length - 1 - self._middle, settings, gaps)
+        self.change = ImageChange(places, settings)
         self._speeds = settings.speeds
         self._images: deque[int] = deque(maxlen=buffer.length)  # the filter's image of each
-        # alpha and speed weights of each image until the window is full; None = nothing was added
-        self._first: list[tuple[float, np.ndarray] | None] = []
 
     def reset(self) -> None:
         """Forget the query."""
         self.filter.reset()
         self.change.reset()
         self._images.clear()
-        self._first.clear()
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -334,7 +354,7 @@ class FilterSearch:
         self.filter.evict(count)
         self.change.evict(count)
 
-    def update(self, z: np.ndarray, change: float, standstill: bool) -> None:
+    def update(self, z: np.ndarray, change: float) -> None:
         """
         Advance by an image.
 
@@ -342,33 +362,17 @@ class FilterSearch:
         dark tunnel, it may move: the filter goes on at its speed, without evidence.
 
         :param z: z-normalized distances to the places, (m,), float32.
-        :param change, standstill: of the image, from :class:`ImageChange`.
+        :param change: of the image, from :class:`ImageChange`.
         """
-        still = standstill and self.filter.count > 0
-        evidence: tuple[float, np.ndarray] | None = None
-        if not still:
-            evidence = self.change.weight(change), self._speed_weights(change)
-        elif self.change.unlit(self.filter.places_of_states()[: len(z)]):
-            evidence = 0.0, np.ones(len(self._speeds))
-        self._advance(z, evidence)
-        if len(self._first) < self.buffer.length:
-            self._first.append(evidence)
-
-    def start_again(self, rows: np.ndarray) -> None:
-        """
-        Repeat the first window with the z-normalization that is known at its end.
-
-        :param rows: z-normalized distances of the window, (l, n).
-        """
-        self.filter.reset()
-        self._images.clear()
-        for row, evidence in zip(rows, self._first, strict=True):
-            self._advance(row, evidence)
-
-    def _advance(self, z: np.ndarray, evidence: tuple[float, np.ndarray] | None) -> None:
-        if evidence is not None:
-            self.filter.update(z, *evidence)
+        if not (self.filter.count and self.change.is_standstill(change)):
+            self.filter.update(z, self.change.weight(change), self._speed_weights(change))
+        elif self.change.unlit(self._by_place(len(z))):
+            self.filter.update(z, 0.0, np.ones(len(self._speeds)))
         self._images.append(self.filter.count - 1)
+
+    def _by_place(self, n: int) -> np.ndarray:
+        probabilities = self.filter.places_of_states()[:n]
+        return probabilities if self._layout is None else probabilities[self._layout.columns]
 
     def _speed_weights(self, change: float) -> np.ndarray:
         if not self.filter.count:
@@ -384,6 +388,8 @@ class FilterSearch:
         place = int(np.argmax(belief.probabilities))
         if not belief.probabilities[place] > 0:
             return self._nowhere(n, first)
+        if self._layout is not None:
+            belief, place = self._layout.shared(belief, CLOSE)
         near = slice(max(0, place - CLOSE), min(n, place + CLOSE + 1))
         weights = belief.weights[near]
         middle = round(float(np.arange(near.start, near.stop) @ weights / weights.sum()))
@@ -428,7 +434,8 @@ class FilterSearch:
         slope = (places[0] - places[lag]) / lag if lag else self._speeds[way[3]]
         earlier = np.maximum(back - lag, 0) * slope
         path = places[np.minimum(back, lag)] - np.rint(earlier).astype(np.int32)
-        return np.stack([np.arange(len(path)), np.maximum(path, 0)], axis=1).astype(np.int32)
+        lowest = 0 if self._layout is None else self._layout.first_column(places[0])
+        return np.stack([np.arange(len(path)), np.maximum(path, lowest)], axis=1).astype(np.int32)
 
 
 def _sequences(probabilities: np.ndarray, first: int) -> Sequences:

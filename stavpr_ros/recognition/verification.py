@@ -7,6 +7,7 @@ Keypoints of both are matched, and the matches counted that one epipolar geometr
 place that looks alike has matches as well, but few that one geometry explains.
 """
 
+from collections import OrderedDict
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.mapping import GrowingMap, PlaceMap
 
 METHODS = ('orb', 'sift')
 LEAST_MATCHES = 8  # a fundamental matrix fits any seven
@@ -21,6 +23,12 @@ ITERATIONS = 2000
 CONFIDENCE = 0.999
 LOWEST = 32  # rows of an image below which keypoints have no room, and some detectors fail
 TALLEST = 4  # an image is brought to at most so many times its width
+IMPROBABLE, CERTAIN = 0.1, 0.99  # probabilities between which a match is checked
+EACH = 10  # of so many certain matches one is checked
+WRONG_PASSED = 0.1  # share of wrong pairs that pass: doubtful ones look alike
+PRIOR_PASSED, PRIOR_CHECKED = 1.0, 4.0  # right pairs before the first is checked
+LEAST_PASSED = 0.3  # r of a pair that has passed: right pairs do pass on this drive
+CACHED = 256  # places whose keypoints are kept, some 40 kB each
 
 
 @dataclass(frozen=True)
@@ -67,7 +75,7 @@ class GeometricSettings:
 
 
 @dataclass(frozen=True)
-class _Keypoints:
+class Keypoints:
     """Those of an image: points (m, 2), pixels at the common width, and descriptors (m, ...)."""
 
     points: np.ndarray
@@ -87,7 +95,7 @@ class GeometricVerifier:
     def __init__(self, settings: GeometricSettings | None = None) -> None:
         self.settings = settings or GeometricSettings()
         self._detector = _detector(self.settings)
-        self._query: tuple[np.ndarray, _Keypoints] | None = None  # small and gray; its keypoints
+        self._query: tuple[np.ndarray, Keypoints] | None = None  # small and gray; its keypoints
 
     def verifies(self, query: np.ndarray, place: np.ndarray) -> bool:
         """Return whether as many matches are explained as the settings ask for."""
@@ -100,18 +108,28 @@ class GeometricVerifier:
         :param query, place: RGB, each (h, w, 3) uint8, of any size.
         :raises InputError: no such images.
         """
+        return self.common(self.query_keypoints(query), self.keypoints(place, 'place'))
+
+    def query_keypoints(self, query: np.ndarray) -> Keypoints:
+        """Return the keypoints of an image, RGB (h, w, 3) uint8; those of the last are kept."""
         gray = self._small_gray(query, 'query')
-        other = self._detected(self._small_gray(place, 'place'))
         # compared by what it shows: a caller may use the memory of an image again for the next
         if self._query is None or not np.array_equal(self._query[0], gray):
             self._query = gray, self._detected(gray)
-        keypoints = self._query[1]
-        if min(len(keypoints.points), len(other.points)) < LEAST_MATCHES:
+        return self._query[1]
+
+    def keypoints(self, image: np.ndarray, name: str) -> Keypoints:
+        """Return the keypoints of an image, RGB (h, w, 3) uint8, which errors call ``name``."""
+        return self._detected(self._small_gray(image, name))
+
+    def common(self, query: Keypoints, place: Keypoints) -> int:
+        """Count the matches that one geometry explains; 0 for too few keypoints."""
+        if min(len(query.points), len(place.points)) < LEAST_MATCHES:
             return 0
-        mine, theirs = self._matches(keypoints.descriptors, other.descriptors)
+        mine, theirs = self._matches(query.descriptors, place.descriptors)
         if len(mine) < LEAST_MATCHES:
             return 0
-        return _explained(keypoints.points[mine], other.points[theirs], self.settings.pixels)
+        return _explained(query.points[mine], place.points[theirs], self.settings.pixels)
 
     def _small_gray(self, image: np.ndarray, name: str) -> np.ndarray:
         """Return an image at the common width, (h, w) uint8."""
@@ -126,14 +144,14 @@ class GeometricVerifier:
             gray, size, interpolation=cv2.INTER_AREA if width > to else cv2.INTER_LINEAR
         )
 
-    def _detected(self, gray: np.ndarray) -> _Keypoints:
-        nothing = _Keypoints(np.empty((0, 2), np.float32), np.empty((0, 0), np.uint8))
+    def _detected(self, gray: np.ndarray) -> Keypoints:
+        nothing = Keypoints(np.empty((0, 2), np.float32), np.empty((0, 0), np.uint8))
         if len(gray) < LOWEST:
             return nothing
         keypoints, descriptors = self._detector.detectAndCompute(gray, None)
         if descriptors is None:
             return nothing
-        return _Keypoints(np.array([point.pt for point in keypoints], np.float32), descriptors)
+        return Keypoints(np.array([point.pt for point in keypoints], np.float32), descriptors)
 
     def _matches(self, mine: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pair the keypoints that are each other's clear nearest; two arrays (m,) of indices."""
@@ -150,6 +168,79 @@ class GeometricVerifier:
         _, back = cv2.batchDistance(theirs[matched], mine, how[0], normType=how[1], K=1)
         mutual = back[:, 0] == clear
         return clear[mutual], matched[mutual]
+
+
+class PlaceVerifier:
+    """
+    Checks images against places of a map. Belongs to one thread.
+
+    The keypoints of the latest places are kept: another image against one of them costs the half.
+
+    :param settings: see :class:`GeometricSettings`.
+    """
+
+    def __init__(self, settings: GeometricSettings) -> None:
+        self.settings = settings
+        self._verifier = GeometricVerifier(settings)
+        self._places: PlaceMap | GrowingMap | None = None
+        self._known: OrderedDict[int, Keypoints] = OrderedDict()
+
+    def inliers(self, query: np.ndarray, places: PlaceMap | GrowingMap, place: int) -> int | None:
+        """
+        Count the matches of an image and a place that one geometry explains.
+
+        :param query: RGB (h, w, 3) uint8; a thumbnail of the width that maps keep is sufficient.
+        :param places: the map, or the route, that the place is of.
+        :returns: None where the place has no thumbnail.
+        """
+        if places is not self._places:
+            self._places = places
+            self._known.clear()
+        if place not in self._known:
+            thumbnail = places.thumbnail(place)
+            if thumbnail is None:
+                return None
+            self._known[place] = self._verifier.keypoints(thumbnail, f'place {place}')
+            if len(self._known) > CACHED:
+                self._known.popitem(last=False)
+        self._known.move_to_end(place)
+        return self._verifier.common(self._verifier.query_keypoints(query), self._known[place])
+
+
+class GeometricEvidence:
+    """
+    The probability of a match in mode robust, after the check of its pair.
+
+    With the share r of right pairs that pass the check, and f of wrong ones, a check multiplies
+    the odds by r / f if it is passed, and by (1 - r) / (1 - f) if not. r is learned on the drive
+    from pairs that are certain without a check, and starts low: by night, where hardly any right
+    pair passes, a failed check is no evidence.
+    """
+
+    def __init__(self) -> None:
+        self._passed, self._checked = PRIOR_PASSED, PRIOR_CHECKED
+        self._certain = 0  # pairs since the last one that was checked
+
+    def wants(self, probability: float) -> bool:
+        """Return whether to check a pair: it is doubtful, or one of many certain ones."""
+        if probability < CERTAIN:
+            return probability > IMPROBABLE
+        self._certain += 1
+        return self._certain % EACH == 1
+
+    def updated(self, probability: float, passed: bool) -> float:
+        """Return the probability of a match whose pair has passed the check, or not."""
+        if probability >= CERTAIN:
+            self._passed += passed
+            self._checked += 1
+            return probability
+        right, wrong = self._passed / self._checked, WRONG_PASSED
+        if passed:
+            factor = max(right, LEAST_PASSED) / wrong
+        else:
+            factor = min((1 - right) / (1 - wrong), 1.0)
+        odds = probability / (1 - probability) * factor
+        return odds / (1 + odds)
 
 
 def _detector(settings: GeometricSettings) -> Any:

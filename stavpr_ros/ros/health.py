@@ -199,6 +199,8 @@ def map_finding(health: Health) -> Finding:
     if health.map_info.state == 'full':
         remedy = 'save it with ~/save_map, then raise max_places'
         return warning, f'full: mapping stopped at {places} (max_places); {remedy}'
+    if health.settings.pipeline.geometric and not health.map_info.has_thumbnails:
+        places += ' without thumbnails, so that geometric_check checks no match,'
     return OK, f'{places} of {health.map_path or "a map without a file"}'
 
 
@@ -258,8 +260,8 @@ def _why_full(health: Health) -> str:
     takes = f'{arriving}, one takes {counts.work.mean:.1f} ms'
     if counts.rate_in * counts.work.mean < BUSY * 1e3:
         return f'{takes}, which is fast enough: they arrive in bursts; raise queue_size'
-    float16 = '' if health.settings.pipeline.precision == 'float16' else 'precision float16, '
-    remedy = f'set max_rate or keyframe_*, {float16}a smaller map'
+    int8 = '' if health.settings.pipeline.precision == 'int8' else 'precision int8, '
+    remedy = f'set max_rate or keyframe_*, {int8}a smaller map'
     return f'{takes}, so {1e3 / counts.work.mean:.1f} per second are possible: {remedy}'
 
 

@@ -5,7 +5,8 @@ The cosine distances of one image's strips to all strips of the map.
 
 A map's features are read once, a block of images at a time, and stay in the cache until the
 block's images are aligned: one frame costs little more than reading the map. In half width
-(float16) that is half as much; products and sums are float32 all the same.
+(float16) that is half as much; products and sums are float32 all the same. In int8 it is a quarter
+(:mod:`stavpr_ros.alignment.cpu.int8`).
 """
 
 from llvmlite import ir
@@ -13,6 +14,7 @@ import numba as nb
 from numba.core import types
 from numba.extending import intrinsic, overload
 import numpy as np
+from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.alignment.cpu.dtw import align_lanes, SLOT
 from stavpr_ros.alignment.cpu.simd import LANES, store
 from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
@@ -76,9 +78,46 @@ def _dots(y, q, sums):
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6] = s0, s1, s2, s3, s4, s5, s6
 
 
+@reassociating_kernel
+def _dot(y, q):
+    """Multiply a vector of the map (d,) by one of the query (d,)."""
+    total = np.float32(0)
+    for t in range(y.shape[0]):
+        total += q[t] * widened(y[t])
+    return total
+
+
+@parallel_kernel
+def cosine_distances(features, queries, out):
+    """
+    Distances 1 - <x, y> of images that are one vector each (W = 1).
+
+    :param features: the map's unit-norm vectors, shape (n, d), float32 or the bits of float16.
+    :param queries: those of Q images, shape (Q, d), float32.
+    :param out: shape (Q, m), written; m <= n: only so many map images are looked at.
+    """
+    n = out.shape[1]
+    for block in nb.prange((n + FEW_IMAGES - 1) // FEW_IMAGES):
+        first = block * FEW_IMAGES
+        for x in range(queries.shape[0]):
+            for y in range(first, min(n, first + FEW_IMAGES)):
+                out[x, y] = np.float32(1) - _dot(features[y], queries[x])
+
+
+def _block_distances(features, queries, x, first, count, d):
+    """Fill d (rows, W, .): strips of query x against ``count`` map images from ``first``."""
+
+
+@overload(_block_distances)
+def _overload_block_distances(features, queries, x, first, count, d):
+    if isinstance(features, types.Array):
+        return _float_block_distances.py_func
+    return int8.block_distances.py_func
+
+
 @kernel
-def _block_distances(features, query, first, count, d, sums):
-    """Fill d (rows, W, .): all query strips against ``count`` map images from ``first``."""
+def _float_block_distances(features, queries, x, first, count, d):
+    query, sums = queries[x], np.empty(TILE, np.float32)
     for j in range(features.shape[0]):
         for y in range(count):
             for i in range(0, query.shape[0], TILE):
@@ -102,9 +141,7 @@ def strip_distances(features, query, d):
     for block in nb.prange((n + IMAGES - 1) // IMAGES):
         first = block * IMAGES
         count = min(IMAGES, n - first)
-        _block_distances(
-            features, query, first, count, d[:, :, first:], np.empty(TILE, np.float32)
-        )
+        _float_block_distances(features, query[None], 0, first, count, d[:, :, first:])
 
 
 @parallel_kernel
@@ -112,21 +149,22 @@ def image_distances(features, queries, weights, xi, out):
     """
     Image distances S[W,W] / C[W,W] of Q images to all map images, from the features in one go.
 
-    :param features: as in :func:`strip_distances`.
-    :param queries: those of Q images, shape (Q, R, d), likewise.
+    :param features: as in :func:`strip_distances`, or in int8, of
+        :meth:`stavpr_ros.alignment.cpu.int8.Int8Strips.kernel_arguments`.
+    :param queries: those of Q images, shape (Q, R, d), likewise; or int8, of
+        :func:`stavpr_ros.alignment.cpu.int8.tiled`.
     :param weights, xi: as in :func:`stavpr_ros.alignment.cpu.dtw.align_lanes`.
     :param out: shape (Q, m), written; m <= n: only so many map images are looked at.
     """
-    W, n = features.shape[0], out.shape[1]
+    W, n = weights.shape[0], out.shape[1]
     for block in nb.prange((n + IMAGES - 1) // IMAGES):
         first = block * IMAGES
         count = min(IMAGES, n - first)
-        d = np.empty((queries.shape[1], W, IMAGES), np.float32)
-        sums = np.empty(TILE, np.float32)
+        d = np.empty(((W + TILE - 1) // TILE * TILE, W, IMAGES), np.float32)
         edge = np.empty((W + 1) * SLOT, np.float32)
         lanes = np.empty(IMAGES, np.float32)
-        for x in range(queries.shape[0]):
-            _block_distances(features, queries[x], first, count, d, sums)
+        for x in range(out.shape[0]):
+            _block_distances(features, queries, x, first, count, d)
             for at in range(0, count, LANES):
                 store(
                     lanes,
@@ -158,12 +196,11 @@ def vertical_image_distances(features, queries, cell_weights, weights, xi, out):
         count = min(FEW_IMAGES, n - first)
         d = np.empty((queries.shape[1], rows, FEW_IMAGES), np.float32)
         strips = np.empty((W, W, FEW_IMAGES), np.float32)
-        sums = np.empty(TILE, np.float32)
         edge = np.empty((max(W, H) + 1) * SLOT, np.float32)
         lanes = np.empty(FEW_IMAGES, np.float32)
         cells, flat = d.reshape(-1), strips.reshape(-1)
         for x in range(queries.shape[0]):
-            _block_distances(features, queries[x], first, count, d, sums)
+            _block_distances(features, queries, x, first, count, d)
             for at in range(0, count, LANES):
                 for i in range(W):
                     for j in range(max(0, i - xi + 1), min(W, i + xi)):

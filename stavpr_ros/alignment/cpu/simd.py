@@ -6,8 +6,8 @@ Vectors of LANES numbers as a type that numba compiles.
 Both recursions run over *lanes*: neighboring map images (or starts) side by side in one SIMD
 register. Left to the compiler, such loops are vectorized at some sizes and not at others, an order
 of magnitude apart; written with vectors they are what they say, on every processor. In a kernel
-``+ * / <`` work on vectors as on numbers; ``<`` gives a mask for :func:`select`. IEEE arithmetic,
-nothing is reordered.
+``+ - * / <`` work on vectors as on numbers; ``<`` gives a mask for :func:`select`. IEEE
+arithmetic, nothing is reordered.
 
 The functions here exist in compiled code only.
 """
@@ -93,17 +93,32 @@ def store(typing: Any, array: Any, offset: Any, vector: Any) -> Any:
     return types.void(array, types.intp, vector), generate
 
 
+def _on_all_lanes(builder: Any, number: Any) -> Any:
+    empty = ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined)
+    first = builder.insert_element(empty, number, ir.Constant(ir.IntType(32), 0))
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), None)
+    return builder.shuffle_vector(first, first, zeros)
+
+
 @intrinsic
 def splat(typing: Any, number: Any) -> Any:
     """Put one number on all lanes."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        empty = ir.Constant(ir.VectorType(arguments[0].type, LANES), ir.Undefined)
-        first = builder.insert_element(empty, arguments[0], ir.Constant(ir.IntType(32), 0))
-        zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), None)
-        return builder.shuffle_vector(first, first, zeros)
+        return _on_all_lanes(builder, *arguments)
 
     return Vector(number)(number), generate
+
+
+@intrinsic
+def load_splat(typing: Any, array: Any, offset: Any) -> Any:
+    """Put one number of a flat array on all lanes; unlike in ``array[offset]``, offset >= 0."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        return _on_all_lanes(builder, builder.load(builder.gep(data, [arguments[1]])))
+
+    return Vector(array.dtype)(array, types.intp), generate
 
 
 @intrinsic
@@ -149,6 +164,7 @@ def _register(function: Any, instruction: Any) -> None:
 
 
 _register(operator.add, _operation('fadd', 'add'))
+_register(operator.sub, _operation('fsub', 'sub'))
 _register(operator.mul, _operation('fmul'))
 _register(operator.truediv, _operation('fdiv'))
 _register(operator.lt, _less)

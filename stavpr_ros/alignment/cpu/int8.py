@@ -1,0 +1,343 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Strips rounded to int8, and the cosine distances of rounded strips: one byte a value.
+
+A strip x of the map is rounded to whole numbers at a scale of its own, ``rint(s x)`` with
+s = min(N / |x|, 127 / max |x_t|), one of the query with 63 instead of 127; N = 181 - sqrt(d) / 2.
+The distance of two strips is 1 less the cosine of their whole numbers. These are never longer than
+181, so that by Cauchy-Schwarz every product of two strips fits 16 bits, 181^2 < 2^15, and sums may
+wrap on the way. Two products of an unsigned map value and a query value, 2 * 255 * 63, fit as
+well: nothing saturates. Sums of whole numbers have no order: every processor returns the same.
+
+In memory, LANES places lie side by side, four dimensions of each: the lanes of one vector. It is
+multiplied by four dimensions of the query, the same on all lanes, by the instruction that this
+processor has (:data:`INSTRUCTIONS`).
+"""
+
+from typing import Any
+
+from llvmlite import binding, ir
+import numba as nb
+from numba.core import types
+from numba.extending import intrinsic
+import numpy as np
+from stavpr_ros.alignment.cpu.simd import LANES, load, load_splat, splat, store, Vector
+from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
+import torch
+
+TILE = 7  # query strips whose sums stay in registers
+QUAD = 4  # dimensions of a lane
+IMAGES = 256  # places a thread takes at a time; a multiple of LANES
+LONGEST = 181.0  # of a rounded strip
+MAP_PEAK, QUERY_PEAK = 127.0, 63.0
+
+# name, required features of the processor, lanes, LLVM's function; the first that fits is taken
+INSTRUCTIONS: tuple[tuple[str, set[str], int, str], ...] = (
+    ('avx512vnni', {'+avx512f', '+avx512vnni'}, 16, 'llvm.x86.avx512.vpdpbusd.512'),
+    ('avxvnni', {'+avx2', '+avxvnni'}, 8, 'llvm.x86.avx512.vpdpbusd.256'),
+    ('avx512bw', {'+avx512f', '+avx512bw'}, 16, 'llvm.x86.avx512.pmaddubs.w.512'),
+    ('avx2', {'+avx2'}, 8, 'llvm.x86.avx2.pmadd.ub.sw'),
+    ('ssse3', {'+ssse3'}, 4, 'llvm.x86.ssse3.pmadd.ub.sw.128'),
+    ('dotprod', {'+neon', '+dotprod'}, 4, 'llvm.aarch64.neon.sdot.v4i32.v16i8'),
+    ('plain', set(), LANES, ''),
+)
+INT8, INT16, INT32 = ir.IntType(8), ir.IntType(16), ir.IntType(32)
+
+
+def choose_instruction(features: str, lanes: int) -> str:
+    """
+    Return the name of the instruction that multiplies and adds.
+
+    :param features: of the processor as LLVM names them, '+avx2,-avx512f,...'.
+    :param lanes: places that lie side by side.
+    """
+    available = set(features.split(','))
+    return next(
+        name
+        for name, required, fitting, _ in INSTRUCTIONS
+        if required <= available and fitting == lanes
+    )
+
+
+INSTRUCTION = choose_instruction(
+    nb.config.CPU_FEATURES or binding.get_host_cpu_features().flatten(), LANES
+)
+
+
+def _filled(vector: ir.VectorType, value: int) -> ir.Constant:
+    return ir.Constant(vector, [value] * vector.count)
+
+
+def write_multiply_add(builder: Any, name: str, total: Any, places: Any, query: Any) -> Any:
+    """
+    Write the code that adds four products to each lane.
+
+    :param name: of the instruction.
+    :param total: sums so far, as many int32 as lanes; what they mean is known to the instruction
+        until :func:`write_total`.
+    :param places, query: four int8 a lane, as int32.
+    """
+    wide = total.type
+    function = next(row[3] for row in INSTRUCTIONS if row[0] == name)
+    bytes_ = ir.VectorType(INT8, wide.count * QUAD)
+    if name == 'plain':
+        for t in range(QUAD):
+            left, right = (
+                builder.ashr(builder.shl(each, _filled(wide, 24 - 8 * t)), _filled(wide, 24))
+                for each in (places, query)
+            )
+            total = builder.add(total, builder.mul(left, right))
+        return total
+    if name == 'dotprod':
+        arguments = [total, builder.bitcast(places, bytes_), builder.bitcast(query, bytes_)]
+        return _call(builder, function, wide, arguments)
+    unsigned = builder.xor(places, _filled(wide, -(2**31) | 0x00808080))  # 128 more
+    if 'vpdpbusd' in function:
+        return _call(builder, function, wide, [total, unsigned, query])
+    pairs = ir.VectorType(INT16, wide.count * 2)
+    arguments = [builder.bitcast(unsigned, bytes_), builder.bitcast(query, bytes_)]
+    products = _call(builder, function, pairs, arguments)
+    return builder.bitcast(builder.add(builder.bitcast(total, pairs), products), wide)
+
+
+def write_total(builder: Any, name: str, total: Any, query_sum: Any) -> Any:
+    """
+    Write the code that turns sums into whole numbers, int32.
+
+    :param query_sum: sum of the query's values, on all lanes.
+    """
+    wide = total.type
+    if name in ('plain', 'dotprod'):
+        return total
+    surplus = builder.shl(query_sum, _filled(wide, 7))  # 128 for each value of the query
+    if 'vnni' in name:
+        return builder.sub(total, surplus)
+    # two sums of 16 bits a lane, which may have wrapped; the whole sum fits again
+    low = builder.ashr(builder.shl(total, _filled(wide, 16)), _filled(wide, 16))
+    high = builder.ashr(total, _filled(wide, 16))
+    whole = builder.sub(builder.add(low, high), surplus)
+    return builder.ashr(builder.shl(whole, _filled(wide, 16)), _filled(wide, 16))
+
+
+def _call(builder: Any, name: str, result: Any, arguments: list[Any]) -> Any:
+    function_type = ir.FunctionType(result, [argument.type for argument in arguments])
+    function = builder.module.globals.get(name) or ir.Function(builder.module, function_type, name)
+    return builder.call(function, arguments)
+
+
+WHOLE = Vector(types.int32)
+
+
+@intrinsic
+def _multiply_add(typing: Any, total: Any, places: Any, query: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return write_multiply_add(builder, INSTRUCTION, *arguments)
+
+    return WHOLE(WHOLE, WHOLE, WHOLE), generate
+
+
+@intrinsic
+def _total(typing: Any, total: Any, query_sum: Any) -> Any:
+    """Return the whole numbers that the sums stand for, as float32, exactly."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        whole = write_total(builder, INSTRUCTION, *arguments)
+        return builder.sitofp(whole, ir.VectorType(ir.FloatType(), LANES))
+
+    return Vector(types.float32)(WHOLE, WHOLE), generate
+
+
+# ------------------------------------------------ rounding
+
+
+@reassociating_kernel
+def _scale(x, longest, peak):
+    """Return the scale of a strip, 0 for a zero one."""
+    squares, most = np.float32(0), np.float32(0)
+    for t in range(len(x)):
+        squares += x[t] * x[t]
+        most = max(most, abs(x[t]))
+    if squares == 0:
+        return np.float32(0)
+    return min(longest / np.sqrt(squares), peak / most)
+
+
+@parallel_kernel
+def _round_places(strips, longest, peak, first, values, reciprocals):
+    """
+    Round strips (W, m, d) into places from ``first`` on.
+
+    :param values: shape (W, groups, quads, LANES, QUAD), int8, written.
+    :param reciprocals: shape (W, groups LANES), written: 1 / length of the rounded strip.
+    """
+    W, m, d = strips.shape
+    begin, end = first // LANES, (first + m + LANES - 1) // LANES
+    for at in nb.prange(W * (end - begin)):
+        j, group = at // (end - begin), begin + at % (end - begin)
+        for y in range(max(first, group * LANES), min(first + m, (group + 1) * LANES)):
+            x, lane = strips[j, y - first], y % LANES
+            scale = _scale(x, longest, peak)
+            squares = np.int64(0)
+            for t in range(d):
+                value = np.int32(np.rint(scale * x[t]))
+                squares += value * value
+                values[j, group, t // QUAD, lane, t % QUAD] = value
+            reciprocals[j, y] = np.float32(1 / np.sqrt(squares)) if squares else np.float32(0)
+
+
+def _longest(d: int) -> np.float32:
+    """Return N: rounding lengthens a strip by sqrt(d) / 2 at most."""
+    return np.float32(max(LONGEST - np.sqrt(d) / 2, 1))
+
+
+class Int8Strips:
+    """
+    The strips of n places, rounded to int8.
+
+    :param W, places, d: strips, places and dimensions.
+    """
+
+    def __init__(self, W: int, places: int, d: int) -> None:
+        groups, quads = -(-places // LANES), -(-d // QUAD)
+        self.shape = W, places, d
+        # of torch's memory, which starts with a cache line
+        memory = torch.zeros((W, groups, quads, LANES, QUAD), dtype=torch.int8)
+        self.values: np.ndarray = memory.numpy()
+        self.reciprocals: np.ndarray = np.zeros((W, groups * LANES), np.float32)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def write(self, first: int, strips: torch.Tensor) -> None:
+        """Round strips (W, m, d), float32, and keep them as the places from ``first`` on."""
+        d = self.shape[2]
+        _round_places(
+            strips.numpy(), _longest(d), np.float32(MAP_PEAK), first, self.values, self.reciprocals
+        )
+
+    def __getitem__(self, index: tuple[slice, slice]) -> torch.Tensor:
+        """Return strips of some places, [:, places], float32, of unit norm again."""
+        places = np.arange(self.shape[1])[index[1]]
+        rounded = self.values[:, places // LANES, :, places % LANES]  # (m, W, quads, QUAD)
+        strips = rounded.reshape(len(places), len(self), -1)[:, :, : self.shape[2]]
+        return torch.from_numpy(
+            strips.transpose(1, 0, 2) * self.reciprocals[:, places, None]
+        ).contiguous()
+
+    def rounded(self) -> torch.Tensor:
+        """Return a copy of the whole numbers, (W, n, d), int8."""
+        W, n, d = self.shape
+        strips = self.values.transpose(0, 1, 3, 2, 4).reshape(W, self.values.shape[1] * LANES, -1)
+        return torch.from_numpy(strips[:, :n, :d]).contiguous()
+
+    def kernel_arguments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the features as the kernels take them."""
+        return self.values.view(np.int32)[..., 0], self.reciprocals
+
+
+def rounded_queries(queries: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Round the strips of Q images.
+
+    :param queries: shape (W, Q, d), float32, on any device.
+    :returns: int8, (Q, W, d); 1 / length of each rounded strip, (Q, W), float32.
+    """
+    d = queries.shape[2]
+    strips = queries.transpose(0, 1).cpu().numpy()
+    lengths = np.linalg.norm(strips, axis=2)
+    peaks = np.abs(strips).max(axis=2, initial=0)
+    with np.errstate(divide='ignore'):
+        scales = np.minimum(_longest(d) / lengths, np.float32(QUERY_PEAK) / peaks)
+    scales[lengths == 0] = 0
+    rounded = np.rint(strips * scales[:, :, None]).astype(np.int8)
+    squares = (rounded.astype(np.int64) ** 2).sum(axis=2)
+    reciprocals = np.where(squares > 0, 1 / np.sqrt(np.maximum(squares, 1)), 0)
+    return rounded, reciprocals.astype(np.float32)
+
+
+def tiled(queries: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Round the strips of Q images and lay them out as the kernels take them.
+
+    :param queries: shape (W, Q, d), float32.
+    :returns: four values each, (Q, tiles, quads, TILE) int32; 1 / length (Q, R) float32 and sum
+        (Q, R) int32 of each rounded strip; R = tiles TILE, zeros from row W on.
+    """
+    W, Q, d = queries.shape
+    tiles, quads = -(-W // TILE), -(-d // QUAD)
+    rounded: np.ndarray = np.zeros((Q, tiles * TILE, quads * QUAD), np.int8)
+    reciprocals: np.ndarray = np.zeros((Q, tiles * TILE), np.float32)
+    rounded[:, :W, :d], reciprocals[:, :W] = rounded_queries(queries)
+    packed = rounded.view(np.int32).reshape(Q, tiles, TILE, quads).transpose(0, 1, 3, 2)
+    sums = rounded.sum(axis=2, dtype=np.int32)
+    return np.ascontiguousarray(packed), reciprocals, sums
+
+
+# ------------------------------------------------ distances
+
+
+@kernel
+def _tile_sums(values, at, quads, query, base, sums):
+    """Write sums of LANES places, from ``at``, with TILE query strips, from ``base``."""
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = splat(np.int32(0))
+    for t in range(quads):
+        places, at_query = load(values, at + t * LANES), base + t * TILE
+        s0 = _multiply_add(s0, places, load_splat(query, at_query))
+        s1 = _multiply_add(s1, places, load_splat(query, at_query + 1))
+        s2 = _multiply_add(s2, places, load_splat(query, at_query + 2))
+        s3 = _multiply_add(s3, places, load_splat(query, at_query + 3))
+        s4 = _multiply_add(s4, places, load_splat(query, at_query + 4))
+        s5 = _multiply_add(s5, places, load_splat(query, at_query + 5))
+        s6 = _multiply_add(s6, places, load_splat(query, at_query + 6))
+    store(sums, 0, s0)
+    store(sums, LANES, s1)
+    store(sums, 2 * LANES, s2)
+    store(sums, 3 * LANES, s3)
+    store(sums, 4 * LANES, s4)
+    store(sums, 5 * LANES, s5)
+    store(sums, 6 * LANES, s6)
+
+
+@kernel
+def block_distances(features, queries, x, first, count, d):
+    """
+    Fill d (rows, W, .), contiguous: strips of query x against ``count`` places from ``first``.
+
+    :param features: of :meth:`Int8Strips.kernel_arguments`; queries: of :func:`tiled`.
+    :param first: a multiple of LANES; count: rounded up to whole lanes, which d has room for.
+    """
+    values, reciprocals = features
+    packed, query_reciprocals, query_sums = queries
+    W, groups, quads, _ = values.shape
+    flat, query = values.reshape(-1), packed[x].reshape(-1)
+    lengths, out = reciprocals.reshape(-1), d.reshape(-1)
+    sums = np.empty(TILE * LANES, np.int32)
+    one = splat(np.float32(1))
+    for j in range(W):
+        for y in range(0, count, LANES):
+            group = j * groups + (first + y) // LANES
+            length = load(lengths, group * LANES)
+            for i in range(0, d.shape[0], TILE):
+                _tile_sums(flat, group * quads * LANES, quads, query, i * quads, sums)
+                for t in range(TILE):
+                    whole = _total(load(sums, t * LANES), splat(query_sums[x, i + t]))
+                    cosine = whole * length * splat(query_reciprocals[x, i + t])
+                    store(out, ((i + t) * W + j) * d.shape[2] + y, one - cosine)
+
+
+@parallel_kernel
+def strip_distances(features, queries, x, d):
+    """
+    Distances d[i, j, y] of query x to all places.
+
+    :param features, queries: as in :func:`block_distances`.
+    :param d: shape (R, W, n), written.
+    """
+    n = d.shape[2]
+    for block in nb.prange((n + IMAGES - 1) // IMAGES):
+        first = block * IMAGES
+        count = min(IMAGES, n - first)
+        part = np.empty((d.shape[0], d.shape[1], IMAGES), np.float32)
+        block_distances(features, queries, x, first, count, part)
+        d[:, :, first : first + count] = part[:, :, :count]

@@ -1,0 +1,64 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Outputs of a network to feature maps or vectors: one of several, tokens to maps."""
+
+from collections.abc import Mapping, Sequence
+import math
+from typing import Any
+
+from stavpr_ros.errors import SettingsError
+import torch
+
+
+def one_of(output: Any, which: str, name: str) -> Any:
+    """
+    Return one output of a network that returns a tuple, a list or a dictionary.
+
+    :param which: its number from 0, or its key; a single output has the number 0.
+    :param name: of the network.
+    :raises SettingsError: there is none of this number or key.
+    """
+    outputs: dict[str, Any] = {'0': output}
+    if isinstance(output, Mapping):
+        outputs = {str(key): value for key, value in output.items()}
+    elif isinstance(output, Sequence):
+        outputs = {str(i): value for i, value in enumerate(output)}
+    if which not in outputs:
+        raise SettingsError(
+            f'{name} has no output {which!r}: its outputs are {", ".join(outputs)}'
+        )
+    return outputs[which]
+
+
+def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> torch.Tensor:
+    """
+    Return what a network computes for a batch as feature maps or vectors.
+
+    :param output: maps (n, C, H, Wf), vectors (n, D), or the tokens of a vision transformer
+        (n, T, C), of square images.
+    :param images: number n of images.
+    :param prefix_tokens: leading tokens that are no patches.
+    :param name: of the layer.
+    :returns: maps or vectors.
+    :raises SettingsError: another shape or type; tokens that are no square.
+    """
+    tensor = isinstance(output, torch.Tensor)
+    shape = tuple(output.shape) if tensor else ()
+    if len(shape) not in (2, 3, 4) or shape[0] != images or 0 in shape:
+        returned = shape if tensor else f'type {type(output).__name__}'
+        raise SettingsError(
+            f'{name} returns {returned} for {images} images: expected maps (n, C, H, W), tokens '
+            '(n, T, C) or vectors (n, D); name another layer'
+        )
+    if len(shape) != 3:
+        return output
+    n, T, C = shape
+    side = math.isqrt(max(T - prefix_tokens, 0))
+    if side < 1 or side**2 != T - prefix_tokens:
+        largest = math.isqrt(T)
+        raise SettingsError(
+            f'{name} returns {T} tokens, {T - prefix_tokens} without the first {prefix_tokens}: '
+            f'expected those of a square; prefix_tokens = {T - largest**2} leaves {largest} x '
+            f'{largest}'
+        )
+    return output[:, prefix_tokens:].mT.reshape(n, C, side, side)

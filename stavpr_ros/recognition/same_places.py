@@ -1,0 +1,52 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which places of a session show what an earlier session of the map shows: by recognition."""
+
+from dataclasses import replace
+
+import numpy as np
+from stavpr_ros.mapping import PlaceMap, select_places
+from stavpr_ros.recognition.recognizer import PlaceRecognizer, RecognizerSettings
+from tqdm import tqdm
+
+SURE = 0.9  # probability above which two places are taken to be the same
+
+
+def with_same_places(place_map: PlaceMap, progress: bool = False) -> PlaceMap:
+    """
+    Return the map with the places of its sessions related (:attr:`PlaceMap.same_as`).
+
+    Each session is driven, as a query of mode robust, on a map of the sessions before it. Where it
+    is matched, its place is the matched one. The time grows with the square of the places.
+
+    :param progress: show it on standard error.
+    """
+    index, n = place_map.session_index, len(place_map)
+    if index is None:
+        return place_map
+    same_as = np.arange(n)
+    for session in tqdm(
+        range(1, len(place_map.sessions)),
+        desc='same places',
+        unit='session',
+        disable=None if progress else True,
+    ):
+        earlier, places = np.flatnonzero(index < session), np.flatnonzero(index == session)
+        reference = select_places(replace(place_map, same_as=same_as.astype(np.int32)), earlier)
+        found = _recognized(reference, place_map, places)
+        known = found >= 0
+        same_as[places[known]] = same_as[earlier[found[known]]]
+    return replace(place_map, same_as=same_as.astype(np.int32))
+
+
+def _recognized(reference: PlaceMap, place_map: PlaceMap, images: np.ndarray) -> np.ndarray:
+    """Return the place of a reference that each of some images shows, -1 = none, (m,)."""
+    recognizer = PlaceRecognizer(reference, RecognizerSettings(1 - SURE, mode='robust'))
+    found, near = (np.full(len(images), -1) for _ in range(2))
+    for i, image in enumerate(images.tolist()):
+        match = recognizer.update(place_map.features[image : image + 1])
+        if match.accepted:
+            window = i - len(match.window_stamps) + 1 + match.path[:, 0]
+            near[window] = match.path[:, 1]
+            found[window[(len(window) - 1) // 2]] = match.place_index
+    return np.where(found >= 0, found, near)

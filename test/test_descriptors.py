@@ -1,0 +1,231 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Descriptors that other programs computed: files, maps and evaluations of them."""
+
+import json
+
+from evaluation_commands import runner, write_images
+import numpy as np
+import pytest
+from scipy.io import savemat
+from stavpr_ros.commands import build_map, evaluate
+from stavpr_ros.errors import FeatureMismatchError, SourceError, UnavailableError
+from stavpr_ros.features.descriptors import (
+    is_descriptors,
+    read_descriptors,
+    require_comparable,
+    write_descriptors,
+)
+from stavpr_ros.mapping import load_map
+import torch
+
+D = 24
+
+
+@pytest.fixture(scope='module')
+def vectors():
+    """Return a curve of 40 vectors, not of unit norm; the sixth is zero."""
+    curve = np.cumsum(np.random.default_rng(0).standard_normal((40, D)), axis=0)
+    curve[5] = 0
+    return curve.astype(np.float32)
+
+
+def unit(array):
+    return array / np.maximum(np.linalg.norm(array, axis=-1, keepdims=True), 1e-12)
+
+
+# ------------------------------------------------ files
+
+
+def save(folder, kind, array):
+    """Write an array as one kind of file; return the path to give."""
+    path = folder / f'a.{kind.split(":")[0]}'
+    match kind:
+        case 'npy':
+            np.save(path, array)
+        case 'npz:b':
+            np.savez(path, a=np.zeros(3), b=array)
+        case 'csv':
+            np.savetxt(path, array, delimiter=',')
+        case 'CSV':
+            lines = [';'.join(f'{value:.9g}' for value in row) for row in array]
+            names = ';'.join(f'f{i}' for i in range(array.shape[1]))
+            path.write_text('\n'.join([f'\ufeff{names}', *lines]))
+        case 'mat':
+            savemat(path, {'features': array.astype(np.float64), 'names': np.array(['a'], object)})
+    return f'{path}{kind[3:]}'
+
+
+@pytest.mark.parametrize('kind', ['npy', 'npz:b', 'csv', 'CSV', 'mat'])
+def test_read_descriptors_of_each_kind_of_file(tmp_path, vectors, kind):
+    path = save(tmp_path, kind, vectors)
+    assert is_descriptors(path)
+    features = read_descriptors(path, 'netvlad')
+    assert features.strips.dtype == torch.float32
+    assert features.strips.shape == (1, 40, D)
+    np.testing.assert_allclose(features.strips[0], unit(vectors), atol=1e-6)
+    assert features.weights[0].tolist() == [float(i != 5) for i in range(40)]
+    assert features.settings.backbone.source == 'netvlad'
+
+
+@pytest.mark.parametrize('kind', ['npy', 'npz:b', 'mat'])
+def test_read_descriptors_of_strips_keeps_their_order(tmp_path, kind):
+    """Strip j of image i is row [i, j]; weights are norms over that of the image."""
+    array = np.random.default_rng(1).standard_normal((6, 3, 5)).astype(np.float32)
+    features = read_descriptors(save(tmp_path, kind, array))
+    assert features.strips.shape == (3, 6, 5)
+    np.testing.assert_allclose(features.strips[2, 4], unit(array[4, 2]), atol=1e-6)
+    share = np.linalg.norm(array[4, 2]) / np.linalg.norm(array[4])
+    assert float(features.weights[2, 4]) == pytest.approx(share, abs=1e-6)
+
+
+@pytest.mark.parametrize('shape', [(7, 6), (7, 3, 6)])
+def test_written_descriptors_are_read_back(tmp_path, shape):
+    array = np.random.default_rng(2).standard_normal(shape).astype(np.float32)
+    np.save(tmp_path / 'a.npy', array)
+    features = read_descriptors(str(tmp_path / 'a.npy'))
+    write_descriptors(features, tmp_path / 'b.npy')
+    again = read_descriptors(str(tmp_path / 'b.npy'))
+    assert np.load(tmp_path / 'b.npy').shape == shape
+    torch.testing.assert_close(again.strips, features.strips)
+    torch.testing.assert_close(again.weights, features.weights)
+
+
+class Harmful:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = str(path)
+
+    def __reduce__(self):
+        return (open, (self.path, 'w'))
+
+
+def test_read_descriptors_executes_nothing(tmp_path):
+    trap = tmp_path / 'trap'
+    np.save(tmp_path / 'a.npy', np.array([Harmful(trap)], object), allow_pickle=True)
+    np.savez(tmp_path / 'a.npz', a=np.array([Harmful(trap)], object))
+    for name in ('a.npy', 'a.npz'):
+        with pytest.raises(SourceError, match='cannot be read'):
+            read_descriptors(str(tmp_path / name))
+    assert not trap.exists()
+
+
+def test_read_descriptors_names_what_is_wrong(tmp_path, vectors):
+    def reject(path, words):
+        with pytest.raises(SourceError, match=words):
+            read_descriptors(str(path))
+
+    reject(tmp_path / 'missing.npy', 'missing.npy cannot be read')
+    reject('a.txt', 'expected a file')
+    for array, words in (
+        (np.zeros(5), r'float64 \(5,\): expected real numbers'),
+        (np.zeros((5, 0)), r'\(5, 0\)'),
+        (np.zeros((5, 2), complex), 'complex128'),
+        (np.zeros((1, 1025, 1)), 'W = 1025'),
+        (np.where(np.arange(40)[:, None] == 7, np.nan, vectors), 'row 7 holds NaN'),
+    ):
+        np.save(tmp_path / 'a.npy', array)
+        reject(tmp_path / 'a.npy', words)
+    reject(f'{tmp_path}/a.npy:x', 'leave :x out')
+    np.savez(tmp_path / 'two.npz', a=vectors, b=vectors)
+    reject(tmp_path / 'two.npz', r'which array\? .* a, b: give .*:NAME')
+    reject(f'{tmp_path}/two.npz:c', r'c\? .* a, b')
+    (tmp_path / 'ragged.csv').write_text('1,2,3\n1,2\n')
+    reject(tmp_path / 'ragged.csv', 'number of columns changed')
+    savemat(tmp_path / 'cell.mat', {'c': np.array([vectors], object)})
+    reject(tmp_path / 'cell.mat', 'arrays of numbers are none')
+    head = b'MATLAB 7.3 MAT-file'.ljust(124) + b'\x00\x02IM' + b'\0' * 384
+    (tmp_path / 'new.mat').write_bytes(head)
+    reject(tmp_path / 'new.mat', 'version 7.3 .* save it with -v7')
+    (tmp_path / 'cut.mat').write_bytes(b'MATLAB')
+    reject(tmp_path / 'cut.mat', 'cannot be read')
+
+
+def test_descriptors_of_another_source_or_dimension_are_rejected(tmp_path, vectors):
+    np.save(tmp_path / 'a.npy', vectors)
+    one = read_descriptors(str(tmp_path / 'a.npy'), 'netvlad')
+    other = read_descriptors(str(tmp_path / 'a.npy'), 'megaloc')
+    with pytest.raises(FeatureMismatchError, match='megaloc'):
+        require_comparable(other, one.settings, D)
+    with pytest.raises(SourceError, match='24 dimensions, those of the map have 25'):
+        require_comparable(one, one.settings, 25)
+
+
+# ------------------------------------------------ commands
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    return runner(evaluate, monkeypatch, capsys)
+
+
+@pytest.fixture
+def pair(tmp_path, vectors):
+    """Write descriptors of a map and a query, with noise; return the options."""
+    np.save(tmp_path / 'map.npy', vectors)
+    noise = np.random.default_rng(3).normal(0, 0.5, vectors.shape)
+    np.savez(tmp_path / 'query.npz', query=vectors + noise)
+    paths = ['--map', tmp_path / 'map.npy', '--query', f'{tmp_path}/query.npz:query']
+    return [*paths, '--sequence-length', 5]
+
+
+def test_evaluate_of_descriptors_and_of_exported_ones_are_equal(run, pair, tmp_path):
+    first, second, exported = (tmp_path / name for name in ('1.json', '2.json', 'arrays'))
+    assert run(*pair, '--json', first, '--export', exported)[0] == 0
+    again = ['--map', exported / 'map.npy', '--query', exported / 'query.npy', *pair[4:]]
+    assert run(*again, '--json', second)[0] == 0
+    numbers = [json.loads(path.read_text()) for path in (first, second)]
+    assert numbers[0]['sequence']['f1'] == pytest.approx(numbers[1]['sequence']['f1'])
+    assert numbers[0]['single']['recall_at_1'] > 0.9
+    code, _, errors = run(*pair, '--json', tmp_path / '3.json', '--export', exported)
+    assert (code, 'exists already' in errors) == (1, True)
+
+
+def test_evaluate_exports_strips_of_images(run, route, tmp_path):
+    folder = write_images(tmp_path / 'images', route[:24])
+    both = ['--map', folder, '--query', folder, '--sequence-length', 5]
+    assert run(*both, '--json', tmp_path / 'a.json', '--export', tmp_path)[0] == 0
+    assert np.load(tmp_path / 'map.npy').shape == (24, 7, 224)
+
+
+@pytest.mark.parametrize(
+    ('options', 'word'),
+    [
+        (['--strips', 7], '--strips'),
+        (['--projection', 8], '--projection'),
+        (['--features', 'onnx'], '--features onnx'),
+        (['--gradient-cell', 32], '--gradient-cell'),
+        (['--crop-map', 0.2], 'saved map or an array'),
+        (['--mirror'], 'saved map or an array'),
+    ],
+)
+def test_evaluate_of_descriptors_rejects_options_of_images(run, pair, options, word):
+    code, _, errors = run(*pair, *options)
+    assert (code, word in errors) == (2, True)
+
+
+def test_map_of_descriptors_takes_descriptors_only(
+    run, pair, route, tmp_path, monkeypatch, capsys
+):
+    build = runner(build_map, monkeypatch, capsys)
+    saved = tmp_path / 'route.stavpr'
+    source = ['--descriptors-source', 'netvlad']
+    poses = tmp_path / 'poses.csv'
+    poses.write_text(''.join(f'{i},0,0\n' for i in range(40)))
+    code, output, _ = build('--input', pair[1], '--output', saved, *source, '--poses', poses)
+    assert (code, '1 strips of 24 dimensions' in output) == (0, True)
+    place_map = load_map(saved)
+    assert place_map.pose(39)[0] == 39
+    with pytest.raises(UnavailableError, match='not from images'):
+        place_map.extractor()
+    query = ['--query', *pair[3:], '--json', tmp_path / 'a.json', '--force']
+    assert run('--map', saved, *query)[0] == 0
+    code, _, errors = run('--map', saved, *query, '--descriptors-source', 'megaloc')
+    assert (code, 'megaloc' in errors) == (1, True)
+    images = write_images(tmp_path / 'images', route[:24])
+    code, _, errors = run('--map', saved, '--query', images)
+    assert (code, 'not from images' in errors) == (1, True)
+    for option in (['--topic', 'x'], ['--keyframe-change', 1]):
+        code, _, errors = build('--input', pair[1], '--output', tmp_path / 'b', *option)
+        assert (code, option[0] in errors) == (2, True)

@@ -1,0 +1,258 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Strips rounded to int8: exact products on every processor, bounds of the rounding."""
+
+import os
+import subprocess
+import sys
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from llvmlite import binding, ir
+import numpy as np
+import oracle
+import pytest
+from stavpr_ros.alignment import image_distances, SpatialSettings
+from stavpr_ros.alignment.cpu import int8
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.evaluation.evaluate import recognize_all
+from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
+from stavpr_ros.features.gradient import GradientSettings
+from stavpr_ros.mapping import build_map, extract_features
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+from stavpr_ros.recognition.int8_features import rounded
+from stavpr_ros.recognition.matcher import make_matcher
+from stavpr_ros.recognition.robust import THRESHOLD
+from stavpr_ros.sources import open_source
+import torch
+
+TILE = int8.TILE
+
+
+def unit(strips):
+    return strips / strips.norm(dim=-1, keepdim=True).clamp_(min=1e-12)
+
+
+def random_strips(W, n, d, seed=0):
+    """Return unit-norm strips (W, n, d), the first of the first image zero."""
+    strips = unit(torch.randn((W, n, d), generator=torch.Generator().manual_seed(seed)))
+    if n:
+        strips[0, 0] = 0
+    return strips
+
+
+def features_of(strips):
+    W, n, _ = strips.shape
+    weights = torch.full((W, n), W**-0.5)
+    return LocalFeatures(strips, weights, FeatureSettings('gradient', GradientSettings(), W))
+
+
+def kernel_distances(reference, queries, x):
+    """Return d (W, W, n) of query x by the kernel."""
+    W, n, d = reference.shape
+    held = int8.Int8Strips(W, n, d)
+    held.write(0, reference)
+    out = np.empty((-(-W // TILE) * TILE, W, n), np.float32)
+    int8.strip_distances(held.kernel_arguments(), int8.tiled(queries), x, out)
+    return out[:W], held
+
+
+def expected_distances(held, queries, x):
+    """Return the oracle's d of the same whole numbers."""
+    whole, lengths = int8.rounded_queries(queries)
+    n = held.shape[1]
+    return oracle.whole_number_distances(
+        whole[x], held.rounded().numpy(), lengths[x], held.reciprocals[:, :n]
+    )
+
+
+@settings(max_examples=25)
+@given(
+    W=st.sampled_from([1, 6, 7, 8]),
+    n=st.sampled_from([1, 7, 8, 9, 17]),
+    d=st.sampled_from([1, 3, 4, 5, 30]),
+    seed=st.integers(0, 9),
+)
+def test_strip_distances_equal_oracle_bit_for_bit(W, n, d, seed):
+    """Whole tiles, lanes and quads, and their remainders."""
+    reference, queries = random_strips(W, n, d, seed), random_strips(W, 2, d, seed + 10)
+    for x in range(2):
+        found, held = kernel_distances(reference, queries, x)
+        np.testing.assert_array_equal(found, expected_distances(held, queries, x))
+
+
+@pytest.mark.parametrize('d', [1, 2, 8, 224, 1000])
+def test_products_of_extreme_strips_neither_saturate_nor_overflow(d):
+    """Strips with one value, all equal, two neighbors, in all signs: the largest products."""
+    one, two, even = torch.zeros(d), torch.zeros(d), torch.ones(d)
+    one[d // 2], two[: min(2, d)] = 1, 1
+    kinds = [unit(sign * x) for x in (one, two, even) for sign in (1, -1)]
+    strips = torch.stack([torch.stack(kinds)] * 2)  # (2, 6, d)
+    for x in range(len(kinds)):
+        found, held = kernel_distances(strips, strips, x)
+        np.testing.assert_array_equal(found, expected_distances(held, strips, x))
+        np.testing.assert_allclose(found[0, 0, x], 0, atol=1e-6)  # itself
+        np.testing.assert_allclose(found[0, 0, x ^ 1], 2, atol=1e-6)  # its opposite
+
+
+@pytest.mark.parametrize('d', [16, 64, 224, 2000])
+def test_rounding_moves_distances_little(d):
+    """A rounded value is off by half a step; strips are as long as 16 bits of a product allow."""
+    reference, query = random_strips(1, 400, d), random_strips(1, 2, d, seed=1)
+    found, held = kernel_distances(reference, query, 1)
+    whole = held.rounded().numpy()[0].astype(np.int64)
+    assert np.sqrt((whole**2).sum(axis=1)).max() <= int8.LONGEST
+    assert np.abs(whole).max() <= 127
+    exact = 1 - reference[0].double() @ query[0, 1].double()
+    off = found[0, 0] - exact.numpy()
+    # both sides are off by a vector of length sqrt(d / 12) / N in a direction of its own
+    expected = np.sqrt(2 / 12) / (int8.LONGEST - np.sqrt(d) / 2)
+    assert np.sqrt((off**2).mean()) < 1.5 * max(expected, 0.29 / 63)
+    assert held[:, 3:5].shape == (1, 2, d)
+    assert (held[:, 3:5] - reference[:, 3:5]).norm(dim=2).max() < 1.3 * np.sqrt(d / 12) / (
+        int8.LONGEST - np.sqrt(d) / 2
+    )
+
+
+@pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'sliding_window', 'none'])
+def test_matcher_in_int8_equals_functions_of_its_strip_distances(strategy):
+    reference, queries = features_of(random_strips(7, 300, 20)), random_strips(7, 3, 20, seed=1)
+    spatial = SpatialSettings(strategy)
+    weights = torch.full((7, 3), 7**-0.5)
+    matrix = CpuMatcher(reference, spatial, 'int8').distance_matrix(queries, weights)
+    assert matrix.shape == (3, 300)
+    for x in range(3):
+        d, _ = kernel_distances(reference.strips, queries, x)
+        if strategy == 'none':
+            expected = np.einsum('iiy->y', d) / 7
+            np.testing.assert_allclose(matrix[x], expected, atol=1e-6)
+        else:
+            np.testing.assert_array_equal(matrix[x], image_distances(d, spatial))
+
+
+def test_features_rounded_in_blocks_equal_those_rounded_at_once():
+    features = features_of(random_strips(3, 600, 10))
+    at_once = int8.Int8Strips(3, 600, 10)
+    at_once.write(0, features.strips)
+    held = rounded(features, lambda some: some)
+    np.testing.assert_array_equal(held.strips.values, at_once.values)
+    np.testing.assert_array_equal(held.strips.reciprocals, at_once.reciprocals)
+    assert held.strips.values.nbytes < 1.25 * 3 * 600 * 10  # whole quads: 12 for 10 dimensions
+
+
+def test_vertical_alignment_in_int8_is_rejected():
+    with pytest.raises(SettingsError, match="'int8' has no vertical"):
+        make_matcher(
+            features_of(random_strips(7, 4, 8)), SpatialSettings(vertical=True), 'cpu', 'int8'
+        )
+
+
+# ------------------------------------------------ instructions
+
+PROCESSORS = (
+    ('avx512vnni', 'x86_64', 'icelake-server', 'vpdpbusd'),
+    ('avxvnni', 'x86_64', 'alderlake', 'vpdpbusd'),
+    ('avx512bw', 'x86_64', 'skylake-avx512', 'vpmaddubsw'),
+    ('avx2', 'x86_64', 'haswell', 'vpmaddubsw'),
+    ('ssse3', 'x86_64', 'core2', 'pmaddubsw'),
+    ('dotprod', 'aarch64', 'neoverse-n1', 'sdot'),
+)
+
+
+def assembly(name, architecture, processor):
+    """Compile one multiply-add and its total for a processor; return the assembly."""
+    lanes = next(row[2] for row in int8.INSTRUCTIONS if row[0] == name)
+    wide = ir.VectorType(ir.IntType(32), lanes)
+    module = ir.Module()
+    function = ir.Function(module, ir.FunctionType(wide, [wide] * 4), 'multiply_add')
+    builder = ir.IRBuilder(function.append_basic_block())
+    total, places, query, query_sum = function.args
+    total = int8.write_multiply_add(builder, name, total, places, query)
+    builder.ret(int8.write_total(builder, name, total, query_sum))
+    target = binding.Target.from_triple(f'{architecture}-unknown-linux-gnu')
+    machine = target.create_target_machine(cpu=processor, opt=3)
+    return machine.emit_assembly(binding.parse_assembly(str(module)))
+
+
+@pytest.mark.parametrize(('name', 'architecture', 'processor', 'instruction'), PROCESSORS)
+def test_instruction_is_in_assembly_of_processor(name, architecture, processor, instruction):
+    binding.initialize_all_targets()
+    binding.initialize_all_asmprinters()
+    try:
+        code = assembly(name, architecture, processor)
+    except RuntimeError as error:
+        pytest.skip(f'this LLVM does not compile for {architecture}: {error}')
+    assert instruction in code
+    assert 'call' not in code
+
+
+def test_instruction_of_processor_fits_its_lanes():
+    assert int8.choose_instruction('+avx512f,+avx512bw,+avx512vnni,+avx2', 16) == 'avx512vnni'
+    assert int8.choose_instruction('+avx512f,+avx512bw,-avx512vnni,+avx2', 16) == 'avx512bw'
+    assert int8.choose_instruction('+avx2,+avxvnni,+ssse3', 8) == 'avxvnni'
+    assert int8.choose_instruction('+avx2,+ssse3', 8) == 'avx2'
+    assert int8.choose_instruction('+ssse3,+sse2', 4) == 'ssse3'
+    assert int8.choose_instruction('+neon,+dotprod', 4) == 'dotprod'
+    assert int8.choose_instruction('+neon', int8.LANES) == 'plain'
+
+
+HASHED = """
+import hashlib, numpy as np, torch
+from stavpr_ros.alignment.cpu import int8
+rng = np.random.default_rng(0)
+strips = torch.from_numpy(rng.standard_normal((3, 21, 37)).astype(np.float32))
+held = int8.Int8Strips(3, 21, 37)
+held.write(0, strips)
+out = np.empty((7, 3, 21), np.float32)
+int8.strip_distances(held.kernel_arguments(), int8.tiled(strips), 5, out)
+print(int8.INSTRUCTION, hashlib.sha256(out[:3].tobytes()).hexdigest())
+"""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(os.uname().machine != 'x86_64', reason='features of x86 processors')
+def test_every_instruction_of_this_processor_returns_same_bits():
+    found = {}
+    sets = ('', '+sse2', '+sse2,+sse3,+ssse3', '+sse2,+sse3,+ssse3,+sse4.1,+avx,+avx2,+fma')
+    for features in sets:
+        chosen = {'NUMBA_CPU_NAME': 'x86-64', 'NUMBA_CPU_FEATURES': features} if features else {}
+        run = subprocess.run(
+            [sys.executable, '-c', HASHED],
+            env=os.environ | chosen,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        name, value = run.stdout.split()
+        found[name] = value
+    assert {'plain', 'ssse3'} < set(found)
+    assert len(set(found.values())) == 1
+
+
+# ------------------------------------------------ real images
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ('places', 'query'),
+    [('gardens_point/day_left', 'gardens_point/day_right'), ('corridor/ref', 'corridor/query')],
+)
+def test_int8_changes_no_verdict_on_real_images(data_folder, places, query):
+    extractor = FeatureExtractor('gradient')
+    place_map = build_map(open_source(data_folder / places), extractor, progress=False)
+    images = extract_features(open_source(data_folder / query), extractor, progress=False)
+    found = {
+        precision: recognize_all(
+            PlaceRecognizer(
+                place_map, RecognizerSettings(THRESHOLD, mode='robust'), precision=precision
+            ),
+            images,
+        )
+        for precision in ('float32', 'int8')
+    }
+    pairs = list(zip(*found.values(), strict=True))
+    assert [one.status for one, _ in pairs] == [other.status for _, other in pairs]
+    accepted = [(one, other) for one, other in pairs if one.accepted]
+    assert len(accepted) > 80
+    assert max(abs(one.place_index - other.place_index) for one, other in accepted) <= 2

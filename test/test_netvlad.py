@@ -1,0 +1,262 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""NetVLAD from files of all published layouts, made here, against plain loops; VGG fc6."""
+
+import io
+import math
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.features.netvlad import STAGES
+from stavpr_ros.features.paper_networks import VGG16Fc6
+from stavpr_ros.features.registry import backbone_class, settings_class
+import torch
+from torch import nn
+
+WIDTHS = (4, 4, 5, 5, 6, 6, 6, 7, 7, 7, 8, 8, 8)
+K, D, OUT, SIZE = 3, 8, 5, 32
+MEAN = (123.0, 117.0, 104.0)
+LAYOUTS = ('mat', 'mat v2', 'pth', 'pth v2', 'pth parallel')
+
+
+@pytest.fixture(scope='module')
+def numbers():
+    """Return random parameters: kernels, w, b, c, whitening of V with d or k running fastest."""
+    rng = np.random.default_rng(0)
+    channels = (3, *WIDTHS)
+    kernels = [
+        rng.standard_normal((out, into, 3, 3)) * math.sqrt(2 / (9 * into))
+        for into, out in zip(channels, WIDTHS, strict=False)
+    ]
+    made = {
+        'kernels': kernels,
+        'biases': [rng.standard_normal(out) * 0.1 for out in WIDTHS],
+        'w': rng.standard_normal((K, D)) * 3,
+        'b': rng.standard_normal(K),
+        'c': rng.standard_normal((K, D)),
+        'matrix': rng.standard_normal((OUT, K * D)),
+        'shift': rng.standard_normal(OUT) * 0.1,
+    }
+    single = {name: value.astype(np.float32) for name, value in made.items() if name[-1] != 's'}
+    for name in ('kernels', 'biases'):
+        single[name] = [value.astype(np.float32) for value in made[name]]
+    return single
+
+
+def matlab_file(path, p, bias=False, whitening=True):
+    """Write net.layers as net_class2struct.m does: MATLAB's axes, the centers negated."""
+
+    def cell(*values):
+        row = np.empty((1, len(values)), object)
+        row[0, :] = values
+        return row
+
+    layers = []
+    for i, (kernel, shift) in enumerate(zip(p['kernels'], p['biases'], strict=True)):
+        weights = cell(kernel.transpose(2, 3, 1, 0), shift[:, None])
+        layers.append({'type': 'conv', 'weights': weights})
+        layers.append({'type': 'relu', 'weights': np.zeros((0, 0))})
+        if i in np.cumsum(STAGES) - 1:
+            layers.append({'type': 'pool'})
+    del layers[-2:]
+    layers.append({'type': 'normalize', 'name': 'preL2'})
+    offset = -p['c'].T
+    vlad = [p['w'].T, p['b'][None], offset] if bias else [p['w'].T, offset]
+    layers.append({'type': 'custom', 'name': 'vlad:core', 'weights': cell(*vlad)})
+    layers.append({'type': 'normalize', 'name': 'vlad:intranorm'})
+    if whitening:
+        matrix = p['matrix'].T[None, None]
+        layers.append({'name': 'WPCA', 'weights': cell(matrix, p['shift'][:, None])})
+    average = np.broadcast_to(np.array(MEAN, np.float32), (224, 224, 3))
+    meta = {'normalization': {'averageImage': average}}
+    savemat(path, {'net': {'layers': cell(*layers), 'meta': meta}})
+
+
+def torch_file(path, p, bias=False, whitening=True, parallel=False):
+    """Write a checkpoint as pytorch-NetVlad and Patch-NetVLAD do."""
+    part = '.module' if parallel else ''
+    state, index = {}, 0
+    for i, (kernel, shift) in enumerate(zip(p['kernels'], p['biases'], strict=True)):
+        state[f'encoder{part}.{index}.weight'] = torch.from_numpy(kernel)
+        state[f'encoder{part}.{index}.bias'] = torch.from_numpy(shift)
+        index += 3 if i in np.cumsum(STAGES) - 1 else 2
+    state[f'pool{part}.conv.weight'] = torch.from_numpy(p['w'][:, :, None, None])
+    if bias:
+        state[f'pool{part}.conv.bias'] = torch.from_numpy(p['b'])
+    state[f'pool{part}.centroids'] = torch.from_numpy(p['c'])
+    if whitening:
+        state['WPCA.0.weight'] = torch.from_numpy(p['matrix'][:, :, None, None])
+        state['WPCA.0.bias'] = torch.from_numpy(p['shift'])
+    recalls = {5: np.float64(0.87), 1: np.float64(0.7)}
+    torch.save({'epoch': 30, 'state_dict': state, 'recalls': recalls, 'parallel': parallel}, path)
+
+
+def write(folder, layout, p, whitening=True):
+    kind, _, change = layout.partition(' ')
+    path = folder / f'net.{kind}{"" if kind == "mat" else ".tar"}'
+    if kind == 'mat':
+        matlab_file(path, p, change == 'v2', whitening)
+    else:
+        torch_file(path, p, change == 'v2', whitening, change == 'parallel')
+    return path
+
+
+def convolved(x, kernel, shift):
+    """Convolve (H, W, in) with (out, in, 3, 3), zeros around it, cell by cell."""
+    H, W, into = x.shape
+    padded = np.zeros((H + 2, W + 2, into))
+    padded[1:-1, 1:-1] = x
+    y = np.empty((H, W, len(kernel)))
+    for i in range(H):
+        for j in range(W):
+            total = shift.astype(np.float64).copy()
+            for u in range(3):
+                for v in range(3):
+                    total += kernel[:, :, u, v].astype(np.float64) @ padded[i + u, j + v]
+            y[i, j] = total
+    return y
+
+
+def pooled(x):
+    H, W, _ = x.shape
+    return np.array(
+        [
+            [x[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].max(axis=(0, 1)) for j in range(W // 2)]
+            for i in range(H // 2)
+        ]
+    )
+
+
+def oracle(image, p, layout, sign=1, flip=False, last_relu=False, whitening=True):
+    """Return the vector in plain loops and float64; sign, flip, last_relu: what would be wrong."""
+    matlab = layout.startswith('mat')
+    x = image.astype(np.float64) - MEAN if matlab else image / 255
+    if not matlab:
+        x = (x - (0.485, 0.456, 0.406)) / (0.229, 0.224, 0.225)
+    for i, (kernel, shift) in enumerate(zip(p['kernels'], p['biases'], strict=True)):
+        x = convolved(x, kernel, shift)
+        if i < 12 or last_relu:
+            x = np.maximum(x, 0)
+        if i < 12 and i in np.cumsum(STAGES) - 1:
+            x = pooled(x)
+    V = [[0.0] * D for _ in range(K)]
+    for values in x.reshape(-1, D):
+        column = values / math.sqrt(sum(v * v for v in values))
+        b = p['b'] if 'v2' in layout else np.zeros(K)
+        scores = [sum(p['w'][k, d] * column[d] for d in range(D)) + b[k] for k in range(K)]
+        powers = [math.exp(score) for score in scores]
+        for k in range(K):
+            for d in range(D):
+                V[k][d] += powers[k] / sum(powers) * (column[d] - sign * p['c'][k, d])
+    for k in range(K):
+        norm = math.sqrt(sum(v * v for v in V[k]))
+        V[k] = [v / norm / math.sqrt(K) for v in V[k]]
+    flat = (
+        [V[k][d] for d in range(D) for k in range(K)]
+        if matlab != flip
+        else [V[k][d] for k in range(K) for d in range(D)]
+    )
+    if whitening:
+        flat = p['matrix'].astype(np.float64) @ flat + p['shift']
+    return flat / np.linalg.norm(flat)
+
+
+@pytest.fixture(scope='module')
+def image():
+    return np.random.default_rng(1).integers(0, 256, (SIZE, SIZE, 3), np.uint8)
+
+
+def vector(path, image, **changes):
+    settings = settings_class('netvlad')(model=str(path), size=SIZE, **changes)
+    return backbone_class('netvlad')(settings).feature_maps([image])[0].numpy()
+
+
+@pytest.mark.parametrize('layout', LAYOUTS)
+def test_netvlad_of_each_layout_equals_plain_loops(tmp_path, numbers, image, layout):
+    path = write(tmp_path, layout, numbers)
+    found = vector(path, image)
+    assert found.shape == (OUT,)
+    np.testing.assert_allclose(found, oracle(image, numbers, layout), atol=1e-5)
+    whole = vector(path, image, whitening=False)
+    assert whole.shape == (K * D,)
+    expected = oracle(image, numbers, layout, whitening=False)
+    np.testing.assert_allclose(whole, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize('layout', ['mat', 'pth'])
+@pytest.mark.parametrize('mistake', [{'sign': -1}, {'flip': True}, {'last_relu': True}])
+def test_netvlad_differs_from_each_mistake(tmp_path, numbers, image, layout, mistake):
+    """The sign of the centers, the order of V, a ReLU after conv5_3."""
+    found = vector(write(tmp_path, layout, numbers), image)
+    wrong = oracle(image, numbers, layout, **mistake)
+    assert abs(found - wrong).max() > 0.01
+
+
+def test_netvlad_extractor_makes_one_strip_of_each_image(tmp_path, numbers, route):
+    settings = settings_class('netvlad')(model=str(write(tmp_path, 'mat', numbers)), size=64)
+    extractor = FeatureExtractor('netvlad', settings)
+    features = extractor.extract(route[:6])
+    assert features.strips.shape == (1, 6, OUT)
+    alone = extractor.extract(route[5:6])
+    torch.testing.assert_close(features.strips[:, 5:], alone.strips, atol=1e-5, rtol=0)
+
+
+def test_netvlad_of_wrong_files_is_rejected(tmp_path, numbers, image):
+    def reject(path, words, error=UnavailableError, **changes):
+        with pytest.raises(error, match=words):
+            vector(path, image, **changes)
+
+    without = write(tmp_path, 'pth', numbers, whitening=False)
+    reject(without, 'no PCA whitening: .* 24 dimensions', SettingsError)
+    assert vector(without, image, whitening=False).shape == (K * D,)
+    reject(without, 'sha256', FeatureMismatchError, sha256='0' * 64)
+    savemat(tmp_path / 'other.mat', {'x': 1})
+    reject(tmp_path / 'other.mat', "cannot be read as the MATLAB file .*'net'")
+    good = write(tmp_path, 'mat', numbers)
+    (tmp_path / 'cut.mat').write_bytes(good.read_bytes()[:-2000])
+    reject(tmp_path / 'cut.mat', 'cannot be read as the MATLAB file')
+    (tmp_path / 'text.pth.tar').write_text('no weights')
+    reject(tmp_path / 'text.pth.tar', 'cannot be read as a file of weights')
+    torch.save({'conv.weight': torch.zeros(2)}, tmp_path / 'other.pth.tar')
+    reject(tmp_path / 'other.pth.tar', 'lacks .encoder.0.weight.; it has conv.weight')
+    for name, value, words in (
+        ('c', np.full((K, D), np.nan, np.float32), 'damaged: it holds NaN'),
+        ('c', np.zeros((K + 1, D), np.float32), r'assignment \(3, 8\), centers \(4, 8\)'),
+        ('matrix', np.zeros((OUT, 7), np.float32), 'takes 7 numbers, expected 24'),
+        ('kernels', [numbers['kernels'][1], *numbers['kernels'][1:]], 'convolution 0 has shape'),
+    ):
+        for layout in ('mat', 'pth'):
+            reject(write(tmp_path, layout, numbers | {name: value}), words)
+
+
+class Harmful:
+    def __init__(self, path):
+        self.path = str(path)
+
+    def __reduce__(self):
+        return (open, (self.path, 'w'))
+
+
+def test_netvlad_checkpoint_executes_nothing(tmp_path, image):
+    content = io.BytesIO()
+    torch.save({'state_dict': {}, 'recalls': Harmful(tmp_path / 'trap')}, content)
+    (tmp_path / 'a.pth.tar').write_bytes(content.getvalue())
+    with pytest.raises(UnavailableError, match='not executed'):
+        vector(tmp_path / 'a.pth.tar', image)
+    assert not (tmp_path / 'trap').exists()
+
+
+def test_vgg16_fc6_by_hand():
+    """Maps of other sizes are averaged to 7 x 7, flattened channel by channel; then ReLU."""
+    network = nn.Module()
+    network.features = nn.Identity()
+    network.classifier = nn.Sequential(nn.Linear(2 * 49, 4), nn.ReLU(), nn.Dropout())
+    maps = torch.rand(3, 2, 14, 14)
+    found = VGG16Fc6.up_to_layer(network)(maps.to(memory_format=torch.channels_last))
+    weight, bias = network.classifier[0].weight, network.classifier[0].bias
+    means = maps.reshape(3, 2, 7, 2, 7, 2).mean(dim=(3, 5)).reshape(3, 98)
+    torch.testing.assert_close(found, torch.relu(means @ weight.T + bias))
+    assert VGG16Fc6.published.name == 'vgg16-397923af.pth'

@@ -1,0 +1,239 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps of several sessions: borders, and places that several sessions show."""
+
+from dataclasses import replace
+
+from map_examples import example_map
+import map_reader
+import numpy as np
+import oracle
+import pytest
+from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.errors import InputError
+from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.mapping import (
+    GrowingMap,
+    load_map,
+    merge_maps,
+    PlaceMap,
+    save_map,
+    select_places,
+    select_session,
+)
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition.place_filter import FilterSettings, PlaceFilter
+from stavpr_ros.recognition.same_places import with_same_places
+from stavpr_ros.recognition.sequence_search import ImageChange
+from stavpr_ros.recognition.sessions import layout_of
+import torch
+
+pytestmark = pytest.mark.usefixtures('one_thread')
+W, D, LENGTH, PLACES = 7, 24, 10, 90
+LIVELY = FilterSettings(
+    speeds=(0.0, 1.0, 2.5), levels=(-1.0, -2.0), keep_level=0.7, keep_speed=0.6, spread=0.15,
+    leave=0.07, enter=0.2, start=0.6,
+)  # fmt: skip
+
+
+def features_of(strips, noise, seed):
+    strips = strips + noise * np.random.default_rng(seed).standard_normal(strips.shape)
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+    weights = torch.full(strips.shape[:2], W**-0.5)
+    return LocalFeatures(
+        torch.from_numpy(strips).float(), weights, FeatureSettings('gradient', None, W)
+    )
+
+
+def route(seed):
+    """Return a route of PLACES places, each like its neighbors, (W, n, d)."""
+    strips = np.random.default_rng(seed).standard_normal((W, PLACES + 3, D))
+    return sum(strips[:, i : i + PLACES] for i in range(4))
+
+
+def drive_map(strips, seed, noise=0.6):
+    features = features_of(strips, noise, seed)
+    n = len(features)
+    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
+
+
+@pytest.fixture(scope='module')
+def town():
+    """Return two drives of a route and one of another."""
+    return [drive_map(route(0), 1), drive_map(route(0), 2), drive_map(route(5), 3)]
+
+
+def recognizer(place_map, mode='robust'):
+    threshold = 0.5 if mode == 'robust' else 2.0
+    settings = RecognizerSettings(
+        threshold, sequence=SequenceSettings(LENGTH), nms_radius=8, mode=mode
+    )
+    return PlaceRecognizer(place_map, settings)
+
+
+def recognize(place_map, query, mode='robust'):
+    one = recognizer(place_map, mode)
+    return [one.update(query[i : i + 1]) for i in range(len(query))]
+
+
+def test_filter_of_sessions_equals_plain_loops():
+    sizes, rng = (6, 1, 9), np.random.default_rng(0)
+    n = sum(sizes)
+    index = np.repeat(np.arange(3, dtype=np.int32), sizes)
+    layout = layout_of(PlaceMapOf(index), 2)
+    plain = oracle.PlaceFilter(LIVELY, (0, 6, 7))
+    one = PlaceFilter(layout.width, 4, LIVELY, layout.gaps)
+    for image in range(12):
+        z, weights = rng.standard_normal(n).astype(np.float32), rng.uniform(0.1, 1, 3)
+        alpha = 0.0 if image == 5 else 0.4
+        one.update(layout.spread(torch.from_numpy(z)).numpy(), alpha, weights)
+        plain.update(z, alpha, weights)
+        found = one.places_of_states()
+        np.testing.assert_allclose(
+            found[layout.columns], plain.a.sum(axis=(0, 1)), rtol=1e-4, atol=2e-6
+        )
+        assert not found[layout.gaps].any()
+        assert one.off_map == pytest.approx(sum(plain.off), abs=2e-5)
+
+
+class PlaceMapOf:
+    """What the layout reads of a map."""
+
+    def __init__(self, session_index):
+        self.session_index, self.same_as = session_index, None
+
+    def __len__(self):
+        return len(self.session_index)
+
+
+def test_map_of_one_session_has_no_layout(town):
+    assert layout_of(town[0], 20) is None
+    one = merge_maps(town[:1], ['a'])
+    assert layout_of(one, 20) is None
+    query = features_of(route(0), 1.0, 9)[10:50]
+    for found, expected in zip(recognize(one, query), recognize(town[0], query), strict=True):
+        assert repr(found) == repr(expected)
+
+
+def test_mode_paper_finds_the_sequences_of_each_session_alone(town):
+    """Exactly: a border is where a map alone ends."""
+    merged, query = merge_maps(town, 'abc'), features_of(route(0), 1.0, 9)[60:90]
+    together, alone = recognizer(merged, 'paper'), [recognizer(one, 'paper') for one in town]
+    for i in range(len(query)):
+        match = together.update(query[i : i + 1])
+        matches = [one.update(query[i : i + 1]) for one in alone]
+        if match.status is Status.WARMING_UP:
+            continue
+        nearest = min(range(3), key=lambda k: matches[k].distance)
+        first = PLACES * nearest
+        assert match.distance == matches[nearest].distance
+        assert (match.sequence.first, match.sequence.last) == (
+            matches[nearest].sequence.first + first, matches[nearest].sequence.last + first,
+        )  # fmt: skip
+        np.testing.assert_array_equal(
+            match.path, matches[nearest].path + np.array([0, first], np.int32)
+        )
+        costs, middles = together._window.sequences()
+        alone_costs = np.concatenate([one._window.sequences()[0] for one in alone])
+        assert sorted(costs[np.isfinite(costs)]) == sorted(alone_costs[np.isfinite(alone_costs)])
+        assert middles.max() < len(merged)
+
+
+@pytest.mark.parametrize('mode', ['paper', 'robust'])
+def test_drive_over_a_border_is_never_one_sequence(town, mode):
+    """A query that shows the end of one session, and at once the start of the next."""
+    merged = merge_maps([town[0], town[2]], 'ab')
+    jump = np.concatenate([route(0)[:, 40:], route(5)[:, :50]], axis=1)
+    for match in recognize(merged, features_of(jump, 0.8, 7), mode):
+        if match.sequence is not None:
+            sessions = merged.session_index[match.path[:, 1]]
+            assert len(set(sessions.tolist())) == 1
+            assert match.sequence.first <= match.sequence.middle <= match.sequence.last
+    assert match.accepted
+    assert merged.session(match.place_index).id == 'b'
+
+
+def test_alike_sessions_share_their_probability_once_related(town):
+    """Twins take half of each other's probability: no place of either has more than a half."""
+    twins = merge_maps([town[0], town[0]], 'ab')
+    query = features_of(route(0), 1.0, 9)
+    alone = [match.accepted for match in recognize(town[0], query)]
+    assert not any(match.accepted for match in recognize(twins, query))
+    related = with_same_places(twins)
+    assert related.same_as[PLACES:].tolist() == list(range(PLACES))
+    matches = recognize(related, query)
+    assert [match.accepted for match in matches] == alone
+    assert sum(alone) > 70
+    for match in matches[LENGTH + 10 :]:
+        second = match.sequence.second_best_index
+        assert second < 0 or abs(second % PLACES - match.sequence.middle % PLACES) > 8
+
+
+@pytest.mark.parametrize('mode', ['paper', 'robust'])
+def test_same_place_in_another_session_is_no_candidate_beside(town, mode):
+    related = with_same_places(merge_maps(town, 'abc'))
+    assert (related.same_as[PLACES : 2 * PLACES] < PLACES).all()
+    assert np.abs(related.same_as[PLACES : 2 * PLACES] - np.arange(PLACES)).max() <= 2
+    assert related.same_as[2 * PLACES :].tolist() == list(range(2 * PLACES, 3 * PLACES))
+    one, query = recognizer(related, mode), features_of(route(0), 1.0, 9)[20:70]
+    for i in range(len(query)):
+        match = one.update(query[i : i + 1])
+    places = [candidate.place for candidate in one.ranked(4)]
+    assert (places[0], *places[1:2]) == (match.sequence.middle, match.sequence.second_best_index)
+    positions = related.same_as[places]
+    assert np.abs(positions[1:] - positions[0]).min() > 8
+    # in another session, a neighbor by number is no neighbor
+    assert one.newest_row().shape == (len(related),)
+    rows, first = one.window_rows()
+    assert (rows.shape, first) == ((LENGTH, len(related)), 0)
+    assert np.isfinite(rows).all()
+
+
+def test_change_of_places_is_learned_within_sessions():
+    strips = np.concatenate([route(0), route(5)], axis=1)
+    n, split = strips.shape[1], PLACES
+    features = features_of(strips, 0, 0).strips
+    together = ImageChange(n, FilterSettings())
+    together.learn(features, (0, split))
+    parts = [ImageChange(split, FilterSettings()) for _ in range(2)]
+    parts[0].learn(features[:, :split])
+    parts[1].learn(features[:, split:])
+    expected = np.mean([part.curve for part in parts], axis=0)
+    np.testing.assert_allclose(together.curve, expected, rtol=1e-5)
+
+
+def test_related_places_are_saved(tmp_path):
+    same_as = np.arange(24, dtype=np.int32)
+    same_as[14:20] = np.arange(6)
+    save_map(replace(example_map(), same_as=same_as), tmp_path / 'map')
+    np.testing.assert_array_equal(load_map(tmp_path / 'map').same_as, same_as)
+    manifest, arrays = map_reader.read(tmp_path / 'map')
+    assert manifest['sections'] == {'same_places': {'version': 1, 'required': False, 'data': None}}
+    np.testing.assert_array_equal(arrays['same_places/same_as'], same_as)
+
+
+def test_related_places_stay_related(town):
+    related = with_same_places(merge_maps(town[:2], ['day', 'night']))
+    night = select_session(related, 'night')
+    assert night.same_as.tolist() == list(range(PLACES))
+    some = select_places(related, np.arange(0, 2 * PLACES, 2))
+    both_left = related.same_as[PLACES::2] % 2 == 0
+    assert (some.same_as[45:] < 45).tolist() == both_left.tolist()
+    again = merge_maps([town[2], related], ['first', ''])
+    np.testing.assert_array_equal(again.same_as[PLACES:], related.same_as + PLACES)
+    growing = GrowingMap.from_map(related, 1000)
+    growing.add(town[0].features[:1])
+    assert growing.snapshot().same_as.tolist() == [*related.same_as.tolist(), 2 * PLACES]
+
+
+@pytest.mark.parametrize(
+    ('same_as', 'message'),
+    [
+        (np.zeros(3, np.int32), r'expected int32 \(90,\)'),
+        (np.full(PLACES, PLACES, np.int32), 'itself or an earlier one'),
+        (np.maximum(np.arange(PLACES, dtype=np.int32) - 1, 0), 'same as another one'),
+    ],
+)
+def test_map_with_impossible_relations_is_rejected(town, same_as, message):
+    with pytest.raises(InputError, match=message):
+        replace(town[0], same_as=same_as)

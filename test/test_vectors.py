@@ -1,0 +1,270 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Features that are one vector an image (W = 1), tokens, several outputs, pooled strips."""
+
+from collections import OrderedDict
+import math
+
+import numpy as np
+from pipelines import localizing, process
+import pytest
+from stavpr_ros.alignment import SequenceSettings, SpatialSettings
+from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
+from stavpr_ros.features.extractor import cut_strips
+from stavpr_ros.features.outputs import as_maps, one_of
+from stavpr_ros.features.registry import settings_class
+from stavpr_ros.mapping import build_map, load_map, PlaceMap, save_map
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.recognition.matcher import make_matcher
+from stavpr_ros.sources.frame import Frame
+import torch
+
+# ------------------------------------------------ outputs
+
+
+def test_as_maps_of_tokens_by_hand():
+    """A class token, a register, then patches row by row: patch 2 is below patch 0."""
+    tokens = torch.tensor([[[9.0, 9], [8, 8], [0, 10], [1, 11], [2, 12], [3, 13]]])
+    maps = as_maps(tokens, 1, 2, 'net')
+    assert maps.tolist() == [[[[0, 1], [2, 3]], [[10, 11], [12, 13]]]]
+
+
+def test_as_maps_leaves_maps_and_vectors():
+    for shape in ((2, 5, 3, 4), (2, 5)):
+        assert as_maps(torch.zeros(shape), 2, 1, 'net').shape == shape
+
+
+@pytest.mark.parametrize(
+    ('output', 'named'),
+    [
+        (torch.zeros(2, 261, 8), r'261 tokens, 260 without the first 1.*prefix_tokens = 5 .*16'),
+        (torch.zeros(1, 8), r'\(1, 8\) for 2 images'),
+        (torch.zeros(2), r'\(2,\)'),
+        (torch.zeros(2, 0, 3, 3), r'\(2, 0, 3, 3\)'),
+        ({'x': 1}, 'type dict'),
+    ],
+)
+def test_as_maps_of_other_outputs_is_rejected(output, named):
+    with pytest.raises(SettingsError, match=named):
+        as_maps(output, 2, 1, 'net')
+
+
+def test_one_of_several_outputs_by_number_and_key():
+    a, b = torch.zeros(1), torch.ones(1)
+    assert one_of(a, '0', 'net') is a
+    assert one_of((a, b), '1', 'net') is b
+    assert one_of(OrderedDict(x_norm=a, tokens=b), 'tokens', 'net') is b
+    with pytest.raises(SettingsError, match=r"no output '2': its outputs are 0, 1"):
+        one_of([a, b], '2', 'net')
+
+
+# ------------------------------------------------ pooled strips
+
+
+@pytest.mark.parametrize('pooling', ['mean', 'gem'])
+def test_cut_strips_pooled_equals_plain_loops(pooling):
+    """A map of 5 rows and 8 columns in three strips: columns 1-2, 3-4, 5-6."""
+    maps = np.random.default_rng(0).standard_normal((2, 3, 5, 8)).astype(np.float32)
+    strips = cut_strips(torch.from_numpy(maps), 3, pooling)
+    assert strips.shape == (3, 2, 3)
+    for w in range(3):
+        for n in range(2):
+            for c in range(3):
+                cells = [float(maps[n, c, y, 1 + 2 * w + x]) for y in range(5) for x in range(2)]
+                expected = sum(cells) / 10
+                if pooling == 'gem':
+                    expected = (sum(max(v, 1e-6) ** 3 for v in cells) / 10) ** (1 / 3)
+                assert float(strips[w, n, c]) == pytest.approx(expected, abs=1e-6)
+
+
+def test_pooled_map_of_a_transformer_has_strips_of_its_channels():
+    assert cut_strips(torch.zeros(1, 768, 23, 23), 7, 'mean').shape == (7, 1, 768)
+
+
+# ------------------------------------------------ extraction
+
+
+@pytest.fixture(scope='module')
+def network(tmp_path_factory):
+    """Return an ONNX file with a map ``map``, its tokens ``tokens`` and a vector ``global``."""
+    onnx = pytest.importorskip('onnx', reason='the extra onnx is not installed')
+    from onnx import helper, numpy_helper, TensorProto
+
+    weights = np.random.default_rng(0).standard_normal((16, 3, 8, 8)).astype(np.float32)
+    constants = {
+        'w': weights,
+        'flat': np.array([0, 16, 64], np.int64),
+        'out': np.random.default_rng(1).standard_normal((1024, 32)).astype(np.float32),
+        'flatter': np.array([0, 1024], np.int64),
+    }
+    nodes = [
+        helper.make_node('Conv', ['x', 'w'], ['conv'], strides=[8, 8]),
+        helper.make_node('Relu', ['conv'], ['map']),
+        helper.make_node('Reshape', ['map', 'flat'], ['channels']),
+        helper.make_node('Transpose', ['channels'], ['tokens'], perm=[0, 2, 1]),
+        helper.make_node('Reshape', ['tokens', 'flatter'], ['cells']),
+        helper.make_node('MatMul', ['cells', 'out'], ['global']),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        'net',
+        [helper.make_tensor_value_info('x', TensorProto.FLOAT, ['b', 3, 64, 64])],
+        [helper.make_tensor_value_info('global', TensorProto.FLOAT, ['b', 32])],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid('', 13)], ir_version=8)
+    path = tmp_path_factory.mktemp('onnx') / 'net.onnx'
+    onnx.save(model, path)
+    return path
+
+
+def extractor(path, layer='global', strips=None, **changes):
+    settings = settings_class('onnx')(model=str(path), layer=layer, size=64, **changes)
+    return FeatureExtractor('onnx', settings, strips)
+
+
+def test_extractor_of_vectors_has_one_strip(network, route):
+    made = extractor(network)
+    features = made.extract(route[:3])
+    assert made.settings.strips == 1
+    assert features.strips.shape == (1, 3, 32)
+    assert features.cells == (1, 1)
+    with pytest.raises(SettingsError, match=r'vector of 32 numbers .* not 7 and flatten'):
+        extractor(network, strips=7)
+    with pytest.raises(SettingsError, match='not 1 and gem'):
+        extractor(network, pooling='gem')
+
+
+def test_extractor_of_tokens_equals_that_of_their_map(network, route):
+    tokens = extractor(network, 'tokens', prefix_tokens=0).extract(route[:2])
+    maps = extractor(network, 'map').extract(route[:2])
+    assert tokens.strips.shape == (7, 2, 16 * 8)
+    torch.testing.assert_close(tokens.strips, maps.strips)
+    pooled = extractor(network, 'map', pooling='mean').extract(route[:2])
+    assert pooled.strips.shape == (7, 2, 16)
+
+
+def test_unusable_layers_are_rejected_before_any_image(network):
+    with pytest.raises(SettingsError, match='63 without the first 1'):
+        extractor(network, 'tokens')
+    with pytest.raises(InputError, match=r'Wf = 8 .*W = 9'):
+        extractor(network, 'map', 9)
+    with pytest.raises(SettingsError, match="pooling = 'max'"):
+        extractor(network, 'map', pooling='max')
+
+
+def test_onnx_file_of_batch_one_is_run_image_by_image(network, tmp_path, route):
+    import onnx
+
+    model = onnx.load(network)
+    onnx.helper.set_model_props(model, {'stavpr_batch': '1'})
+    onnx.save(model, tmp_path / 'one.onnx')
+    one, many = extractor(tmp_path / 'one.onnx'), extractor(network)
+    calls = []
+    run = one._backbone._session.run
+    one._backbone._session = type(
+        'Session', (), {'run': lambda _, names, feed: calls.append(feed) or run(names, feed)}
+    )()
+    features = one.extract(route[:3]).strips
+    torch.testing.assert_close(features, many.extract(route[:3]).strips)
+    assert [batch.shape[0] for feed in calls for batch in feed.values()] == [1, 1, 1]
+
+
+@pytest.mark.parametrize('mode', ['robust', 'paper'])
+def test_map_of_vectors_localizes_in_the_pipeline(network, route, tmp_path, mode):
+    frames = [Frame(image, i + 1, '') for i, image in enumerate(route)]
+    path = tmp_path / 'vectors.stavpr'
+    save_map(build_map(frames, extractor(network), progress=False), path)
+    assert load_map(path).features.strips.shape == (1, 60, 32)
+    threshold = {'threshold': 0.5} if mode == 'paper' else {}
+    pipeline = localizing(str(path), mode=mode, model_path=str(network), **threshold)
+    noise = np.random.default_rng(0)
+    images = [
+        np.clip(image + noise.normal(0, 10, image.shape), 0, 255).astype(np.uint8)
+        for image in route[20:40]
+    ]
+    last = process(pipeline, images)[-1]
+    assert last.status == Status.MATCH
+    assert last.place_index == 37
+
+
+# ------------------------------------------------ matching
+
+
+def vectors(n, d, seed=0):
+    """Return unit-norm vectors along a random curve; the first is zero."""
+    steps = np.random.default_rng(seed).standard_normal((n, d))
+    curve = np.cumsum(steps, axis=0) * 0.5 + steps
+    curve /= np.linalg.norm(curve, axis=1, keepdims=True)
+    curve[0] = 0
+    weights = (np.linalg.norm(curve, axis=1) > 0).astype(np.float32)
+    return LocalFeatures(
+        torch.from_numpy(curve[None].astype(np.float32)),
+        torch.from_numpy(weights[None]),
+        FeatureSettings('gradient', None, 1),
+        (1, 1),
+    )
+
+
+@pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'none', 'vertical'])
+@pytest.mark.parametrize('precision', ['float32', 'float16'])
+def test_alignment_of_one_strip_is_the_cosine_distance(strategy, precision):
+    vertical = strategy == 'vertical'
+    spatial = SpatialSettings('adaptive' if vertical else strategy, vertical=vertical)
+    features, queries = vectors(131, 515), vectors(3, 515, seed=1)
+    rounded = features.strips.to(getattr(torch, precision)).double()[0]
+    matcher = make_matcher(features, spatial, 'cpu', precision)
+    matrix = matcher.distance_matrix(queries.strips, queries.weights)
+    expected = 1 - queries.strips[0].double() @ rounded.T
+    torch.testing.assert_close(matrix.double(), expected, rtol=0, atol=1e-5)
+    row = matcher.distances(queries.strips[:, 1], queries.weights[:, 1])
+    assert torch.equal(row, matrix[1])
+
+
+def test_sliding_window_over_one_strip_is_rejected_with_the_map():
+    with pytest.raises(InputError, match='W = 1 strips: the sliding window'):
+        make_matcher(vectors(5, 4), SpatialSettings('sliding_window'), 'cpu', 'float32')
+
+
+def place_map(features):
+    n = len(features)
+    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
+
+
+@pytest.mark.parametrize('mode', ['robust', 'paper'])
+def test_sequence_of_vectors_is_matched(mode):
+    features = vectors(80, 64)
+    noise = torch.from_numpy(np.random.default_rng(2).normal(0, 0.08, (1, 80, 64))).float()
+    strips = features.strips + noise
+    strips = strips / strips.norm(dim=2, keepdim=True)
+    query = LocalFeatures(strips, torch.ones(1, 80), features.settings, features.cells)
+    settings = RecognizerSettings(0.5, sequence=SequenceSettings(10), mode=mode)
+    recognizer = PlaceRecognizer(place_map(features), settings)
+    matches = [recognizer.update(query[i : i + 1]) for i in range(20, 50)]
+    assert {match.status for match in matches[15:]} == {Status.MATCH}
+    for i, match in enumerate(matches[15:], 35):
+        assert abs(match.place_index - (i - 5)) <= 1
+        assert math.isfinite(match.distance)
+
+
+def test_loop_of_vectors_is_closed():
+    """The same curve twice, the second time with noise."""
+    features = vectors(60, 64)
+    noise = torch.from_numpy(np.random.default_rng(3).normal(0, 0.05, (1, 60, 64))).float()
+    again = features.strips + noise
+    route = torch.cat([features.strips, again / again.norm(dim=2, keepdim=True)], dim=1)
+    closer = LoopCloser(
+        RecognizerSettings(0.5, sequence=SequenceSettings(10), mode='robust'),
+        exclude=30,
+        feature_settings=features.settings,
+    )
+    found = []
+    for i in range(120):
+        one = LocalFeatures(route[:, i : i + 1], torch.ones(1, 1), features.settings, (1, 1))
+        match = closer.update(one)
+        if match.status == Status.MATCH:
+            found.append((i, match.place_index))
+    assert len(found) > 20
+    assert all(abs(place - (i - 60 - 5)) <= 2 for i, place in found)
