@@ -13,7 +13,10 @@ import stavpr_ros
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'stavpr_ros'
 ROS = {'rclpy', 'ament_index_python', 'stavpr_msgs', 'rcl_interfaces', 'builtin_interfaces'}
-ROS |= {f'{name}_msgs' for name in ('std', 'sensor', 'geometry', 'nav', 'diagnostic', 'lifecycle', 'visualization')}
+ROS |= {
+    f'{name}_msgs'
+    for name in ('std', 'sensor', 'geometry', 'nav', 'diagnostic', 'lifecycle', 'visualization')
+}
 CORE = ('alignment', 'sources', 'features', 'mapping', 'recognition', 'pipeline')
 """Each of these may import the ones before it, and features and sources not each other."""
 MAY_IMPORT = {

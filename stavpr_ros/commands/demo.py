@@ -62,11 +62,13 @@ def _parser() -> argparse.ArgumentParser:
     add('--slam', choices=('world',), help='three laps with a drifting odometry, and a pose graph')
     slam = parser.add_argument_group('options of --slam')
     add_slam = slam.add_argument
-    add_slam('--world', type=int, default=7, metavar='SEED', help='seed of the world (%(default)s)')
+    add_slam(
+        '--world', type=int, default=7, metavar='SEED', help='seed of the world (%(default)s)'
+    )
     add_slam('--draw', type=int, default=0, help='of the errors of the odometry (%(default)s)')
     add_slam(
         '--drift', type=float, default=DRIFT, metavar='F',
-        help='factor on the errors of the odometry; 0.06: about 2 m after three laps (%(default)s)',
+        help='factor on the errors of the odometry; 0.06: some 2 m after three laps (%(default)s)',
     )  # fmt: skip
     add_slam(
         '--false-closures', type=float, default=0.0, metavar='P',
@@ -121,12 +123,7 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
             parser.error(f'--{name.replace("_", "-")} {value} must be at least {least}')
     truth = arguments.truth
     if arguments.slam is not None:
-        if arguments.loop or arguments.map or arguments.query or truth:
-            parser.error('--slam has its own drive: leave --loop, --map, --query and --truth out')
-        if not 0 <= arguments.false_closures <= 1:
-            parser.error(f'--false-closures {arguments.false_closures} must be 0 to 1')
-        if not 0 < arguments.drift <= 2:
-            parser.error(f'--drift {arguments.drift} must be above 0 and at most 2')
+        _check_slam(parser, arguments)
         return
     if arguments.loop is not None:
         if arguments.map or arguments.query:
@@ -146,6 +143,15 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         parser.error('--truth goes with --map and --query')
     if truth not in (None, 'identity'):
         parser.error(f'--truth {truth}: expected identity; files are for --loop, and for evaluate')
+
+
+def _check_slam(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    if arguments.loop or arguments.map or arguments.query or arguments.truth:
+        parser.error('--slam has its own drive: leave --loop, --map, --query and --truth out')
+    if not 0 <= arguments.false_closures <= 1:
+        parser.error(f'--false-closures {arguments.false_closures} must be 0 to 1')
+    if not 0 < arguments.drift <= 2:
+        parser.error(f'--drift {arguments.drift} must be above 0 and at most 2')
 
 
 def _check_limits(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
@@ -362,7 +368,7 @@ def _slam(arguments: argparse.Namespace, folder: Path) -> None:
 
     run_live(
         parameters, str(bag), len(drive), folder, TOPIC, others,
-        ['--odometry', '--also', slam.CAMERA_INFO], fetch,
+        ['--odometry', '--also', slam.CAMERA_INFO, '--timeout', '120'], fetch,
     )  # fmt: skip
     values, edges = result[0]
     found = slam.evaluate_drive(drive, folder / 'optimized.tum', values)

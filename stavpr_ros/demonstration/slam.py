@@ -168,7 +168,9 @@ def trajectory_errors(
     moved = np.column_stack(
         [estimate.positions_xyz, estimate.orientations_quat_wxyz[:, [1, 2, 3, 0]]]
     )
-    errors = [float(each.get_statistic(metrics.StatisticsType.rmse)) for each in (absolute, relative)]
+    errors = [
+        float(each.get_statistic(metrics.StatisticsType.rmse)) for each in (absolute, relative)
+    ]
     return errors[0], errors[1], moved
 
 

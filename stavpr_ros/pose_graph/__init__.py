@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loop closures and odometry become one trajectory: a pose graph, solved with GTSAM."""
 
+from stavpr_ros.pose_graph.alignment import align_maps
 from stavpr_ros.pose_graph.closures import Closure
 from stavpr_ros.pose_graph.consistency import ConsistencySettings
 from stavpr_ros.pose_graph.graph import GraphEdge, GraphSettings, PoseGraph
@@ -16,5 +17,6 @@ __all__ = [
     'KeyframeSettings',
     'OdometryNoise',
     'PoseGraph',
+    'align_maps',
     'optimize',
 ]

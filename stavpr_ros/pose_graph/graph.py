@@ -206,9 +206,7 @@ class PoseGraph:
             self.chain.split(node)
             self.splits += 1
             self._solver.restart()
-            self._accepted = self._consistent.update(
-                self._clusters, everything, self.chain, noise
-            )
+            self._accepted = self._consistent.update(self._clusters, everything, self.chain, noise)
         accepted = int(self._accepted.sum())
         if self.settings.adapt and accepted >= max(6, 1.3 * self._scaled_at):
             self._scaled_at = accepted
@@ -340,9 +338,7 @@ class PoseGraph:
                 result[node] = self._start(node, result, links)
         return result
 
-    def _place_all(
-        self, joins: frozenset[tuple[int, int]], links: dict[int, int]
-    ) -> np.ndarray:
+    def _place_all(self, joins: frozenset[tuple[int, int]], links: dict[int, int]) -> np.ndarray:
         """Return the odometry of all nodes, each session moved to where its closures vote for."""
         T, session = self.chain.transforms, self.chain.session
         result = np.empty((len(self.chain), 4, 4))
@@ -357,9 +353,7 @@ class PoseGraph:
             placed.add(number)
         return result
 
-    def _order(
-        self, joins: frozenset[tuple[int, int]], links: dict[int, int]
-    ) -> list[int]:
+    def _order(self, joins: frozenset[tuple[int, int]], links: dict[int, int]) -> list[int]:
         """Return the sessions, each after one that it is joined or tied to."""
         session = self.chain.session
         order: list[int] = []

@@ -63,7 +63,7 @@ class KeyframeChain:
     def __init__(self, settings: KeyframeSettings) -> None:
         self._settings = settings
         self._capacity = 1024
-        self._arrays = {
+        self._arrays: dict[str, np.ndarray] = {
             'stamps': np.zeros(self._capacity, np.int64),
             'transforms': np.zeros((self._capacity, 4, 4)),
             'travelled': np.zeros(self._capacity),

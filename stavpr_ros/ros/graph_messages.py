@@ -2,19 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of the pose graph: loop closures in; paths, poses and markers out."""
 
+from typing import Any
+
 from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import Path
 import numpy as np
-from std_msgs.msg import ColorRGBA, Header
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_ros.pose_graph import Closure, PoseGraph
+from stavpr_ros.pose_graph.alignment import APPEARANCE, IDENTITY
 from stavpr_ros.pose_graph.transforms import to_poses
 from stavpr_ros.ros.output import nanoseconds, pose_message, time_message
+from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-# Deviations of an edge by appearance alone: the query is taken to be where the place is. Measured
-# on synthetic streets with two lanes: .9 m along, 2 m across.
-APPEARANCE = np.diag([3.0, 3.0, 1.0, 0.18, 0.18, 0.18]) ** 2
 COLORS = {
     True: ColorRGBA(r=0.1, g=0.7, b=0.2, a=0.8),
     False: ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.5),
@@ -30,7 +30,7 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
     """
     relative = message.relative_pose
     on_map = message.query_index < 0 and message.has_poses
-    known = {
+    known: dict[str, Any] = {
         'map_id': (message.map_id or 'map') if on_map else '',
         'place_pose': _pose(message.place_pose) if on_map else None,
     }
@@ -42,9 +42,8 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
         )  # fmt: skip
     if not appearance:
         return None
-    same = np.array([0, 0, 0, 0, 0, 0, 1.0])
     stamps = nanoseconds(message.query_stamp), nanoseconds(message.place_stamp)
-    return Closure(*stamps, same, APPEARANCE, False, **known)
+    return Closure(*stamps, IDENTITY, APPEARANCE, False, **known)
 
 
 def _pose(pose: object) -> np.ndarray:

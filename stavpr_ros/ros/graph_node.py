@@ -82,7 +82,7 @@ class PoseGraphNode(ManagedNode):
                 raise SettingsError(f'{name} = {given[name]}: expected a number above 0')
         keyframes = KeyframeSettings(given['keyframe_distance'], max_gap=given['max_odometry_gap'])
         self._graph = PoseGraph(GraphSettings(keyframes))
-        self._tf_type = tf_message() if given['publish_tf'] else None
+        self._tf_type: Any = tf_message() if given['publish_tf'] else None
         self._lock = threading.Lock()  # of the graph
         self._wake = threading.Condition()  # of the inbox
         self._inbox: list[Odometry | LoopClosure] = []
@@ -140,9 +140,7 @@ class PoseGraphNode(ManagedNode):
         self._entities = [
             subscribe(Odometry, 'odom', self._on_odometry, ODOMETRY_QOS, callback_group=group),
             *(
-                subscribe(
-                    LoopClosure, topic, self._hand_over, CLOSURE_QOS, callback_group=group
-                )
+                subscribe(LoopClosure, topic, self._hand_over, CLOSURE_QOS, callback_group=group)
                 for topic in self._topics
             ),
         ]

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Three laps on a synthetic street that closes on itself, with the true poses and a drifting odometry.
+Three laps on a synthetic street that closes on itself, with true poses and drifting odometry.
 
 Lap 2 is on the other lane and has a detour and a stop, lap 3 is in the rain at dusk. Poses are
 planar: x, y (m) and yaw (rad) of the robot's base, which is on the ground below the camera.
@@ -13,7 +13,7 @@ from math import pi
 
 import numpy as np
 from stavpr_ros.demonstration.street.rendering import EYE, FOCAL, HORIZON
-from stavpr_ros.demonstration.street.street import CELL, make_street, Street, THING_ALONG, VIEW
+from stavpr_ros.demonstration.street.street import CELL, Street, THING_ALONG, VIEW
 from stavpr_ros.demonstration.street.traverses import (
     DETOUR,
     DETOUR_FROM,
@@ -46,7 +46,12 @@ CAMERA_IN_BASE = np.array([0.0, 0.0, EYE, -0.5, 0.5, -0.5, 0.5])
 
 # Odometry at drift 1: deviation of the scale of a step, per step; of the heading, per square root
 # of a meter; bias of the heading, per meter; bias of the scale.
-SCALE_NOISE, HEADING_NOISE, HEADING_BIAS, SCALE_BIAS = 0.02, np.radians(0.5), np.radians(0.02), 0.01
+SCALE_NOISE, HEADING_NOISE, HEADING_BIAS, SCALE_BIAS = (
+    0.02,
+    np.radians(0.5),
+    np.radians(0.02),
+    0.01,
+)
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,9 @@ class RingWorld(World):
         headings = -street.headings[: round(LENGTH / CELL) + 1]
         middle = (headings[1:] + headings[:-1]) / 2
         steps = CELL * np.stack([np.cos(middle), np.sin(middle)], axis=1)
-        return np.column_stack([np.concatenate([[[0.0, 0.0]], np.cumsum(steps, axis=0)]), headings])
+        return np.column_stack(
+            [np.concatenate([[[0.0, 0.0]], np.cumsum(steps, axis=0)]), headings]
+        )
 
 
 def _closed_curvature(seed: int, cells: int) -> np.ndarray:
@@ -178,9 +185,7 @@ def intrinsics(size: tuple[int, int] = SIZE) -> np.ndarray:
     """Return the camera matrix of rendered images, without distortion, shape (3, 3)."""
     width, height = size
     focal = FOCAL * width
-    return np.array(
-        [[focal, 0, width / 2 - 0.5], [0, focal, HORIZON * height - 0.5], [0, 0, 1.0]]
-    )
+    return np.array([[focal, 0, width / 2 - 0.5], [0, focal, HORIZON * height - 0.5], [0, 0, 1.0]])
 
 
 def drive_laps(
