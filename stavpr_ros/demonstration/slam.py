@@ -190,11 +190,11 @@ def write_result(
         )
     plot = folder / 'slam.png'
     with page(plot, 12.5, 6.6) as figure:
-        figure.text(0.012, 0.985, 'Three laps of a synthetic street', fontsize=15, va='top',
-                    weight='bold', color=INK)  # fmt: skip
-        figure.text(0.012, 0.93, result.summary(), fontsize=10.5, va='top', color=QUIET)
-        left, right = figure.subplots(1, 2)
-        figure.subplots_adjust(top=0.78, bottom=0.08, left=0.05, right=0.99)
+        top, below = figure.subfigures(2, 1, height_ratios=(1.1, 5.5))
+        top.text(0.012, 0.96, 'Three laps of a synthetic street', fontsize=15, va='top',
+                 weight='bold', color=INK)  # fmt: skip
+        top.text(0.012, 0.6, result.summary(), fontsize=10.5, va='top', color=QUIET)
+        left, right = below.subplots(1, 2)
         style: dict[str, Any] = {'lw': 1.0}
         left.plot(*result.truth[:, :2].T, color='black', label='truth', lw=2.2, alpha=0.5)
         left.plot(*result.before[:, :2].T, color='#c44', label='odometry', **style)

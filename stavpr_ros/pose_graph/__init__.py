@@ -6,7 +6,7 @@ from stavpr_ros.pose_graph.alignment import align_maps
 from stavpr_ros.pose_graph.closures import Closure
 from stavpr_ros.pose_graph.consistency import ConsistencySettings
 from stavpr_ros.pose_graph.graph import GraphEdge, GraphSettings, PoseGraph
-from stavpr_ros.pose_graph.odometry import KeyframeSettings, OdometryNoise
+from stavpr_ros.pose_graph.odometry import ChainSettings, OdometryNoise
 from stavpr_ros.pose_graph.offline import optimize
 
 __all__ = [
@@ -14,7 +14,7 @@ __all__ = [
     'ConsistencySettings',
     'GraphEdge',
     'GraphSettings',
-    'KeyframeSettings',
+    'ChainSettings',
     'OdometryNoise',
     'PoseGraph',
     'align_maps',

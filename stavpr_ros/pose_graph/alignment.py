@@ -9,7 +9,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.trajectory import SECOND
 from stavpr_ros.pose_graph.closures import Closure
 from stavpr_ros.pose_graph.graph import GraphSettings, PoseGraph
-from stavpr_ros.pose_graph.odometry import KeyframeSettings
+from stavpr_ros.pose_graph.odometry import ChainSettings
 
 # Deviations of a closure by appearance alone: the query is taken to be where the place is.
 # Measured on synthetic streets with two lanes: .9 m along, 2 m across.
@@ -31,7 +31,7 @@ def align_maps(reference: np.ndarray, poses: np.ndarray, pairs: np.ndarray) -> n
     :raises InputError: too few pairs agree.
     :raises UnavailableError: GTSAM is not installed.
     """
-    keyframes = KeyframeSettings(distance=0.0, max_gap=math.inf, max_speed=math.inf)
+    keyframes = ChainSettings(distance=0.0, max_gap=math.inf, max_speed=math.inf)
     graph = PoseGraph(GraphSettings(keyframes))
     for i, pose in enumerate(poses):
         graph.add_odometry((i + 1) * SECOND, pose)

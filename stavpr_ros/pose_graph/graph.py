@@ -16,7 +16,7 @@ from stavpr_ros.pose_graph.consistency import (
     grow,
     largest_consistent,
 )
-from stavpr_ros.pose_graph.odometry import KeyframeChain, KeyframeSettings, OdometryNoise
+from stavpr_ros.pose_graph.odometry import KeyframeChain, ChainSettings, OdometryNoise
 from stavpr_ros.pose_graph.solver import CAUCHY, Solver, WIDE
 from stavpr_ros.pose_graph.transforms import body_covariance, inverse, matrices, to_poses
 
@@ -34,7 +34,7 @@ class GraphSettings:
     :param noise: errors of the odometry; their factor is estimated if ``adapt``.
     """
 
-    keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
+    keyframes: ChainSettings = field(default_factory=ChainSettings)
     noise: OdometryNoise = field(default_factory=OdometryNoise)
     consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
     adapt: bool = True

@@ -34,7 +34,7 @@ class OdometryNoise:
 
 
 @dataclass(frozen=True)
-class KeyframeSettings:
+class ChainSettings:
     """
     When the odometry becomes a keyframe, and when it breaks.
 
@@ -60,7 +60,7 @@ class KeyframeChain:
 
     FIXED = -1
 
-    def __init__(self, settings: KeyframeSettings) -> None:
+    def __init__(self, settings: ChainSettings) -> None:
         self._settings = settings
         self._capacity = 1024
         self._arrays: dict[str, np.ndarray] = {

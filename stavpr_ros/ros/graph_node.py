@@ -20,7 +20,7 @@ from stavpr_msgs.msg import LoopClosure
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.errors import InputError, SettingsError, StavprError
 from stavpr_ros.pipeline.maps_folder import inside, maps_folder
-from stavpr_ros.pose_graph import GraphSettings, KeyframeSettings, PoseGraph
+from stavpr_ros.pose_graph import GraphSettings, ChainSettings, PoseGraph
 from stavpr_ros.pose_graph.files import save_graph
 from stavpr_ros.pose_graph.transforms import matrices, to_poses
 from stavpr_ros.ros.graph_messages import closure_of, edge_markers, paths
@@ -80,7 +80,7 @@ class PoseGraphNode(ManagedNode):
         for name in ('keyframe_distance', 'max_odometry_gap'):
             if not (math.isfinite(given[name]) and given[name] > 0):
                 raise SettingsError(f'{name} = {given[name]}: expected a number above 0')
-        keyframes = KeyframeSettings(given['keyframe_distance'], max_gap=given['max_odometry_gap'])
+        keyframes = ChainSettings(given['keyframe_distance'], max_gap=given['max_odometry_gap'])
         self._graph = PoseGraph(GraphSettings(keyframes))
         self._tf_type: Any = tf_message() if given['publish_tf'] else None
         self._lock = threading.Lock()  # of the graph
