@@ -88,6 +88,7 @@ setup(
         'dev': [*TEST, *LINT],
         'docs': ['myst-parser>=2.0', 'sphinx>=7.2'],
         'evaluation': EVALUATION,
+        'faiss': ['faiss-cpu>=1.8'],
         'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
         'slam': ['evo>=1.31', 'gtsam>=4.2'],
         'test': TEST,

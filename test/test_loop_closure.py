@@ -14,6 +14,7 @@ from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition import RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import (
+    AROUND,
     choose_loop_backend,
     EVICTED,
     LEAST_PLACES,
@@ -21,10 +22,10 @@ from stavpr_ros.recognition.loop_closer import (
 )
 from stavpr_ros.recognition.place_filter import CLOSE, FilterSettings, PlaceFilter
 from stavpr_ros.recognition.robust import (
-    MIN_DEVIATION,
     PAPER,
     ROBUST,
     THRESHOLD,
+    z_normalized,
 )
 from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
 from stavpr_ros.recognition.sequence_search import ImageChange
@@ -109,7 +110,7 @@ class PlainCloser:
             return np.empty(0, np.float32)
         live = self.distances(image, last)[first:]
         if self.settings.applied_options.query_znorm:
-            live = (live - live.mean()) / np.float32(max(live.std(), MIN_DEVIATION))
+            live = z_normalized(live, AROUND)
         return live
 
     def add(self, image, first, last):
@@ -289,6 +290,22 @@ def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
             middle = first + int(np.argmax(belief.probabilities))
             assert answer.place_index == pytest.approx(middle, abs=2)
     assert first > 0
+
+
+def test_loop_closer_closes_no_loop_within_another_light():
+    """Images of the second light are nearer to each other than to those of their own places."""
+    rng = np.random.default_rng(3)
+    places, lights = rng.standard_normal((2, 7, 200, 64)), rng.standard_normal((7, 2, 64))
+    first = places[0] + lights[:, :1]
+    second = np.concatenate([0.6 * places[0][:, :60], places[1]], 1) + 1.2 * lights[:, 1:]
+    strips = np.concatenate([first, second], 1) + 0.5 * rng.standard_normal((7, 460, 64))
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+    closer = LoopCloser(RecognizerSettings(THRESHOLD, mode='robust'), 20, laps_of(1, 1).settings)
+    answers = drive(closer, features_of(torch.from_numpy(strips).float()))
+    middles = np.array([answer.place_index for answer in answers])
+    again = np.arange(225, 260)  # images half a window behind the second pass
+    assert (np.abs(middles[again] - (again - 210)) <= 2).mean() > 0.8
+    assert (middles[280:] < 0).all()
 
 
 # ------------------------------------------------ seconds

@@ -149,6 +149,17 @@ def test_z_normalized_row_has_mean_0_and_deviation_1_of_finite_entries():
     assert len(z_normalized(row[:0])) == 0
 
 
+def test_z_normalized_around_subtracts_mean_of_neighbors():
+    row = np.random.default_rng(0).normal(3, 2, 40).astype(np.float32)
+    z = z_normalized(row)
+    found = z_normalized(row, 3)
+    for y in range(40):
+        near = [max(z[min(max(i, 0), 39)], -1) for i in range(y - 3, y + 4)]
+        assert found[y] == pytest.approx(z[y] - np.mean(near), abs=1e-5)
+    row[4] = np.inf
+    assert np.isinf(z_normalized(row, 3)).tolist() == [i == 4 for i in range(40)]
+
+
 # ------------------------------------------------ the recognizer
 
 

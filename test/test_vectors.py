@@ -34,6 +34,7 @@ def test_as_maps_of_tokens_by_hand():
 def test_as_maps_leaves_maps_and_vectors():
     for shape in ((2, 5, 3, 4), (2, 5)):
         assert as_maps(torch.zeros(shape), 2, 1, 'net').shape == shape
+    assert as_maps(torch.zeros(2, 5, 1, 1), 2, 1, 'net').shape == (2, 5)
 
 
 @pytest.mark.parametrize(
@@ -221,6 +222,14 @@ def test_alignment_of_one_strip_is_the_cosine_distance(strategy, precision):
     torch.testing.assert_close(matrix.double(), expected, rtol=0, atol=1e-5)
     row = matcher.distances(queries.strips[:, 1], queries.weights[:, 1])
     assert torch.equal(row, matrix[1])
+
+
+def test_alignment_of_one_strip_in_int8_is_near_the_cosine_distance():
+    features, queries = vectors(131, 515), vectors(3, 515, seed=1)
+    matcher = make_matcher(features, SpatialSettings(), 'cpu', 'int8')
+    matrix = matcher.distance_matrix(queries.strips, queries.weights)
+    expected = 1 - queries.strips[0] @ features.strips[0].T
+    torch.testing.assert_close(matrix, expected, rtol=0, atol=0.02)
 
 
 def test_sliding_window_over_one_strip_is_rejected_with_the_map():

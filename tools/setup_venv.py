@@ -30,7 +30,7 @@ LAST_LINES = 25  # of the log of a failed command
 
 # Names of files requirements/NAME.txt; torch has its own file, since it may have its own index.
 REQUIRED = ('torch', 'runtime', 'ros', 'build')
-EXTRAS = ('onnx', 'cuda', 'slam', 'evaluation', 'bench', 'dev', 'docs')
+EXTRAS = ('onnx', 'faiss', 'cuda', 'slam', 'evaluation', 'bench', 'dev', 'docs')
 
 # The files that a package is built from, in build order: stavpr_ros depends on stavpr_msgs.
 SOURCES = {

@@ -4,6 +4,7 @@
 
 import argparse
 import json
+from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
@@ -14,7 +15,7 @@ from stavpr_ros.output_file import JSON, require_replaceable, write_output
 if TYPE_CHECKING:
     from stavpr_ros.evaluation.metrics import Metrics
     from stavpr_ros.evaluation.paper.datasets import Dataset
-    from stavpr_ros.evaluation.paper.experiments import Configuration
+    from stavpr_ros.evaluation.paper.experiments import BaselineInputs, Configuration
 
 EMPTY = '-'
 
@@ -25,7 +26,8 @@ the table beside the published numbers (F1; the paper has no others).
 
 EPILOG = """
 experiments:
-  paper        SeqSLAM, no alignment, STA-VPR, STA-VPR with GRP and RA
+  paper        SeqSLAM, NetVLAD, SAES, no alignment, VGG fc6, SSM-VPR, STA-VPR, STA-VPR with GRP
+               and RA; - where --descriptors or --ssm-layers are missing
   ablation     no alignment, only spatial, only temporal, both
   strategies   sliding window, vanilla DTW, adaptive DTW
   fast         random projection (GRP) and restricted alignment (RA), off and on
@@ -39,6 +41,8 @@ examples:
   experiments paper --data folder_of_all --datasets nordland synth_nordland gardens_point
   experiments strategies --datasets gardens_point=data/gp --features onnx --onnx-model m.onnx \\
       --onnx-layer x
+  experiments paper --data all --features onnx --onnx-model m.onnx --onnx-layer x \\
+      --ssm-layers y x --descriptors netvlad=arrays/netvlad
   experiments sweep --parameter sigma --values 0 0.5 1 2 --data all
 
 exit codes: 0 done, 1 failed (the reason is printed), 2 usage, 130 interrupted
@@ -64,6 +68,20 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--parameter', choices=tuple(SWEEPS), help='of sweep (l)')
     parser.add_argument(
         '--values', nargs='+', type=float, default=(), metavar='X', help='of sweep'
+    )
+    parser.add_argument(
+        '--descriptors',
+        action='append',
+        default=[],
+        metavar='COLUMN=FOLDER',
+        help='of paper: arrays FOLDER/DATASET/map.npy and query.npy (or .npz .csv .mat) for the '
+        'column netvlad, saes or vgg_fc6; may be repeated',
+    )
+    parser.add_argument(
+        '--ssm-layers',
+        nargs=2,
+        metavar=('FIRST', 'SECOND'),
+        help='of paper: two layers of the network of --features for SSM-VPR, the coarser first',
     )
     parser.add_argument('--json', metavar='FILE', help='write all numbers')
     parser.add_argument('--force', action='store_true', help='replace an existing FILE')
@@ -114,6 +132,40 @@ def _check_features(options: argparse.Namespace) -> None:
         )
 
 
+def _check_baselines(options: argparse.Namespace) -> None:
+    from stavpr_ros.evaluation.paper.experiments import PRESETS
+
+    if (options.descriptors or options.ssm_layers) and options.experiment != 'paper':
+        raise SettingsError('--descriptors and --ssm-layers go with the experiment paper')
+    if options.ssm_layers and options.features not in ('onnx', 'torchscript'):
+        raise SettingsError('--ssm-layers: give --features onnx or torchscript')
+    known = [row.name for row in PRESETS['paper'] if row.baseline == 'descriptors']
+    for entry in options.descriptors:
+        column, _, folder = entry.partition('=')
+        if column not in known or not folder or not Path(folder).is_dir():
+            raise SettingsError(
+                f'--descriptors {entry}: expected {" or ".join(known)}, = and a folder'
+            )
+
+
+def _inputs(options: argparse.Namespace, dataset: str) -> 'BaselineInputs':
+    """Return the inputs of the baselines on a data set; its descriptors may be missing."""
+    from stavpr_ros.evaluation.paper.experiments import BaselineInputs
+    from stavpr_ros.features.descriptors import is_descriptors
+
+    arrays: dict[str, tuple[str, str]] = {}
+    for entry in options.descriptors:
+        column, _, folder = entry.partition('=')
+        both = [
+            [str(path) for path in sorted(Path(folder, dataset).glob(f'{name}.*'))]
+            for name in ('map', 'query')
+        ]
+        places, queries = ([path for path in paths if is_descriptors(path)] for paths in both)
+        if places and queries:
+            arrays[column] = places[0], queries[0]
+    return BaselineInputs(arrays, tuple(options.ssm_layers) if options.ssm_layers else None)
+
+
 def _run_row(
     dataset: 'Dataset',
     options: argparse.Namespace,
@@ -128,9 +180,13 @@ def _run_row(
 
     features = make_extractor(options).settings
     device = choose_device(options.device)
-    experiment = DatasetExperiment(dataset, features.kind, features.backbone, options.mode, device)
+    inputs = _inputs(options, name)
+    experiment = DatasetExperiment(
+        dataset, features.kind, features.backbone, options.mode, device, inputs
+    )
     found: dict[str, Metrics | None] = {}
-    for column in tqdm(columns, desc=name, unit='column', disable=None):
+    title = f'{name}, {features.kind}'
+    for column in tqdm(columns, desc=title, unit='column', disable=None):
         too_short = len(dataset.query) < column.sequence.length
         found[column.name] = None if too_short else experiment.evaluate(column)
     return found
@@ -176,11 +232,12 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.json:
         require_replaceable(arguments.json, JSON, arguments.force)
     _check_features(arguments)
+    _check_baselines(arguments)
     columns, datasets = _columns(arguments), _datasets(arguments)
     rows = [['data set', 'features', *(column.title for column in columns)]]
     results: list[dict[str, Any]] = []
     for name, dataset in datasets.items():
-        metrics = _run_row(dataset, arguments, columns, f'{name}, {arguments.features}')
+        metrics = _run_row(dataset, arguments, columns, name)
         numbers = {
             key: None if found is None else found.to_json() for key, found in metrics.items()
         }

@@ -267,6 +267,14 @@ def export_onnx(content: bytes, outputs: Outputs, size: int) -> Exported:
     onnx = _import_onnx()
     model = onnx.load_model_from_string(content)
     graph = model.graph
+    weights = {tensor.name for tensor in graph.initializer}
+    images_in = [value for value in graph.input if value.name not in weights]
+    if len(images_in) != 1:
+        raise SettingsError(f'there are {len(images_in)} inputs: expected one, the image')
+    tensor_type = images_in[0].type.tensor_type
+    tensor_type.shape.dim[0].dim_param = 'batch'
+    del graph.value_info[:]  # it may fix the batch size
+    content = model.SerializeToString()
     tensors = [name for node in graph.node for name in node.output]
     for wanted in filter(None, (outputs.vector, outputs.map)):
         if wanted not in tensors:
@@ -296,7 +304,7 @@ def export_onnx(content: bytes, outputs: Outputs, size: int) -> Exported:
     del graph.output[:]
     graph.output.extend(
         onnx.helper.make_tensor_value_info(
-            name, onnx.TensorProto.FLOAT, ['batch', *reference.shape[1:]]
+            name, tensor_type.elem_type, ['batch', *reference.shape[1:]]
         )
         for name, reference in zip(names, references, strict=True)
     )
@@ -321,6 +329,8 @@ def _renaming(
 ) -> list[tuple[Any, list[Any]]]:
     """Return the nodes from a tensor to an output, and their constants."""
     node = onnx.helper.make_node
+    if found.ndim > maps.ndim:
+        return [(node('Flatten', [tensor], [name], axis=1), [])]
     if tensor == name and found.ndim == maps.ndim:
         return []
     if found.ndim == maps.ndim:
@@ -373,8 +383,14 @@ def _runner(content: bytes) -> Callable[[np.ndarray], list[np.ndarray]]:
     import onnxruntime
 
     session = onnxruntime.InferenceSession(content, providers=['CPUExecutionProvider'])
-    name = session.get_inputs()[0].name
-    return lambda images: session.run(None, {name: images})
+    image = session.get_inputs()[0]
+    dtype = np.float16 if image.type == 'tensor(float16)' else np.float32
+
+    def run(images: np.ndarray) -> list[np.ndarray]:
+        outputs = session.run(None, {image.name: images.astype(dtype)})
+        return [output.astype(np.float32) for output in outputs]
+
+    return run
 
 
 def _import_onnx() -> Any:

@@ -34,8 +34,8 @@ def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> torch.Te
     """
     Return what a network computes for a batch as feature maps or vectors.
 
-    :param output: maps (n, C, H, Wf), vectors (n, D), or the tokens of a vision transformer
-        (n, T, C), of square images.
+    :param output: maps (n, C, H, Wf), vectors (n, D) or (n, D, 1, 1), or the tokens of a vision
+        transformer (n, T, C), of square images.
     :param images: number n of images.
     :param prefix_tokens: leading tokens that are no patches.
     :param name: of the layer.
@@ -50,6 +50,8 @@ def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> torch.Te
             f'{name} returns {returned} for {images} images: expected maps (n, C, H, W), tokens '
             '(n, T, C) or vectors (n, D); name another layer'
         )
+    if shape[2:] == (1, 1):  # of a pooling over the whole map
+        return output.flatten(1)
     if len(shape) != 3:
         return output
     n, T, C = shape

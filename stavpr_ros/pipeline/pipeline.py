@@ -298,12 +298,13 @@ class Pipeline:
         """
         Check the middle pair of a match by their thumbnails; without these, nothing changes.
 
-        Mode robust weighs the result (:class:`GeometricEvidence`), where the match is doubtful;
-        mode paper rejects matches with too few inliers.
+        Matches with too few inliers are rejected. Localization in mode robust weighs the result
+        instead (:class:`GeometricEvidence`), where the match is doubtful.
         """
         if self._verifier is None or match.sequence is None:
             return match
-        checked = self._evidence.wants(match.probability) if match.relative else match.accepted
+        weighed = match.relative and self._name == 'localization'
+        checked = self._evidence.wants(match.probability) if weighed else match.accepted
         query = self._thumbnails[0]
         if not checked or query is None:
             return match
@@ -312,7 +313,7 @@ class Pipeline:
             return match
         least = self._verifier.settings.min_inliers
         match = replace(match, inliers=inliers)
-        if match.relative:
+        if weighed:
             return match.with_probability(
                 self._evidence.updated(match.probability, inliers >= least)
             )

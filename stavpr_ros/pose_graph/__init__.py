@@ -10,11 +10,11 @@ from stavpr_ros.pose_graph.odometry import ChainSettings, OdometryNoise
 from stavpr_ros.pose_graph.offline import optimize
 
 __all__ = [
+    'ChainSettings',
     'Closure',
     'ConsistencySettings',
     'GraphEdge',
     'GraphSettings',
-    'ChainSettings',
     'OdometryNoise',
     'PoseGraph',
     'align_maps',

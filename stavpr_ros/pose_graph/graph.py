@@ -16,7 +16,7 @@ from stavpr_ros.pose_graph.consistency import (
     grow,
     largest_consistent,
 )
-from stavpr_ros.pose_graph.odometry import KeyframeChain, ChainSettings, OdometryNoise
+from stavpr_ros.pose_graph.odometry import ChainSettings, KeyframeChain, OdometryNoise
 from stavpr_ros.pose_graph.solver import CAUCHY, Solver, WIDE
 from stavpr_ros.pose_graph.transforms import body_covariance, inverse, matrices, to_poses
 

@@ -14,11 +14,13 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.match import Match, Status
 from stavpr_ros.recognition.recognizer import RecognizerSettings, SequenceRecognizer
+from stavpr_ros.recognition.robust import z_normalized
 from stavpr_ros.recognition.route_features import RouteFeatures
 from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
 import torch
 
 EVICTED = 8  # the oldest one in so many is evicted at a time
+AROUND = 30  # places whose mean distance is subtracted: a route has been through several lights
 LEAST_PLACES = 5  # fewer distances have no meaningful mean and deviation
 
 
@@ -173,6 +175,9 @@ class LoopCloser(SequenceRecognizer):
         while young and (not young[0] or (stamp and stamp - young[0] >= self._exclude_ns)):
             young.popleft()
         return len(young) if stamp else 0
+
+    def _z_normalized(self, row: np.ndarray) -> np.ndarray:
+        return z_normalized(row, AROUND)
 
     def _distances(self) -> np.ndarray:
         """Return the distances of the newest image to its places; none if they are too few."""

@@ -201,8 +201,7 @@ class SequenceRecognizer:
         :param strips: the image's features, centered, shape (W, d).
         """
         if self._settings.applied_options.query_znorm:
-            normalized = z_normalized if self._layout is None else self._layout.z_normalized
-            row = torch.from_numpy(normalized(row.cpu().numpy()))
+            row = torch.from_numpy(self._z_normalized(row.cpu().numpy()))
         if self._layout is not None:
             row = self._layout.spread(row)
         self._buffer.push(row.to(self._buffer.memory.device), stamp)
@@ -210,6 +209,9 @@ class SequenceRecognizer:
             change = self._filter.change.next_query(strips.cpu().numpy())
             self._filter.update(row.cpu().numpy(), change)
         return replace(self._match_window(), window_stamps=self._buffer.stamps)
+
+    def _z_normalized(self, row: np.ndarray) -> np.ndarray:
+        return z_normalized(row) if self._layout is None else self._layout.z_normalized(row)
 
     def _match_window(self) -> Match:
         threshold, length = self._settings.threshold, self._settings.sequence.length

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures
 import torch
@@ -298,9 +299,19 @@ def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
     return unit_norm(centered)
 
 
-def z_normalized(row: np.ndarray) -> np.ndarray:
-    """Return a row with mean 0 and deviation 1 of its finite entries, shape (n,), float32."""
+def z_normalized(row: np.ndarray, around: int = 0) -> np.ndarray:
+    """
+    Return a row with mean 0 and deviation 1 of its finite entries, shape (n,), float32.
+
+    :param around: subtract the mean of so many places to either side as well, in which no place
+        counts for less than -1, so that the right one counts little. Images of one light are
+        nearer to each other than to all others, which says nothing of their places. 0 = no.
+    """
     known = row[np.isfinite(row)]
     if not known.size:
         return row
-    return (row - known.mean()) / np.float32(max(known.std(), MIN_DEVIATION))
+    z = (row - known.mean()) / np.float32(max(known.std(), MIN_DEVIATION))
+    if not around:
+        return z
+    clipped = np.where(np.isfinite(z), np.maximum(z, -1), np.float32(0))
+    return z - uniform_filter1d(clipped, 2 * around + 1, mode='nearest')

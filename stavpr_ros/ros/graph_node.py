@@ -20,7 +20,7 @@ from stavpr_msgs.msg import LoopClosure
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.errors import InputError, SettingsError, StavprError
 from stavpr_ros.pipeline.maps_folder import inside, maps_folder
-from stavpr_ros.pose_graph import GraphSettings, ChainSettings, PoseGraph
+from stavpr_ros.pose_graph import ChainSettings, GraphSettings, PoseGraph
 from stavpr_ros.pose_graph.files import save_graph
 from stavpr_ros.pose_graph.transforms import matrices, to_poses
 from stavpr_ros.ros.graph_messages import closure_of, edge_markers, paths

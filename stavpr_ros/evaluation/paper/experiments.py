@@ -6,16 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+import numpy as np
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.evaluation.evaluate import evaluate_on_map
 from stavpr_ros.evaluation.metrics import evaluate_ranking, Metrics, Ranking
 from stavpr_ros.evaluation.paper.datasets import Dataset
 from stavpr_ros.evaluation.seqslam import seqslam, SeqSlamSettings
+from stavpr_ros.evaluation.ssm_vpr import SsmVpr
+from stavpr_ros.evaluation.warp import FrameSource
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map, PlaceMap
+from stavpr_ros.features.descriptors import read_descriptors, require_comparable
+from stavpr_ros.features.registry import backbone_class
+from stavpr_ros.mapping import build_map, descriptor_map, PlaceMap
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.robust import PAPER, ROBUST, RobustOptions
+import torch
 
 W = 7
 GRP, XI = 512, 3  # the paper's random projection and restricted alignment
@@ -32,7 +38,9 @@ class Configuration:
     :param strips: W.
     :param projection: dimensions of a random projection, None without.
     :param robust_options: of the recognizer; None = those of the mode.
-    :param baseline: ``seqslam``: run that instead, with the length of the sequence settings.
+    :param baseline: run that instead: ``seqslam``, with the length of the sequence settings;
+        ``ssm_vpr``, with two layers of the network; ``descriptors``, single images by the arrays
+        of this name.
     """
 
     name: str
@@ -53,7 +61,11 @@ FAST = Configuration('sta_vpr_fast', 'GRP + RA', SpatialSettings(xi=XI), project
 PRESETS: dict[str, tuple[Configuration, ...]] = {
     'paper': (
         Configuration('seqslam', 'SeqSLAM', baseline='seqslam'),
+        Configuration('netvlad', 'NetVLAD', baseline='descriptors'),
+        Configuration('saes', 'SAES', baseline='descriptors'),
         Configuration('no_alignment', 'no alignment', NO_ALIGNMENT, temporal=False),
+        Configuration('vgg_fc6', 'VGG fc6', baseline='descriptors'),
+        Configuration('ssm_vpr', 'SSM-VPR', baseline='ssm_vpr'),
         STA_VPR,
         FAST,
     ),
@@ -130,6 +142,19 @@ def _changed(plain: Configuration, parameter: str, value: float) -> Configuratio
     return replace(plain, spatial=spatial)
 
 
+@dataclass(frozen=True)
+class BaselineInputs:
+    """
+    What baselines need besides the images.
+
+    :param arrays: files of the descriptors of map and query, by the name of the column.
+    :param ssm_layers: two layers of the network of the features, for SSM-VPR.
+    """
+
+    arrays: dict[str, tuple[str, str]] = field(default_factory=dict)
+    ssm_layers: tuple[str, str] | None = None
+
+
 class DatasetExperiment:
     """
     Evaluates configurations on one data set; features are kept, since several columns share them.
@@ -137,19 +162,31 @@ class DatasetExperiment:
     :param dataset: images and ground truth.
     :param kind, backbone: of the features, see :class:`stavpr_ros.features.FeatureExtractor`.
     :param mode: of the recognizer, ``paper`` or ``robust``.
+    :param inputs: of the baselines.
     """
 
     def __init__(
-        self, dataset: Dataset, kind: str, backbone: Any, mode: str = 'paper', device: str = 'cpu'
+        self,
+        dataset: Dataset,
+        kind: str,
+        backbone: Any,
+        mode: str = 'paper',
+        device: str = 'cpu',
+        inputs: BaselineInputs | None = None,
     ) -> None:
+        self._inputs = inputs or BaselineInputs()
         self._dataset, self._kind, self._backbone = dataset, kind, backbone
         self._mode, self._device = mode, device
         self._features: dict[tuple[int, int | None], tuple[PlaceMap, PlaceMap]] = {}
 
-    def evaluate(self, configuration: Configuration) -> Metrics:
-        """Return the metrics of one configuration."""
-        if configuration.baseline:
-            return self._evaluate_baseline(configuration)
+    def evaluate(self, configuration: Configuration) -> Metrics | None:
+        """Return the metrics of one configuration; None without the inputs of its baseline."""
+        if configuration.baseline == 'seqslam':
+            return self._evaluate_seqslam(configuration)
+        if configuration.baseline == 'ssm_vpr':
+            return self._evaluate_ssm_vpr()
+        if configuration.baseline == 'descriptors':
+            return self._evaluate_descriptors(configuration.name)
         reference, query = self._maps(configuration)
         settings = RecognizerSettings(
             threshold=1.0,
@@ -163,7 +200,47 @@ class DatasetExperiment:
         )
         return evaluation.sequence if configuration.temporal else evaluation.single
 
-    def _evaluate_baseline(self, configuration: Configuration) -> Metrics:
+    def _evaluate_descriptors(self, name: str) -> Metrics | None:
+        """Match single images by the cosine distance of descriptors from files."""
+        if name not in self._inputs.arrays:
+            return None
+        reference, query = (read_descriptors(path) for path in self._inputs.arrays[name])
+        require_comparable(query, reference.settings, reference.dimension)
+        found = len(reference), len(query)
+        expected = len(self._dataset.map), len(self._dataset.query)
+        if found != expected:
+            raise SourceError(
+                f'descriptors {" and ".join(self._inputs.arrays[name])} are of {found} images: '
+                f'expected {expected}'
+            )
+        settings = RecognizerSettings(threshold=1.0, spatial=NO_ALIGNMENT)
+        truth = self._dataset.ground_truth
+        return evaluate_on_map(descriptor_map(reference), query, truth, settings).single
+
+    def _evaluate_ssm_vpr(self) -> Metrics | None:
+        if self._inputs.ssm_layers is None:
+            return None
+        networks = [
+            backbone_class(self._kind)(replace(self._backbone, layer=layer), self._device)
+            for layer in self._inputs.ssm_layers
+        ]
+
+        def maps(source: FrameSource) -> list[torch.Tensor]:
+            images = [frame.image for frame in source]
+            return [
+                torch.cat([network.feature_maps([image]).cpu() for image in images])
+                for network in networks
+            ]
+
+        coarse, fine = maps(self._dataset.map)
+        ssm = SsmVpr(coarse, fine)
+        pairs = zip(*maps(self._dataset.query), strict=True)
+        found = [ssm.recognize(first, second) for first, second in pairs]
+        places = np.array([ranked[0] for ranked, _ in found])
+        scores = np.array([1 - ranked[0] for _, ranked in found])  # lower is better
+        return evaluate_ranking(Ranking(places[:, None], scores), self._dataset.ground_truth)
+
+    def _evaluate_seqslam(self, configuration: Configuration) -> Metrics:
         settings = SeqSlamSettings(length=configuration.sequence.length)
         sources = (self._dataset.map, self._dataset.query)
         first, second = ((frame.image for frame in source) for source in sources)

@@ -14,6 +14,16 @@ F1 = {
     'ua': (0.687, (0.955, 0.968, 0.963), (0.979, 0.991, 0.990)),
     'berlin_a100': (0.457, (0.714, 0.873, 0.857), (0.683, 0.857, 0.801)),
 }
+# systems that the paper compares with, whatever the features: NetVLAD, SAES, VGG fc6, SSM-VPR
+SYSTEMS = ('netvlad', 'saes', 'vgg_fc6', 'ssm_vpr')
+F1_OF_SYSTEMS = {
+    'nordland': (0.587, 0.682, 0.221, 0.952),
+    'synth_nordland': (0.457, 0.072, 0.098, 0.864),
+    'gardens_point': (0.964, 0.649, 0.916, 0.997),
+    'gardens_point_night': (0.758, 0.367, 0.671, 0.950),
+    'ua': (0.574, 0.794, 0.492, 0.977),
+    'berlin_a100': (0.843, 0.603, 0.527, 0.927),
+}
 COLUMNS = ('no_alignment', 'sta_vpr', 'sta_vpr_fast')
 
 # DenseNet161 with temporal alignment, by how two images are compared
@@ -39,4 +49,5 @@ def published_f1(dataset: str, backbone: str, configuration: str) -> float | Non
     seqslam, densenet, vgg = F1[dataset]
     columns = dict(zip(COLUMNS, densenet if backbone == DENSENET else vgg, strict=True))
     strategies = STRATEGIES.get(dataset, {}) if backbone == DENSENET else {}
-    return (columns | strategies | {'seqslam': seqslam}).get(configuration)
+    systems = dict(zip(SYSTEMS, F1_OF_SYSTEMS[dataset], strict=True))
+    return (columns | strategies | systems | {'seqslam': seqslam}).get(configuration)
