@@ -190,7 +190,8 @@ def write_result(
         )
     plot = folder / 'slam.png'
     with page(plot, 12.5, 6.6) as figure:
-        top, below = figure.subfigures(2, 1, height_ratios=(1.1, 5.5))
+        parts = figure.add_gridspec(2, 1, height_ratios=(1.1, 5.5))
+        top, below = figure.add_subfigure(parts[0]), figure.add_subfigure(parts[1])
         top.text(0.012, 0.96, 'Three laps of a synthetic street', fontsize=15, va='top',
                  weight='bold', color=INK)  # fmt: skip
         top.text(0.012, 0.6, result.summary(), fontsize=10.5, va='top', color=QUIET)
