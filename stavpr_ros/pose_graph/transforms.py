@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 
 def matrices(poses: np.ndarray) -> np.ndarray:
-    """Return poses (..., 7), x y z and quaternion x y z w, as matrices (..., 4, 4)."""
+    """Return x y z and quaternion x y z w, shape (..., 7), as transforms (..., 4, 4)."""
     poses = np.asarray(poses, np.float64)
     result = np.zeros((*poses.shape[:-1], 4, 4))
     turns = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).as_matrix()
