@@ -5,7 +5,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from stavpr_ros.recognition.place_filter import FilterSettings
+from stavpr_ros.recognition.place_filter import BLOCK, FilterSettings
 
 ITEM_BYTES = {'float32': 4, 'bfloat16': 2, 'float16': 2}
 INT8_BYTES = 1
@@ -139,21 +139,21 @@ def window_push(sizes: Sizes) -> Work:
 
 def filter_update(sizes: Sizes, settings: FilterSettings) -> Work:
     """
-    Advance the filter: states and row are read once; states and their origins are written once.
+    Advance the filter: states and row are read once; states, origins and sums are written once.
 
-    A likelihood takes an exponential (1), a product and a difference. A state mixes levels (2
-    each) and speeds (9, where it comes from 2), moves (5, 2), is joined by births and weighed (4).
+    Half a byte an origin, a sum for each place. A likelihood takes an exponential (1), a product
+    and a difference. A state mixes levels (2 each) and speeds (9, where it comes from 2), moves
+    (5, 2), is joined by births and weighed (4).
     """
     K = len(settings.levels)
     states = K * len(settings.speeds)
     each = 3 * K + states * (2 * K + 9 + 2 + 5 + 2 + 4)
-    return Work(sizes.n * (4 + states * (4 + 4 + 1)), sizes.n * each)
+    return Work(sizes.n * (8 + states * (4 + 4 + 0.5)), sizes.n * each)
 
 
-def filter_belief(sizes: Sizes, settings: FilterSettings) -> Work:
-    """Sum the states by place; sums over neighbors (3) and their largest (1) of the way back."""
-    states = len(settings.levels) * len(settings.speeds)
-    return Work(4 * sizes.n * (states + 1), sizes.n * (states + 4))
+def filter_belief(sizes: Sizes) -> Work:
+    """Read the largest sum of each block; the way back starts at few places."""
+    return Work(4 * sizes.n / BLOCK, sizes.n / BLOCK)
 
 
 def lm_dtw(sizes: Sizes) -> Work:

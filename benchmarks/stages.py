@@ -88,7 +88,7 @@ def robust_stages(run: Run, n: int, seed: int) -> None:
         found = place_filter.belief(n, lag)
         return place_filter.way(found.ways[int(np.argmax(found.weights))], lag)
 
-    add('filter_belief', call=belief, works=[bounds.filter_belief(sizes, FILTER)])
+    add('filter_belief', call=belief, works=[bounds.filter_belief(sizes)])
 
 
 def _plain_filter(place_filter: PlaceFilter, rows: np.ndarray, speed_weights: np.ndarray) -> Peer:
@@ -225,7 +225,7 @@ def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
     works += [bounds.window_push(sizes)]
     if mode == 'paper':
         return [*works, bounds.lm_dtw(sizes), bounds.selection(sizes)]
-    filters = [bounds.filter_update(sizes, FILTER), bounds.filter_belief(sizes, FILTER)]
+    filters = [bounds.filter_update(sizes, FILTER), bounds.filter_belief(sizes)]
     return [bounds.mean_centering(sizes), *works, bounds.query_znorm(sizes), *filters]
 
 

@@ -322,6 +322,22 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         ),
         NodeParameter('map_frame', 'map', 'Frame of the poses of the map, for ~/pose.'),
         NodeParameter(
+            'relative_pose',
+            'auto',
+            'Relative poses of query and place in ~/loop_closure: pnp (keypoints; requires '
+            'camera_info, thumbnails and poses of the places), aligned (by odometry alone), auto '
+            '(pnp where it is possible, else aligned), none.',
+            choices=('auto', 'none', 'aligned', 'pnp'),
+        ),
+        NodeParameter(
+            'camera_transform',
+            '',
+            'Pose of the optical frame of the camera (z ahead, x right) in the base of the robot, '
+            'whose poses the odometry has: x y z roll pitch yaw, or x y z and a quaternion x y z '
+            'w, m and rad. Empty: from tf, where tf2_ros is installed, else a camera at the base '
+            'that looks ahead.',
+        ),
+        NodeParameter(
             'publish_tf',
             False,
             'localization: publish the transform from map_frame to the frame of the odometry on '

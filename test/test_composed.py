@@ -181,18 +181,25 @@ def test_operation_of_the_service_lasts_until_the_next_configuration(make, map_f
 def test_failed_odometry_subscription_is_the_problem(make, map_file):
     """Live parameters are applied; the error is logged and in the diagnostics."""
     topic = {'qos_overrides./odom.subscription.reliability': 'certain'}
-    node = activated(make(map_path=map_file, **topic))
+    node = activated(make(map_path=map_file, relative_pose='none', **topic))
     assert set_parameter(node, 'keyframe_distance', 1.0).successful
     assert 'correct qos_overrides./odom.subscription' in node.runtime.problem
     assert node.runtime.pipeline.settings.keyframes.distance == 1
 
 
 def test_odometry_is_subscribed_while_it_is_needed(make, map_file):
-    node = activated(make(map_path=map_file))
+    node = activated(make(map_path=map_file, relative_pose='none'))
     for distance, count in ((1.0, 1), (2.0, 1), (0.0, 0)):
         assert set_parameter(node, 'keyframe_distance', distance).successful
         assert node.count_subscribers('/odom') == count
     node.set_operation('mapping')
+    assert node.count_subscribers('/odom') == 1
+
+
+def test_odometry_is_subscribed_for_edges_to_a_map_with_poses(make, map_file):
+    node = activated(make(relative_pose='aligned'))
+    assert node.count_subscribers('/odom') == 0
+    node.load_map(map_file)
     assert node.count_subscribers('/odom') == 1
 
 

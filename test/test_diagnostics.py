@@ -458,6 +458,8 @@ def test_values_of_recognition_are_complete():
         'last_place': '17',
         'last_distance': '0.422',
         'last_answer_age_s': 'none',
+        'camera': 'not needed',
+        'last_edge_reason': 'none',
         'statuses_warming_up': '19',
         'statuses_no_match': '971',
         'statuses_match': '2000',

@@ -285,9 +285,10 @@ def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
             assert not len(z)
             continue
         belief = filtered.belief(len(z), 2)
-        assert answer.probability == pytest.approx(belief.probabilities.max(), abs=1e-4)
+        near, probabilities = belief.probabilities(len(z))
+        assert answer.probability == pytest.approx(max(probabilities, default=0), abs=1e-4)
         if answer.accepted:
-            middle = first + int(np.argmax(belief.probabilities))
+            middle = first + int(near[np.argmax(probabilities)])
             assert answer.place_index == pytest.approx(middle, abs=2)
     assert first > 0
 

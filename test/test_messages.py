@@ -18,6 +18,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Session
 from stavpr_ros.pipeline import overlay
 from stavpr_ros.recognition import Candidate, Match, Status
+from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.ros.output import (
     candidates_message,
     image_message,
@@ -78,14 +79,16 @@ BLANK = (
     | dict.fromkeys(('window_first', 'window_middle', 'window_last'), HEADER.stamp)
     | dict.fromkeys(('place_stamp', 'newest_stamp'), Time())
     | dict.fromkeys(('place_id', 'newest_id', 'robot_id', 'map_id', 'session'), '')
-    | {'threshold': 0.3, 'header': HEADER, 'path': []}
+    | {'threshold': 0.3, 'header': HEADER, 'path': [], 'has_relative_pose': False}
 )
 
 
 def same(message, **expected):
     """Every field is as expected, and fields that are not named are blank; NaN equals NaN."""
     plain = BLANK | expected
-    assert set(plain) == set(PlaceMatch.get_fields_and_field_types())
+    edge = message.relative_pose
+    assert (edge.source, edge.query_index, edge.place_index, edge.inliers) == (0, -1, -1, -1)
+    assert set(plain) | {'relative_pose'} == set(PlaceMatch.get_fields_and_field_types())
     for name, value in plain.items():
         field = getattr(message, name)
         if isinstance(value, float):
@@ -172,6 +175,22 @@ def test_match_message_without_match_has_the_sequence_but_no_place(places):
          inliers=3)  # fmt: skip
 
 
+def test_match_message_with_an_edge_names_its_pair(places):
+    pose = np.array([0.5, 0.1, 0, 0, 0, 0, 1])
+    edge = Edge(Source.ALIGNED, 'no camera', pose, np.diag(np.arange(6.0)))
+    message = match_message(HEADER, accepted(), places, edge=edge, frame='base')
+    found = message.relative_pose
+    assert message.has_relative_pose
+    assert (found.source, found.reason, found.frame) == (found.ALIGNED, 'no camera', 'base')
+    assert (found.query_index, found.query_stamp) == (-1, time_message(WINDOW[2]))
+    assert (found.place_index, found.place_stamp) == (32, Time(sec=33))
+    assert found.pose.pose == pose_message(pose)
+    np.testing.assert_array_equal(found.pose.covariance[::7], np.arange(6.0))
+    assert (found.inliers, found.is_independent) == (-1, False)
+    none = match_message(HEADER, accepted(), places, edge=Edge(Source.NONE, 'why'), frame='base')
+    assert (none.has_relative_pose, none.relative_pose.reason) == (False, 'why')
+
+
 # ------------------------------------------------ candidates, loop closures, poses
 
 
@@ -206,14 +225,33 @@ def test_loop_closure_message_of_a_match(places, first_image, has_poses):
     )  # fmt: skip
     if has_poses:
         expected.pose_frame, expected.pose_child_frame = 'odom', 'base'
+        expected.query_pose_frame = 'odom'
         expected.query_pose = pose_message(np.array([query, query**2, 0, 0, 0, 0, 1]))
         expected.place_pose = pose_message(np.array([32, 32**2, 0, 0, 0, 0, 1]))
+    assert math.isnan(message.relative_pose.reprojection_error)
+    message.relative_pose = expected.relative_pose
     assert message == expected
     assert message.threshold == pytest.approx(0.3)
 
 
-def test_loop_closure_message_needs_a_match_on_a_growing_route(places):
-    assert loop_closure_message(HEADER, accepted(), places) is None
+def test_loop_closure_message_on_a_map_has_poses_of_two_frames(places):
+    query = np.array([7.0, 8, 0, 0, 0, 0, 1])
+    frames = PoseFrames('map', 'base')
+    message = loop_closure_message(HEADER, accepted(), places, 'r2', frames, (query, 'odom'))
+    assert (message.query_index, message.place_index) == (-1, 32)
+    assert (message.query_stamp, message.place_stamp) == (time_message(WINDOW[2]), Time(sec=33))
+    assert {pair.query_index for pair in message.pairs} == {-1}
+    assert [pair.query_stamp for pair in message.pairs] == [time_message(at) for at in WINDOW]
+    assert message.has_poses
+    assert (message.pose_frame, message.query_pose_frame) == ('map', 'odom')
+    assert (message.pose_child_frame, message.query_pose) == ('base', pose_message(query))
+    assert message.place_pose == pose_message(np.array([32, 32**2, 0, 0, 0, 0, 1]))
+    message = loop_closure_message(HEADER, accepted(), places, 'r2', frames)
+    assert not message.has_poses
+
+
+def test_loop_closure_message_needs_a_match(places):
+    assert loop_closure_message(HEADER, accepted(), None) is None
     assert loop_closure_message(HEADER, rejected(image_index=59), places) is None
 
 

@@ -126,7 +126,7 @@ def test_node_with_publish_tf_without_tf2_msgs_explains_it(robot, start, monkeyp
 
 
 def test_node_publishes_the_initial_pose_and_subscribes_to_no_odometry(robot, start, route):
-    start(publish_initialpose=True)
+    start(publish_initialpose=True, relative_pose='none')
     poses = robot.listen(PoseWithCovarianceStamped, '/initialpose')
     robot.until(lambda: robot.node.count_publishers('/initialpose') == 1, 'the publisher')
     shown = iter(route)

@@ -22,6 +22,7 @@ from stavpr_ros.pipeline import (
 from stavpr_ros.recognition.matcher import PRECISIONS
 from stavpr_ros.recognition.robust import MODES
 from stavpr_ros.recognition.verification import METHODS
+from stavpr_ros.relative_pose.estimator import METHODS as EDGE_METHODS
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,6 +55,7 @@ def test_choices_are_those_of_library():
         'mode': MODES,
         'features': tuple(kind for kind in KINDS if kind != 'descriptors'),
         'geometric_check': ('none', *METHODS),
+        'relative_pose': EDGE_METHODS,
         'backend': BACKENDS,
         'strategy': STRATEGIES,
         'precision': PRECISIONS,

@@ -9,7 +9,30 @@ from hypothesis import strategies as st
 import numpy as np
 import oracle
 import pytest
-from stavpr_ros.recognition.place_filter import CLOSE, FilterSettings, NEGLIGIBLE, PlaceFilter, TOP
+from stavpr_ros.alignment.cpu.simd import LANES, load, store
+from stavpr_ros.compilation import kernel
+from stavpr_ros.recognition.place_filter import (
+    CLOSE,
+    exp,
+    FilterSettings,
+    NEGLIGIBLE,
+    PlaceFilter,
+    TOP,
+)
+
+
+@kernel
+def _exponentials(x, out):
+    for i in range(0, len(x), LANES):
+        store(out, i, exp(load(x, i)))
+
+
+def exponentials(x):
+    """Return e^x of whole vectors by the kernel's function."""
+    out = np.empty_like(x)
+    _exponentials(x, out)
+    return out
+
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 # Every probability large enough to matter, and the levels not as likely as each other
@@ -98,6 +121,31 @@ def test_filter_after_reset_is_as_new():
         assert_equal(one, plain)
 
 
+@pytest.mark.parametrize('n', [1, 127, 129, 1000])
+def test_most_probable_place_equals_that_of_all(n):
+    """Whatever is excluded: nothing, the best places, whole blocks, all."""
+    one, rng = PlaceFilter(n + 5, LAG, FEW), np.random.default_rng(n)
+    for _ in range(3):
+        one.update(*random_image(rng, n, FEW))
+    by_place = one.places_of_states()[:n].astype(float)
+    best = np.argsort(by_place)[::-1]
+    for excluded in (best[:0], best[:1], best[:5], np.arange(min(n, 300)), np.arange(n)):
+        left = by_place.copy()
+        left[excluded] = 0
+        place, probability = one.most_probable(np.sort(excluded))
+        assert probability == pytest.approx(left.max(), rel=1e-5)
+        assert left[place] == pytest.approx(left.max(), rel=1e-5)
+
+
+def test_exponential_of_kernel_is_that_of_numpy():
+    """Below what float32 holds it is 0, so that a banned place is; far above, it stays finite."""
+    x = np.linspace(-86, 79, 1001).astype(np.float32)[: 1001 // LANES * LANES]
+    np.testing.assert_allclose(exponentials(x), np.exp(x.astype(float)), rtol=3e-7)
+    few = np.resize(np.array([-np.inf, -88, 0, 500], np.float32), LANES)
+    assert exponentials(few).tolist()[:3] == [0, 0, 1]
+    assert np.isfinite(exponentials(few)).all()
+
+
 def test_filter_without_weight_sees_nothing():
     one, other = (PlaceFilter(20, LAG) for _ in range(2))
     for z in (np.zeros(20, np.float32), np.linspace(-9, 9, 20, dtype=np.float32)):
@@ -107,6 +155,13 @@ def test_filter_without_weight_sees_nothing():
 
 
 # ------------------------------------------------ where the camera was
+
+
+def dense(places, values, n):
+    """Return values of some places for all n."""
+    out = np.zeros(n)
+    out[places] = values
+    return out
 
 
 def assert_belief_equal(one, plain, n, images_ago):
@@ -121,11 +176,14 @@ def assert_belief_equal(one, plain, n, images_ago):
         if state[2] in tops and p >= NEGLIGIBLE * largest > 0 and there and there[2] >= 0:
             weights[there[2]] += p
             ways[there[2]] = max(ways.get(there[2], (0,)), (p, *state, there[1]))
-    np.testing.assert_allclose(found.weights, weights, rtol=1e-4, atol=1e-5)
-    close = [weights[max(y - CLOSE, 0) : y + CLOSE + 1].sum() for y in range(n)]
-    np.testing.assert_allclose(found.probabilities, np.minimum(close, 1), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        dense(found.places, found.weights, n), weights, rtol=1e-4, atol=1e-5
+    )
+    close = np.minimum([weights[max(y - CLOSE, 0) : y + CLOSE + 1].sum() for y in range(n)], 1)
+    np.testing.assert_allclose(dense(*found.probabilities(n), n), close, rtol=1e-4, atol=1e-5)
+    found_ways = dict(zip(found.places.tolist(), found.ways.tolist(), strict=True))
     for place, (p, *way) in ways.items():
-        assert found.ways[place].tolist() == way, (place, p)
+        assert found_ways[place] == way, (place, p)
         places = [
             -1 if state is None else state[2] for state in plain.way(tuple(way[:3]), images_ago)
         ]
@@ -148,4 +206,4 @@ def test_belief_of_places_born_on_map_since_then_is_nothing():
     for places in (0, 0, 9):
         one.update(np.zeros(places, np.float32), 0.1, np.ones(3))
     assert one.belief(9, 0).weights.sum() > 0.5
-    assert not one.belief(9, 1).probabilities.any()
+    assert not one.belief(9, 1).places.size

@@ -294,8 +294,8 @@ def test_requirements_are_pinned_exactly():
         (['demo', 'MAP=a', 'QUERY=b', 'ARGS=-v'], r'/demo --map "\$MAP" --query "\$QUERY" +-v$'),
         (['evaluate', 'EXTRAS=onnx', 'MAP=a', 'QUERY=b'], r'--with onnx evaluation\n'),
         (['setup', 'TORCH_INDEX=file:///cpu'], r"--torch-index 'file:///cpu' --with *$"),
-        (['test', 'ARGS=-x'], r'sphinx-build .*-W(.|\n)* pytest test -m .not long. -x$'),
-        (['test-long'], r' pytest test -m long *$'),
+        (['test', 'ARGS=-x'], r'sphinx-build .*-W(.|\n)* -n 2 .* test -m .not long. -x$'),
+        (['test-long'], r' pytest .* test -m long *$'),
         (['setup', 'PYTHON=python3.12'], r'^python3.12 -E tools/setup_venv.py setup '),
     ],
 )

@@ -9,6 +9,7 @@ import itertools
 import numpy as np
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures, Projection
+from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.place_map import (
     decode_thumbnail,
     Place,
@@ -59,6 +60,7 @@ class GrowingMap:
         self._weights = np.empty((settings.strips, 0), np.float32)
         self._stamps = np.empty(0, np.int64)
         self._poses = np.empty((0, 7))
+        self.camera: Camera | None = None  # of the images, None = unknown
         self.sessions: tuple[Session, ...] = ()  # of the map that is continued
         self._session_index: np.ndarray | None = None
         self._same_as: np.ndarray | None = None
@@ -88,6 +90,7 @@ class GrowingMap:
         growing._stamps[:n] = place_map.stamps
         growing._poses[:n] = np.nan if place_map.poses is None else place_map.poses
         growing.sessions, growing._session_index = place_map.sessions, place_map.session_index
+        growing.camera = place_map.camera
         growing._same_as = place_map.same_as
         growing.ids = list(place_map.ids)
         growing.thumbnails = list(place_map.thumbnails) or [b''] * n
@@ -211,6 +214,7 @@ class GrowingMap:
             same_as=same_as,
             sessions=sessions,
             session_index=session_index,
+            camera=self.camera,
             features=features,
             projection=self.projection,
             stamps=self.stamps.copy(),

@@ -75,5 +75,6 @@ def journal_map(path: Path) -> PlaceMap:
         stamps=stamps,
         ids=tuple(ids),
         poses=None if np.isnan(poses).all() else poses,
+        camera=template.camera,
         thumbnails=_Thumbnails(path, ends, sizes) if any(sizes) else (),
     )

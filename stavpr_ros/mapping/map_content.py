@@ -10,9 +10,11 @@ import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureSettings, Projection
 from stavpr_ros.features.registry import settings_class
+from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.jpeg import jpeg_pixels, MOST_PIXELS
 from stavpr_ros.mapping.map_container import MapFile, Part
-from stavpr_ros.mapping.map_schema import identity_fields, Object
+from stavpr_ros.mapping.map_schema import identity_fields, INTRINSICS, Object
+from stavpr_ros.mapping.map_version2 import KNOWN_SECTIONS
 from stavpr_ros.mapping.place_map import PlaceMap, Session
 from stavpr_ros.mapping.stored_features import LONGEST, StoredFeatures, StoredThumbnails
 import torch
@@ -74,9 +76,19 @@ def map_content(file: MapFile) -> PlaceMap:
         thumbnails=_thumbnails(file, arrays.get('thumbnail_ends')),
         sessions=tuple(Session(**session) for session in manifest['sessions']),
         session_index=arrays.get('session'),
+        camera=_camera(manifest['sections']),
         same_as=arrays.get('same_places/same_as'),
         map_id=file.map_id,
     )
+
+
+def _camera(sections: dict[str, Any]) -> Camera | None:
+    """Return the camera of section intrinsics, None without one that is known."""
+    section = sections.get('intrinsics')
+    if section is None or section['version'] > KNOWN_SECTIONS['intrinsics']:
+        return None
+    INTRINSICS.check(section['data'], 'section intrinsics')
+    return Camera.from_json(section['data'])
 
 
 def _settings(record: dict[str, Any]) -> FeatureSettings:

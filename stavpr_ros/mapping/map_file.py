@@ -50,6 +50,12 @@ def save_map(
 
 
 def _manifest(place_map: PlaceMap) -> dict[str, Any]:
+    sections: dict[str, Any] = {}
+    if place_map.camera is not None:
+        data = place_map.camera.to_json()
+        sections['intrinsics'] = {'version': 1, 'required': False, 'data': data}
+    if place_map.same_as is not None:
+        sections['same_places'] = {'version': 1, 'required': False, 'data': None}
     settings, projection = place_map.settings, place_map.projection
     backbone = {name: getattr(settings.backbone, name) for name in identity_fields(settings.kind)}
     return {
@@ -66,9 +72,7 @@ def _manifest(place_map: PlaceMap) -> dict[str, Any]:
             {row.name: getattr(session, row.name) for row in fields(session)}
             for session in place_map.sessions
         ],
-        'sections': {}
-        if place_map.same_as is None
-        else {'same_places': {'version': 1, 'required': False, 'data': None}},
+        'sections': sections,
     }
 
 

@@ -166,6 +166,17 @@ MANIFEST = Object(
         ),
     }
 )
+INTRINSICS = Object(
+    {
+        'width': Int(1, 2**16),
+        'height': Int(1, 2**16),
+        'focal': ListOf(Number(), 2, 2),
+        'center': ListOf(Number(), 2, 2),
+        'model': Text(64),
+        'distortion': ListOf(Number(), most=16),
+        'mount': ListOf(Number(), 7, 7),
+    }
+)
 _SETTING_TYPES: dict[Any, Any] = {
     bool: Bool(),
     int: Int(-(2**31)),

@@ -130,5 +130,7 @@ def _joined(
         else (),
         sessions=sessions,
         session_index=index,
+        # one section for the whole map
+        camera=maps[0].camera if len({each.camera for each in maps}) == 1 else None,
         same_as=same_as,
     )

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
+from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.jpeg import is_thumbnail, MOST_PIXELS
 
 THUMBNAIL_WIDTH = 192  # pixels
@@ -68,6 +69,7 @@ class PlaceMap:
         place; empty = none kept.
     :param sessions: the drives that the places are of; empty = one drive, nothing known of it.
     :param session_index: number of each place's session, shape (n,), int32; None without sessions.
+    :param camera: of its images; None = unknown.
     :param same_as: of each place, itself, or the place of an earlier session that shows the same,
         shape (n,), int32; None = unknown: see :func:`stavpr_ros.recognition.same_places`.
     :param map_id: first 16 hexadecimal digits of the hash of its file's content, '' = it was not
@@ -82,6 +84,7 @@ class PlaceMap:
     thumbnails: Sequence[bytes] = field(default=(), repr=False)
     sessions: tuple[Session, ...] = ()
     session_index: np.ndarray | None = None
+    camera: Camera | None = None
     same_as: np.ndarray | None = None
     map_id: str = ''
 

@@ -14,6 +14,7 @@ import numpy as np
 from stavpr_ros.errors import ImageError, InputError, StavprError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap, thumbnail_of
+from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
@@ -24,6 +25,7 @@ from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.pipeline.start import LoadedMap, start_operation
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.recognition.verification import GeometricEvidence, PlaceVerifier
+from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair
 from stavpr_ros.sources.encodings import decode_message
 
 NO_MAP = (
@@ -63,10 +65,12 @@ class Pipeline:
         self._last: Match | None = None
         # of the window, from its middle image on; None = the image came when none was needed
         self._thumbnails: deque[np.ndarray | None] = deque()
+        self._poses: deque[np.ndarray | None] = deque()  # of the window
         self.save_state = SaveState()  # of the places in use
         # of the map, where loop closure has places of its own
         self._map_save_state = self.save_state
         self.list_candidates = True  # with every match
+        self.camera: Camera | None = None  # None = unknown: thumbnails of queries are not kept
         self.contrast = math.nan  # of the last image
         self._start(operation, settings, None)
 
@@ -185,6 +189,7 @@ class Pipeline:
         self._keyframes.reset()
         self._last = None
         self._thumbnails.clear()
+        self._poses.clear()
         self._evidence = GeometricEvidence()
         if self._operation is not None and self._operation.recognizer:
             self._operation.recognizer.reset()
@@ -207,6 +212,15 @@ class Pipeline:
                 f'{self.window_fill} of {self.settings.sequence.length} images in the window'
             )
         return self._last.with_candidates(recognizer.ranked(count))
+
+    def matched_pair(self, match: Match) -> MatchedPair | None:
+        """Return the middle pair of the newest match, for its edge; None without a match."""
+        places = self.places
+        if not match.accepted or places is None or match.cause:
+            return None
+        unknown = np.full(7, np.nan)
+        poses = np.array([unknown if pose is None else pose for pose in self._poses])
+        return matched_pair(match, places, self._thumbnails[0], poses, self.window_distances())
 
     def window_distances(self) -> tuple[np.ndarray, int]:
         """
@@ -263,8 +277,10 @@ class Pipeline:
             thumbnail = self._thumbnail(operation, image)
             match = operation.update(Observation(features, thumbnail, stamp, pose))
         self._thumbnails.append(thumbnail)
+        self._poses.append(pose)
         self._keyframes.accept(stamp, pose, image)
         if not isinstance(operation, Localization):
+            operation.places.camera = operation.places.camera or self.camera
             self.save_state.record(operation.places, features, self._open_journal)
         if operation.recognizer is None:
             return replace(match, image=image)
@@ -287,7 +303,7 @@ class Pipeline:
         """Return the width of the thumbnails that are needed, 0 = none is."""
         width = self.settings.thumbnail_width
         if isinstance(operation, Localization):
-            return (width or THUMBNAIL_WIDTH) if self._verifier else 0
+            return (width or THUMBNAIL_WIDTH) if self._verifier or self.camera else 0
         return width
 
     def _thumbnail(self, operation: Operation, image: np.ndarray) -> np.ndarray | None:
@@ -338,6 +354,7 @@ class Pipeline:
         self._operation, self._name = operation, name
         length = settings.sequence.length
         self._thumbnails = deque(maxlen=length - (length - 1) // 2)
+        self._poses = deque(maxlen=length)
         self._extractor = operation.extractor if operation is not None else extractor
         self._map_save_state = save_state
         self.save_state = SaveState() if name == 'loop_closure' else save_state

@@ -64,7 +64,9 @@ class SaveState:
         newest = places.place(places.first + len(places) - 1)
         if self.journal is None and self.recorded == self.saved:
             stamps, ids = np.array([newest.stamp]), (newest.identifier,)
-            template = PlaceMap(features.to('cpu'), places.projection, stamps, ids)
+            template = PlaceMap(
+                features.to('cpu'), places.projection, stamps, ids, camera=places.camera
+            )
             self.journal = open_journal(self.base, template)
             self._forgotten = self.recorded
         if self.journal is not None:

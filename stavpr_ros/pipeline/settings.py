@@ -200,6 +200,8 @@ class NodeSettings:
     threads: int
     publish_tf: bool
     publish_initialpose: bool
+    relative_pose: str
+    camera_transform: str
     pipeline: PipelineSettings
 
     def __post_init__(self) -> None:

@@ -18,21 +18,45 @@ predicted from the same change: the map shows how much images of places so far a
 The place of an image is read off a few images later (fixed-lag smoothing): the states of today are
 followed back to where they were. After Xu, Sünderhauf and Milford, "Probabilistic Visual Place
 Recognition for Hierarchical Localization", RA-L 2021, with speeds, levels and smoothing added.
+
+All states advance in one pass over the places, in place and on all lanes. A thread takes
+``PLACES`` places, from the last to the first ``BLOCK`` of them, since states only move up; the
+last places before its own are copied beforehand. States are not normalized: the factor that makes
+their sum 1 is part of the next image's level changes. Where a state came from in speed travels in
+the lowest two bits of its probability, which no answer depends on; two origins share a byte, those
+of an even speed and of the next.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
-from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
+from stavpr_ros.alignment.cpu.simd import (
+    bits,
+    from_bits,
+    LANES,
+    load,
+    load_bytes,
+    load_splat,
+    select,
+    splat,
+    store,
+    store_bytes,
+)
+from stavpr_ros.compilation import kernel, parallel_kernel
 from stavpr_ros.recognition.robust import FilterSettings
 
-F = np.float32
+F, INT = np.float32, np.int32
 PLACES = 2048  # that a thread takes at a time
+BLOCK = 128  # places whose scratch stays in the cache; divides PLACES, a multiple of all LANES
 BORN = 9  # origin of a state that came from off the map; others are 3 * step + speed, each 0..2
+NO_PLACE = F(-np.inf)  # z of a gap between sessions, where likelihoods are 1
+LEAST, MOST = -87.0, 80.0  # exponents that float32 holds
 TOP = 64  # places whose states are followed back
 NEGLIGIBLE = 1e-3  # of the most probable state: states below are not followed back
 CLOSE = 2  # places: the probability of a place is that of so many to either side, too
+ALL_BORN = BORN | BORN << 4  # two origins
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,20 +64,36 @@ class Belief:
     """
     Where the camera was some images ago.
 
-    :param probabilities: of each place, those close to it included, (n,).
-    :param ways: for each place with a way to it, the most probable state now and the speed then,
-        (n, 4), int: level, speed, place, speed then.
-    :param weights: probability of each place alone, (n,).
+    :param places: places to which a way leads, ascending, (m,).
+    :param weights: probability of each of them alone, (m,).
+    :param ways: the most probable state now and the speed then, (m, 4), int: level, speed, place,
+        speed then.
     """
 
-    probabilities: np.ndarray
+    places: np.ndarray
     weights: np.ndarray
     ways: np.ndarray
+
+    def probabilities(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return the places of n whose probability, that of close ones included, is not 0.
+
+        :returns: places, ascending, (m,), and their probabilities.
+        """
+        near = np.unique(self.places[:, None] + np.arange(-CLOSE, CLOSE + 1))
+        near = near[(near >= 0) & (near < n)]
+        sums = np.concatenate([[0], np.cumsum(self.weights)])
+        low = np.searchsorted(self.places, near - CLOSE)
+        high = np.searchsorted(self.places, near + CLOSE, 'right')
+        return near, np.minimum(sums[high] - sums[low], 1)
 
 
 class PlaceFilter:
     """
     The filter over n places; see the module.
+
+    It holds 4 bytes for each state of a place and half a byte for each image of the lag: 247 bytes
+    a place with the default speeds and levels and a lag of 10.
 
     :param places: places that there is room for.
     :param lag: most images that states are followed back.
@@ -72,20 +112,27 @@ class PlaceFilter:
         self._speeds = np.array(self.settings.speeds, np.float64)
         self._levels = np.array(self.settings.levels, np.float32)
         self._level_changes = self.settings.level_changes()
-        K, V = len(self._levels), len(self._speeds)
-        self._steps = np.zeros((lag, V), np.int64)
-        self._allocate(places, np.zeros((K, V, 0), np.float32), np.zeros((lag, K, V, 0), np.int8))
+        self._steps = np.zeros((lag, len(self._speeds)), np.int64)
+        self._reach = -(-(int(np.ceil(self._speeds.max())) + 2) // LANES) * LANES
+        self._allocate(places)
         self.reset()
 
-    def _allocate(self, room: int, states: np.ndarray, origins: np.ndarray) -> None:
-        shape, n = states.shape[:2], states.shape[2]
-        self._a, self._next = (np.zeros((*shape, room), np.float32) for _ in range(2))
-        self._origins = np.full((len(origins), *shape, room), BORN, np.int8)
-        self._a[:, :, :n], self._origins[..., :n] = states, origins
+    def _allocate(self, room: int) -> None:
+        K, V = len(self._levels), len(self._speeds)
+        self._room, pitch = room, -(-room // LANES) * LANES
+        # not normalized: times scale, the states are probabilities
+        self._a: np.ndarray = np.zeros((K, V, pitch), np.float32)
+        blocks = max(1, -(-room // BLOCK))
+        self._by_place: np.ndarray = np.zeros(blocks * BLOCK, np.float32)  # sums of the states
+        self._maxima: np.ndarray = np.zeros(blocks, np.float32)  # of these, by block
+        shape = len(self._steps), K, (V + 1) // 2, pitch
+        self._origins: np.ndarray = np.full(shape, ALL_BORN, np.uint8)
+        self._halos: np.ndarray = np.zeros((-(-room // PLACES), K, V, self._reach), np.float32)
 
     def reset(self) -> None:
         """Forget where the camera was."""
-        self._a[:] = self._next[:] = 0
+        self._a[:] = self._by_place[:] = self._maxima[:] = 0
+        self._scale = 1.0
         self._off = np.full(len(self._levels), 1 / len(self._levels))
         self._count = self._known = 0
 
@@ -101,17 +148,29 @@ class PlaceFilter:
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
-        self._allocate(places, self._a, self._origins)
+        a, origins, by_place, n = self._a, self._origins, self._by_place, self._room
+        self._allocate(places)
+        self._a[:, :, :n], self._origins[..., :n] = a[:, :, :n], origins[..., :n]
+        self._set_by_place(by_place)
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
-        for values, none in ((self._a, 0), (self._origins, BORN)):
+        for values, none in ((self._a, 0), (self._origins, ALL_BORN)):
             values[..., :-count] = values[..., count:].copy()
             values[..., -count:] = none
+        self._set_by_place(self._by_place[count:].copy())
+
+    def _set_by_place(self, by_place: np.ndarray) -> None:
+        self._by_place[: len(by_place)], self._by_place[len(by_place) :] = by_place, 0
+        self._find_maxima(range(len(self._maxima)))
+
+    def _find_maxima(self, blocks: Iterable[int]) -> None:
+        for block in blocks:
+            self._maxima[block] = self._by_place[block * BLOCK : (block + 1) * BLOCK].max()
 
     def places_of_states(self) -> np.ndarray:
         """Return the probability of each place, (room,), float32."""
-        return self._a.sum(axis=(0, 1))
+        return self._by_place[: self._room] * np.float32(self._scale)
 
     def update(self, z: np.ndarray, weight: float, speed_weights: np.ndarray) -> None:
         """
@@ -130,40 +189,34 @@ class PlaceFilter:
         if not self._count and n:
             self._a[:, :, :n], self._off[:] = s.start / states, (1 - s.start) / len(self._levels)
             self._a[:, :, self._gaps] = 0
-        blocks = -(-n // PLACES)
-        totals = np.zeros((blocks, len(self._levels), 3))
+        if n < self._known:
+            self._a[:, :, n:] = self._by_place[n:] = self._maxima[-(-n // BLOCK) :] = 0
+        totals = np.zeros((-(-n // BLOCK), len(self._levels), 3))
         off = self._off @ self._level_changes
         births = (off * s.enter / (len(self._speeds) * real)).astype(np.float32)
         if n:
+            if len(self._gaps):
+                z = z.copy()
+                z[self._gaps] = NO_PLACE
             advance(
-                self._a, n, self._likelihood(z, weight), self._level_changes,
-                s.speed_changes(speed_weights), self._steps[slot], np.float32(s.spread),
-                np.float32(1 - s.leave), births, self._next, self._origins[slot], totals,
+                self._a, n, np.ascontiguousarray(z), np.float32(weight), self._levels,
+                self._level_changes * np.float32(self._scale), s.speed_changes(speed_weights),
+                self._steps[slot], np.float32(s.spread), np.float32(1 - s.leave), births,
+                self._halos, self._origins[slot], totals, self._by_place, self._maxima,
             )  # fmt: skip
-            self._a, self._next = self._next, self._a
         before, lost, seen = totals.sum(axis=0).T if n else np.zeros((3, len(off)))
         if len(self._gaps):  # likelihoods are 1 there
             in_gaps = self._a[:, :, self._gaps].sum(axis=(1, 2), dtype=np.float64)
             born = births * (len(self._speeds) * len(self._gaps))
             lost = lost + (in_gaps - born) / (1 - s.leave)
             seen = seen - in_gaps
-            self._a[:, :, self._gaps] = 0
+            self._a[:, :, self._gaps] = self._by_place[self._gaps] = 0
+            self._find_maxima(np.unique(self._gaps // BLOCK))
         off = off * (1 - s.enter) + (before - lost) * s.leave + lost
         total = float(off.sum() + seen.sum())
-        self._off = off / total
-        self._a[:, :, :n] *= np.float32(1 / total)
-        if n < self._known:
-            self._a[:, :, n:] = self._next[:, :, n:] = 0
+        self._off, self._scale = off / total, 1 / total
         self._known = n
         self._count += 1
-
-    def _likelihood(self, z: np.ndarray, weight: float) -> np.ndarray:
-        if not weight:
-            return np.ones((len(self._levels), len(z)), np.float32)
-        mu = self._levels[:, None]
-        likelihood = np.exp(np.float32(weight) * (mu * z - mu * mu / 2))
-        likelihood[:, self._gaps] = 1
-        return likelihood
 
     def belief(self, n: int, images_ago: int) -> Belief:
         """
@@ -172,18 +225,43 @@ class PlaceFilter:
         :param n: places.
         :param images_ago: at most ``lag`` and ``count - 1``.
         """
-        by_place = self._a[:, :, :n].sum(axis=(0, 1))
-        top = np.argpartition(by_place, max(n - TOP, 0))[-TOP:]
-        least = NEGLIGIBLE * float(self._a[:, :, top].max()) if n else 1.0
-        weights, ways = np.zeros(n, np.float32), np.zeros((n, 4), np.int64)
-        middle_probabilities(
-            self._a, np.float32(least), top, self._origins, self._steps,
-            (self._count - 1) % len(self._steps), images_ago, weights, ways,
+        top = self._top(n)
+        least = NEGLIGIBLE * self._a[:, :, top].max(initial=0)
+        most = len(top) * len(self._levels) * len(self._speeds)
+        ways, states = np.empty((most, 5), np.int64), np.empty(most, np.float32)
+        count = followed_back(
+            self._a, np.float32(least or 1), top, self._origins, self._steps,
+            (self._count - 1) % len(self._steps), images_ago, ways, states,
         )  # fmt: skip
-        sums = np.concatenate([[0], np.cumsum(weights, dtype=np.float64)])
-        ends = np.arange(n)
-        high, low = np.minimum(ends + CLOSE + 1, n), np.maximum(ends - CLOSE, 0)
-        return Belief(np.minimum(sums[high] - sums[low], 1), weights, ways)
+        ways, probabilities = ways[:count], states[:count].astype(np.float64) * self._scale
+        order = np.lexsort((-probabilities, ways[:, 0]))  # the most probable first, of each place
+        places, firsts, each = np.unique(ways[order, 0], return_index=True, return_inverse=True)
+        weights = np.bincount(each, probabilities[order], len(places))
+        return Belief(places, weights, ways[order[firsts], 1:])
+
+    def _top(self, n: int) -> np.ndarray:
+        """Return the ``TOP`` most probable places, int64; they lie in blocks with large maxima."""
+        blocks = max(1, -(-n // BLOCK))
+        some = np.sort(np.argpartition(self._maxima[:blocks], max(blocks - TOP, 0))[-TOP:])
+        places = (some[:, None] * BLOCK + np.arange(BLOCK)).ravel()
+        places = places[places < n]
+        return places[np.argpartition(self._by_place[places], max(len(places) - TOP, 0))[-TOP:]]
+
+    def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
+        """
+        Return the most probable place now and its probability, 0 if all are excluded.
+
+        :param excluded: places that do not count.
+        """
+        maxima, by_block = self._maxima.copy(), self._by_place.reshape(-1, BLOCK)
+        touched = np.unique(excluded // BLOCK)
+        left = by_block[touched]
+        left[np.searchsorted(touched, excluded // BLOCK), excluded % BLOCK] = 0
+        maxima[touched] = left.max(axis=1)
+        block = int(np.argmax(maxima))
+        values = by_block[block].copy()
+        values[excluded[excluded // BLOCK == block] % BLOCK] = 0
+        return block * BLOCK + int(np.argmax(values)), float(maxima[block]) * self._scale
 
     def way(self, state: np.ndarray, images: int) -> np.ndarray:
         """
@@ -199,133 +277,221 @@ class PlaceFilter:
         return places
 
 
-@kernel
-def _mixed(a, k, levels, speeds, low, mixed, source):
-    """
-    Let level and speed change, for the places from ``low`` on.
-
-    :param a: probabilities, (K, V, n or more).
-    :param k: level afterwards; levels: probability of a level by the one before, (K, K).
-    :param speeds: probabilities of the speed to stay, to become a neighbor, to become any one, by
-        the speed before; factor by the speed after: (4, V).
-    :param mixed, source: (V, width), written; where places are below 0, zero. source: 0 = same
-        speed, 1 = the one below, 2 = the one above.
-    :returns: sum of the probabilities with the levels mixed, by position.
-    """
-    (K, V), width = a.shape[:2], mixed.shape[1]
-    skipped = max(0, -low)
-    b = np.zeros((V, width), np.float32)
-    anywhere, total = np.zeros(width, np.float32), np.zeros(width, np.float32)
-    for v in range(V):
-        row = b[v]
-        for j in range(K):
-            g, before = levels[j, k], a[j, v]
-            for i in range(skipped, width):
-                row[i] += g * before[low + i]
-        share = speeds[2, v]
-        for i in range(width):
-            anywhere[i] += row[i] * share
-            total[i] += row[i]
-    for v in range(V):
-        below, above = b[max(v - 1, 0)], b[min(v + 1, V - 1)]
-        stay, after, row = speeds[0, v], speeds[3, v], b[v]
-        up = speeds[1, v - 1] if v > 0 else F(0)
-        down = speeds[1, v + 1] if v < V - 1 else F(0)
-        target, origin = mixed[v], source[v]
-        for i in range(width):
-            same, lower, upper = row[i] * stay, below[i] * up, above[i] * down
-            target[i] = after * (same + lower + upper + anywhere[i])
-            most = same if same > lower else lower
-            origin[i] = np.int8(2) if upper > most else np.int8(lower > same)
-    return total
-
-
-@reassociating_kernel
-def _sum(values):
-    total = np.float32(0)
-    for i in range(len(values)):
-        total += values[i]
-    return total
+# ------------------------------------------------ kernels
 
 
 @kernel
-def _lost(mixed, steps, spread):
-    """Return what the last block loses over the end of the map, whose last place is its last."""
-    total = F(0)
-    for v in range(len(steps)):
-        r, row = steps[v], mixed[v]
-        end = len(row)
-        slow = r - 1 if r > 0 else 0
-        total += (F(1) - F(2) * spread) * row[end - r :].sum()
-        total += spread * (row[end - r - 1 :].sum() + row[end - slow :].sum())
+def exp(x):
+    """Return e^x, within 2e-7 relative; 0 below LEAST, e^MOST above MOST."""
+    kept = select(splat(F(LEAST)) < x, x, splat(F(LEAST)))
+    kept = select(kept < splat(F(MOST)), kept, splat(F(MOST)))
+    magic = splat(F(12582912))  # 1.5 * 2^23: adding it rounds to whole numbers
+    shifted = kept * splat(F(1.44269504)) + magic
+    whole = shifted - magic
+    rest = kept - whole * splat(F(0.693359375)) - whole * splat(F(-2.12194440e-4))
+    power = splat(F(1.9875691500e-4))
+    power = power * rest + splat(F(1.3981999507e-3))
+    power = power * rest + splat(F(8.3334519073e-3))
+    power = power * rest + splat(F(4.1665795894e-2))
+    power = power * rest + splat(F(1.6666665459e-1))
+    power = power * rest + splat(F(5.0000001201e-1))
+    power = power * rest * rest + rest + splat(F(1))
+    found = from_bits(bits(power) + (bits(shifted) << splat(INT(23))))
+    return select(x < splat(F(LEAST)), splat(F(0)), found)
+
+
+@kernel
+def _see(z, first, count, weight, mu, seen):
+    """Write the likelihood of each level and place into seen (K, BLOCK); 0 from ``count`` on."""
+    K = len(mu)
+    flat = seen.reshape(-1)
+    if weight == 0:
+        seen[:] = 1
+    else:
+        seen[0, :count] = z[first : first + count]
+        seen[0, count:] = 0
+        factor = splat(weight)
+        for x in range(0, BLOCK, LANES):
+            distance = load(flat, x)
+            for k in range(K):
+                level = load_splat(mu, k)
+                off = level * distance - level * level * splat(F(0.5))
+                likelihood = exp(factor * off)
+                gap = distance < splat(F(-1e30))
+                store(flat, k * BLOCK + x, select(gap, splat(F(1)), likelihood))
+    seen[:, count:] = 0
+
+
+@kernel
+def _mix(source, at, pitch, count, levels, speeds, b, mixed, to, width, sums):
+    """
+    Let level and speed change, for ``count`` neighboring places, whole vectors.
+
+    :param source, at, pitch: flat states; level j, speed v begin at + (j V + v) pitch.
+    :param levels: factor by the level before and after, (K, K), neighbors only.
+    :param speeds: factors of the speed to stay, of the one below, of the one above, after any, and
+        of any before, flat (5, V).
+    :param b: (V + 1) LANES, scratch, zero at the end.
+    :param mixed: flat, (K, V, width), written from column ``to`` on.
+    :param sums: K LANES; sums after the change of level are added.
+    """
+    K = len(levels)
+    V = len(b) // LANES - 1
+    changes = levels.reshape(-1)
+    mask = splat(INT(-4))
+    for x in range(0, count, LANES):
+        for k in range(K):
+            anywhere = total = splat(F(0))
+            for v in range(V):
+                state = splat(F(0))
+                for j in range(max(k - 1, 0), min(k + 2, K)):
+                    before = load(source, at + (j * V + v) * pitch + x)
+                    state = state + load_splat(changes, j * K + k) * before
+                store(b, v * LANES, state)
+                anywhere = anywhere + state * load_splat(speeds, 4 * V + v)
+                total = total + state
+            store(sums, k * LANES, load(sums, k * LANES) + total)
+            below, current = splat(F(0)), load(b, 0)
+            for v in range(V):
+                above = load(b, (v + 1) * LANES)
+                same = current * load_splat(speeds, v)
+                lower = below * load_splat(speeds, V + v)
+                upper = above * load_splat(speeds, 2 * V + v)
+                target = (same + lower) + (upper + anywhere * load_splat(speeds, 3 * V + v))
+                from_below = same < lower
+                code = select(from_below, splat(INT(1)), splat(INT(0)))
+                code = select(select(from_below, lower, same) < upper, splat(INT(2)), code)
+                store(mixed, (k * V + v) * width + to + x, from_bits((bits(target) & mask) | code))
+                below, current = current, above
+
+
+@kernel
+def _move(
+    mixed, at, slow, count, spread, stay_on, birth, seen, seen_at, a, to, origins, to_origin, half,
+    places,
+):  # fmt: skip
+    """
+    Move the states of one level and speed on, and weigh them by the image; see advance.
+
+    :param mixed, at: flat; the states that arrive without a place more or less begin there.
+    :param slow: 1 where states may arrive from one place fewer; 0 where that is none.
+    :param half: which half of the origins' bytes is written; 0 comes first.
+    :param places: (BLOCK,), to which the states are added.
+    :returns: sums of the states, by lane.
+    """
+    total = splat(F(0))
+    center, aside = splat(F(1) - F(2) * spread), splat(spread)
+    staying, born = splat(stay_on), splat(birth)
+    three, six, nine = splat(INT(3)), splat(INT(6)), splat(INT(BORN))
+    low = splat(INT(3))
+    for x in range(0, count, LANES):
+        straight_from = load(mixed, at + x)
+        faster_from = load(mixed, at + x - 1)
+        slower_from = load(mixed, at + x + slow)
+        straight = center * straight_from
+        faster, slower = aside * faster_from, aside * slower_from
+        arrived = (straight + faster + slower) * staying
+        state = (arrived + born) * load(seen, seen_at + x)
+        store(a, to + x, state)
+        store(places, x, load(places, x) + state)
+        total = total + state
+        fast = straight < faster
+        most = select(fast, faster, straight)
+        code = select(fast, (bits(faster_from) & low) + three, bits(straight_from) & low)
+        code = select(most < slower, (bits(slower_from) & low) + six, code)
+        code = select(born < arrived, code, nine)
+        if half:
+            code = (code << splat(INT(4))) | load_bytes(origins, to_origin + x)
+        store_bytes(origins, to_origin + x, code)
+    return total
+
+
+@kernel
+def _lost(row, step, spread):
+    """Return what a row, whose last place is the map's last, loses over the end of the map."""
+    end = len(row)
+    slow = step - 1 if step > 0 else 0
+    total = (F(1) - F(2) * spread) * row[end - step :].sum()
+    return total + spread * (row[end - step - 1 :].sum() + row[end - slow :].sum())
+
+
+@kernel
+def _sum_of_lanes(values, at):
+    total = 0.0
+    for lane in range(LANES):
+        total += values[at + lane]
     return total
 
 
 @parallel_kernel
 def advance(
-    a, n, likelihood, levels, speeds, steps, spread, stay_on, births, out, origins, totals
-):
+    a, n, z, weight, mu, levels, speeds, steps, spread, stay_on, births, halos, origins, totals,
+    by_place, maxima,
+):  # fmt: skip
     """
     Advance all states by one image.
 
-    :param a: probabilities, (K, V, n or more).
-    :param n: places.
-    :param likelihood: of the image at each place, relative to that off the map, (K, n).
-    :param levels, speeds: see :func:`_mixed`.
+    :param a: states, (K, V, pitch), read and written; 0 from place n on.
+    :param n: places, at least 1.
+    :param z, weight, mu: z-normalized distances (n,), alpha, and mean of right places by level.
+    :param levels, speeds: see :func:`_mix`.
     :param steps: places that each speed moves on, (V,).
     :param spread: probability of one place more, and of one less, but never back.
     :param stay_on: probability of staying on the map.
     :param births: probability of each state of a level to come from off the map, (K,).
-    :param out: written like a, not normalized; origins: (K, V, n or more), int8, written.
+    :param halos: (parts of PLACES, K, V, reach), scratch; reach in whole vectors, more than a step
+        and one place; zeros in the first.
+    :param origins: of this image, (K, (V + 1) // 2, pitch), uint8, written.
     :param totals: (blocks, K, 3), written: sums before moving, of what moved over the map's end,
         and with the image.
+    :param by_place: sum of the states of each place, (n or more,), and maxima: the largest of each
+        block, (blocks,); written.
     """
-    K, V = a.shape[:2]
-    reach = steps.max() + 1
-    for block in nb.prange((n + PLACES - 1) // PLACES):
-        first = block * PLACES
-        count = min(PLACES, n - first)
-        mixed = np.empty((V, reach + count), np.float32)
-        source = np.empty((V, reach + count), np.int8)
-        for k in range(K):
-            total = _mixed(a, k, levels, speeds, first - reach, mixed, source)
-            totals[block, k, 0] = _sum(total[reach:])
-            if first + count == n:
-                totals[block, k, 1] = _lost(mixed, steps, spread)
-            birth, seen = births[k], likelihood[k, first : first + count]
-            after = F(0)
-            for v in range(V):
-                at = reach - steps[v]
-                target = out[k, v, first : first + count]
-                _move(
-                    mixed[v], source[v], at, at + 1 if steps[v] > 0 else at, spread, stay_on,
-                    birth, seen, target, origins[k, v, first : first + count],
+    K, V, pitch = a.shape
+    reach, halves, parts = halos.shape[3], origins.shape[1], (n + PLACES - 1) // PLACES
+    width = reach + BLOCK
+    states, flat_halos, flat_origins = a.reshape(-1), halos.reshape(-1), origins.reshape(-1)
+    for part in nb.prange(1, parts):
+        halos[part] = a[:, :, part * PLACES - reach : part * PLACES]
+    for part in nb.prange(parts):
+        mixed = np.empty(K * V * width, np.float32)
+        seen, places = np.empty((K, BLOCK), np.float32), np.empty(BLOCK, np.float32)
+        b = np.zeros((V + 1) * LANES, np.float32)
+        sums, lanes = np.zeros(K * LANES, np.float32), np.empty(LANES, np.float32)
+        blocks = (min(n - part * PLACES, PLACES) + BLOCK - 1) // BLOCK
+        for block in range(blocks - 1, -1, -1):
+            first = part * PLACES + block * BLOCK
+            count, at = min(BLOCK, n - first), first // BLOCK
+            whole = (count + LANES - 1) // LANES * LANES
+            _see(z, first, count, weight, mu, seen)
+            if block:
+                _mix(states, first - reach, pitch, reach, levels, speeds, b, mixed, 0, width, sums)
+            else:
+                _mix(
+                    flat_halos, part * K * V * reach, reach, reach, levels, speeds, b, mixed, 0,
+                    width, sums,
                 )  # fmt: skip
-                after += _sum(target)
-            totals[block, k, 2] = after
-
-
-@kernel
-def _move(row, change, at, slow, spread, stay_on, birth, seen, target, origin):
-    """Move the states of one level and speed on, and weigh them by the image; see advance."""
-    count = len(target)
-    center = F(1) - F(2) * spread
-    straight_row, straight_change = row[at : at + count], change[at : at + count]
-    faster_row, faster_change = row[at - 1 : at - 1 + count], change[at - 1 : at - 1 + count]
-    slower_row, slower_change = row[slow : slow + count], change[slow : slow + count]
-    for i in range(count):
-        straight = center * straight_row[i]
-        faster, slower = spread * faster_row[i], spread * slower_row[i]
-        s = (straight + faster + slower) * stay_on
-        target[i] = (s + birth) * seen[i]
-    for i in range(count):
-        straight = center * straight_row[i]
-        faster, slower = spread * faster_row[i], spread * slower_row[i]
-        s = (straight + faster + slower) * stay_on
-        most = straight if straight > faster else faster
-        code = np.int8(3 + faster_change[i]) if faster > straight else straight_change[i]
-        code = np.int8(6 + slower_change[i]) if slower > most else code
-        origin[i] = code if s > birth else np.int8(BORN)
+            sums[:] = 0
+            _mix(states, first, pitch, whole, levels, speeds, b, mixed, reach, width, sums)
+            places[:] = 0
+            for k in range(K):
+                totals[at, k, 0], totals[at, k, 1] = _sum_of_lanes(sums, k * LANES), 0
+                total = splat(F(0))
+                for v in range(V):
+                    row, step = (k * V + v) * width, steps[v]
+                    if first + count == n:
+                        ending = mixed[row : row + reach + count]
+                        totals[at, k, 1] += _lost(ending, step, spread)
+                    total = total + _move(
+                        mixed, row + reach - step, 1 if step > 0 else 0, whole, spread, stay_on,
+                        births[k], seen.reshape(-1), k * BLOCK, states,
+                        (k * V + v) * pitch + first, flat_origins,
+                        (k * halves + v // 2) * pitch + first, v % 2, places,
+                    )  # fmt: skip
+                store(lanes, 0, total)
+                totals[at, k, 2] = _sum_of_lanes(lanes, 0)
+            by_place[first : first + count] = places[:count]
+            maxima[at] = places[:count].max()
 
 
 @kernel
@@ -333,7 +499,7 @@ def trace_back(k, v, y, origins, steps, newest, count, places):
     """
     Follow the most probable way to a state back.
 
-    :param origins: ring of the last images' origins, (m, K, V, n or more).
+    :param origins: ring of the last images' origins, (m, K, (V + 1) // 2, n or more), uint8.
     :param steps: ring of their steps, (m, V).
     :param newest: slot of the newest image.
     :param count: images to go back, at most m.
@@ -345,7 +511,7 @@ def trace_back(k, v, y, origins, steps, newest, count, places):
     places[0] = y
     for i in range(count):
         slot = (newest - i) % m
-        origin = origins[slot, k, v, y]
+        origin = (origins[slot, k, v // 2, y] >> (v % 2 * 4)) & 15
         if origin == BORN:
             places[i + 1 :] = -1
             return v
@@ -366,20 +532,20 @@ def trace_back(k, v, y, origins, steps, newest, count, places):
 
 
 @kernel
-def middle_probabilities(a, least, tops, origins, steps, newest, count, found, best):
+def followed_back(a, least, tops, origins, steps, newest, count, ways, probabilities):
     """
-    Sum the probabilities of states by the place where they were some images ago.
+    Follow states back to where they were some images ago.
 
-    :param a: probabilities, (K, V, n or more).
+    :param a: states, (K, V, n or more).
     :param least: states below it are left out.
     :param tops: places whose states count, (m,).
     :param count: images to go back; other parameters: see :func:`trace_back`.
-    :param found: (n,), zeros, written: probability by place.
-    :param best: (n, 4), written where found > 0: the most probable state (k, v, y) there, and the
-        speed at the place.
+    :param ways: (m K V, 5), written: place then, state now (k, v, y), speed then.
+    :param probabilities: (m K V,), written: of these states.
+    :returns: how many were on the map then.
     """
     places = np.empty(count + 1, np.int32)
-    highest = np.zeros(len(found), np.float32)
+    found = 0
     for y in tops:
         for k in range(a.shape[0]):
             for v in range(a.shape[1]):
@@ -387,11 +553,9 @@ def middle_probabilities(a, least, tops, origins, steps, newest, count, found, b
                 if p < least:
                     continue
                 speed = trace_back(k, v, y, origins, steps, newest, count, places)
-                middle = places[count]
-                if middle < 0:
-                    continue
-                found[middle] += p
-                if p > highest[middle]:
-                    highest[middle] = p
-                    best[middle, 0], best[middle, 1] = k, v
-                    best[middle, 2], best[middle, 3] = y, speed
+                if places[count] >= 0:
+                    ways[found, 0], ways[found, 1], ways[found, 2] = places[count], k, v
+                    ways[found, 3], ways[found, 4] = y, speed
+                    probabilities[found] = p
+                    found += 1
+    return found

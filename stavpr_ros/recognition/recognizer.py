@@ -12,6 +12,7 @@ from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.recognition.int8_features import Int8Features, rounded
 from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
 from stavpr_ros.recognition.match import (
@@ -269,8 +270,9 @@ class PlaceRecognizer(SequenceRecognizer):
         layout = layout_of(place_map, settings.nms_radius)
         super().__init__(settings, place_map.settings, len(place_map), layout)
         features, options = place_map.features, settings.applied_options
-        for _, some in blocks(features):
-            require_finite(some, 'the map')
+        if not isinstance(features, StoredFeatures):  # these are checked whenever they are read
+            for _, some in blocks(features):
+                require_finite(some, 'the map')
         self._dimension = features.dimension
         self._centering = None
         if options.mean_centering or options.whitening:

@@ -141,7 +141,10 @@ class FilterSettings:
 
     def speed_changes(self, weights: np.ndarray) -> np.ndarray:
         """
-        Return the probabilities that the kernels take, (4, V), float32.
+        Return the factors of the speeds for the kernels, (5, V), float32.
+
+        To stay, from the speed below, from the one above, of all by the speed after, and from any
+        by the speed before.
 
         :param weights: relative probability of each speed for this image, (V,).
         """
@@ -150,8 +153,15 @@ class FilterSettings:
         total = self.keep_speed * weights + far * weights.sum()
         total[1:] += near * weights[:-1]
         total[:-1] += near * weights[1:]
-        before = np.array([self.keep_speed, near, far])[:, None] / total
-        return np.concatenate([before, weights[None]]).astype(np.float32)
+        changes = np.zeros((5, V), np.float32)
+        changes[0], changes[3], changes[4] = (
+            self.keep_speed * weights / total,
+            weights,
+            far / total,
+        )
+        changes[1, 1:] = near * weights[1:] / total[:-1]
+        changes[2, :-1] = near * weights[:-1] / total[1:]
+        return changes
 
 
 class Whitening:
@@ -305,7 +315,7 @@ def z_normalized(row: np.ndarray, around: int = 0) -> np.ndarray:
 
     :param around: subtract the mean of so many places to either side as well, in which no place
         counts for less than -1, so that the right one counts little. Images of one light are
-        nearer to each other than to all others, which says nothing of their places. 0 = no.
+        nearer to each other than to all others, wherever they were taken. 0 = no.
     """
     known = row[np.isfinite(row)]
     if not known.size:

@@ -19,7 +19,7 @@ from stavpr_ros.alignment.lm_dtw import padded_width, SequenceMatch
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.checks import no_nan
 from stavpr_ros.compilation import parallel_kernel
-from stavpr_ros.recognition.place_filter import Belief, CLOSE, NEGLIGIBLE, PlaceFilter
+from stavpr_ros.recognition.place_filter import CLOSE, NEGLIGIBLE, PlaceFilter
 from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.sessions import Sequences, SessionLayout
 import torch
@@ -385,45 +385,58 @@ class FilterSearch:
             return WindowMatch()
         newest = self._images[-1]
         belief = self.filter.belief(n, newest - self._images[self._middle])
-        place = int(np.argmax(belief.probabilities))
-        if not belief.probabilities[place] > 0:
+        places, probabilities = belief.probabilities(n)
+        if not places.size:
             return self._nowhere(n, first)
+        best = int(np.argmax(probabilities))
         if self._layout is not None:
-            belief, place = self._layout.shared(belief, CLOSE)
-        near = slice(max(0, place - CLOSE), min(n, place + CLOSE + 1))
+            places, probabilities, best = self._layout.shared(belief, CLOSE)
+        near = np.abs(belief.places - places[best]) <= CLOSE
         weights = belief.weights[near]
-        middle = round(float(np.arange(near.start, near.stop) @ weights / weights.sum()))
-        path = self._path(belief.ways[near.start + int(np.argmax(weights))])
-        probabilities = self._all_probabilities(belief)
-        elsewhere = probabilities.copy()
-        elsewhere[max(0, middle - nms_radius) : middle + nms_radius + 1] = 0
-        second = int(np.argmax(elsewhere))
-        found = float(elsewhere[second])
+        middle = round(float(belief.places[near] @ weights / weights.sum()))
+        path = self._path(belief.ways[near][np.argmax(weights)])
+        second, found = self._second_best(n, places, probabilities, middle, nms_radius)
         path[:, 1] += first
         match = SequenceMatch(
             first=int(path[0, 1]),
             last=int(path[-1, 1]),
             middle=middle + first,
-            distance=float(1 - belief.probabilities[place]),
+            distance=float(1 - probabilities[best]),
             second_best_index=second + first if found > 0 else -1,
             second_best_distance=1 - found if found > 0 else float('nan'),
         )
-        return WindowMatch(match, path, lambda: _sequences(probabilities, first))
+        return WindowMatch(match, path, lambda: self._sequences(n, first, places, probabilities))
 
-    def _all_probabilities(self, belief: Belief) -> np.ndarray:
-        """Return the probabilities of places, of improbable ones by the filter's state today."""
-        n = len(belief.probabilities)
-        faint = self.filter.places_of_states()[:n] * np.float64(NEGLIGIBLE)
-        return np.where(belief.probabilities > 0, belief.probabilities, faint)
+    def _second_best(
+        self, n: int, places: np.ndarray, probabilities: np.ndarray, middle: int, radius: int
+    ) -> tuple[int, float]:
+        """Return the most probable place beyond a radius, and its probability, 0 if none."""
+        around = np.arange(max(0, middle - radius), min(n, middle + radius + 1))
+        now, faint = self.filter.most_probable(np.union1d(around, places))
+        faint *= NEGLIGIBLE
+        apart = np.abs(places - middle) > radius
+        if apart.any():
+            second = int(np.argmax(np.where(apart, probabilities, 0)))
+            if probabilities[second] >= faint:
+                return int(places[second]), float(probabilities[second])
+        return now, faint
+
+    def _sequences(
+        self, n: int, first: int, places: np.ndarray, probabilities: np.ndarray
+    ) -> Sequences:
+        """Return the costs of all places; of improbable ones by the filter's state today."""
+        every = self.filter.places_of_states()[:n] * np.float64(NEGLIGIBLE)
+        every[places] = probabilities
+        return np.where(every > 0, 1 - every, np.inf), np.arange(first, first + n)
 
     def _nowhere(self, n: int, first: int) -> WindowMatch:
         """Return the place that is most probable now, with the distance 1."""
-        now = self.filter.places_of_states()[:n] * np.float64(NEGLIGIBLE)
-        place = int(np.argmax(now)) + first
+        nothing = np.empty(0, np.int64)
+        place = self.filter.most_probable(nothing)[0] + first
         match = SequenceMatch(place, place, place, 1.0, -1, float('nan'))
         length = self.buffer.length
         path = np.stack([np.arange(length), np.full(length, place)], axis=1).astype(np.int32)
-        return WindowMatch(match, path, lambda: _sequences(now, first))
+        return WindowMatch(match, path, lambda: self._sequences(n, first, nothing, np.empty(0)))
 
     def _path(self, way: np.ndarray) -> np.ndarray:
         """Return the place of each image of the window, (l, 2); before the middle at one speed."""
@@ -436,8 +449,3 @@ class FilterSearch:
         path = places[np.minimum(back, lag)] - np.rint(earlier).astype(np.int32)
         lowest = 0 if self._layout is None else self._layout.first_column(places[0])
         return np.stack([np.arange(len(path)), np.maximum(path, lowest)], axis=1).astype(np.int32)
-
-
-def _sequences(probabilities: np.ndarray, first: int) -> Sequences:
-    costs = np.where(probabilities > 0, 1 - probabilities, np.inf)
-    return costs, np.arange(first, first + len(costs))

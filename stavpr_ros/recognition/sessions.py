@@ -79,20 +79,26 @@ class SessionLayout:
         sums = np.concatenate([sums, np.full(close, sums[-1])])
         return np.minimum(sums[2 * close + 1 :] - sums[: -2 * close - 1], 1)[self._shared]
 
-    def shared(self, belief: Belief, close: int) -> tuple[Belief, int]:
+    def shared(self, belief: Belief, close: int) -> tuple[np.ndarray, np.ndarray, int]:
         """
         Let places of one position share their probability.
 
         :param close: places to either side that count for a place, too.
-        :returns: the belief, and the most probable column: of the session that is most probable
-            at the most probable position.
+        :returns: columns whose probability is not 0, ascending, and their probabilities; among
+            them the most probable one: of the session that is most probable at the most probable
+            position.
         """
-        probabilities = self.summed(belief.weights, close)
+        weights, own = np.zeros(self.width), np.zeros(self.width)
+        weights[belief.places] = belief.weights
+        near, probabilities_near = belief.probabilities(self.width)
+        own[near] = probabilities_near
+        probabilities = self.summed(weights, close)
         best = int(np.argmax(probabilities))
         at_position = np.abs(self._shared - self._shared[best]) <= close
-        column = int(np.argmax(np.where(at_position, belief.probabilities, 0)))
+        column = int(np.argmax(np.where(at_position, own, 0)))
         probabilities[column] = probabilities[best]
-        return replace(belief, probabilities=probabilities), column
+        columns = np.flatnonzero(probabilities)
+        return columns, probabilities[columns], int(np.searchsorted(columns, column))
 
     def positions(self, places: np.ndarray | int) -> np.ndarray:
         """Return positions: those at most nms_radius apart are neighbors in one session."""

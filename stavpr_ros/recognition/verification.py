@@ -126,7 +126,7 @@ class GeometricVerifier:
         """Count the matches that one geometry explains; 0 for too few keypoints."""
         if min(len(query.points), len(place.points)) < LEAST_MATCHES:
             return 0
-        mine, theirs = self._matches(query.descriptors, place.descriptors)
+        mine, theirs = mutual_matches(query.descriptors, place.descriptors, self.settings.ratio)
         if len(mine) < LEAST_MATCHES:
             return 0
         return _explained(query.points[mine], place.points[theirs], self.settings.pixels)
@@ -153,21 +153,29 @@ class GeometricVerifier:
             return nothing
         return Keypoints(np.array([point.pt for point in keypoints], np.float32), descriptors)
 
-    def _matches(self, mine: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pair the keypoints that are each other's clear nearest; two arrays (m,) of indices."""
-        how = (
-            (cv2.CV_32S, cv2.NORM_HAMMING)
-            if self.settings.method == 'orb'
-            else (cv2.CV_32F, cv2.NORM_L2)
-        )
-        distances, nearest = cv2.batchDistance(mine, theirs, how[0], normType=how[1], K=2)
-        clear = np.flatnonzero(distances[:, 0] < self.settings.ratio * distances[:, 1])
-        matched = nearest[clear, 0]
-        if not len(clear):
-            return clear, matched
-        _, back = cv2.batchDistance(theirs[matched], mine, how[0], normType=how[1], K=1)
-        mutual = back[:, 0] == clear
-        return clear[mutual], matched[mutual]
+
+def mutual_matches(
+    mine: np.ndarray, theirs: np.ndarray, ratio: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Pair the descriptors that are each other's clear nearest.
+
+    :param mine, theirs: shape (m, d) and (k, d), uint8 for ORB, float32 for SIFT.
+    :param ratio: the nearest is this much nearer than the second nearest, in (0, 1].
+    :returns: two arrays of indices, of equal length.
+    """
+    none = np.empty(0, np.intp)
+    if not len(mine) or len(theirs) < 2:
+        return none, none
+    how = (cv2.CV_32S, cv2.NORM_HAMMING) if mine.dtype == np.uint8 else (cv2.CV_32F, cv2.NORM_L2)
+    distances, nearest = cv2.batchDistance(mine, theirs, how[0], normType=how[1], K=2)
+    clear = np.flatnonzero(distances[:, 0] < ratio * distances[:, 1])
+    matched = nearest[clear, 0]
+    if not len(clear):
+        return clear, matched
+    _, back = cv2.batchDistance(theirs[matched], mine, how[0], normType=how[1], K=1)
+    mutual = back[:, 0] == clear
+    return clear[mutual], matched[mutual]
 
 
 class PlaceVerifier:

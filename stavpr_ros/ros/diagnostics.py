@@ -146,6 +146,9 @@ def _recognition_values(health: Health) -> dict[str, Value]:
         'last_place': counts.place if counts.place >= 0 else None,
         'last_distance': counts.distance,
         'last_answer_age_s': counts.answered_age,
+        'camera': health.camera,
+        **{_key('edges', source): count for source, count in health.edges.sources.items()},
+        'last_edge_reason': health.edges.reason or None,
         **{_key('statuses', status): count for status, count in counts.statuses.items()},
     }
 

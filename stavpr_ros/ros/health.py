@@ -9,6 +9,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.statistics import ImageCounts, RECENT
+from stavpr_ros.ros.edges import EdgeCounts
 from stavpr_ros.ros.faults import blank_images, never_matched, short_map
 from stavpr_ros.ros.input import InputStatus
 
@@ -44,6 +45,8 @@ class Health:
     :param queue: waiting images; ``window``: images in the window.
     :param missing: prerequisite of a match that is missing; empty = none.
     :param odometry_fault: why no odometry can arrive on its topic; empty = unknown.
+    :param camera: whether the camera of the edges is known, or why not.
+    :param edges: counts of the edges.
     :param contrast: standard deviation of the last image, of 255; NaN = unknown.
     """
 
@@ -60,6 +63,8 @@ class Health:
     window: int = 0
     missing: str = ''
     odometry_fault: str = ''
+    camera: str = 'not needed'
+    edges: EdgeCounts = field(default_factory=lambda: EdgeCounts({}))
     contrast: float = math.nan
 
     @property

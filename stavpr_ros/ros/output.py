@@ -26,12 +26,14 @@ from stavpr_msgs.msg import (
     PlaceCandidate,
     PlaceCandidates,
     PlaceMatch,
+    RelativePose,
 )
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.map_version2 import VERSION
 from stavpr_ros.pipeline.overlay import draw_match
 from stavpr_ros.recognition import Match, Status
+from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from std_msgs.msg import Float32, Header, Int32
 
@@ -87,12 +89,15 @@ def match_message(
     match: Match,
     places: PlaceMap | GrowingMap | None = None,
     robot_id: str = '',
+    edge: Edge | None = None,
+    frame: str = '',
 ) -> PlaceMatch:
     """
     Return the message of a match.
 
     :param places: the map that the indices of the match refer to.
     :param robot_id: the parameter of this name.
+    :param edge: of the middle pair, None = none; frame: of the base.
     """
     message = PlaceMatch(
         header=header,
@@ -113,6 +118,7 @@ def match_message(
         second_best_index=-1,
         second_best_distance=math.nan,
         inliers=match.inliers,
+        relative_pose=no_edge(),
     )
     if match.window_stamps:
         stamps = match.window_stamps
@@ -130,6 +136,16 @@ def match_message(
         message.place_stamp, message.place_id = time_message(place.stamp), place.identifier
         message.session = place.session
         message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
+        if edge is not None:
+            message.has_relative_pose = edge.source is not Source.NONE
+            first, length = match.first_image_index, len(match.window_stamps)
+            pair = AlignedPlaces(
+                query_index=first + (length - 1) // 2 if first >= 0 else -1,
+                query_stamp=message.window_middle,
+                place_index=message.place_index,
+                place_stamp=message.place_stamp,
+            )
+            message.relative_pose = relative_pose_message(edge, pair, frame)
     return message
 
 
@@ -160,47 +176,88 @@ def candidates_message(
 def loop_closure_message(
     header: Header,
     match: Match,
-    route: PlaceMap | GrowingMap | None,
+    places: PlaceMap | GrowingMap | None,
     robot_id: str = '',
     frames: PoseFrames = NO_FRAMES,
+    query: tuple[np.ndarray | None, str] = (None, ''),
 ) -> LoopClosure | None:
     """
-    Return the loop closure of a match on a growing route, None for any other match.
+    Return the loop closure of a match, without its edge; None without a match.
 
-    :param frames: of the poses of the route.
+    :param places: the route, whose places the images of the window are, or a map.
+    :param frames: of the poses of the places.
+    :param query: pose of the middle image of the window, shape (7,), and its frame; for maps only,
+        a route has it.
     """
-    first = match.first_image_index
-    if not match.accepted or first < 0 or route is None:
+    if not match.accepted or places is None:
         return None
+    first = match.first_image_index
+    is_route = first >= 0
+    stamps = match.window_stamps
     pairs = [
         AlignedPlaces(
-            query_index=first + q,
-            query_stamp=time_message(route.place(first + q).stamp),
+            query_index=first + q if is_route else -1,
+            query_stamp=time_message(places.place(first + q).stamp if is_route else stamps[q]),
             place_index=m,
-            place_stamp=time_message(route.place(m).stamp),
+            place_stamp=time_message(places.place(m).stamp),
         )
         for q, m in match.path.tolist()
     ]
-    middle = first + (len(match.window_stamps) - 1) // 2
-    query, place = route.place(middle), route.place(match.place_index)
+    middle = (len(stamps) - 1) // 2
+    query_stamp, place = stamps[middle], places.place(match.place_index)
+    if is_route:
+        own = places.place(first + middle)
+        query_stamp, query = own.stamp, (own.pose, frames.frame)
     message = LoopClosure(
         header=header,
-        **_origin(robot_id, route),
-        query_index=middle,
-        query_stamp=time_message(query.stamp),
+        **_origin(robot_id, places),
+        query_index=first + middle if is_route else -1,
+        query_stamp=time_message(query_stamp),
+        place_session=place.session,
         place_index=match.place_index,
         place_stamp=time_message(place.stamp),
         distance=match.distance,
         threshold=match.threshold,
         probability=match.probability,
         inliers=match.inliers,
+        relative_pose=no_edge(),
         pairs=pairs,
     )
-    if query.pose is not None and place.pose is not None:
+    if query[0] is not None and place.pose is not None:
         message.has_poses = True
         message.pose_frame, message.pose_child_frame = frames.frame, frames.child
-        message.query_pose, message.place_pose = pose_message(query.pose), pose_message(place.pose)
+        message.query_pose_frame = query[1]
+        message.query_pose, message.place_pose = pose_message(query[0]), pose_message(place.pose)
     return message
+
+
+def relative_pose_message(edge: Edge, pair: AlignedPlaces, frame: str) -> RelativePose:
+    """
+    Return an edge as a message.
+
+    :param pair: indices and stamps of query and place.
+    :param frame: of the base.
+    """
+    message = RelativePose(
+        source=edge.source,
+        reason=edge.reason,
+        query_index=pair.query_index,
+        query_stamp=pair.query_stamp,
+        place_index=pair.place_index,
+        place_stamp=pair.place_stamp,
+        frame=frame,
+        is_independent=edge.independent,
+        inliers=edge.inliers,
+        reprojection_error=edge.error,
+    )
+    message.pose.pose = pose_message(edge.pose)
+    message.pose.covariance = edge.covariance.ravel()
+    return message
+
+
+def no_edge() -> RelativePose:
+    """Return the message where there is no pair."""
+    return RelativePose(query_index=-1, place_index=-1, inliers=-1, reprojection_error=math.nan)
 
 
 def matched_pose_message(
@@ -318,24 +375,24 @@ class Output:
         match: Match,
         places: PlaceMap | GrowingMap | None = None,
         frames: PoseFrames = NO_FRAMES,
+        edge: Edge | None = None,
     ) -> PlaceMatch:
         """
         Publish the results for one image, ``~/match`` last; return that message.
 
+        Loop closures are not among them: they wait for their edges.
+
         :param places: the map that the indices of the match refer to.
         :param frames: of its poses.
+        :param edge: of the middle pair, None = none.
         """
         robot_id = self._robot_id
-        message = match_message(header, match, places, robot_id)
+        message = match_message(header, match, places, robot_id, edge, frames.child)
         try:
             if match.accepted:
                 self.place_index.publish(Int32(data=message.place_index))
                 self.distance.publish(Float32(data=message.distance))
             for publisher, more in (
-                (
-                    self.loop_closure,
-                    loop_closure_message(header, match, places, robot_id, frames),
-                ),
                 (self.pose, matched_pose_message(header, match, places, frames.frame)),
                 (self.candidates, candidates_message(header, match, places, robot_id)),
             ):
@@ -348,6 +405,14 @@ class Output:
             if self._node.context.ok():  # else ROS was shut down before the node
                 raise
         return message
+
+    def publish_closure(self, message: LoopClosure) -> None:
+        """Publish a loop closure."""
+        try:
+            self.loop_closure.publish(message)
+        except rclpy_implementation.RCLError:
+            if self._node.context.ok():  # else ROS was shut down before the node
+                raise
 
     @property
     def candidates_requested(self) -> bool:

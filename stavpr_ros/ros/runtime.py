@@ -13,6 +13,7 @@ import time
 import traceback
 from typing import Any
 
+import numpy as np
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.errors import JournalError, MapFileError, SettingsError, StavprError
 from stavpr_ros.mapping import PlaceMap, verify_map
@@ -23,10 +24,19 @@ from stavpr_ros.pipeline.saving import recover_maps, save_recorded_map
 from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
+from stavpr_ros.relative_pose.pair import MatchedPair
+from stavpr_ros.ros.camera import CameraInput
+from stavpr_ros.ros.edges import EdgePublisher
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import END_POLL, ImageInput, InputStatus, STOP_TIMEOUT, Worker
 from stavpr_ros.ros.navigation import Navigation
-from stavpr_ros.ros.output import map_info_message, nanoseconds, Output, PoseFrames
+from stavpr_ros.ros.output import (
+    loop_closure_message,
+    map_info_message,
+    nanoseconds,
+    Output,
+    PoseFrames,
+)
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import OdometryInput
 from stavpr_ros.ros.visualization import Visualization
@@ -71,6 +81,7 @@ class Runtime:
         self.on_map_change = on_map_change
         self.images: ImageInput | None = None
         self.odometry: OdometryInput | None = None
+        self.camera: CameraInput | None = None
         self._epoch = self._pipeline_epoch = 0
         self._explained: set[str] = set()
         self.last_header = Header()  # of the last image in the window
@@ -79,6 +90,9 @@ class Runtime:
         self._navigation = Navigation(node, settings)
         self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size, settings.robot_id)
+        self._edges = EdgePublisher(
+            settings.relative_pose, self._output.publish_closure, node.ending
+        )
         self._pipeline: Pipeline | None = None
         self._views = Visualization(node, lambda: self.worker.call(self._publish_route))
         try:
@@ -122,13 +136,16 @@ class Runtime:
         """Subscribe, with an empty window: the camera may have been moved since the last image."""
         self.reset()
         self._update_odometry()
+        if self.settings.relative_pose in ('auto', 'pnp'):
+            self.camera = CameraInput(self._node, self.settings.camera_transform)
         self.images = ImageInput(
             self._node, self.settings, self._statistics, self._enqueue, self._reject, self.restart
         )
 
     def deactivate(self) -> None:
-        """Unsubscribe; publish waiting images as dropped, and save a recorded map."""
+        """Unsubscribe; publish what waits, images as dropped; save a recorded map."""
         self._unsubscribe()
+        self.worker.run(self._edges.flush)  # after the image in process
         self._save(self.worker.run)
 
     def close(self) -> None:
@@ -137,7 +154,7 @@ class Runtime:
             self._unsubscribe()
             self.save_at_end()
         finally:
-            if not self.worker.stop():
+            if not (self.worker.stop() & self._edges.stop()):
                 self._node.left_behind = True
             self._close_journals()
             self._output.close()
@@ -163,17 +180,22 @@ class Runtime:
                 )
 
     def _unsubscribe(self) -> None:
-        for subscription in (self.images, self.odometry):
+        for subscription in (self.images, self.odometry, self.camera):
             if subscription is not None:
                 subscription.close()
-        self.images = self.odometry = None
+        self.images = self.odometry = self.camera = None
         for item in self.worker.clear():
             reason = 'the node was deactivated before it was processed'
             self._drop(item.message, Status.DROPPED, reason, 'deactivated')
 
     def _update_odometry(self) -> None:
         """Subscribe to odometry while it is needed."""
-        needed = self.settings.needs_odometry
+        places, settings = self.pipeline.places, self.settings
+        needed = settings.needs_odometry or (  # edges to places of a map
+            settings.relative_pose in ('auto', 'aligned')
+            and isinstance(places, PlaceMap)
+            and places.has_poses
+        )
         if needed and self.odometry is None:
             self.odometry = OdometryInput(self._node, self.settings.odometry_timeout)
         elif not needed and self.odometry is not None:
@@ -214,6 +236,8 @@ class Runtime:
             loaded = self._read_in_time(path)
             with lock or nullcontext():
                 self.worker.run(lambda: self.pipeline.change(loaded=loaded))
+                if self.images is not None:
+                    self._update_odometry()
             self.worker.call(self._publish_route)
         places = loaded.places
         self._node.get_logger().info(
@@ -305,9 +329,19 @@ class Runtime:
             queue=self.worker.waiting,
             window=pipeline.window_fill,
             missing=pipeline.missing,
+            camera=self._camera_state(),
+            edges=self._edges.counts,
             odometry_fault='' if odometry is None else odometry.fault(),
             contrast=pipeline.contrast,
         )
+
+    def _camera_state(self) -> str:
+        """Return whether camera and transform are known, for the diagnostics."""
+        if self.camera is None:
+            return 'not needed'
+        if self.camera.problem:
+            return self.camera.problem
+        return 'known, transform assumed' if self.camera.assumed else 'known'
 
     # images
 
@@ -351,10 +385,15 @@ class Runtime:
         pose, frames = None, PoseFrames(self.settings.map_frame)
         if odometry is not None:
             pose = odometry.trajectory.at(stamp)
-            if self.pipeline.operation != 'localization':  # places have the poses of the odometry
-                frames = PoseFrames(odometry.frame, odometry.child_frame)
+            # places of a route have the poses of the odometry
+            own = self.pipeline.operation != 'localization'
+            frames = PoseFrames(odometry.frame if own else frames.frame, odometry.child_frame)
         self.pipeline.list_candidates = self._output.candidates_requested
         self.pipeline.list_candidates |= self._views.needs_candidates
+        camera = self.camera
+        if camera is not None:
+            base = '' if odometry is None else odometry.child_frame
+            self.pipeline.camera = camera.camera(base, header.frame_id)
         try:
             match = self.pipeline.process(item.message, stamp, pose)
         except Exception as error:
@@ -372,7 +411,12 @@ class Runtime:
     def _publish(self, header: Header, match: Match, frames: PoseFrames, waited: float) -> None:
         began = time.monotonic()
         self._views.publish(header, match, self.pipeline, frames.frame)
-        message = self._output.publish(header, match, self.pipeline.places, frames)
+        pair = self.pipeline.matched_pair(match)
+        # a match does not wait for PnP
+        edge = self._edges.aligned(pair) if pair is not None else None
+        message = self._output.publish(header, match, self.pipeline.places, frames, edge)
+        if pair is not None:
+            self._put_closure(header, match, frames, pair)
         stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
         if match.cause:
             self._statistics.dropped(match.cause)
@@ -381,6 +425,25 @@ class Runtime:
         self.last_header = header
         place = message.newest_index if match.status is Status.MAPPED else message.place_index
         self._statistics.answered(match.status.name, match.reason, place, message.distance, stages)
+
+    def _put_closure(
+        self, header: Header, match: Match, frames: PoseFrames, pair: MatchedPair
+    ) -> None:
+        """Publish the loop closure of a match when its edge is ready."""
+        places, odometry = pair.source, self.odometry
+        is_map = self.pipeline.operation == 'localization'
+        if is_map and (
+            self.settings.relative_pose == 'none' or places.place(pair.place).pose is None
+        ):
+            return
+        known = not np.isnan(pair.query_pose).any() and odometry is not None
+        query = (pair.query_pose, odometry.frame) if known and odometry else (None, '')
+        message = loop_closure_message(
+            header, match, places, self.settings.robot_id, frames, query
+        )
+        if message is not None:
+            camera = self.pipeline.camera
+            self._edges.put(message, pair, camera, places.camera if is_map else camera)
 
     def _publish_route(self) -> None:
         """Publish the route for a new subscriber, in the frame of the last image if it grows."""

@@ -49,6 +49,7 @@ _ELEMENTS = {
     types.float32: ir.FloatType(),
     types.float64: ir.DoubleType(),
     types.int32: ir.IntType(32),
+    types.uint8: ir.IntType(8),
 }
 
 
@@ -122,6 +123,51 @@ def load_splat(typing: Any, array: Any, offset: Any) -> Any:
 
 
 @intrinsic
+def load_bytes(typing: Any, array: Any, offset: Any) -> Any:
+    """Read LANES neighbors of a flat array of uint8, from ``offset``, as int32."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = _pointer(context, builder, signature.args[0], *arguments)
+        wide = ir.VectorType(ir.IntType(32), LANES)
+        return builder.zext(builder.load(pointer, align=1), wide)
+
+    return Vector(types.int32)(array, types.intp), generate
+
+
+@intrinsic
+def store_bytes(typing: Any, array: Any, offset: Any, vector: Any) -> Any:
+    """Write the lowest byte of each int32 into a flat array of uint8, from ``offset``."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = _pointer(context, builder, signature.args[0], *arguments[:2])
+        bytes_ = ir.VectorType(ir.IntType(8), LANES)
+        builder.store(builder.trunc(arguments[2], bytes_), pointer, align=1)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, vector), generate
+
+
+@intrinsic
+def bits(typing: Any, vector: Any) -> Any:
+    """Return the bits of float32 numbers as int32."""
+    return Vector(types.int32)(
+        vector
+    ), lambda context, builder, signature, arguments: builder.bitcast(
+        arguments[0], ir.VectorType(ir.IntType(32), LANES)
+    )
+
+
+@intrinsic
+def from_bits(typing: Any, vector: Any) -> Any:
+    """Return the float32 numbers that have these bits."""
+    return Vector(types.float32)(
+        vector
+    ), lambda context, builder, signature, arguments: builder.bitcast(
+        arguments[0], ir.VectorType(ir.FloatType(), LANES)
+    )
+
+
+@intrinsic
 def select(typing: Any, mask: Any, yes: Any, no: Any) -> Any:
     """Take the lanes of ``yes`` where the mask is true, of ``no`` elsewhere."""
     return yes(mask, yes, no), lambda context, builder, signature, arguments: builder.select(
@@ -168,3 +214,6 @@ _register(operator.sub, _operation('fsub', 'sub'))
 _register(operator.mul, _operation('fmul'))
 _register(operator.truediv, _operation('fdiv'))
 _register(operator.lt, _less)
+_register(operator.and_, _operation('', 'and_'))
+_register(operator.or_, _operation('', 'or_'))
+_register(operator.lshift, _operation('', 'shl'))

@@ -1,0 +1,106 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The camera of a map: its intrinsics, and where it is on the robot."""
+
+from dataclasses import asdict, dataclass
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping.trajectory import checked_pose
+
+MODELS = {'plumb_bob': (4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}
+FORWARD = (0.0, 0.0, 0.0, -0.5, 0.5, -0.5, 0.5)
+"""Pose in the base (x ahead, z up) of an optical frame (z ahead, y down) that looks ahead."""
+ASPECT = 0.02  # by which the proportions of an image may differ from those of the intrinsics
+
+
+@dataclass(frozen=True)
+class Camera:
+    """
+    A calibrated camera on a robot.
+
+    :param width, height: of the images that the intrinsics are of, pixels.
+    :param focal: fx and fy, pixels; center: cx and cy.
+    :param model: of the distortion, as in sensor_msgs/CameraInfo; '' = none.
+    :param distortion: its coefficients.
+    :param mount: pose of the optical frame (z ahead, x right) in the frame whose poses the places
+        have, x y z (meters) and quaternion x y z w.
+    :raises InputError: not calibrated, an unknown model, or numbers that are not finite.
+    """
+
+    width: int
+    height: int
+    focal: tuple[float, float]
+    center: tuple[float, float]
+    model: str = ''
+    distortion: tuple[float, ...] = ()
+    mount: tuple[float, ...] = FORWARD
+
+    def __post_init__(self) -> None:
+        numbers = (*self.focal, *self.center, *self.distortion)
+        if not (min(self.width, self.height) > 0 and min(self.focal) > 0):
+            raise InputError(
+                f'camera of {self.width}x{self.height} pixels, focal length {self.focal}: '
+                'expected numbers above 0; calibrate the camera'
+            )
+        if not all(map(math.isfinite, numbers)):
+            raise InputError(f'intrinsics {numbers} are not finite: calibrate the camera')
+        if any(self.distortion) and len(self.distortion) not in MODELS.get(self.model, ()):
+            raise InputError(
+                f'distortion model {self.model!r} with {len(self.distortion)} coefficients: take '
+                f'one of {", ".join(MODELS)}'
+            )
+        object.__setattr__(self, 'mount', tuple(checked_pose(np.array(self.mount)).tolist()))
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> 'Camera':
+        """
+        Return the camera of :meth:`to_json`.
+
+        :raises InputError: see the class.
+        """
+        tuples = ('focal', 'center', 'distortion', 'mount')
+        return cls(**{**data, **{name: tuple(data[name]) for name in tuples}})
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON values, tuples as lists."""
+        return {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in asdict(self).items()
+        }
+
+    def require_fitting(self, width: int, height: int) -> None:
+        """
+        Reject intrinsics of images of other proportions.
+
+        :raises InputError: names both sizes.
+        """
+        if abs(width * self.height / (height * self.width) - 1) > ASPECT + 1 / min(width, height):
+            raise InputError(
+                f'the intrinsics are of {self.width}x{self.height} pixels, images have the '
+                f'proportions of {width}x{height}: correct camera_info'
+            )
+
+    def rays(self, points: np.ndarray, width: int, height: int) -> np.ndarray:
+        """
+        Return the directions in which points of an image are, without distortion.
+
+        :param points: pixels (x, y), centers of pixels are whole numbers, shape (m, 2).
+        :param width, height: of the image, which may be smaller than that of the intrinsics.
+        :returns: x / z and y / z in the optical frame, shape (m, 2), float64.
+        """
+        if not len(points):
+            return np.empty((0, 2))
+        scale = np.array([self.width / width, self.height / height])
+        full = ((points.astype(np.float64) + 0.5) * scale - 0.5)[:, None]
+        matrix = np.array([[self.focal[0], 0, self.center[0]], [0, self.focal[1], self.center[1]]])
+        matrix = np.vstack([matrix, [0, 0, 1.0]])
+        if not any(self.distortion):
+            return (full[:, 0] - self.center) / self.focal
+        coefficients = np.array(self.distortion)
+        if self.model == 'equidistant':
+            return np.asarray(cv2.fisheye.undistortPoints(full, matrix, coefficients))[:, 0]
+        return np.asarray(cv2.undistortPoints(full, matrix, coefficients))[:, 0]

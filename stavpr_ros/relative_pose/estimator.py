@@ -1,0 +1,214 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Estimates edges; keypoints and landmarks of the latest places are kept."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+import math
+from typing import TypeVar
+
+import numpy as np
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping.camera import Camera
+from stavpr_ros.mapping.place_map import decode_thumbnail
+from stavpr_ros.relative_pose.edge import Edge, Source
+from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View, view_of
+from stavpr_ros.relative_pose.odometry import align
+from stavpr_ros.relative_pose.pair import BESIDE, MatchedPair, NEIGHBORS
+from stavpr_ros.relative_pose.pnp import LEAST_INLIERS, PnpPose, solve_pnp
+from stavpr_ros.relative_pose.transforms import cross_matrices, inverse, matrix_of, pose_of
+
+METHODS = ('auto', 'none', 'aligned', 'pnp')
+VIEWS, LANDMARKS = 64, 32  # places kept: some 300 kB and 100 kB each
+LEAST_BASELINE = 0.05  # meters between the place and a neighbor
+# Places between independent edges: their errors have views, or odometry, in common.
+APART = {Source.PNP: 5, Source.ALIGNED: 10}
+REACH = 2.0  # a query is at most so many times as far from the place as its neighbors
+# The Jacobian misses what all landmarks of a place have in common, such as errors of its odometry:
+# the deviation of an observation in pixels, and what is added in position (m) and rotation (rad).
+NOISE, SHIFT, TURN = 2.0, 0.2, math.radians(0.4)
+
+Value = TypeVar('Value')
+
+
+class EdgeEstimator:
+    """
+    Estimates the relative pose of matched pairs. Belongs to one thread.
+
+    :param method: ``auto``: PnP where it is possible, else aligned by odometry; ``pnp`` and
+        ``aligned``: that alone; ``none``.
+    """
+
+    def __init__(self, method: str = 'auto') -> None:
+        self.method = method
+        self._source: tuple[PlaceMap | GrowingMap, Camera] | None = None
+        self._last: tuple[PlaceMap | GrowingMap, np.ndarray] | None = None
+        self._views: OrderedDict[int, View | None] = OrderedDict()
+        self._landmarks: OrderedDict[int, tuple[Landmarks, float, list[int]]] = OrderedDict()
+
+    def estimate(
+        self,
+        pair: MatchedPair,
+        query_camera: Camera | None,
+        place_camera: Camera | None,
+        in_time: bool = True,
+    ) -> Edge:
+        """
+        Return the edge of a pair, and whether it is independent of those before.
+
+        :param query_camera, place_camera: of the two images; None = unknown.
+        :param in_time: there is time for PnP.
+        """
+        edge = self._estimated(pair, query_camera, place_camera, in_time)
+        return replace(edge, independent=self._is_independent(pair, edge))
+
+    def _is_independent(self, pair: MatchedPair, edge: Edge) -> bool:
+        """Return whether the query has moved far enough since the last independent edge."""
+        if edge.source is Source.NONE:
+            return False
+        base = matrix_of(pair.pose(pair.place)) @ matrix_of(edge.pose)
+        last = self._last
+        if last is not None and last[0] is pair.source:
+            moved = float(np.linalg.norm(base[:3, 3] - last[1]))
+            if moved < (APART[edge.source] - 0.5) * pair.spacing:
+                return False
+        self._last = pair.source, base[:3, 3]
+        return True
+
+    def _estimated(
+        self,
+        pair: MatchedPair,
+        query_camera: Camera | None,
+        place_camera: Camera | None,
+        in_time: bool,
+    ) -> Edge:
+        if self.method == 'none':
+            return Edge(Source.NONE, 'parameter relative_pose is none')
+        if self.method == 'aligned':
+            return replace(align(pair), reason='parameter relative_pose is aligned')
+        edge = Edge(Source.NONE, 'PnP: too many closures are waiting')
+        if in_time:
+            edge = self._pnp(pair, query_camera, place_camera)
+        if edge.source is Source.PNP or self.method == 'pnp':
+            return edge
+        other = align(pair)
+        reason = f'{edge.reason}; {other.reason}' if other.reason else edge.reason
+        return replace(other, reason=reason, inliers=edge.inliers)
+
+    def _pnp(
+        self, pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None
+    ) -> Edge:
+        """Return the edge by PnP; without a pose, and with a reason, where it is impossible."""
+        if query_camera is None or place_camera is None:
+            of = 'the camera' if query_camera is None else 'the camera of the map'
+            return Edge(Source.NONE, f'PnP: the intrinsics of {of} are unknown')
+        try:
+            query, landmarks, reach = self._seen(pair, query_camera, place_camera)
+        except InputError as error:
+            return Edge(Source.NONE, f'PnP: {error}')
+        found = solve_pnp(query, landmarks)
+        if found.matrix is None:
+            reason = f'PnP: {found.inliers} inliers are fewer than {LEAST_INLIERS}'
+            return Edge(Source.NONE, reason, inliers=found.inliers)
+        if np.linalg.norm(found.matrix[:3, 3]) > reach:
+            reason = f'PnP: more than {reach:.1f} m from the place'
+            return Edge(Source.NONE, reason, inliers=found.inliers)
+        return _edge(found, query_camera, place_camera)
+
+    def _seen(
+        self, pair: MatchedPair, query_camera: Camera, place_camera: Camera
+    ) -> tuple[View, list[Landmarks], float]:
+        """
+        Return the query, landmarks in the frame of the place, and how far they serve (m).
+
+        :raises InputError: something is missing.
+        """
+        if np.isnan(pair.pose(pair.place)).any():
+            raise InputError('the place has no pose')
+        if pair.query is None or not pair.thumbnails.get(pair.place):
+            raise InputError('query or place has no thumbnail')
+        source = self._source
+        if source is None or source[0] is not pair.source or source[1] != place_camera:
+            self._source = pair.source, place_camera
+            self._views.clear()
+            self._landmarks.clear()
+        own, reach, neighbors = self._landmarks_of(pair, pair.place, place_camera)
+        landmarks = [own]
+        for motion, index in zip(own.motions, neighbors, strict=True):
+            if abs(index - pair.place) <= BESIDE:
+                beside, _, _ = self._landmarks_of(pair, index, place_camera)
+                landmarks.append(beside.seen_from(inverse(motion)))
+        return self._view(pair.query, query_camera), landmarks, reach
+
+    def _landmarks_of(
+        self, pair: MatchedPair, place: int, camera: Camera
+    ) -> tuple[Landmarks, float, list[int]]:
+        make = partial(self._triangulated, pair, place, camera)
+        return _kept(self._landmarks, place, LANDMARKS, make)
+
+    def _view(self, image: np.ndarray, camera: Camera) -> View:
+        camera.require_fitting(image.shape[1], image.shape[0])
+        return view_of(image, camera)
+
+    def _triangulated(
+        self, pair: MatchedPair, place: int, camera: Camera
+    ) -> tuple[Landmarks, float, list[int]]:
+        """Return the landmarks of a place, how far from it they serve (m), and its neighbors."""
+        mount, own = matrix_of(np.array(camera.mount)), matrix_of(pair.pose(place))
+        neighbors, indices, reach = [], [], 0.0
+        for index in range(place - NEIGHBORS, place + NEIGHBORS + 1):
+            if index == place or not pair.thumbnails.get(index):
+                continue
+            pose, view = pair.pose(index), self._view_of(pair, index, camera)
+            if view is None or np.isnan(pose).any():
+                continue
+            motion = inverse(matrix_of(pose) @ mount) @ own @ mount
+            baseline = float(np.linalg.norm(motion[:3, 3]))
+            if baseline > LEAST_BASELINE:
+                neighbors.append((view, motion))
+                indices.append(index)
+                reach = max(reach, REACH * baseline)
+        view = self._view_of(pair, place, camera)
+        if view is None or not neighbors:
+            raise InputError('the place has no neighbors with poses and thumbnails')
+        return triangulate(view, neighbors), reach, indices
+
+    def _view_of(self, pair: MatchedPair, index: int, camera: Camera) -> View | None:
+        """Return the view of a place; None if its thumbnail is damaged."""
+
+        def make() -> View | None:
+            image = decode_thumbnail(pair.thumbnails[index])
+            return None if image is None else self._view(image, camera)
+
+        return _kept(self._views, index, VIEWS, make)
+
+
+def _kept(
+    values: OrderedDict[int, Value], key: int, most: int, make: Callable[[], Value]
+) -> Value:
+    """Return the value of a key, made if it is not kept; the least recently used one goes."""
+    if key not in values:
+        values[key] = make()
+        if len(values) > most:
+            values.popitem(last=False)
+    values.move_to_end(key)
+    return values[key]
+
+
+def _edge(found: PnpPose, query_camera: Camera, place_camera: Camera) -> Edge:
+    """Return the edge between the bases of the cameras."""
+    assert found.matrix is not None
+    place_mount = matrix_of(np.array(place_camera.mount))
+    to_base = inverse(matrix_of(np.array(query_camera.mount)))
+    turn = place_mount[:3, :3]
+    lever = found.matrix[:3, :3] @ to_base[:3, 3]  # from the query's camera to its base
+    change = np.zeros((6, 6))
+    change[:3, :3] = change[3:, 3:] = turn
+    change[:3, 3:] = -turn @ cross_matrices(lever[None])[0]
+    covariance = NOISE**2 * change @ found.covariance @ change.T
+    covariance += np.diag([SHIFT**2] * 3 + [TURN**2] * 3)
+    pose = pose_of(place_mount @ found.matrix @ to_base)
+    return Edge(Source.PNP, '', pose, covariance, found.inliers, found.error)

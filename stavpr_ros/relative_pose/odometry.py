@@ -1,0 +1,102 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where a query is along the track of the places, by the odometry of both passes."""
+
+import math
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from stavpr_ros.mapping.trajectory import interpolate
+from stavpr_ros.relative_pose.edge import Edge, Source
+from stavpr_ros.relative_pose.pair import MatchedPair
+from stavpr_ros.relative_pose.transforms import inverse, matrix_of, pose_of
+
+FARTHEST, STEP = 4.0, 0.05  # offsets that are tried, and between two of them, places
+NEAR = 0.5  # of the least sum: where a parabola is fitted, places
+LEAST_IMAGES = 3
+LEAST_STEP = 0.01  # meters
+# Deviations: along the track, in places, and at least (m); across it (m); of the rotation (rad).
+ALONG, LEAST_ALONG, ACROSS, TURN = 0.5, 0.1, 1.25, math.radians(3)
+
+
+def align(pair: MatchedPair) -> Edge:
+    """
+    Place the query on the track of the places.
+
+    Odometry has the places of the images of the window relative to each other. So the window is
+    moved along the track as a whole, to where the sum of its image distances is least. Unlike the
+    path of the recognizer, which moves at one of a few speeds, this has no bias. The offset to the
+    side is unknown, and has a variance accordingly.
+    """
+    if np.isnan(pair.pose(pair.place)).any():
+        return Edge(Source.NONE, 'the place has no pose: record maps and routes with odometry')
+    if np.isnan(pair.query_pose).any():
+        return Edge(Source.NONE, 'no odometry at the middle image of the window')
+    track, driven = _lengths(pair.poses), _lengths(pair.query_poses)
+    known, images = np.flatnonzero(np.isfinite(track)), np.flatnonzero(np.isfinite(driven))
+    apart = known[np.diff(track[known], prepend=-1) > LEAST_STEP]  # not where the robot stood
+    if min(len(images), len(apart)) < LEAST_IMAGES or not pair.spacing > 0:
+        reason = 'the odometry of query or places has gaps, or no motion, in the window'
+        return Edge(Source.NONE, reason)
+    offsets = np.arange(-FARTHEST, FARTHEST + STEP, STEP) * pair.spacing
+    start = float(track[pair.place - pair.first])
+    total = np.zeros(len(offsets))
+    rows = np.array([_finite(pair.distances[image, apart]) for image in images])
+    # smooth: between places, linear interpolation would pull all images to the same side
+    grid = np.arange(track[apart[0]], track[apart[-1]], STEP * pair.spacing)
+    smooth = CubicSpline(track[apart], rows.T)(grid)
+    for column, image in enumerate(images):
+        at = start + offsets + driven[image] - driven[pair.middle]
+        total += np.interp(at, grid, smooth[:, column])
+    at = start + _least(offsets, total)
+    place = matrix_of(pair.pose(pair.place))
+    pose = pose_of(inverse(place) @ matrix_of(_on_track(pair.poses[known], track[known], at)))
+    direction = _direction(pair, place)
+    along = max(ALONG * pair.spacing, LEAST_ALONG)
+    covariance = np.diag([ACROSS**2] * 3 + [TURN**2] * 3)
+    covariance[:3, :3] += (along**2 - ACROSS**2) * np.outer(direction, direction)
+    return Edge(Source.ALIGNED, '', pose, covariance)
+
+
+def _finite(row: np.ndarray) -> np.ndarray:
+    """Return distances (k,); places that are not compared are as far as the farthest."""
+    compared = np.isfinite(row)
+    farthest = float(row[compared].max()) if compared.any() else 0.0
+    return np.where(compared, row, farthest)
+
+
+def _least(offsets: np.ndarray, total: np.ndarray) -> float:
+    """Return the offset at the vertex of the parabola around the least sum."""
+    least = int(np.argmin(total))
+    width = round(NEAR / STEP)
+    near = slice(max(0, least - width), least + width + 1)
+    a, b, _ = np.polyfit(offsets[near], total[near], 2)
+    if not a > 0:
+        return float(offsets[least])
+    return float(np.clip(-b / (2 * a), offsets[near][0], offsets[near][-1]))
+
+
+def _lengths(poses: np.ndarray) -> np.ndarray:
+    """Return the distance driven until each pose (m, 7); NaN where a pose is unknown."""
+    known = np.flatnonzero(np.isfinite(poses[:, 0]))
+    lengths = np.full(len(poses), np.nan)
+    steps = np.linalg.norm(np.diff(poses[known, :3], axis=0), axis=1)
+    lengths[known] = np.concatenate([[0.0], np.cumsum(steps)])[: len(known)]
+    return lengths
+
+
+def _on_track(poses: np.ndarray, track: np.ndarray, at: float) -> np.ndarray:
+    """Return the pose (7,) at a length of the track, between the poses (m, 7) of its places."""
+    after = int(np.clip(np.searchsorted(track, at), 1, len(track) - 1))
+    step = track[after] - track[after - 1]
+    part = 0.0 if step == 0 else (at - track[after - 1]) / step
+    return interpolate(poses[after - 1], poses[after], float(np.clip(part, 0, 1)))
+
+
+def _direction(pair: MatchedPair, place: np.ndarray) -> np.ndarray:
+    """Return the direction of the track at the place, in the base of the place, (3,)."""
+    known = pair.poses[np.isfinite(pair.poses[:, 0]), :3]
+    nearest = int(np.argmin(np.linalg.norm(known - place[:3, 3], axis=1)))
+    ahead = known[min(nearest + 1, len(known) - 1)] - known[max(nearest - 1, 0)]
+    length = float(np.linalg.norm(ahead))
+    return place[:3, :3].T @ ahead / length if length > 0 else np.array([1.0, 0, 0])

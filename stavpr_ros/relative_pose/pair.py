@@ -1,0 +1,104 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A matched pair of images, with all that is known of their surroundings."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from stavpr_ros.errors import MapFileError
+from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.recognition import Match
+
+NEIGHBORS = 4  # places before and after a place that its keypoints are triangulated with
+BESIDE = 1  # places before and after the place whose landmarks are used as well
+AROUND = NEIGHBORS + BESIDE
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedPair:
+    """
+    The middle image of a window, and its place; nothing in it changes when the map grows.
+
+    :param source: the map that the place is of.
+    :param place: its index.
+    :param query: thumbnail of the image, RGB (h, w, 3) uint8; None = unknown.
+    :param query_poses: of the base, at the images of the window, shape (l, 7); NaN = unknown.
+    :param middle: position of the image in the window.
+    :param distances: of the images of the window to the places around, shape (l, k); +inf = not
+        compared.
+    :param first: index of the first of the places around it.
+    :param poses: of the base at those places, shape (k, 7); NaN = unknown.
+    :param thumbnails: of those of them that are at most ``AROUND`` away, and of the same
+        session, by index: JPEG images, empty = none.
+    """
+
+    source: PlaceMap | GrowingMap
+    place: int
+    query: np.ndarray | None
+    query_poses: np.ndarray
+    middle: int
+    distances: np.ndarray
+    first: int
+    poses: np.ndarray
+    thumbnails: dict[int, bytes]
+
+    def pose(self, place: int) -> np.ndarray:
+        """Return the pose of a place near by, shape (7,); NaN = unknown."""
+        return np.asarray(self.poses[place - self.first])
+
+    @property
+    def query_pose(self) -> np.ndarray:
+        """Return the pose of the query, in the frame of the odometry, shape (7,)."""
+        return np.asarray(self.query_poses[self.middle])
+
+    @cached_property
+    def spacing(self) -> float:
+        """Return the median distance between successive places, meters; NaN = unknown."""
+        steps = np.linalg.norm(np.diff(self.poses[:, :3], axis=0), axis=1)
+        steps = steps[np.isfinite(steps)]
+        return float(np.median(steps)) if len(steps) else float('nan')
+
+
+def matched_pair(
+    match: Match,
+    places: PlaceMap | GrowingMap,
+    query: np.ndarray | None,
+    query_poses: np.ndarray,
+    window: tuple[np.ndarray, int],
+) -> MatchedPair:
+    """
+    Take the middle pair of a match out of its map.
+
+    :param query, query_poses: see :class:`MatchedPair`.
+    :param window: distances of the images in the window, shape (l, n), +inf = not compared, and
+        the index of the first place.
+    """
+    place, start = match.place_index, places.first if isinstance(places, GrowingMap) else 0
+    low, high = int(match.path[:, 1].min()), int(match.path[:, 1].max())
+    low = max(start, min(low, place) - AROUND)
+    high = min(start + len(places), max(high, place) + AROUND + 1)
+    poses = np.full((high - low, 7), np.nan)
+    if places.poses is not None:
+        poses[:] = places.poses[low - start : high - start]
+    rows, origin = window
+    distances = np.full((len(rows), high - low), np.inf, np.float32)
+    some = rows[:, low - origin : high - origin]
+    distances[:, : some.shape[1]] = some
+    session = places.place(place).session
+    thumbnails = {}
+    if len(places.thumbnails):
+        for index in range(max(low, place - AROUND), min(high, place + AROUND + 1)):
+            if places.place(index).session == session:
+                thumbnails[index] = _thumbnail(places, index - start)
+    middle = (len(match.window_stamps) - 1) // 2
+    return MatchedPair(
+        places, place, query, query_poses, middle, distances, low, poses, thumbnails
+    )
+
+
+def _thumbnail(places: PlaceMap | GrowingMap, position: int) -> bytes:
+    try:
+        return places.thumbnails[position]
+    except MapFileError:  # the file has become shorter since it was opened
+        return b''

@@ -1,0 +1,138 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Edges over ROS: loop closures with camera_info and odometry, and their source and frames."""
+
+import threading
+
+import numpy as np
+import pytest
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo
+from stavpr_msgs.msg import LoopClosure, PlaceMatch, RelativePose
+from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.mapping.camera import FORWARD
+from stavpr_ros.relative_pose.edge import Edge, Source
+from stavpr_ros.relative_pose.estimator import EdgeEstimator
+from stavpr_ros.ros.camera import camera_of, mount_of
+from stavpr_ros.ros.edges import EdgePublisher
+
+MOUNT = '0.1 0 1.2 -1.5708 0 -1.5708'
+
+
+def info(size=(640, 480), focal=300.0, **fields):
+    """Return a message about a camera without distortion."""
+    width, height = size
+    k = [focal, 0.0, width / 2 - 0.5, 0.0, focal, height / 2 - 0.5, 0.0, 0.0, 1.0]
+    return CameraInfo(width=width, height=height, k=k, **fields)
+
+
+def test_mount_of_text_is_a_pose():
+    found = np.array(mount_of(MOUNT))
+    np.testing.assert_allclose(found[:3], (0.1, 0, 1.2))
+    assert abs(found[3:] @ FORWARD[3:]) == pytest.approx(1)
+    assert mount_of('1, 2, 3, 0, 0, 0, 1') == (1, 2, 3, 0, 0, 0, 1)
+    assert mount_of(' ') is None
+
+
+@pytest.mark.parametrize('text', ['1 2 3', 'a b c d e f', '0 0 0 0 0 0 0', '0 0 nan 0 0 0'])
+def test_mount_of_other_text_is_rejected(text):
+    with pytest.raises(SettingsError, match='x y z roll pitch yaw'):
+        mount_of(text)
+
+
+def test_camera_of_binned_and_cut_out_images():
+    message = info(binning_x=2, binning_y=2)
+    message.roi.x_offset, message.roi.y_offset = 100, 40
+    message.roi.width, message.roi.height = 400, 300
+    camera = camera_of(message, FORWARD)
+    assert (camera.width, camera.height, camera.focal) == (200, 150, (150.0, 150.0))
+    assert camera.center == ((320 - 100) / 2 - 0.5, (240 - 40) / 2 - 0.5)
+
+
+def test_camera_of_a_camera_that_is_not_calibrated_is_rejected():
+    with pytest.raises(InputError, match='calibrate the camera'):
+        camera_of(CameraInfo(width=640, height=480), FORWARD)
+
+
+def test_sources_equal_the_constants_of_the_message():
+    assert {name: getattr(RelativePose, name) for name in Source.__members__} == {
+        source.name: source.value for source in Source
+    }
+
+
+@pytest.fixture
+def closing(robot, start, route):
+    """Return a function that drives two laps, and returns matches and loop closures."""
+
+    def drive(camera_info=None, **parameters):
+        closures = robot.listen(LoopClosure, '/stavpr/loop_closure', 1000)
+        start(
+            operation='loop_closure',
+            map_path='',
+            exclude_places=10,
+            keyframe_distance=0.001,
+            **parameters,
+        )
+        robot.until(lambda: robot.odometry.get_subscription_count() > 0, 'odometry')
+        if camera_info is not None:
+            publisher = robot.node.create_publisher(
+                CameraInfo, '/camera_info', QoSProfile(depth=1)
+            )
+            robot.until(lambda: publisher.get_subscription_count() > 0, 'camera_info')
+            publisher.publish(camera_info)
+        matches = [robot.show_at(i % 30, image) for i, image in enumerate((route[:30] * 2)[:45])]
+        count = sum(match.status == PlaceMatch.MATCH for match in matches)
+        robot.until(lambda: len(closures) >= count > 5, 'a closure for each match')
+        return [match for match in matches if match.status == PlaceMatch.MATCH], closures
+
+    return drive
+
+
+def test_closures_without_camera_info_are_aligned(closing):
+    matches, closures = closing()
+    assert [c.header.stamp for c in closures] == [m.header.stamp for m in matches]
+    for match, closure in zip(matches, closures, strict=True):
+        edge = closure.relative_pose
+        assert closure.has_relative_pose
+        assert edge.source == RelativePose.ALIGNED
+        assert 'the intrinsics of the camera are unknown' in edge.reason
+        assert (edge.query_index, edge.place_index) == (closure.query_index, closure.place_index)
+        assert (edge.query_stamp, edge.place_stamp) == (closure.query_stamp, closure.place_stamp)
+        assert edge.frame == closure.pose_child_frame
+        assert match.relative_pose.source == RelativePose.ALIGNED
+        assert match.relative_pose.pose == edge.pose
+    assert closures[0].relative_pose.is_independent
+
+
+def test_edges_that_are_off_leave_closures_as_they_were(closing):
+    matches, closures = closing(relative_pose='none')
+    assert len(matches) == len(closures)
+    for message in (*matches, *closures):
+        assert not message.has_relative_pose
+        assert message.relative_pose.reason == 'parameter relative_pose is none'
+
+
+def test_images_do_not_wait_for_edges(closing, monkeypatch):
+    """Five closures come while PnP of the first waits; all are published, in order."""
+    free = threading.Event()
+
+    def slow(self, pair, query_camera, place_camera):
+        free.wait(60)
+        return Edge(Source.PNP, inliers=99, error=1.0, covariance=np.eye(6))
+
+    monkeypatch.setattr(EdgeEstimator, '_pnp', slow)
+    seen, put = [], EdgePublisher.put
+
+    def noting(self, message, pair, query_camera, place_camera):
+        seen.append(query_camera)
+        put(self, message, pair, query_camera, place_camera)
+        if len(seen) == 5:
+            free.set()
+
+    monkeypatch.setattr(EdgePublisher, 'put', noting)
+    matches, closures = closing(info(), camera_transform=MOUNT)
+    assert [c.header.stamp for c in closures] == [m.header.stamp for m in matches]
+    sources = {closure.relative_pose.source for closure in closures}
+    assert RelativePose.PNP in sources
+    assert {m.relative_pose.source for m in matches} == {RelativePose.ALIGNED}
+    assert {camera.focal for camera in seen if camera} == {(300.0, 300.0)}

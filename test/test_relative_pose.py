@@ -1,0 +1,399 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Edges: landmarks and PnP of synthetic geometry, alignment by odometry, cameras, fallbacks."""
+
+from dataclasses import replace
+import math
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping import encode_thumbnail, load_map, merge_maps, save_map, thumbnail_of
+from stavpr_ros.mapping.camera import Camera, FORWARD
+from stavpr_ros.relative_pose.edge import Source
+from stavpr_ros.relative_pose.estimator import APART, EdgeEstimator
+from stavpr_ros.relative_pose.landmarks import triangulate, View
+from stavpr_ros.relative_pose.odometry import align
+from stavpr_ros.relative_pose.pair import AROUND, MatchedPair
+from stavpr_ros.relative_pose.pnp import LEAST_INLIERS, solve_pnp
+from stavpr_ros.relative_pose.transforms import inverse, matrix_of, pose_of
+
+SIZE = 320, 240
+SPACING = 1.0  # meters between places
+PLACE, PLACES, LENGTH = 10, 21, 11
+CAMERA = Camera(*SIZE, (200.0, 200.0), (159.5, 119.5))
+MOUNTED = replace(CAMERA, mount=(0.4, -0.2, 1.1, *FORWARD[3:]))
+DISTORTED = replace(CAMERA, model='plumb_bob', distortion=(-0.2, 0.05, 0.001, -0.001, 0.0))
+
+
+def pose(x, y=0.0, yaw=0.0):
+    return np.array([x, y, 0, 0, 0, math.sin(yaw / 2), math.cos(yaw / 2)])
+
+
+def points_ahead(count, seed=0):
+    """Return points on both sides of the way ahead, in the base's frame, (count, 3)."""
+    rng = np.random.default_rng(seed)
+    side = np.where(rng.random(count) < 0.5, -1, 1)
+    return np.column_stack(
+        [rng.uniform(4, 45, count), side * rng.uniform(1, 9, count), rng.uniform(-1, 5, count)]
+    )
+
+
+# ------------------------------------------------ landmarks and PnP, without images
+
+
+def views_of(points, poses, noise=0.0, seed=1):
+    """Return ideal views of points with a descriptor each, (m, 3), from poses of the base."""
+    rng = np.random.default_rng(seed)
+    descriptors = rng.uniform(0, 100, (len(points), 128)).astype(np.float32)
+    views = []
+    for each in poses:
+        seen = in_camera(points, each, CAMERA)
+        known = seen[:, 2] > 0.5
+        rays = seen[known, :2] / seen[known, 2:]
+        views.append(
+            View(rays + noise / 200 * rng.normal(size=rays.shape), descriptors[known], 200.0)
+        )
+    return views
+
+
+def in_camera(points, base, camera):
+    to = inverse(matrix_of(base) @ matrix_of(np.array(camera.mount)))
+    return points @ to[:3, :3].T + to[:3, 3]
+
+
+def motions(poses, center):
+    mount = matrix_of(np.array(FORWARD))
+    own = matrix_of(center) @ mount
+    return [inverse(matrix_of(each) @ mount) @ own for each in poses]
+
+
+def test_triangulate_of_exact_views_returns_the_points():
+    poses = [pose(x) for x in (-2, -1, 0, 1, 2)]
+    points = points_ahead(200)
+    views = views_of(points, poses)
+    around = [0, 1, 3, 4]
+    neighbors = list(zip([views[i] for i in around], motions([poses[i] for i in around], poses[2]),
+                         strict=True))  # fmt: skip
+    landmarks = triangulate(views[2], neighbors)
+    assert len(landmarks.points) > 140  # others are far ahead, without parallax
+    true = in_camera(points, poses[2], CAMERA)
+    away = np.linalg.norm(landmarks.points[:, None] - true, axis=2).min(axis=1)
+    assert away.max() < 1e-3
+
+
+def test_triangulate_corrects_the_rotation_of_the_odometry():
+    """A degree is 3.5 pixels; the distance, which only odometry knows, stays."""
+    poses = [pose(x) for x in (-2, -1, 0, 1, 2)]
+    turns = np.radians([1, -1, 0, 1, -1])
+    measured = [pose(each[0], yaw=turn) for each, turn in zip(poses, turns, strict=True)]
+    points = points_ahead(300)
+    views = views_of(points, poses, noise=0.2)
+    around = [0, 1, 3, 4]
+    wrong = motions([measured[i] for i in around], measured[2])
+    neighbors = list(zip([views[i] for i in around], wrong, strict=True))
+    landmarks = triangulate(views[2], neighbors)
+    assert len(landmarks.points) > 200
+    true = motions([poses[i] for i in around], poses[2])
+    for found, expected in zip(landmarks.motions, true, strict=True):
+        turn = Rotation.from_matrix(found[:3, :3] @ expected[:3, :3].T).magnitude()
+        assert math.degrees(turn) < 0.7
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_pnp_covariance_fits_the_errors(seed):
+    """Of 60 noisy queries, the mean normalized square of the errors is near its 6 dimensions."""
+    points, center = points_ahead(80, seed), pose(0)
+    views = views_of(points, [center, *[pose(x) for x in (-4, -3, 3, 4)]])
+    landmarks = triangulate(
+        views[0], list(zip(views[1:], motions([pose(x) for x in (-4, -3, 3, 4)], center),
+                           strict=True))
+    )  # fmt: skip
+    mount = matrix_of(np.array(FORWARD))
+    squares = []
+    for query in (pose(0.6, 1.2, 0.05), pose(-0.4, -0.5, -0.03)):
+        true = inverse(mount) @ matrix_of(query) @ mount
+        for trial in range(30):
+            view = views_of(points, [query], noise=0.5, seed=1)[0]
+            rng = np.random.default_rng(trial)
+            noisy = view.rays * 0 + views_of(points, [query])[0].rays
+            view = replace(view, rays=noisy + 0.5 / 200 * rng.normal(size=noisy.shape))
+            found = solve_pnp(view, [landmarks])
+            turn = Rotation.from_matrix(found.matrix[:3, :3] @ true[:3, :3].T).as_rotvec()
+            error = np.concatenate([found.matrix[:3, 3] - true[:3, 3], turn])
+            squares.append(error @ np.linalg.solve(0.25 * found.covariance, error))
+    assert 4 < np.mean(squares) < 9
+
+
+def test_pnp_counts_each_keypoint_once_and_rejects_other_points():
+    points = points_ahead(60)
+    center, aside = pose(0), [pose(-2), pose(2)]
+    views = views_of(points, [center, *aside])
+    landmarks = triangulate(views[0], list(zip(views[1:], motions(aside, center), strict=True)))
+    query = views_of(points, [pose(0.5, 0.5)])[0]
+    once, twice = solve_pnp(query, [landmarks]), solve_pnp(query, [landmarks, landmarks])
+    assert once.inliers == twice.inliers > 30
+    few = replace(landmarks, points=landmarks.points[:11], descriptors=landmarks.descriptors[:11])
+    assert solve_pnp(query, [few, few]).matrix is None
+    rng = np.random.default_rng(3)
+    shuffled = replace(landmarks, points=rng.permutation(landmarks.points))
+    found = solve_pnp(query, [shuffled])
+    assert found.matrix is None
+    assert found.inliers < LEAST_INLIERS
+
+
+# ------------------------------------------------ from images to edges
+
+
+def render(points, textures, base, camera):
+    """Draw a textured square at each point, the farthest first."""
+    width, height = SIZE
+    image = np.full((height, width, 3), 90, np.uint8)
+    seen = in_camera(points, base, camera)
+    matrix = np.array([[200.0, 0, 159.5], [0, 200, 119.5], [0, 0, 1]])
+    for i in np.argsort(-seen[:, 2]):
+        z = seen[i, 2]
+        if z < 1:
+            continue
+        flat = cv2.projectPoints(
+            seen[i][None],
+            np.zeros(3),
+            np.zeros(3),
+            matrix,
+            np.array(camera.distortion or (0.0,) * 5),
+        )[0]
+        (u, v), side = flat.ravel(), 200 * 0.9 / z
+        if not (-50 < u < width + 50 and -50 < v < height + 50):
+            continue
+        scale = side / 12
+        warp = np.array([[scale, 0, u - 5.5 * scale], [0, scale, v - 5.5 * scale]])
+        cv2.warpAffine(textures[i], warp, (width, height), image, cv2.INTER_LINEAR,
+                       cv2.BORDER_TRANSPARENT)  # fmt: skip
+    return image
+
+
+def scene(camera, query, seed=0, say=lambda p: p):
+    """
+    Return the pair of a query and the place PLACE, of places SPACING apart.
+
+    :param query: pose of its base in that of the place.
+    :param say: pose of the odometry of the places by the true one.
+    """
+    rng = np.random.default_rng(seed)
+    points = np.add(points_ahead(260, seed), [PLACE * SPACING - 5, 0, 0])
+    textures = rng.integers(0, 255, (len(points), 12, 12, 3), dtype=np.uint8)
+    poses = np.array([pose(i * SPACING) for i in range(PLACES)])
+    near = range(PLACE - AROUND, PLACE + AROUND + 1)
+    thumbnails = {i: encode_thumbnail(render(points, textures, poses[i], camera)) for i in near}
+    true = matrix_of(poses[PLACE]) @ matrix_of(query)
+    image = thumbnail_of(render(points, textures, pose_of(true), camera))
+    return MatchedPair(
+        object(), PLACE, image, *driven(), 0, np.array([say(each) for each in poses]), thumbnails
+    )
+
+
+def driven(ahead=0.0, speed=1.0, middle=5):
+    """
+    Return poses of the window, the middle's position, and distances to the places.
+
+    :param ahead: where the middle image was, in places from PLACE.
+    :param speed: places an image.
+    """
+    steps = (np.arange(LENGTH) - middle) * speed
+    query_poses = np.array([pose(100 + step * SPACING) for step in steps])
+    away = PLACE + ahead + steps[:, None] - np.arange(PLACES)
+    return query_poses, middle, np.minimum(np.abs(away), 2) ** 1.5 - 1
+
+
+@pytest.mark.parametrize('camera', [CAMERA, MOUNTED, DISTORTED])
+def test_edge_of_images_is_the_pose_between_the_bases(camera):
+    query = pose(0.4, -0.7, math.radians(3))
+    pair = scene(camera, query)
+    edge = EdgeEstimator().estimate(pair, camera, camera)
+    assert (edge.source, edge.reason) == (Source.PNP, '')
+    assert edge.inliers >= LEAST_INLIERS
+    assert 0 < edge.error < 2
+    np.testing.assert_allclose(edge.pose[:3], query[:3], atol=0.12)
+    turn = Rotation.from_quat(edge.pose[3:]).inv() * Rotation.from_quat(query[3:])
+    assert math.degrees(turn.magnitude()) < 0.7
+    error = np.concatenate([edge.pose[:3] - query[:3], turn.as_rotvec()])
+    assert error @ np.linalg.solve(edge.covariance, error) < 12.6  # 95 % of 6 dimensions
+    assert np.linalg.eigvalsh(edge.covariance).min() > 0
+
+
+def test_edge_of_other_images_is_aligned_with_the_reason():
+    pair = scene(CAMERA, pose(0))
+    other = scene(CAMERA, pose(0), seed=9)
+    estimator = EdgeEstimator()
+    edge = estimator.estimate(replace(pair, query=other.query), CAMERA, CAMERA)
+    assert edge.source is Source.ALIGNED
+    assert 'inliers are fewer than 12' in edge.reason
+    edge = EdgeEstimator('pnp').estimate(replace(pair, query=other.query), CAMERA, CAMERA)
+    assert edge.source is Source.NONE
+
+
+def test_estimator_keeps_landmarks_of_places_until_the_map_changes(monkeypatch):
+    pair = scene(CAMERA, pose(0.3))
+    detected = []
+    name = 'stavpr_ros.relative_pose.estimator.view_of'
+    from stavpr_ros.relative_pose import estimator as module
+
+    view_of = module.view_of
+    monkeypatch.setattr(name, lambda *of: detected.append(of) or view_of(*of))
+    estimator = EdgeEstimator()
+    estimator.estimate(pair, CAMERA, CAMERA)
+    assert len(detected) == 2 * AROUND + 2
+    estimator.estimate(pair, CAMERA, CAMERA)
+    assert len(detected) == 2 * AROUND + 3  # the query alone
+    estimator.estimate(replace(pair, source=object()), CAMERA, CAMERA)
+    assert len(detected) == 4 * AROUND + 5
+
+
+NO_POSES = {'poses': np.full((PLACES, 7), np.nan)}
+
+
+@pytest.mark.parametrize(
+    ('changes', 'cameras', 'source', 'words'),
+    [
+        ({}, (None, CAMERA), Source.ALIGNED, 'intrinsics of the camera are unknown'),
+        ({}, (CAMERA, None), Source.ALIGNED, 'intrinsics of the camera of the map'),
+        ({'query': None}, (CAMERA, CAMERA), Source.ALIGNED, 'no thumbnail'),
+        ({'thumbnails': {}}, (CAMERA, CAMERA), Source.ALIGNED, 'no thumbnail'),
+        ({'thumbnails': {PLACE: b'damaged'}}, (CAMERA, CAMERA), Source.ALIGNED, 'no neighbors'),
+        ({}, (replace(CAMERA, height=320), CAMERA), Source.ALIGNED, 'intrinsics are of 320x320'),
+        (NO_POSES, (CAMERA, CAMERA), Source.NONE, 'the place has no pose'),
+        (
+            {'query_poses': np.full((LENGTH, 7), np.nan), 'query': None},
+            (CAMERA, CAMERA), Source.NONE, 'no odometry at the middle',
+        ),
+    ],
+)  # fmt: skip
+def test_edge_without_what_pnp_needs_names_it(changes, cameras, source, words):
+    flat = np.zeros((144, 192, 3), np.uint8)
+    thumbnails = {PLACE + i: encode_thumbnail(flat) for i in range(-AROUND, AROUND + 1)}
+    poses = np.array([pose(i * SPACING) for i in range(PLACES)])
+    pair = MatchedPair(object(), PLACE, flat, *driven(), 0, poses, thumbnails)
+    edge = EdgeEstimator().estimate(replace(pair, **changes), *cameras)
+    assert edge.source is source
+    assert words in edge.reason
+
+
+# ------------------------------------------------ alignment by odometry
+
+
+def plain_pair(query_poses, middle, distances, poses=None):
+    poses = np.array([pose(i * SPACING) for i in range(PLACES)]) if poses is None else poses
+    return MatchedPair(object(), PLACE, None, query_poses, middle, distances, 0, poses, {})
+
+
+@pytest.mark.parametrize('speed', [0.5, 0.91, 1.0, 1.6])
+@pytest.mark.parametrize('ahead', [-0.7, 0.0, 0.3, 2.2])
+def test_align_finds_the_offset_at_any_speed(speed, ahead):
+    edge = align(plain_pair(*driven(ahead, speed)))
+    assert (edge.source, edge.reason) == (Source.ALIGNED, '')
+    np.testing.assert_allclose(edge.pose[:3], [ahead * SPACING, 0, 0], atol=0.06)
+    along, across = edge.covariance[0, 0], edge.covariance[1, 1]
+    assert across > 4 * along
+
+
+def test_align_leaves_out_images_without_odometry_and_places_that_are_not_compared():
+    query_poses, middle, distances = driven(0.5)
+    query_poses[2:4] = np.nan
+    distances[2:4] = -5
+    distances[:, :4] = np.inf
+    edge = align(plain_pair(query_poses, middle, distances))
+    assert edge.pose[0] == pytest.approx(0.5, abs=0.06)
+    query_poses[: middle - 1] = np.nan
+    query_poses[middle + 1 :] = np.nan
+    gaps = align(plain_pair(query_poses, middle, distances))
+    assert (gaps.source, 'has gaps' in gaps.reason) == (Source.NONE, True)
+
+
+def test_align_follows_the_track_of_the_places_in_a_bend():
+    turns = np.radians(6) * np.arange(PLACES)
+    steps = np.column_stack([np.cos(turns), np.sin(turns)])
+    corners = np.concatenate([[[0, 0]], np.cumsum(steps, axis=0)[:-1]])
+    poses = np.array([pose(*at, yaw) for at, yaw in zip(corners, turns, strict=True)])
+    edge = align(plain_pair(*driven(2.0), poses))
+    expected = pose_of(inverse(matrix_of(poses[PLACE])) @ matrix_of(poses[PLACE + 2]))
+    np.testing.assert_allclose(edge.pose, expected, atol=0.06)
+    direction = expected[:3] / np.linalg.norm(expected[:3])
+    assert direction @ edge.covariance[:3, :3] @ direction < 0.5
+
+
+@pytest.mark.parametrize('method', ['auto', 'aligned'])
+def test_independent_edges_are_apart(method):
+    """Of edges at every place, each tenth is independent."""
+    estimator, source, found = EdgeEstimator(method), object(), []
+    poses = np.array([pose(i * SPACING) for i in range(60)])
+    for place in range(15, 45):
+        query_poses, middle, distances = driven()
+        near = np.full((LENGTH, 60), 2.0)
+        near[:, place - PLACE : place - PLACE + PLACES] = distances
+        pair = MatchedPair(source, place, None, query_poses, middle, near, 0, poses, {})
+        found.append(estimator.estimate(pair, None, None).independent)
+    assert np.flatnonzero(found).tolist() == list(range(0, 30, APART[Source.ALIGNED]))
+    assert not EdgeEstimator('none').estimate(pair, None, None).independent
+
+
+# ------------------------------------------------ cameras
+
+
+def test_rays_of_a_thumbnail_are_those_of_the_image():
+    """Pixel centers of an image of half the size lie between those of the image."""
+    points = np.array([[0.0, 0.0], [79.5, 59.5], [100.25, 10.75]])
+    small = CAMERA.rays(points, 160, 120)
+    np.testing.assert_allclose(small, CAMERA.rays(points * 2 + 0.5, 320, 240))
+    np.testing.assert_allclose(small[1], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('model', 'coefficients'),
+    [
+        ('plumb_bob', (-0.2, 0.05, 0.001, -0.001, 0.0)),
+        ('rational_polynomial', (-0.2, 0.05, 0.001, -0.001, 0.0, 0.1, 0.01, 0.0)),
+        ('equidistant', (0.02, -0.01, 0.002, 0.0)),
+    ],
+)
+def test_rays_are_without_distortion(model, coefficients):
+    rays = np.array([[0.3, -0.2], [-0.5, 0.1], [0.0, 0.0]])
+    matrix = np.array([[200.0, 0, 159.5], [0, 200, 119.5], [0, 0, 1]])
+    if model == 'equidistant':
+        pixels = cv2.fisheye.distortPoints((rays * 1.0)[:, None], matrix, np.array(coefficients))[
+            :, 0
+        ]
+    else:
+        solid = np.column_stack([rays, np.ones(3)])
+        pixels = cv2.projectPoints(
+            solid, np.zeros(3), np.zeros(3), matrix, np.array(coefficients)
+        )[0][:, 0]
+    camera = replace(CAMERA, model=model, distortion=coefficients)
+    np.testing.assert_allclose(camera.rays(pixels, *SIZE), rays, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'words'),
+    [
+        ({'focal': (0.0, 0.0)}, 'calibrate the camera'),
+        ({'center': (math.nan, 1.0)}, 'not finite'),
+        ({'model': 'other', 'distortion': (0.1,) * 5}, "model 'other'"),
+        ({'model': 'plumb_bob', 'distortion': (0.1,) * 7}, '7 coefficients'),
+        ({'mount': (0.0,) * 7}, 'quaternion of zeros'),
+    ],
+)
+def test_camera_with_invalid_numbers_is_rejected(changes, words):
+    with pytest.raises(InputError, match=words):
+        replace(CAMERA, **changes)
+
+
+def test_map_file_holds_the_camera(small_map, tmp_path):
+    camera = replace(DISTORTED, mount=MOUNTED.mount)
+    with_camera = replace(small_map, camera=camera)
+    save_map(with_camera, tmp_path / 'a.stavpr')
+    assert load_map(tmp_path / 'a.stavpr').camera == camera
+    save_map(small_map, tmp_path / 'b.stavpr')
+    assert load_map(tmp_path / 'b.stavpr').camera is None
+    assert merge_maps([with_camera] * 2, ['a', 'b']).camera == camera
+    assert merge_maps([with_camera, small_map], ['a', 'b']).camera is None
