@@ -13,18 +13,13 @@ import stavpr_ros
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'stavpr_ros'
 ROS = {'rclpy', 'ament_index_python', 'stavpr_msgs', 'rcl_interfaces', 'builtin_interfaces'}
-<<<<<<< HEAD
 ROS |= {
     f'{name}_msgs'
     for name in ('std', 'sensor', 'geometry', 'nav', 'diagnostic', 'lifecycle', 'visualization')
 }
-CORE = ('alignment', 'sources', 'features', 'mapping', 'recognition', 'pipeline')
-=======
-ROS |= {f'{name}_msgs' for name in ('std', 'sensor', 'geometry', 'nav', 'diagnostic', 'lifecycle')}
 CORE = (
     *('alignment', 'sources', 'features', 'mapping', 'recognition', 'relative_pose', 'pipeline'),
 )
->>>>>>> main
 """Each of these may import the ones before it, and features and sources not each other."""
 MAY_IMPORT = {
     'alignment': set(),
@@ -32,13 +27,9 @@ MAY_IMPORT = {
     'features': set(),
     'mapping': {'alignment', 'sources', 'features'},
     'recognition': {'alignment', 'features', 'mapping'},
-<<<<<<< HEAD
-    'pipeline': set(CORE[:5]),
-    'pose_graph': {'mapping'},
-=======
     'relative_pose': {'alignment', 'features', 'mapping', 'recognition'},
     'pipeline': set(CORE[:6]),
->>>>>>> main
+    'pose_graph': {'mapping'},
     'evaluation': set(CORE[:5]),
     'demonstration': {'evaluation', 'pose_graph', *CORE},
     'ros': {'pose_graph', *CORE},

@@ -40,14 +40,9 @@ ROSDEP_KEYS = {
     'tqdm': 'python3-tqdm',
     'yaml': 'python3-yaml',
 }
-<<<<<<< HEAD
 NO_ROSDEP_KEY = {'evo', 'faiss', 'gtsam', 'llvmlite', 'onnx', 'onnxruntime', 'rosbags', 'torch'}
-ROS = re.compile(r'\w+_(msgs|srvs|interfaces)|rclpy|launch|launch_ros|ament_index_python')
-=======
-NO_ROSDEP_KEY = {'faiss', 'llvmlite', 'onnx', 'onnxruntime', 'rosbags', 'torch'}
 ROS = re.compile(r'\w+_(msgs|srvs|interfaces)|rclpy|launch|launch_ros|ament_index_python|tf2_ros')
 PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules of another name
->>>>>>> main
 
 
 @pytest.fixture(scope='module')
