@@ -12,7 +12,7 @@ MAP ?=
 QUERY ?=
 LOOP ?=
 ARGS ?=
-export MAP QUERY LOOP
+export MAP QUERY LOOP SLAM
 
 # -E: a sourced ROS adds its own packages to PYTHONPATH
 SETUP = $(PYTHON) -E tools/setup_venv.py
@@ -30,9 +30,10 @@ help: ## list the targets (the default)
 	@echo 'Names and values:'
 	@echo '  PYTHON=python3.12          the Python to use, 3.11 to 3.13 (default: python3)'
 	@echo '  TORCH_INDEX=URL            package index for torch, for example one of CPU wheels'
-	@echo '  EXTRAS="onnx cuda"         optional packages: onnx, faiss, cuda, evaluation, bench, dev, docs'
+	@echo '  EXTRAS="onnx cuda"         optional packages: onnx, faiss, cuda, slam, evaluation, bench, dev, docs'
 	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your folders of images, bags or saved maps'
 	@echo '  LOOP=PATH                  demo: your sequence with loops, or synthetic for the street'
+	@echo '  SLAM=world                 demo: three laps, odometry corrected by a pose graph'
 	@echo '  ARGS="..."                 options for the program of the target (test: pytest)'
 
 setup: ## create .venv with the pinned Python packages and the ROS 2 Jazzy wheels
@@ -41,9 +42,12 @@ setup: ## create .venv with the pinned Python packages and the ROS 2 Jazzy wheel
 build: ## setup, then build stavpr_msgs and stavpr_ros with colcon
 	@$(SETUP) build $(OPTIONS) $(EXTRAS)
 
+ifdef SLAM
+demo: override EXTRAS += slam
+endif
 demo: build ## run the node on the synthetic street, or on your images (MAP= QUERY= LOOP= ARGS=)
 	@$(RUN) $(EXECUTABLES)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
-		$(if $(LOOP),--loop "$$LOOP") $(ARGS)
+		$(if $(LOOP),--loop "$$LOOP") $(if $(SLAM),--slam "$$SLAM") $(ARGS)
 
 evaluate: override EXTRAS += evaluation
 evaluate: build ## evaluate the recognition of QUERY= on MAP=: metrics, plots, a report (ARGS=)
@@ -90,4 +94,4 @@ distclean: clean ## also remove .venv and the caches of tools
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 development:
-	@$(SETUP) build $(OPTIONS) onnx evaluation dev docs
+	@$(SETUP) build $(OPTIONS) onnx slam evaluation dev docs

@@ -26,6 +26,7 @@ EXECUTABLES = (
     'demo',
     'record',
     'monitor',
+    'pose_graph',
     'evaluate',
     'experiments',
 )
@@ -89,6 +90,7 @@ setup(
         'evaluation': EVALUATION,
         'faiss': ['faiss-cpu>=1.8'],
         'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
+        'slam': ['evo>=1.31', 'gtsam>=4.2'],
         'test': TEST,
     },
     zip_safe=False,

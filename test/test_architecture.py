@@ -13,7 +13,10 @@ import stavpr_ros
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'stavpr_ros'
 ROS = {'rclpy', 'ament_index_python', 'stavpr_msgs', 'rcl_interfaces', 'builtin_interfaces'}
-ROS |= {f'{name}_msgs' for name in ('std', 'sensor', 'geometry', 'nav', 'diagnostic', 'lifecycle')}
+ROS |= {
+    f'{name}_msgs'
+    for name in ('std', 'sensor', 'geometry', 'nav', 'diagnostic', 'lifecycle', 'visualization')
+}
 CORE = (
     *('alignment', 'sources', 'features', 'mapping', 'recognition', 'relative_pose', 'pipeline'),
 )
@@ -26,10 +29,11 @@ MAY_IMPORT = {
     'recognition': {'alignment', 'features', 'mapping'},
     'relative_pose': {'alignment', 'features', 'mapping', 'recognition'},
     'pipeline': set(CORE[:6]),
+    'pose_graph': {'mapping'},
     'evaluation': set(CORE[:5]),
-    'demonstration': {'evaluation', *CORE},
-    'ros': set(CORE),
-    'commands': {'ros', 'demonstration', 'evaluation', *CORE},
+    'demonstration': {'evaluation', 'pose_graph', *CORE},
+    'ros': {'pose_graph', *CORE},
+    'commands': {'ros', 'demonstration', 'evaluation', 'pose_graph', *CORE},
 }
 # On an image's way as well, but not traced: compiled code does not report its calls, and these
 # files of the node run before and after the pipeline, in the executor's and the worker's thread.

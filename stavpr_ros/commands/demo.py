@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 import sys
 import time
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import InputError, SettingsError, SourceError, StavprError
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 EXCLUDE_PLACES, GEOMETRIC_CHECK = 50, 'sift'  # defaults with --loop
 SYNTHETIC = 'synthetic'
+DRIFT = 0.7  # odometry of about 20 m after three laps
 
 DESCRIPTION = """
 Without options: renders two traverses of a synthetic street (the second at dusk in the rain, on
@@ -28,6 +29,9 @@ your own folders of images or bags.
 
 With --loop: one traverse that passes places again is replayed into the node in operation
 loop_closure, which compares it with its own past; 'synthetic' is the synthetic street, twice.
+
+With --slam world: three laps on a closed street with a drifting odometry; the node pose_graph
+corrects it by the loop closures of the node. Requires gtsam and evo (the extra slam).
 """
 
 EPILOG = """
@@ -37,6 +41,7 @@ examples:
   demo --map monday.bag --query tuesday.bag --topic /camera/image_raw --min-probability 0.8
   demo --loop synthetic
   demo --loop round/ --truth closures.png --exclude-places 100
+  demo --slam world --world 3 --drift 0.06 --false-closures 0.3
 
 exit codes: 0 done, 1 something failed (the reason is printed), 2 usage, 130 interrupted
 """
@@ -53,6 +58,30 @@ def _parser() -> argparse.ArgumentParser:
     add(
         '--loop', nargs='?', const=SYNTHETIC, metavar='FOLDER|BAG|synthetic',
         help=f'a traverse that passes places again ({SYNTHETIC})',
+    )  # fmt: skip
+    add('--slam', choices=('world',), help='three laps with a drifting odometry, and a pose graph')
+    slam = parser.add_argument_group('options of --slam')
+    add_slam = slam.add_argument
+    add_slam(
+        '--world', type=int, default=7, metavar='SEED', help='seed of the world (%(default)s)'
+    )
+    add_slam('--draw', type=int, default=0, help='of the errors of the odometry (%(default)s)')
+    add_slam(
+        '--drift', type=float, default=DRIFT, metavar='F',
+        help='factor on the errors of the odometry; 0.06: some 2 m after three laps (%(default)s)',
+    )  # fmt: skip
+    add_slam(
+        '--false-closures', type=float, default=0.0, metavar='P',
+        help='share of loop closures that are made wrong (%(default)g)',
+    )  # fmt: skip
+    add_slam('--coherent', action='store_true', help='they are wrong in runs of 20 that agree')
+    add_slam(
+        '--carried', action='store_true',
+        help='the robot is carried over 60 images of lap 2, which the odometry misses',
+    )  # fmt: skip
+    add_slam(
+        '--sessions', type=int, default=1, choices=(1, 2),
+        help='2: lap 3 is on the next day, its odometry starts anew',
     )  # fmt: skip
     add('--topic', help='image topic of the bags, if they have several')
     add(
@@ -93,6 +122,9 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         if value is not None and value < least:
             parser.error(f'--{name.replace("_", "-")} {value} must be at least {least}')
     truth = arguments.truth
+    if arguments.slam is not None:
+        _check_slam(parser, arguments)
+        return
     if arguments.loop is not None:
         if arguments.map or arguments.query:
             parser.error('--loop is one traverse: leave --map and --query out')
@@ -111,6 +143,15 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         parser.error('--truth goes with --map and --query')
     if truth not in (None, 'identity'):
         parser.error(f'--truth {truth}: expected identity; files are for --loop, and for evaluate')
+
+
+def _check_slam(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    if arguments.loop or arguments.map or arguments.query or arguments.truth:
+        parser.error('--slam has its own drive: leave --loop, --map, --query and --truth out')
+    if not 0 <= arguments.false_closures <= 1:
+        parser.error(f'--false-closures {arguments.false_closures} must be 0 to 1')
+    if not 0 < arguments.drift <= 2:
+        parser.error(f'--drift {arguments.drift} must be above 0 and at most 2')
 
 
 def _check_limits(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
@@ -148,7 +189,9 @@ def _run(arguments: argparse.Namespace) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SourceError(f'folder {folder} cannot be made: {error}') from error
-    if arguments.loop is None:
+    if arguments.slam is not None:
+        _slam(arguments, folder)
+    elif arguments.loop is None:
         _localization(arguments, folder)
     else:
         _loop_closure(arguments, folder)
@@ -270,6 +313,66 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
     )
     result = read_result(matches, closures, traverse.ground_truth, exclude)
     _report('3', result.summary(), draw_loops(result, place_map, traverse.title, folder))
+
+
+def _slam(arguments: argparse.Namespace, folder: Path) -> None:
+    """Correct the odometry of three laps by loop closures."""
+    from stavpr_ros.commands.feature_options import make_extractor
+    from stavpr_ros.demonstration import slam
+    from stavpr_ros.demonstration.recordings import Recording, TOPIC
+    from stavpr_ros.demonstration.street.laps import CAMERA_IN_BASE, drive_laps
+    from stavpr_ros.pose_graph.solver import load_gtsam
+    from stavpr_ros.ros.graph_client import fetch_graph
+    from stavpr_ros.ros.live import executable, run_live
+
+    load_gtsam()
+    _print('1. Three laps of a synthetic street, with a drifting odometry')
+    drive = drive_laps(
+        arguments.world, arguments.draw, arguments.drift, arguments.carried, arguments.sessions
+    )
+    bag, features = folder / 'laps', folder / 'features.stavpr'
+    slam.write_drive(drive, bag)
+    recording = Recording(str(bag), TOPIC)
+    recording.save_feature_settings(make_extractor(arguments), features)
+
+    _print('2. The drive through node and pose_graph, over ROS, with a replay and recorders')
+    topic = 'stavpr/loop_closure'
+    others = {}
+    if arguments.false_closures:
+        topic = 'false_closures/loop_closure'
+        relay = [sys.executable, '-m', 'stavpr_ros.ros.false_closures']
+        relay += ['--share', str(arguments.false_closures), '--seed', str(arguments.world)]
+        others['false_closures'] = relay + ['--coherent'] * arguments.coherent
+    graph = {
+        'maps_folder': folder.absolute(),
+        'loop_closure_topics': [topic],
+    }
+    others['pose_graph'] = [
+        executable('pose_graph'), '--ros-args',
+        *(word for name, value in graph.items() for word in ('-p', f'{name}:={value}')),
+    ]  # fmt: skip
+    parameters = {
+        'operation': 'loop_closure',
+        'map_path': features,
+        **_limit(arguments, arguments.threshold),
+        'sequence_length': arguments.sequence_length,
+        'keyframe_change': 0.0,
+    }
+    if 'camera_transform' in BY_NAME:
+        parameters['camera_transform'] = ' '.join(f'{value:g}' for value in CAMERA_IN_BASE)
+    result: list[Any] = []
+
+    def fetch(closures: list[dict[str, Any]], environment: dict[str, str]) -> None:
+        domain = int(environment['ROS_DOMAIN_ID'])
+        result.append(fetch_graph(['graph.g2o', 'optimized.tum'], len(closures), domain))
+
+    run_live(
+        parameters, str(bag), len(drive), folder, TOPIC, others,
+        ['--odometry', '--also', slam.CAMERA_INFO, '--timeout', '120'], fetch,
+    )  # fmt: skip
+    values, edges = result[0]
+    found = slam.evaluate_drive(drive, folder / 'optimized.tum', values)
+    _report('3', found.summary(), slam.write_result(found, drive, edges, folder))
 
 
 def _report(number: str, summary: str, plot: Path) -> None:

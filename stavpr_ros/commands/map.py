@@ -82,6 +82,12 @@ def _parser() -> argparse.ArgumentParser:
     action.add_argument('output', metavar='OUTPUT')
     action.add_argument('maps', nargs='+', metavar='MAP')
     action.add_argument(
+        '--align',
+        action='store_true',
+        help='move the poses of each further map into the frame of the first, by the places that '
+        'are recognized on it; requires gtsam',
+    )
+    action.add_argument(
         '--different-routes',
         action='store_true',
         help='do not look for places that several sessions show; it takes the time of driving '
@@ -218,10 +224,37 @@ def _merge(arguments: argparse.Namespace) -> None:
     maps = [open_map(path) for path in arguments.maps]
     for place_map in maps:
         verify_map(place_map)
+    if arguments.align:
+        maps[1:] = [_aligned(place_map, maps[0]) for place_map in maps[1:]]
     merged = merge_maps(maps, [Path(path).stem for path in arguments.maps])
     if not arguments.different_routes:
         merged = with_same_places(merged, progress=True)
     _write(merged, arguments)
+
+
+def _aligned(place_map: 'PlaceMap', reference: 'PlaceMap') -> 'PlaceMap':
+    """Return a map in the frame of another, by the places that are recognized on it."""
+    from dataclasses import replace
+
+    import numpy as np
+    from stavpr_ros.errors import InputError
+    from stavpr_ros.pose_graph import align_maps
+    from stavpr_ros.pose_graph.transforms import matrices, to_poses
+    from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+
+    if place_map.poses is None or reference.poses is None:
+        raise InputError('--align: a map has no poses; expected maps recorded with odometry')
+    recognizer = PlaceRecognizer(reference, RecognizerSettings(threshold=0.5, mode='robust'))
+    pairs = []
+    for i in range(len(place_map)):
+        match = recognizer.update(place_map.features[i : i + 1])
+        if match.accepted and len(match.path):
+            position, place = match.path[len(match.path) // 2].tolist()
+            pairs.append((i - int(match.path[-1, 0]) + position, place))
+    found = np.array(pairs, np.int64).reshape(-1, 2)
+    print(f'{len(found)} of {len(place_map)} places are recognized on the first map')
+    transform = align_maps(reference.poses, place_map.poses, found)
+    return replace(place_map, poses=to_poses(transform @ matrices(place_map.poses)), map_id='')
 
 
 def _sessions(arguments: argparse.Namespace) -> None:

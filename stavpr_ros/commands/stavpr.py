@@ -22,9 +22,10 @@ COMMANDS = {
     'replay': 'publish a bag or a folder of images to the node (ROS 2)',
     'record': 'write matches or loop closures to a JSON Lines file (ROS 2)',
     'monitor': 'show the node in a web browser (ROS 2)',
+    'pose_graph': 'correct odometry by loop closures (ROS 2)',
     'demo': 'build, run and evaluate everything on a synthetic street (ROS 2)',
 }
-NEED_ROS = ('node', 'replay', 'record', 'monitor', 'demo')
+NEED_ROS = ('node', 'replay', 'record', 'monitor', 'pose_graph', 'demo')
 
 
 def usage() -> str:

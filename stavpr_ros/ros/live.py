@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs the node, a replay and recorders as processes of their own: recognition as on a robot."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack
 from functools import partial
 import json
@@ -56,6 +56,9 @@ def run_live(
     images: int,
     folder: Path,
     topic: str | None = None,
+    others: Mapping[str, list[str]] | None = None,
+    replay_options: Sequence[str] = (),
+    at_end: Callable[[Records, dict[str, str]], None] = lambda closures, environment: None,
 ) -> tuple[Records, Records]:
     """
     Replay a query losslessly into a node and return what was recorded.
@@ -66,6 +69,9 @@ def run_live(
     :param folder: for the logs, ``matches.jsonl``, and in operation loop_closure
         ``loop_closures.jsonl``.
     :param topic: image topic of the bag; None = its only one.
+    :param others: commands of further processes by their names.
+    :param replay_options: further options of the command ``replay``.
+    :param at_end: called with the loop closures and the environment, while everything still runs.
     :returns: one match per image, and the loop closures; see the command ``record``.
     :raises StavprError: a process failed; names its log.
     """
@@ -74,6 +80,7 @@ def run_live(
     node = [executable('node'), '--ros-args', *(word for p in parameters for word in ('-p', p))]
     replay = [executable('replay'), query, '--lossless', '--wait', '120']
     replay += [] if topic is None else ['--topic', topic]
+    replay += replay_options
     record = [executable('record'), '--output']
     matches, closures = folder / 'matches.jsonl', folder / 'loop_closures.jsonl'
     recorders = {'record': [*record, str(matches)]}
@@ -91,7 +98,7 @@ def run_live(
 
     with ExitStack() as stack:
         processes: dict[str, Process] = {}
-        for name, command in {'node': node, **recorders}.items():
+        for name, command in {'node': node, **(others or {}), **recorders}.items():
             running = _running(command, folder / f'{name}.log', environment)
             processes[name] = stack.enter_context(running)
 
@@ -106,6 +113,7 @@ def run_live(
         if player.returncode != 0:
             raise StavprError(f'the replay ended with {player.returncode}, see {folder}/node.log')
         wait_until(complete, END_TIMEOUT, 'the last record')
+        at_end(_records(closures), environment)
     found = _records(matches)
     if len(found) != images:
         raise StavprError(f'{len(found)} matches of {images} images, see the logs in {folder}')

@@ -34,7 +34,7 @@ class Navigation:
         self._tf: Any = None
         self._initial_pose: Any = None
         if settings.publish_tf:
-            self._tf = node.create_publisher(_tf_message(), '/tf', TF_DEPTH)
+            self._tf = node.create_publisher(tf_message(), '/tf', TF_DEPTH)
         if settings.publish_initialpose:
             self._initial_pose = node.create_publisher(PoseWithCovarianceStamped, 'initialpose', 1)
         self._unmatched = settings.pipeline.sequence.length  # images since the last match
@@ -91,7 +91,7 @@ class Navigation:
             )
         if self._transform is not None:
             self._transform.header.stamp = header.stamp
-            self._tf.publish(_tf_message()(transforms=[self._transform]))
+            self._tf.publish(tf_message()(transforms=[self._transform]))
 
     def _publish_initial_pose(self, header: Header, match: Match, places: PlaceMap) -> None:
         """Publish the first match after a whole window without one, or with a new window."""
@@ -135,7 +135,8 @@ def planar(message: PoseWithCovarianceStamped) -> PoseWithCovarianceStamped:
     return result
 
 
-def _tf_message() -> Any:
+def tf_message() -> Any:
+    """Return the class of the messages on /tf."""
     try:
         from tf2_msgs.msg import TFMessage
     except ImportError as error:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes image records into a new ROS 2 bag."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from rosbags.typesys.store import Typestore
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.output_file import atomic_folder
 from stavpr_ros.sources.bag import RAW, SECOND
-from stavpr_ros.sources.frame import ImageRecord
+from stavpr_ros.sources.frame import ImageRecord, MessageRecord
 
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
 VERSION: int = 9
@@ -23,15 +23,18 @@ VERSION: int = 9
 def write_bag(
     path: str | Path,
     topic: str,
-    records: Iterable[ImageRecord],
+    records: Iterable[ImageRecord | MessageRecord],
     storage: str = 'sqlite3',
+    others: Mapping[str, str] | None = None,
 ) -> int:
     """
-    Write a bag with one topic of raw images, all of it or nothing.
+    Write a bag with raw images and other messages, all of it or nothing.
 
     :param path: the bag's folder, which must not exist yet.
-    :param records: the images, in the order of their times of recording.
+    :param topic: of the images.
+    :param records: images and other messages, in the order of their times of recording.
     :param storage: ``sqlite3`` or ``mcap``.
+    :param others: the topics of other messages: name to type.
     :returns: number of images written.
     :raises OutputError: the folder exists, or cannot be written.
     """
@@ -49,7 +52,14 @@ def write_bag(
         ) as writer,
     ):
         connection = writer.add_connection(topic, RAW, typestore=typestore)
+        connections = {
+            name: writer.add_connection(name, kind, typestore=typestore)
+            for name, kind in (others or {}).items()
+        }
         for record in records:
+            if isinstance(record, MessageRecord):
+                writer.write(connections[record.topic], record.time_ns, record.content)
+                continue
             _write(writer, connection, typestore, record)
             count += 1
     return count

@@ -110,15 +110,18 @@ class Traverse:
     :param detour: whether that is the detour, shape (images,), bool.
     :param epoch: stamp of the first image, ns.
     :param size: width and height of the images.
+    :param lanes: of each image, meters to the right of the center line, shape (images,); None =
+        that of the conditions.
 
     ``position`` is in meters along the street of the first traverse; NaN in the detour.
     """
 
     def __init__(
         self, world: World, along: np.ndarray, detour: np.ndarray, conditions: Conditions,
-        epoch: int = EPOCH, size: tuple[int, int] = SIZE,
+        epoch: int = EPOCH, size: tuple[int, int] = SIZE, lanes: np.ndarray | None = None,
     ) -> None:  # fmt: skip
-        self._along, self._detour, self._size = along, detour, size
+        self.along, self.detour, self._size = along, detour, size
+        self._lanes = np.full(len(along), conditions.lane) if lanes is None else lanes
         self.position = np.where(detour, np.nan, along)
         self.stamps = epoch + np.arange(len(along), dtype=np.int64) * round(1e9 / RATE)
         self._conditions = c = conditions
@@ -145,21 +148,26 @@ class Traverse:
         """Render image k."""
         return Frame(self._render(k), int(self.stamps[k]), '')
 
-    def _render(self, k: int) -> np.ndarray:
-        c, along, turn = self._conditions, float(self._along[k]), int(self._detour[k])
+    def camera(self, k: int) -> tuple[float, float, float]:
+        """Return meters to the right of the center line, and pitch and yaw as in `render`."""
+        c, along = self._conditions, float(self.along[k])
         # Sway and shake depend on the place: while the vehicle stands, only traffic moves.
         sway = noise(along / 17.0, 0.0, c.traffic) - 0.5
         bump = hash01(int(along * 10), 3, c.traffic) + hash01(int(along * 10), 4, c.traffic) - 1.0
-        pitch, yaw = radians(c.shake) * 2.4 * bump, radians(1.2) * sway
+        across = float(self._lanes[k]) + 0.5 * sway
+        return across, radians(c.shake) * 2.4 * bump, radians(1.2) * sway
+
+    def _render(self, k: int) -> np.ndarray:
+        turn = int(self.detour[k])
         traffic = np.concatenate([self._parked[turn], self._driving(k)])
         return render(
-            self._streets[turn], along, c.lane + 0.5 * sway, pitch, yaw, self._light, traffic,
-            k * 7919 + c.traffic, *self._size,
+            self._streets[turn], float(self.along[k]), *self.camera(k), self._light, traffic,
+            k * 7919 + self._conditions.traffic, *self._size,
         )  # fmt: skip
 
     def _driving(self, k: int) -> np.ndarray:
         """Place the cars that drive ahead: some in each lane, coming nearer and falling back."""
-        c, along = self._conditions, float(self._along[k])
+        c, along = self._conditions, float(self.along[k])
         rows = []
         for car in range(3):
             wave = noise(k / 40.0, car * 9.0, c.traffic + 40)
@@ -182,6 +190,7 @@ def second_traverse(
     images: int = 330,
     size: tuple[int, int] = SIZE,
     conditions: Conditions = RAINY_DUSK,
+    lanes: np.ndarray | None = None,
 ) -> Traverse:
     """Traverse along the street again, with a detour, a stop and other conditions: the query."""
     distance = LENGTH - (DETOUR_TO - DETOUR_FROM) + DETOUR
@@ -190,7 +199,7 @@ def second_traverse(
     back = DETOUR_FROM + DETOUR
     detour = (driven >= DETOUR_FROM) & (driven < back)
     along = np.where(driven < back, driven - DETOUR_FROM * detour, driven - back + DETOUR_TO)
-    return Traverse(world, along, detour, conditions, SECOND_EPOCH, size)
+    return Traverse(world, along, detour, conditions, SECOND_EPOCH, size, lanes)
 
 
 def nearest_places(first: Traverse, second: Traverse) -> np.ndarray:

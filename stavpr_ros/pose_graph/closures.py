@@ -1,0 +1,74 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Loop closures with a relative pose: the measurements of the graph."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping.trajectory import checked_pose
+
+
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """
+    One measured relative pose of two stamps.
+
+    :param query_stamp, place_stamp: ns.
+    :param pose: of the query in the place's frame, shape (7,).
+    :param covariance: x y z, rotations about the fixed axes of the place, shape (6, 6).
+    :param is_independent: its error does not correlate with that of the edge before.
+    :param map_id: of the map that the place is in, whose pose there is ``place_pose``, shape (7,);
+        empty = the place is on the same drive.
+    """
+
+    query_stamp: int
+    place_stamp: int
+    pose: np.ndarray
+    covariance: np.ndarray
+    is_independent: bool = True
+    map_id: str = ''
+    place_pose: np.ndarray | None = None
+
+    def checked(self) -> 'Closure':
+        """
+        Return this closure with a unit quaternion.
+
+        :raises InputError: values that are not finite, or no covariance.
+        """
+        covariance = np.array(self.covariance, np.float64)
+        if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
+            raise InputError('the covariance of a closure is not finite: expected 6 x 6 numbers')
+        if np.linalg.eigvalsh((covariance + covariance.T) / 2)[0] <= 0:
+            raise InputError(
+                'the covariance of a closure is not positive definite: expected variances above 0'
+            )
+        if self.query_stamp <= 0 or self.place_stamp <= 0:
+            raise InputError('a closure has a stamp of 0: expected those of the two images')
+        if self.map_id and self.place_pose is None:
+            raise InputError('a closure with a map has no pose of the place in the map')
+        return Closure(
+            self.query_stamp, self.place_stamp, checked_pose(self.pose), covariance,
+            self.is_independent, self.map_id, self.place_pose,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ResolvedClosure:
+    """
+    A closure between two nodes of the graph.
+
+    :param query, place: nodes.
+    :param transform: of the query's node in the place's, shape (4, 4).
+    :param covariance: in the axes of the query's node, rotation first, shape (6, 6).
+    :param at: distance travelled at the query, m.
+    :param number: of the closure, in the order of arrival.
+    """
+
+    query: int
+    place: int
+    transform: np.ndarray
+    covariance: np.ndarray
+    at: float
+    number: int
+    is_independent: bool

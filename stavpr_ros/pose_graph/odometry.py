@@ -1,0 +1,234 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes of the odometry, the sessions between its breaks, and the growth of its errors."""
+
+from bisect import bisect_right
+from dataclasses import dataclass
+
+import numpy as np
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping.trajectory import checked_pose, interpolate, SECOND
+from stavpr_ros.pose_graph.transforms import inverse, matrices, to_poses
+
+
+@dataclass(frozen=True)
+class OdometryNoise:
+    """
+    Errors of an odometry, as deviations that grow with the distance.
+
+    :param translation: meters per square root of a meter.
+    :param rotation: radians per square root of a meter.
+    """
+
+    translation: float = 0.05
+    rotation: float = 0.012
+
+    def position_variance(self, distance: np.ndarray) -> np.ndarray:
+        """Return the variance of a position after distances (m), of each axis, m^2."""
+        heading = self.rotation**2 * distance**3 / 3  # a random walk of the heading
+        return self.translation**2 * distance + heading
+
+    def angle_variance(self, distance: np.ndarray) -> np.ndarray:
+        """Return the variance of a heading after distances (m), rad^2."""
+        return self.rotation**2 * distance
+
+
+@dataclass(frozen=True)
+class ChainSettings:
+    """
+    When the odometry becomes a keyframe, and when it breaks.
+
+    :param distance: meters between keyframes.
+    :param angle: radians between keyframes.
+    :param max_gap: seconds without odometry that begin a new session.
+    :param max_speed: meters per second; a faster motion begins a new session.
+    """
+
+    distance: float = 1.0
+    angle: float = 0.1
+    max_gap: float = 5.0
+    max_speed: float = 60.0
+
+
+class KeyframeChain:
+    """
+    Keyframes of the odometry in sessions, and fixed places of a map; all are nodes of the graph.
+
+    ``stamps`` (ns), ``transforms`` (in the odometry of its session, or in the map), ``travelled``
+    (m), ``session`` (negative = fixed) are arrays of N nodes.
+    """
+
+    FIXED = -1
+
+    def __init__(self, settings: ChainSettings) -> None:
+        self._settings = settings
+        self._capacity = 1024
+        self._arrays: dict[str, np.ndarray] = {
+            'stamps': np.zeros(self._capacity, np.int64),
+            'transforms': np.zeros((self._capacity, 4, 4)),
+            'travelled': np.zeros(self._capacity),
+            'session': np.zeros(self._capacity, np.int32),
+            'previous': np.zeros(self._capacity, np.int64),
+        }
+        self._count = 0
+        self._recorded: list[tuple[list[int], list[int]]] = []  # stamps, nodes; split or not
+        self.sessions = 0
+        self._tail: tuple[int, np.ndarray] | None = None  # stamp and pose of the newest odometry
+        self._fixed: dict[tuple[str, int], int] = {}
+        self.breaks: list[str] = []
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def stamps(self) -> np.ndarray:
+        """Return the stamps of the nodes, (N,), int64, ns."""
+        return self._arrays['stamps'][: self._count]
+
+    @property
+    def transforms(self) -> np.ndarray:
+        """Return the transforms of the nodes, (N, 4, 4)."""
+        return self._arrays['transforms'][: self._count]
+
+    @property
+    def travelled(self) -> np.ndarray:
+        """Return the distance travelled up to each node, (N,), m."""
+        return self._arrays['travelled'][: self._count]
+
+    @property
+    def session(self) -> np.ndarray:
+        """Return the session of each node, (N,), int32; negative = a fixed place."""
+        return self._arrays['session'][: self._count]
+
+    @property
+    def previous(self) -> np.ndarray:
+        """Return the node before each one in its session, (N,), int64; -1 = none."""
+        return self._arrays['previous'][: self._count]
+
+    @property
+    def newest(self) -> int:
+        """Return the newest keyframe; -1 = none."""
+        return self._recorded[-1][1][-1] if self._recorded else -1
+
+    @property
+    def tail(self) -> np.ndarray | None:
+        """Return the pose of the newest odometry, (4, 4)."""
+        return None if self._tail is None else matrices(self._tail[1])
+
+    def add(self, stamp: int, pose: np.ndarray) -> bool:
+        """
+        Add the odometry; return whether it is a new keyframe.
+
+        :param stamp: ns.
+        :param pose: of the base in the frame of the odometry, shape (7,).
+        :raises InputError: an invalid pose or stamp; nothing is changed.
+        """
+        pose = checked_pose(pose)
+        if stamp <= 0:
+            raise InputError(f'odometry with stamp {stamp}: expected nanoseconds above 0')
+        cause = self._break(stamp, pose)
+        if cause == '':
+            assert self._tail is not None
+            if stamp <= self._tail[0]:
+                return False
+            node = self.newest
+            step = inverse(self.transforms[node]) @ matrices(pose)
+            near = np.linalg.norm(step[:3, 3]) < self._settings.distance
+            turned = (np.trace(step[:3, :3]) - 1) / 2 < np.cos(self._settings.angle)
+            self._tail = stamp, pose
+            if near and not turned:
+                return False
+            self._append(stamp, matrices(pose), node)
+            return True
+        if self._tail is not None:
+            self.breaks.append(cause)
+        self._tail = stamp, pose
+        self._recorded.append(([], []))
+        self.sessions += 1
+        self._append(stamp, matrices(pose), -1)
+        return True
+
+    def _break(self, stamp: int, pose: np.ndarray) -> str:
+        """Return why a new session begins; empty = none does."""
+        if self._tail is None:
+            return 'start'
+        seconds = (stamp - self._tail[0]) / SECOND
+        if seconds < -0.5:
+            return f'the stamps jumped back by {-seconds:.3f} s'
+        if seconds > self._settings.max_gap:
+            return f'no odometry for {seconds:.1f} s'
+        moved = float(np.linalg.norm(pose[:3] - self._tail[1][:3]))
+        if seconds >= 0 and moved > max(2.0, self._settings.max_speed * seconds):
+            return f'the odometry jumped by {moved:.1f} m'
+        return ''
+
+    def _append(self, stamp: int, transform: np.ndarray, previous: int) -> None:
+        travelled, session = 0.0, self.sessions - 1
+        if previous >= 0:
+            step = transform[:3, 3] - self.transforms[previous][:3, 3]
+            travelled = float(self.travelled[previous] + np.linalg.norm(step))
+            session = int(self.session[previous])
+        node = self._extend(stamp, transform, travelled, session, previous)
+        stamps, nodes = self._recorded[-1]
+        stamps.append(stamp)
+        nodes.append(node)
+
+    def _extend(
+        self, stamp: int, transform: np.ndarray, travelled: float, session: int, previous: int
+    ) -> int:
+        if self._count == self._capacity:
+            self._capacity *= 2
+            for name, array in self._arrays.items():
+                grown = np.zeros((self._capacity, *array.shape[1:]), array.dtype)
+                grown[: self._count] = array
+                self._arrays[name] = grown
+        values = (stamp, transform, travelled, session, previous)
+        for array, value in zip(self._arrays.values(), values, strict=True):
+            array[self._count] = value
+        self._count += 1
+        return self._count - 1
+
+    def fixed(self, map_id: str, stamp: int, pose: np.ndarray) -> int:
+        """Return the node of a place of a map, whose pose in the map is known, shape (7,)."""
+        key = (map_id, stamp)
+        if key not in self._fixed:
+            pose = checked_pose(pose)
+            self._fixed[key] = self._extend(stamp, matrices(pose), 0.0, self.FIXED, -1)
+        return self._fixed[key]
+
+    def find(self, stamp: int) -> tuple[int, np.ndarray] | None:
+        """
+        Return the keyframe before a stamp, and the transform (4, 4) from it to the stamp.
+
+        None = no odometry at this stamp; the latest recording counts where stamps repeat.
+        """
+        for number in range(len(self._recorded) - 1, -1, -1):
+            stamps, nodes = self._recorded[number]
+            end = self._tail if number == len(self._recorded) - 1 else None
+            last = stamps[-1] if end is None else end[0]
+            if not stamps[0] <= stamp <= last:
+                continue
+            i = bisect_right(stamps, stamp) - 1
+            if stamps[i] == stamp:
+                return nodes[i], np.eye(4)
+            start = to_poses(self.transforms[nodes[i]])
+            if i + 1 < len(stamps):
+                after, pose = stamps[i + 1], to_poses(self.transforms[nodes[i + 1]])
+            else:
+                assert end is not None
+                after, pose = end[0], end[1]
+            at = interpolate(start, pose, (stamp - stamps[i]) / (after - stamps[i]))
+            return nodes[i], inverse(matrices(start)) @ matrices(at)
+        return None
+
+    def is_ahead(self, stamp: int) -> bool:
+        """Return whether odometry of this stamp may still arrive."""
+        return self._tail is None or stamp > self._tail[0]
+
+    def split(self, node: int) -> None:
+        """Let a new session begin at a keyframe."""
+        old = self.session[node]
+        later = (self.session == old) & (np.arange(self._count) >= node)
+        self.session[later] = self.sessions
+        self.previous[node] = -1
+        self.sessions += 1

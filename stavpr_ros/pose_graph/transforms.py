@@ -1,0 +1,65 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Rigid transforms as homogeneous matrices, many at once."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+def matrices(poses: np.ndarray) -> np.ndarray:
+    """Return x y z and quaternion x y z w, shape (..., 7), as transforms (..., 4, 4)."""
+    poses = np.asarray(poses, np.float64)
+    result = np.zeros((*poses.shape[:-1], 4, 4))
+    turns = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).as_matrix()
+    result[..., :3, :3] = turns.reshape(*poses.shape[:-1], 3, 3)
+    result[..., :3, 3] = poses[..., :3]
+    result[..., 3, 3] = 1
+    return result
+
+
+def to_poses(transforms: np.ndarray) -> np.ndarray:
+    """Return matrices (..., 4, 4) as poses (..., 7)."""
+    turns = Rotation.from_matrix(transforms[..., :3, :3].reshape(-1, 3, 3)).as_quat()
+    shape = transforms.shape[:-2]
+    return np.concatenate([transforms[..., :3, 3], turns.reshape(*shape, 4)], axis=-1)
+
+
+def inverse(transforms: np.ndarray) -> np.ndarray:
+    """Return the inverses of rigid transforms (..., 4, 4)."""
+    result = np.zeros_like(transforms)
+    turned = np.swapaxes(transforms[..., :3, :3], -1, -2)
+    result[..., :3, :3] = turned
+    result[..., :3, 3] = -(turned @ transforms[..., :3, 3, None])[..., 0]
+    result[..., 3, 3] = 1
+    return result
+
+
+def angles(transforms: np.ndarray) -> np.ndarray:
+    """Return the angles of rotation of transforms (..., 4, 4), radians."""
+    trace = np.trace(transforms[..., :3, :3], axis1=-2, axis2=-1)
+    result: np.ndarray = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    return result
+
+
+def planar_poses(poses: np.ndarray) -> np.ndarray:
+    """Return planar poses (N, 3), x y and yaw in radians, as poses (N, 7)."""
+    result = np.zeros((len(poses), 7))
+    result[:, :2] = poses[:, :2]
+    result[:, 5], result[:, 6] = np.sin(poses[:, 2] / 2), np.cos(poses[:, 2] / 2)
+    return result
+
+
+def body_covariance(covariance: np.ndarray, transform: np.ndarray) -> np.ndarray:
+    """
+    Return the covariance of a pose in the axes of its own frame, rotation first.
+
+    :param covariance: as in ``geometry_msgs/PoseWithCovariance``: x y z and rotations about the
+        fixed axes of the parent frame, shape (6, 6).
+    :param transform: the pose, shape (4, 4).
+    :returns: that of ``Z Exp([rotation, translation])``, as GTSAM has it, shape (6, 6).
+    """
+    turn = transform[:3, :3].T
+    change = np.zeros((6, 6))
+    change[:3, 3:] = change[3:, :3] = turn
+    result: np.ndarray = change @ covariance @ change.T
+    return result

@@ -1,0 +1,241 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The pose graph as a library: drives on a circle with a known truth."""
+
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from stavpr_ros.demonstration.street.laps import drifted
+from stavpr_ros.errors import InputError, SettingsError, UnavailableError
+from stavpr_ros.pose_graph import align_maps, Closure, optimize, PoseGraph
+from stavpr_ros.pose_graph.consistency import largest_consistent
+from stavpr_ros.pose_graph.files import save_graph
+from stavpr_ros.pose_graph.transforms import (
+    body_covariance,
+    inverse,
+    matrices,
+    planar_poses,
+    to_poses,
+)
+
+SECOND = 10**9
+LAP = 100  # images of 2 m
+NOISE = np.diag([0.3, 0.3, 0.3, 0.02, 0.02, 0.02]) ** 2
+
+
+def circle(laps: int = 2) -> np.ndarray:
+    """Return planar poses on a circle of 200 m."""
+    angle = np.arange(laps * LAP) * 2 * np.pi / LAP
+    radius = 2 * LAP / (2 * np.pi)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), angle + np.pi / 2])
+
+
+def odometry_of(truth: np.ndarray, moved: np.ndarray | None = None) -> np.ndarray:
+    noticed = np.ones(len(truth), bool) if moved is None else moved
+    return planar_poses(drifted(truth, noticed, np.random.default_rng(1), 1.0))
+
+
+def closure(truth, query, place, claimed=None, stamps=None, independent=None) -> Closure:
+    """Measure query in place with noise, and claim it of another place."""
+    T = matrices(planar_poses(truth[[place, query]]))
+    Z = inverse(T[0]) @ T[1]
+    Z[:2, 3] += np.random.default_rng(query).normal(size=2) * 0.1
+    at = (np.arange(len(truth)) + 1) * SECOND if stamps is None else stamps
+    to = place if claimed is None else claimed
+    marked = query % 3 == 0 if independent is None else independent
+    return Closure(int(at[query]), int(at[to]), to_poses(Z), NOISE, marked)
+
+
+def error(poses: np.ndarray, truth: np.ndarray) -> float:
+    """Return the rms distance (m) after alignment in the plane."""
+    a, b = poses[:, :2] - poses[:, :2].mean(axis=0), truth[:, :2] - truth[:, :2].mean(axis=0)
+    turn, _ = Rotation.align_vectors(np.pad(b, ((0, 0), (0, 1))), np.pad(a, ((0, 0), (0, 1))))
+    moved = turn.apply(np.pad(a, ((0, 0), (0, 1))))[:, :2]
+    return float(np.sqrt(((moved - b) ** 2).sum(axis=1).mean()))
+
+
+def solve(truth, closures, odometry=None, stamps=None):
+    at = (np.arange(len(truth)) + 1) * SECOND if stamps is None else stamps
+    return optimize(at, odometry_of(truth) if odometry is None else odometry, closures)
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """Return the truth of two laps and the closures of the second."""
+    truth = circle()
+    return truth, [closure(truth, q, q - LAP) for q in range(LAP, 2 * LAP)]
+
+
+def test_optimize_with_closures_corrects_drift(drive):
+    truth, closures = drive
+    found, graph = solve(truth, closures)
+    assert error(odometry_of(truth), truth) > 3
+    assert error(found, truth) < 1
+    assert graph.accepted >= 0.95 * len(closures)
+
+
+def test_optimize_twice_gives_same_trajectory(drive):
+    truth, closures = drive
+    assert np.array_equal(solve(truth, closures[::4])[0], solve(truth, closures[::4])[0])
+
+
+def test_optimize_without_closures_returns_odometry():
+    truth = circle(1)
+    found, _ = solve(truth, [])
+    np.testing.assert_allclose(matrices(found), matrices(odometry_of(truth)), atol=1e-6)
+
+
+@pytest.mark.parametrize('run', [1, 20])
+def test_optimize_with_wrong_closures_rejects_them(drive, run):
+    """A third is wrong, alone or in runs that agree with each other."""
+    truth, closures = drive
+    false = [(q // run) % 3 == 1 for q in range(LAP)]
+    mixed = [
+        closure(truth, LAP + k, k, (k + 30 + 9 * (k // run % 5)) % LAP) if wrong else closures[k]
+        for k, wrong in enumerate(false)
+    ]
+    found, graph = solve(truth, mixed)
+    clean, _ = solve(
+        truth, [each for each, wrong in zip(closures, false, strict=True) if not wrong]
+    )
+    assert graph.rejected >= 0.9 * sum(false)
+    assert error(found, truth) < 1.3 * error(clean, truth) + 0.1
+
+
+def test_optimize_carried_robot_begins_session_and_joins_it():
+    """The odometry misses 40 m of the way; the closures after it prove it."""
+    truth = np.delete(circle(3), np.s_[140:160], axis=0)
+    moved = np.arange(len(truth)) != 140
+    closures = [
+        closure(truth, q, (q + (20 if q >= 140 else 0)) % LAP) for q in range(LAP, len(truth))
+    ]
+    found, graph = solve(truth, closures, odometry_of(truth, moved))
+    assert graph.splits >= 1
+    assert graph.chain.sessions == graph.splits + 1
+    later = np.r_[0:135, 146 : len(truth)]
+    assert error(found[later], truth[later]) < 1.5
+
+
+def test_optimize_odometry_reset_joins_sessions():
+    truth = circle()
+    stamps = (np.arange(2 * LAP) + 1) * SECOND
+    stamps[LAP:] += 3600 * SECOND
+    odometry = odometry_of(truth)
+    odometry[LAP:] = odometry_of(truth[LAP:])
+    closures = [closure(truth, q, q - LAP, stamps=stamps) for q in range(LAP, 2 * LAP)]
+    found, graph = solve(truth, closures, odometry, stamps)
+    assert graph.chain.sessions == 2
+    assert 'no odometry for' in graph.chain.breaks[0]
+    later = np.linalg.norm(found[LAP:, :2] - found[:LAP, :2], axis=1)
+    assert later.max() < 1.0  # both passes of a place are at one place
+
+
+def test_optimize_closures_with_map_move_graph_into_it():
+    truth = circle(1)
+    moved = planar_poses(truth + np.array([100.0, 50.0, 0.0]))
+    same = np.array([0, 0, 0, 0, 0, 0, 1.0])
+    closures = [
+        Closure((q + 1) * SECOND, 7 + q, same, NOISE, q % 5 == 0, 'map', moved[q])
+        for q in range(0, LAP, 2)
+    ]
+    found, _ = solve(truth, closures)
+    assert np.linalg.norm(found[:, :3] - moved[:, :3], axis=1).max() < 1.0
+
+
+def test_update_online_agrees_with_offline(drive):
+    truth, closures = drive
+    graph = PoseGraph()
+    for i, pose in enumerate(odometry_of(truth)):
+        graph.add_odometry((i + 1) * SECOND, pose)
+        if i >= LAP:
+            graph.add_closure(closures[i - LAP])
+            if i % 10 == 0:
+                graph.update()
+    graph.update()
+    assert error(to_poses(graph.solved), truth) < 1
+    online = matrices(graph.map_to_odom()) @ graph.chain.transforms[-1]
+    np.testing.assert_allclose(online, graph.solved[-1], atol=1e-9)
+
+
+def test_add_odometry_not_finite_is_counted():
+    graph = PoseGraph()
+    with pytest.raises(InputError, match='not finite'):
+        graph.add_odometry(SECOND, np.full(7, np.nan))
+    assert graph.counts['invalid odometry'] == 1
+    assert len(graph.chain) == 0
+
+
+def test_add_closure_invalid_is_counted(drive):
+    _, closures = drive
+    graph = PoseGraph()
+    bad = Closure(1, 2, closures[0].pose, np.zeros((6, 6)))
+    with pytest.raises(InputError, match='positive definite'):
+        graph.add_closure(bad)
+    assert graph.counts['invalid'] == 1
+
+
+def test_update_closure_of_unknown_stamp_is_counted(drive):
+    truth, closures = drive
+    graph = PoseGraph()
+    for i, pose in enumerate(odometry_of(truth)[:50]):
+        graph.add_odometry((i + 1) * SECOND, pose)
+    graph.add_closure(Closure(40 * SECOND, SECOND // 2, closures[0].pose, NOISE))
+    graph.add_closure(Closure(60 * SECOND, SECOND, closures[0].pose, NOISE))
+    graph.update()
+    assert graph.counts['unknown stamp'] == 1
+    assert graph.pending == 1
+
+
+def test_largest_consistent_by_hand():
+    conflicts = np.zeros((4, 4), bool)
+    conflicts[0, 1] = conflicts[1, 0] = conflicts[1, 2] = conflicts[2, 1] = True
+    everyone = np.ones(4, bool)
+    light = largest_consistent(conflicts, np.array([3, 4, 3, 1]), everyone)
+    assert light.tolist() == [True, False, True, True]
+    heavy = largest_consistent(conflicts, np.array([3, 9, 3, 1]), everyone)
+    assert heavy.tolist() == [False, True, False, True]
+
+
+def test_body_covariance_turned_by_90_degrees_swaps_axes():
+    T = matrices(np.array([0, 0, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)]))
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    expected = np.diag([5.0, 4.0, 6.0, 2.0, 1.0, 3.0])
+    np.testing.assert_allclose(body_covariance(covariance, T), expected, atol=1e-12)
+
+
+def test_align_maps_with_wrong_pairs_returns_transform():
+    truth = circle(1)
+    poses = planar_poses(truth)
+    move = matrices(planar_poses(np.array([[30.0, -20.0, 1.0]])))[0]
+    reference = to_poses(move @ matrices(poses))
+    pairs = np.array([(k, (k + 40) % LAP if k // 20 % 3 == 1 else k) for k in range(LAP)])
+    np.testing.assert_allclose(align_maps(reference, poses, pairs), move, atol=0.3)
+
+
+def test_align_maps_without_common_places_raises():
+    poses = planar_poses(circle(1))
+    with pytest.raises(InputError, match='common stretch'):
+        align_maps(poses, poses, np.zeros((0, 2), int))
+
+
+def test_save_graph_writes_g2o_and_tum(drive, tmp_path):
+    truth, closures = drive
+    _, graph = solve(truth, closures)
+    assert save_graph(graph, str(tmp_path / 'a.tum')) == 2 * LAP
+    assert save_graph(graph, str(tmp_path / 'a.g2o')) == 2 * LAP
+    tum = np.loadtxt(tmp_path / 'a.tum')
+    assert tum.shape == (2 * LAP, 8)
+    lines = (tmp_path / 'a.g2o').read_text().splitlines()
+    edges = [line for line in lines if line.startswith('EDGE_SE3:QUAT')]
+    assert len(edges) == 2 * LAP - 1 + len(graph.used)
+    assert {len(line.split()) for line in edges} == {31}
+    with pytest.raises(SettingsError, match=r'\.g2o or \.tum'):
+        save_graph(graph, str(tmp_path / 'a.txt'))
+
+
+def test_graph_without_gtsam_names_remedy(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'gtsam', None)
+    with pytest.raises(UnavailableError, match='pip install gtsam'):
+        PoseGraph()
