@@ -207,7 +207,7 @@ def test_launch_argument_of_the_wrong_type_is_rejected_by_name(load, name, value
     ('arguments', 'expected'),
     [
         (['max_rat:=3', 'image:=/camera'], "argument 'max_rat' is unknown: did you mean max_rate"),
-        (['camera_topic:=/c'], "argument 'camera_topic' is unknown: see the option --show-args"),
+        (['webcam:=/c'], "argument 'webcam' is unknown: see the option --show-args"),
     ],
 )
 @pytest.mark.parametrize('file', [['stavpr_ros', 'x.launch.py'], ['/launch/file.launch.py']])

@@ -216,6 +216,8 @@ class ImageChange:
         :param firsts: first place of each session.
         """
         n = strips.shape[1]
+        if not n:
+            return
         changes = np.empty((APART + 1, n), np.float32)
         for low in range(0, n, LEARNED_AT_ONCE):
             first, high = max(0, low - APART), min(low + LEARNED_AT_ONCE, n)

@@ -14,7 +14,7 @@ import traceback
 from typing import Any
 
 import numpy as np
-from stavpr_msgs.msg import MapInfo
+from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.errors import JournalError, MapFileError, SettingsError, StavprError
 from stavpr_ros.mapping import PlaceMap, verify_map
 from stavpr_ros.mapping.journal import Base
@@ -84,7 +84,7 @@ class Runtime:
         self.camera: CameraInput | None = None
         self._epoch = self._pipeline_epoch = 0
         self._explained: set[str] = set()
-        self.last_header = Header()  # of the last image in the window
+        self.last_match = PlaceMatch()  # published for the last image in the window
         self.loading = self.problem = ''
         self._load_lock = threading.Lock()
         self._navigation = Navigation(node, settings)
@@ -422,7 +422,7 @@ class Runtime:
             self._statistics.dropped(match.cause)
             self._log_cause(match)
             return
-        self.last_header = header
+        self.last_match = message
         place = message.newest_index if match.status is Status.MAPPED else message.place_index
         self._statistics.answered(match.status.name, match.reason, place, message.distance, stages)
 

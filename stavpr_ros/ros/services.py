@@ -126,11 +126,10 @@ class Services:
         def relocalize() -> None:
             # messages are made on the worker: a growing route may evict places before the next
             # call
-            pipeline, header = runtime.pipeline, runtime.last_header
-            match = pipeline.relocalize(count)
-            robot_id = runtime.settings.robot_id
-            response.match = match_message(header, match, pipeline.places, robot_id)
-            candidates = candidates_message(header, match, pipeline.places)
+            match = runtime.pipeline.relocalize(count)
+            response.match = runtime.last_match
+            header = response.match.header
+            candidates = candidates_message(header, match, runtime.pipeline.places)
             response.candidates = candidates.candidates if candidates is not None else []
 
         runtime.worker.run(relocalize)
