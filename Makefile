@@ -94,4 +94,4 @@ distclean: clean ## also remove .venv and the caches of tools
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 development:
-	@$(SETUP) build $(OPTIONS) onnx slam evaluation dev docs
+	@$(SETUP) build $(OPTIONS) onnx faiss slam evaluation dev docs
