@@ -71,7 +71,7 @@ bench bench-quick: override EXTRAS += bench
 bench: build ## measure speed and memory beside lower bounds and peers (ARGS=)
 	@$(RUN) python benchmarks/matching.py $(ARGS)
 
-bench-quick: build ## the same for up to 20,000 places, in about two minutes (ARGS=)
+bench-quick: build ## the same for up to 20,000 places, in two to three minutes (ARGS=)
 	@$(RUN) python benchmarks/matching.py --quick $(ARGS)
 
 accuracy: override EXTRAS += evaluation
