@@ -59,6 +59,8 @@ class Match:
     :param relative: distances are those of mode robust, 1 - probability.
     :param probability: that the nearest sequence is the right place; NaN = unknown (mode paper).
     :param window_stamps: stamps (ns) of the images in the window, oldest first, this one the last.
+    :param window_changes: how much each of them differs from the image before it, 0 = equal; empty
+        in mode paper.
     :param image_index: place of a growing map that this image has become, -1 = none.
     :param inliers: of the geometric verification, -1 = not verified.
     :param candidates: nearest places, nearest first.
@@ -76,6 +78,7 @@ class Match:
     relative: bool = False
     probability: float = math.nan
     window_stamps: tuple[int, ...] = field(default=(), repr=False)
+    window_changes: tuple[float, ...] = field(default=(), repr=False)
     image_index: int = -1
     inliers: int = -1
     candidates: tuple[Candidate, ...] = ()

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frame by frame: distances of the newest image, nearest sequence of the window, status."""
 
+from collections import deque
 from dataclasses import dataclass, field, replace
 import math
 
@@ -113,6 +114,7 @@ class SequenceRecognizer:
         self._search: Search = self._filter or LmDtwSearch(self._buffer)
         self._window = WindowMatch()  # of the newest image
         self._nearest: SequenceMatch | None = None
+        self._changes: deque[float] = deque(maxlen=sequence.length)  # of the window
 
     @property
     def settings(self) -> RecognizerSettings:
@@ -188,6 +190,7 @@ class SequenceRecognizer:
         if self._filter is not None:
             self._filter.reset()
         self._window, self._nearest = WindowMatch(), None
+        self._changes.clear()
 
     def _require_one_image(self, features: LocalFeatures, where: str) -> None:
         features.require_same_settings(self._feature_settings, where)
@@ -209,7 +212,12 @@ class SequenceRecognizer:
         if self._filter is not None:
             change = self._filter.change.next_query(strips.cpu().numpy())
             self._filter.update(row.cpu().numpy(), change)
-        return replace(self._match_window(), window_stamps=self._buffer.stamps)
+            self._changes.append(change)
+        return replace(
+            self._match_window(),
+            window_stamps=self._buffer.stamps,
+            window_changes=tuple(self._changes),
+        )
 
     def _z_normalized(self, row: np.ndarray) -> np.ndarray:
         return z_normalized(row) if self._layout is None else self._layout.z_normalized(row)
