@@ -47,12 +47,12 @@ def find_break(
     :param conflicts: which clusters contradict each other, shape (n, n), bool.
     :param changes: how much the images of stamps (ns) differ from the images before them.
     """
+    queries = np.array([cluster.members[0].query for cluster in clusters], int)
     for session in range(chain.sessions):
         own = [
-            (cluster.members[0].stamp, i)
-            for i, cluster in enumerate(clusters)
-            if chain.session[cluster.members[0].query] == session
-            and cluster.weight >= settings.support
+            (clusters[i].members[0].stamp, i)
+            for i in np.flatnonzero(chain.session[queries] == session).tolist()
+            if clusters[i].weight >= settings.support
         ]
         runs: list[list[int]] = []
         for _, i in sorted(own):

@@ -17,7 +17,7 @@ from stavpr_ros.pose_graph.consistency import (
     grow,
 )
 from stavpr_ros.pose_graph.odometry import ChainSettings, KeyframeChain, OdometryNoise
-from stavpr_ros.pose_graph.sessions import extended, placed, tie, Ties
+from stavpr_ros.pose_graph.sessions import extended, placed, session_pairs, tie, Ties
 from stavpr_ros.pose_graph.solver import CAUCHY, Solver, WIDE
 from stavpr_ros.pose_graph.transforms import body_covariance, inverse, matrices, to_poses
 
@@ -262,13 +262,13 @@ class PoseGraph:
 
     def _select(self, accepted: list[Cluster], ties: Ties) -> dict[int, ResolvedClosure]:
         """Return the edges of the solution by their numbers."""
-        session = self.chain.session
-        chosen: dict[int, ResolvedClosure] = {}
-        for cluster in accepted:
-            edge = cluster.representative
-            if ties.allows(int(session[edge.query]), int(session[edge.place])):
-                chosen |= {each.number: each for each in independent(cluster)}
-        return chosen
+        query, place = session_pairs(self.chain, accepted)
+        return {
+            each.number: each
+            for cluster, a, b in zip(accepted, query, place, strict=True)
+            if ties.allows(a, b)
+            for each in independent(cluster)
+        }
 
     def _far(
         self, edges: dict[int, ResolvedClosure], initial: np.ndarray

@@ -34,6 +34,15 @@ class Ties:
         return a == b or (min(a, b), max(a, b)) in self.joins
 
 
+def session_pairs(
+    chain: KeyframeChain, clusters: Sequence[Cluster]
+) -> tuple[list[int], list[int]]:
+    """Return the sessions of the queries and of the places of clusters."""
+    ends = [(cluster.representative.query, cluster.representative.place) for cluster in clusters]
+    query, place = chain.session[np.array(ends, int).reshape(-1, 2)].T.tolist()
+    return query, place
+
+
 def tie(chain: KeyframeChain, accepted: Sequence[Cluster], least: int) -> Ties:
     """
     Tie the sessions of a graph together.
@@ -42,10 +51,8 @@ def tie(chain: KeyframeChain, accepted: Sequence[Cluster], least: int) -> Ties:
     """
     session = chain.session
     weights: Counter[tuple[int, int]] = Counter()
-    for cluster in accepted:
-        ends = session[cluster.representative.query], session[cluster.representative.place]
-        a, b = sorted(map(int, ends))
-        weights[a, b] += cluster.weight
+    for a, b, cluster in zip(*session_pairs(chain, accepted), accepted, strict=True):
+        weights[min(a, b), max(a, b)] += cluster.weight
     joins = frozenset(pair for pair, w in weights.items() if pair[0] != pair[1] and w >= least)
     anchor = KeyframeChain.FIXED if any(a < 0 for a, _ in joins) else 0
     reached, links = {anchor}, {}
