@@ -190,9 +190,10 @@ class ManagedNode(LifecycleNodeMixin, Node):
         try:
             return change()
         except rclpy_implementation.RCLError as error:
-            self.get_logger().error(
-                f'no transition {requested!r} from state {self.state}: {error}'
-            )
+            if not self._destroyed:  # else the process ends
+                self.get_logger().error(
+                    f'no transition {requested!r} from state {self.state}: {error}'
+                )
             return False
         finally:
             self._in_transition.release()
