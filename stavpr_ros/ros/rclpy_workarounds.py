@@ -182,6 +182,8 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return response
 
     def _guarded(self, requested: str | int, change: Callable[[], bool]) -> bool:
+        if self._destroyed:  # a timer may have been due; the state machine must not be used
+            return False
         if not self._in_transition.acquire(blocking=False):
             self.get_logger().warning(
                 f'transition {requested!r} rejected: another is under way ({self.state})'
@@ -190,10 +192,9 @@ class ManagedNode(LifecycleNodeMixin, Node):
         try:
             return change()
         except rclpy_implementation.RCLError as error:
-            if not self._destroyed:  # else the process ends
-                self.get_logger().error(
-                    f'no transition {requested!r} from state {self.state}: {error}'
-                )
+            self.get_logger().error(
+                f'no transition {requested!r} from state {self.state}: {error}'
+            )
             return False
         finally:
             self._in_transition.release()
