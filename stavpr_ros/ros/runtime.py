@@ -365,11 +365,13 @@ class Runtime:
         self._navigation.publish(header, match, self.pipeline.places, pose, odometry_frame)
         if match.status is Status.NOT_READY and (path := self._maps.path):
             match = replace(match, reason=f'map {path} is being loaded')
-        self._publish(header, match, frames, waited)
-
-    def _publish(self, header: Header, match: Match, frames: PoseFrames, waited: float) -> None:
         began = time.monotonic()
-        self._views.publish(header, match, self.pipeline, frames.frame)
+        self._views.publish(header, match, self.pipeline, frames.frame, pose)
+        self._publish(header, match, frames, waited, began)
+
+    def _publish(
+        self, header: Header, match: Match, frames: PoseFrames, waited: float, began: float
+    ) -> None:
         pair = self.pipeline.matched_pair(match)
         # a match does not wait for PnP
         edge = self._edges.aligned(pair) if pair is not None else None
