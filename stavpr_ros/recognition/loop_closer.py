@@ -13,7 +13,11 @@ from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.match import Match, Status
-from stavpr_ros.recognition.recognizer import RecognizerSettings, SequenceRecognizer
+from stavpr_ros.recognition.recognizer import (
+    position_of,
+    RecognizerSettings,
+    SequenceRecognizer,
+)
 from stavpr_ros.recognition.robust import z_normalized
 from stavpr_ros.recognition.route_features import RouteFeatures
 from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
@@ -86,6 +90,8 @@ class LoopCloser(SequenceRecognizer):
         self._route = RouteFeatures(
             feature_settings, options.mean_centering, options.whitening, limit
         )
+        self._track: list[np.ndarray] = []  # position of each place held
+        self._compare(self._track)
         # stamps of the latest places, not yet old enough in seconds
         self._young: deque[int] = deque()
         self._places = 0  # the newest image may be matched with so many of the oldest places
@@ -118,7 +124,9 @@ class LoopCloser(SequenceRecognizer):
         self._clear_window()
         self._young.clear()
 
-    def update(self, features: LocalFeatures, stamp: int = 0) -> Match:
+    def update(
+        self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
+    ) -> Match:
         """
         Add the next image and match the window that ends with it; places are earlier images.
 
@@ -127,13 +135,16 @@ class LoopCloser(SequenceRecognizer):
         :param features: those of one image, strips (W, 1, d).
         :param stamp: when it was taken, ns; 0 = unknown: it is then excluded by the count of
             images alone.
+        :param pose: by odometry, shape (7,), z is up; None = unknown.
         :raises FeatureMismatchError: made with other settings.
-        :raises InputError: not one image, or features that are not finite.
+        :raises InputError: not one image, features that are not finite, or an invalid pose.
         """
+        position = position_of(pose)
         self._require_one_image(features, 'the route so far')
         self._append(features, stamp)
+        self._track.append(position)
         newest = self._route.newest[:, 0]
-        match = self._match(torch.from_numpy(self._distances()), newest, stamp)
+        match = self._match(torch.from_numpy(self._distances()), newest, stamp, position)
         if match.status is Status.NO_MATCH and match.sequence is None:
             return replace(match, reason='no earlier place is old enough to be matched with')
         return match
@@ -153,6 +164,7 @@ class LoopCloser(SequenceRecognizer):
             evicted = max(1, self._limit // EVICTED)
             for part in (route, *self._parts()):
                 part.evict(evicted)
+            del self._track[:evicted]
             while len(self._young) > route.count:
                 self._young.popleft()
         if route.append(features):

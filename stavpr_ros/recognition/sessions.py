@@ -66,6 +66,11 @@ class SessionLayout:
         place = self._places[column]
         return int(self.columns[self.firsts[np.searchsorted(self.firsts, place, 'right') - 1]])
 
+    def session_of(self, place: int) -> tuple[int, int]:
+        """Return the first place of a place's session, and the first one behind it."""
+        run = self._runs[int(np.searchsorted(self.firsts, place, 'right')) - 1]
+        return int(run.start), int(run.stop)
+
     def summed(self, weights: np.ndarray, close: int) -> np.ndarray:
         """
         Add up probabilities of the same position in several sessions.

@@ -191,8 +191,8 @@ class Runtime:
     def _update_odometry(self) -> None:
         """Subscribe to odometry while it is needed."""
         places, settings = self.pipeline.places, self.settings
-        needed = settings.needs_odometry or (  # edges to places of a map
-            settings.relative_pose in ('auto', 'aligned')
+        needed = settings.needs_odometry or (  # edges to places of a map, and their paths
+            (settings.relative_pose in ('auto', 'aligned') or settings.pipeline.compares_odometry)
             and isinstance(places, PlaceMap)
             and places.has_poses
         )
