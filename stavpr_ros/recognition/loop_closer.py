@@ -81,7 +81,7 @@ class LoopCloser(SequenceRecognizer):
     ) -> None:
         _require_fitting(settings, exclude, limit, exclude_seconds)
         choose_loop_backend(backend, precision)
-        super().__init__(settings, feature_settings, 0)
+        super().__init__(settings, feature_settings, 0, to_oldest=True)
         W = feature_settings.strips
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
         self._band = settings.spatial.band(W)
@@ -90,6 +90,8 @@ class LoopCloser(SequenceRecognizer):
         self._route = RouteFeatures(
             feature_settings, options.mean_centering, options.whitening, limit
         )
+        # of the images of the window: each one had a match as the middle one
+        self._closed: deque[bool] = deque(maxlen=settings.sequence.length)
         self._track: list[np.ndarray] = []  # position of each place held
         self._compare(self._track)
         # stamps of the latest places, not yet old enough in seconds
@@ -123,6 +125,7 @@ class LoopCloser(SequenceRecognizer):
         """
         self._clear_window()
         self._young.clear()
+        self._closed.clear()
 
     def update(
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
@@ -147,7 +150,31 @@ class LoopCloser(SequenceRecognizer):
         match = self._match(torch.from_numpy(self._distances()), newest, stamp, position)
         if match.status is Status.NO_MATCH and match.sequence is None:
             return replace(match, reason='no earlier place is old enough to be matched with')
-        return match
+        return replace(match, late=self._late(match))
+
+    def _late(self, match: Match) -> Match | None:
+        """
+        Return the match of the oldest image, if it had none as the middle one, but is certain now.
+
+        It is a backward pass over the window. Windows without a match have no late one either.
+        """
+        self._closed.append(False)
+        if self._filter is None or not self._buffer.full:
+            return None
+        self._closed[match.position] = match.accepted
+        if self._closed[0] or not match.accepted:
+            return None
+        window = self._filter.at(0, self._settings.nms_radius)
+        nearest = window.nearest
+        if nearest is None or not nearest.distance < match.threshold:
+            return None
+        return replace(
+            match,
+            sequence=nearest,
+            path=window.path,
+            probability=1 - nearest.distance,
+            is_late=True,
+        )
 
     def newest_row(self) -> np.ndarray:
         """

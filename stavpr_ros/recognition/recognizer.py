@@ -105,6 +105,7 @@ class SequenceRecognizer:
     :param feature_settings: how the features are made.
     :param places: number of places n.
     :param layout: of a map of several sessions.
+    :param to_oldest: see :class:`stavpr_ros.recognition.sequence_search.FilterSearch`.
     """
 
     def __init__(
@@ -113,13 +114,16 @@ class SequenceRecognizer:
         feature_settings: FeatureSettings,
         places: int,
         layout: SessionLayout | None = None,
+        to_oldest: bool = False,
     ) -> None:
         options, sequence = settings.applied_options, settings.sequence
         self._settings, self._feature_settings = settings, feature_settings
         self._layout = layout
         columns = places if layout is None else layout.width
         self._buffer = SequenceBuffer(sequence.length, columns, sequence.k)
-        self._filter = FilterSearch(self._buffer, layout=layout) if options.place_filter else None
+        self._filter = None
+        if options.place_filter:
+            self._filter = FilterSearch(self._buffer, layout=layout, to_oldest=to_oldest)
         self._search: Search = self._filter or LmDtwSearch(self._buffer)
         # x and y of each place, or of the places held; empty = unknown
         self._positions: Positions = ()

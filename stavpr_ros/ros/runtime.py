@@ -417,6 +417,9 @@ class Runtime:
         message = self._output.publish(header, match, self.pipeline.places, frames, edge)
         if pair is not None:
             self._put_closure(header, match, frames, pair)
+        late = self.pipeline.matched_pair(match.late) if match.late is not None else None
+        if match.late is not None and late is not None:
+            self._put_closure(header, match.late, frames, late)
         stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
         if match.cause:
             self._statistics.dropped(match.cause)
