@@ -194,8 +194,8 @@ class Runtime:
     def _update_odometry(self) -> None:
         """Subscribe to odometry while it is needed."""
         places, settings = self.pipeline.places, self.settings
-        needed = settings.needs_odometry or (  # edges to places of a map
-            settings.relative_pose in ('auto', 'aligned')
+        needed = settings.needs_odometry or (  # edges to places of a map, and their paths
+            (settings.relative_pose in ('auto', 'aligned') or settings.pipeline.compares_odometry)
             and isinstance(places, PlaceMap)
             and places.has_poses
         )
@@ -378,6 +378,9 @@ class Runtime:
         message = self._output.publish(header, match, self.pipeline.places, frames, edge)
         if pair is not None:
             self._put_closure(header, match, frames, pair)
+        late = self.pipeline.matched_pair(match.late) if match.late is not None else None
+        if match.late is not None and late is not None:
+            self._put_closure(header, match.late, frames, late)
         stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
         if match.cause:
             self._statistics.dropped(match.cause)
