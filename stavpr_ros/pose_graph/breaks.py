@@ -88,7 +88,8 @@ def _locate(
 
     Windows at the break have images of both sides, so that some closures are on the wrong side.
     """
-    last, first = ends[0].members[-1], ends[1].members[0]
+    last = max(ends[0].members, key=lambda each: each.at)
+    first = min(ends[1].members, key=lambda each: each.at)
     session = chain.session[first.query]
     nodes = np.arange(last.query + 1, first.query + 1)
     nodes = nodes[chain.session[nodes] == session]

@@ -58,6 +58,9 @@ class Match:
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
     :param relative: distances are those of mode robust, 1 - probability.
     :param probability: that the nearest sequence is the right place; NaN = unknown (mode paper).
+    :param is_late: the place is that of the oldest image of the window instead of the middle one.
+    :param late: the match of the oldest image, where it had none as the middle one; None = it had,
+        or is not certain now either.
     :param window_stamps: stamps (ns) of the images in the window, oldest first, this one the last.
     :param window_changes: how much each of them differs from the image before it, 0 = equal; empty
         in mode paper.
@@ -77,6 +80,8 @@ class Match:
     path: np.ndarray = field(default_factory=lambda: NO_PATH, repr=False)
     relative: bool = False
     probability: float = math.nan
+    is_late: bool = False
+    late: 'Match | None' = field(default=None, repr=False)
     window_stamps: tuple[int, ...] = field(default=(), repr=False)
     window_changes: tuple[float, ...] = field(default=(), repr=False)
     image_index: int = -1
@@ -95,6 +100,11 @@ class Match:
     def place_index(self) -> int:
         """Return the matched place, the middle of the matched sequence; -1 unless matched."""
         return self.sequence.middle if self.sequence and self.accepted else -1
+
+    @property
+    def position(self) -> int:
+        """Position in the window of the image that the place is of."""
+        return 0 if self.is_late else (len(self.window_stamps) - 1) // 2
 
     @property
     def newest_index(self) -> int:
