@@ -23,7 +23,7 @@ from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord
 from tqdm import tqdm
 
-ODOMETRY, CAMERA_INFO = '/odom', '/camera/camera_info'
+ODOMETRY, CAMERA_INFO = '/odom', '/camera_info'  # beside the topic of the node's images, /image
 RPE_METERS = 50.0
 
 
