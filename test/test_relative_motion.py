@@ -112,7 +112,7 @@ def test_agreement_without_poses_is_unknown():
     assert np.isnan(agreement(track(), (40, 45), np.full((LENGTH, 2), np.nan), MIDDLE, 0.1))
 
 
-def test_look_alike_corridors_are_told_apart_by_their_turns():
+def test_look_alike_corridors_are_distinguished_by_their_turns():
     """Equal images; matched until the corner is in the window, and long not after it."""
     places, query = corridor()
     place_map = map_of(places, track(90))

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mode robust: each option alone, and all on real traverses of other speed, season and view."""
 
-import math
-
 import numpy as np
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
@@ -19,7 +17,6 @@ from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.place_filter import CLOSE
 from stavpr_ros.recognition.robust import (
-    less_alike,
     MeanCentering,
     options_of,
     PAPER,
@@ -49,7 +46,7 @@ def test_robust_options_by_name():
     assert options_of('robust') == ROBUST == RobustOptions()
     assert options_of('paper') == PAPER
     assert not PAPER.any
-    assert RobustOptions.only('place_filter') == RobustOptions(False, False, False, False, True)
+    assert RobustOptions.only('place_filter') == RobustOptions(False, False, False, True)
     assert not ROBUST.without('mean_centering', 'place_filter').mean_centering
     assert ROBUST.without('mean_centering').place_filter
     for wrong in (
@@ -150,19 +147,6 @@ def test_z_normalized_row_has_mean_0_and_deviation_1_of_finite_entries():
     np.testing.assert_allclose(found, expected, atol=1e-5)
     np.testing.assert_array_equal(z_normalized(np.full(3, 0.5, np.float32)), [0, 0, 0])
     assert len(z_normalized(row[:0])) == 0
-
-
-def test_less_alike_adds_what_a_second_place_is_nearer_than_chance():
-    z = np.zeros(100, np.float32)
-    z[30], z[50], z[51] = -5, -4.5, -4  # 50 is around the nearest, 51 elsewhere
-    chance = math.sqrt(2 * math.log(100 / 5))
-    np.testing.assert_allclose(less_alike(z), z + (4 - chance), atol=1e-6)
-    z[51] = -chance + 0.01  # no nearer than chance
-    assert less_alike(z) is not z
-    np.testing.assert_array_equal(less_alike(z), z)
-    assert less_alike(z).dtype == np.float32
-    for few in (z[:0], z[:5], z[20:60]):  # no places elsewhere
-        np.testing.assert_array_equal(less_alike(few), few)
 
 
 def test_z_normalized_around_subtracts_mean_of_neighbors():
