@@ -103,6 +103,20 @@ class CpuMatcher:
                 out[x] = self._without_dtw(queries, x, weights[:, x])
         return torch.from_numpy(out)
 
+    def distances_at(self, strips: torch.Tensor, firsts: np.ndarray, size: int) -> np.ndarray:
+        """
+        Return the distances of one image to chunks of places, strategies with DTW only.
+
+        :param firsts: first place of each chunk, multiples of the kernels' lanes, (m,).
+        :returns: shape (m, size), float32; +inf behind the last place.
+        """
+        out = np.full((len(firsts), size), np.inf, np.float32)
+        tiled = int8.tiled if isinstance(self._map, tuple) else dot.tiled
+        dot.image_distances_at(
+            self._map, tiled(strips[:, None]), self._a, self._band, self.places, firsts, out
+        )
+        return out
+
     def _without_dtw(self, queries: Any, x: int, weights: torch.Tensor) -> np.ndarray:
         """Return the distances of image x without DTW, (n,)."""
         W, n = self._weights.shape

@@ -1,0 +1,144 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A first stage for maps too large to be compared exactly within a time budget.
+
+Every strip of every place is reduced to a few principal components, so that an image is one vector
+of ``BYTES`` bytes. The *coarse* distance of two images is 1 less their largest cosine similarity,
+when one is shifted against the other by whole strips. It is computed for all places. Exact
+distances are computed in chunks of places: those with the smallest coarse distances, those that
+the place filter finds probable after the images so far, and a fixed sample. Mean and deviation of
+the sample scale the coarse distances to exact ones, so that z-normalization, the filter and the
+second best see one row with an entry for every place.
+"""
+
+from collections.abc import Callable
+
+import numba as nb
+import numpy as np
+from stavpr_ros.alignment.cpu import int8
+from stavpr_ros.alignment.cpu.int8 import Int8Strips, TILE
+from stavpr_ros.compilation import parallel_kernel
+from stavpr_ros.features import LocalFeatures
+from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+from stavpr_ros.recognition.int8_features import Int8Features
+from stavpr_ros.recognition.robust import evenly, MIN_DEVIATION, unit_norm
+import torch
+
+BYTES = 128  # of a place, at most
+LEARNED = 2048  # places that the components are learned from
+PIECE = 1024  # places reduced at a time
+CHUNK = 32  # places compared exactly together; a multiple of all LANES
+SAMPLED, NEAREST = 128, 512  # chunks of the sample, and of small coarse distances
+
+
+@parallel_kernel
+def coarse_distances(features, queries, out, nearest):
+    """
+    Smallest distance of a few vectors to each place.
+
+    :param features: of places with one strip, queries: of one image with R strips; see
+        :func:`stavpr_ros.alignment.cpu.int8.block_distances`.
+    :param out: shape (n,), float32, written.
+    :param nearest: shape (chunks,), written: the smallest of each chunk.
+    """
+    n = len(out)
+    for block in nb.prange((n + int8.IMAGES - 1) // int8.IMAGES):
+        first = block * int8.IMAGES
+        count = min(int8.IMAGES, n - first)
+        d = np.empty((queries[1].shape[1], 1, int8.IMAGES), np.float32)
+        int8.block_distances(features, queries, 0, first, count, d)
+        for i in range(1, len(d)):
+            for y in range(count):
+                d[0, 0, y] = min(d[0, 0, y], d[i, 0, y])
+        out[first : first + count] = d[0, 0, :count]
+        for low in range(0, count, CHUNK):
+            nearest[(first + low) // CHUNK] = d[0, 0, low : min(low + CHUNK, count)].min()
+
+
+class FirstStage:
+    """
+    A matcher that compares images with few places exactly, see the module.
+
+    :param matcher: compares with the places exactly, strategy ``adaptive`` or ``vanilla``.
+    :param features: of the places, as the matcher holds them.
+    :param probable: returns the first places of the blocks that the filter finds probable, and
+        how many places each has.
+    """
+
+    def __init__(
+        self,
+        matcher: CpuMatcher,
+        features: LocalFeatures | Int8Features,
+        probable: Callable[[], tuple[np.ndarray, int]],
+    ) -> None:
+        self._matcher, self._probable = matcher, probable
+        W, n, d = features.strips.shape
+        learned = torch.as_tensor(features.strips[:, evenly(n, LEARNED)]).float()
+        _, vectors = torch.linalg.eigh(learned.transpose(1, 2) @ learned)
+        self._basis = vectors[..., -min(d, max(1, BYTES // W)) :]  # (W, d, p)
+        self._reduced = Int8Strips(1, n, W * self._basis.shape[2])
+        for low in range(0, n, PIECE):
+            strips = torch.as_tensor(features.strips[:, low : low + PIECE]).float()
+            self._reduced.write(low, self._flat(self._components(strips)))
+        self._chunks = -(-n // CHUNK)
+        self._sample = evenly(self._chunks, SAMPLED)
+
+    @property
+    def places(self) -> int:
+        """Return the number of places n."""
+        return self._matcher.places
+
+    def _components(self, strips: torch.Tensor) -> torch.Tensor:
+        return unit_norm(strips @ self._basis)
+
+    @staticmethod
+    def _flat(strips: torch.Tensor) -> torch.Tensor:
+        """Return images as one vector each, (1, m, W p)."""
+        return strips.transpose(0, 1).flatten(1)[None].contiguous()
+
+    def distances(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        """Return the distances of one image to every place, (n,); exact ones where they count."""
+        n = self.places
+        out, nearest = np.empty(n, np.float32), np.empty(self._chunks, np.float32)
+        query = int8.tiled(self._shifted(self._components(strips[:, None])[:, 0])[:, None])
+        coarse_distances(self._reduced.kernel_arguments(), query, out, nearest)
+        coarse = self._of_sample(out)
+        chunks = np.union1d(self._sample, self._candidates(nearest))
+        exact = self._matcher.distances_at(strips, chunks * CHUNK, CHUNK)
+        sampled = exact[np.searchsorted(chunks, self._sample)].ravel()
+        sampled = sampled[np.isfinite(sampled)]
+        scale = np.float32(sampled.std() / max(coarse.std(), MIN_DEVIATION))
+        out -= coarse.mean()
+        out *= scale
+        out += sampled.mean()
+        places = (chunks[:, None] * CHUNK + np.arange(CHUNK)).ravel()
+        inside = places < n
+        out[places[inside]] = exact.ravel()[inside]
+        return torch.from_numpy(out)
+
+    def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        """Return the exact distances of Q images to every place, (Q, n)."""
+        return self._matcher.distance_matrix(strips, weights)
+
+    def _of_sample(self, row: np.ndarray) -> np.ndarray:
+        places = (self._sample[:, None] * CHUNK + np.arange(CHUNK)).ravel()
+        return row[places[places < len(row)]]
+
+    def _candidates(self, nearest: np.ndarray) -> np.ndarray:
+        count = min(NEAREST, self._chunks)
+        near = np.argpartition(nearest, count - 1)[:count]
+        firsts, size = self._probable()
+        # a camera that moves on leaves its block by a chunk at most
+        probable = (firsts // CHUNK)[:, None] + np.arange(size // CHUNK + 1)
+        return np.append(near, probable[probable < self._chunks])
+
+    def _shifted(self, strips: torch.Tensor) -> torch.Tensor:
+        """Return an image (W, p) shifted by up to so many strips that one tile has, (m, W p)."""
+        W, p = strips.shape
+        most = min(W - 1, TILE // 2)
+        rows = torch.zeros((2 * most + 1, W, p))
+        for shift in range(-most, most + 1):
+            low, high = max(0, -shift), min(W, W - shift)
+            rows[shift + most, low:high] = strips[low + shift : high + shift]
+        return rows.flatten(1)
