@@ -19,11 +19,11 @@ from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Session
 from stavpr_ros.pipeline import overlay
 from stavpr_ros.recognition import Candidate, Match, Status
 from stavpr_ros.relative_pose.edge import Edge, Source
+from stavpr_ros.ros.map_info import map_info_message
 from stavpr_ros.ros.output import (
     candidates_message,
     image_message,
     loop_closure_message,
-    map_info_message,
     match_message,
     matched_pose_message,
     nanoseconds,

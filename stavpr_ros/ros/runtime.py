@@ -29,10 +29,10 @@ from stavpr_ros.ros.camera import CameraInput
 from stavpr_ros.ros.edges import EdgePublisher
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import END_POLL, ImageInput, InputStatus, STOP_TIMEOUT, Worker
+from stavpr_ros.ros.map_info import map_info_message
 from stavpr_ros.ros.navigation import Navigation
 from stavpr_ros.ros.output import (
     loop_closure_message,
-    map_info_message,
     nanoseconds,
     Output,
     PoseFrames,
