@@ -49,6 +49,7 @@ class PipelineSettings:
     mode: str = 'robust'
     backend: str = 'auto'
     precision: str = 'float32'
+    time_budget_ms: float = 0.0
     model_path: str = ''
     allow_torchscript: bool = False
     features: str = 'gradient'
@@ -95,7 +96,12 @@ class PipelineSettings:
         """Return settings of the recognizer; without a threshold, with one that is not applied."""
         threshold = self.applied_threshold or 1.0
         return RecognizerSettings(
-            threshold, self.spatial, self.sequence, self.nms_radius, self.mode
+            threshold,
+            self.spatial,
+            self.sequence,
+            self.nms_radius,
+            self.mode,
+            time_budget_ms=self.time_budget_ms,
         )
 
     def require_operation(self, operation: str) -> None:

@@ -14,14 +14,13 @@ second best see one row with an entry for every place.
 
 from collections.abc import Callable
 
-import numba as nb
 import numpy as np
 from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.alignment.cpu.int8 import Int8Strips, TILE
-from stavpr_ros.compilation import parallel_kernel
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.int8_features import Int8Features
+from stavpr_ros.recognition.place_filter import BLOCK
 from stavpr_ros.recognition.robust import evenly, MIN_DEVIATION, unit_norm
 import torch
 
@@ -32,45 +31,21 @@ CHUNK = 32  # places compared exactly together; a multiple of all LANES
 SAMPLED, NEAREST = 128, 512  # chunks of the sample, and of small coarse distances
 
 
-@parallel_kernel
-def coarse_distances(features, queries, out, nearest):
-    """
-    Smallest distance of a few vectors to each place.
-
-    :param features: of places with one strip, queries: of one image with R strips; see
-        :func:`stavpr_ros.alignment.cpu.int8.block_distances`.
-    :param out: shape (n,), float32, written.
-    :param nearest: shape (chunks,), written: the smallest of each chunk.
-    """
-    n = len(out)
-    for block in nb.prange((n + int8.IMAGES - 1) // int8.IMAGES):
-        first = block * int8.IMAGES
-        count = min(int8.IMAGES, n - first)
-        d = np.empty((queries[1].shape[1], 1, int8.IMAGES), np.float32)
-        int8.block_distances(features, queries, 0, first, count, d)
-        for i in range(1, len(d)):
-            for y in range(count):
-                d[0, 0, y] = min(d[0, 0, y], d[i, 0, y])
-        out[first : first + count] = d[0, 0, :count]
-        for low in range(0, count, CHUNK):
-            nearest[(first + low) // CHUNK] = d[0, 0, low : min(low + CHUNK, count)].min()
-
-
 class FirstStage:
     """
     A matcher that compares images with few places exactly, see the module.
 
     :param matcher: compares with the places exactly, strategy ``adaptive`` or ``vanilla``.
     :param features: of the places, as the matcher holds them.
-    :param probable: returns the first places of the blocks that the filter finds probable, and
-        how many places each has.
+    :param probable: returns the first places of the blocks of ``BLOCK`` places that the filter
+        finds probable.
     """
 
     def __init__(
         self,
         matcher: CpuMatcher,
         features: LocalFeatures | Int8Features,
-        probable: Callable[[], tuple[np.ndarray, int]],
+        probable: Callable[[], np.ndarray],
     ) -> None:
         self._matcher, self._probable = matcher, probable
         W, n, d = features.strips.shape
@@ -80,7 +55,8 @@ class FirstStage:
         self._reduced = Int8Strips(1, n, W * self._basis.shape[2])
         for low in range(0, n, PIECE):
             strips = torch.as_tensor(features.strips[:, low : low + PIECE]).float()
-            self._reduced.write(low, self._flat(self._components(strips)))
+            reduced = unit_norm(strips @ self._basis).transpose(0, 1).flatten(1)  # (m, W p)
+            self._reduced.write(low, reduced[None].contiguous())
         self._chunks = -(-n // CHUNK)
         self._sample = evenly(self._chunks, SAMPLED)
 
@@ -89,29 +65,20 @@ class FirstStage:
         """Return the number of places n."""
         return self._matcher.places
 
-    def _components(self, strips: torch.Tensor) -> torch.Tensor:
-        return unit_norm(strips @ self._basis)
-
-    @staticmethod
-    def _flat(strips: torch.Tensor) -> torch.Tensor:
-        """Return images as one vector each, (1, m, W p)."""
-        return strips.transpose(0, 1).flatten(1)[None].contiguous()
-
     def distances(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Return the distances of one image to every place, (n,); exact ones where they count."""
         n = self.places
         out, nearest = np.empty(n, np.float32), np.empty(self._chunks, np.float32)
-        query = int8.tiled(self._shifted(self._components(strips[:, None])[:, 0])[:, None])
-        coarse_distances(self._reduced.kernel_arguments(), query, out, nearest)
+        query = int8.tiled(self._shifted(strips)[:, None])
+        int8.smallest_distances(self._reduced.kernel_arguments(), query, CHUNK, out, nearest)
         coarse = self._of_sample(out)
         chunks = np.union1d(self._sample, self._candidates(nearest))
         exact = self._matcher.distances_at(strips, chunks * CHUNK, CHUNK)
         sampled = exact[np.searchsorted(chunks, self._sample)].ravel()
         sampled = sampled[np.isfinite(sampled)]
-        scale = np.float32(sampled.std() / max(coarse.std(), MIN_DEVIATION))
-        out -= coarse.mean()
+        scale = sampled.std() / max(coarse.std(), np.float32(MIN_DEVIATION))
         out *= scale
-        out += sampled.mean()
+        out += sampled.mean() - scale * coarse.mean()
         places = (chunks[:, None] * CHUNK + np.arange(CHUNK)).ravel()
         inside = places < n
         out[places[inside]] = exact.ravel()[inside]
@@ -128,17 +95,22 @@ class FirstStage:
     def _candidates(self, nearest: np.ndarray) -> np.ndarray:
         count = min(NEAREST, self._chunks)
         near = np.argpartition(nearest, count - 1)[:count]
-        firsts, size = self._probable()
         # a camera that moves on leaves its block by a chunk at most
-        probable = (firsts // CHUNK)[:, None] + np.arange(size // CHUNK + 1)
+        probable = (self._probable() // CHUNK)[:, None] + np.arange(BLOCK // CHUNK + 1)
         return np.append(near, probable[probable < self._chunks])
 
     def _shifted(self, strips: torch.Tensor) -> torch.Tensor:
-        """Return an image (W, p) shifted by up to so many strips that one tile has, (m, W p)."""
-        W, p = strips.shape
+        """
+        Return an image, shifted by up to so many strips that one tile has, reduced as places are.
+
+        :param strips: shape (W, d).
+        :returns: shape (shifts, W p).
+        """
+        W, _, p = self._basis.shape
         most = min(W - 1, TILE // 2)
         rows = torch.zeros((2 * most + 1, W, p))
         for shift in range(-most, most + 1):
-            low, high = max(0, -shift), min(W, W - shift)
-            rows[shift + most, low:high] = strips[low + shift : high + shift]
+            places = slice(max(0, -shift), min(W, W - shift))  # strips of a place
+            shifted = strips[places.start + shift : places.stop + shift, None]
+            rows[shift + most, places] = (shifted @ self._basis[places])[:, 0]
         return rows.flatten(1)

@@ -21,10 +21,10 @@ Recognition for Hierarchical Localization", RA-L 2021, with speeds, levels and s
 
 All states advance in one pass over the places, in place and on all lanes. A thread takes
 ``PLACES`` places, from the last to the first ``BLOCK`` of them, since states only move up; the
-last places before its own are copied beforehand. States are not normalized: the factor that makes
-their sum 1 is part of the next image's level changes. The states of a block lie together. Where a state came from in speed travels in
-the lowest two bits of its probability, which no answer depends on; two origins share a byte, those
-of an even speed and of the next.
+last places before its own are copied beforehand. The states of a block lie together. They are not
+normalized: the factor that makes their sum 1 is part of the next image's level changes. Where a
+state came from in speed travels in the lowest two bits of its probability, which no answer depends
+on; two origins share a byte, those of an even speed and of the next.
 """
 
 from collections.abc import Iterable

@@ -244,6 +244,8 @@ class Runtime:
             f'map {path}: {len(places)} places, features {places.settings.kind}, '
             f'{places.settings.strips} strips of {places.dimension} dimensions'
         )
+        if stages := self.pipeline.stages:
+            self._node.get_logger().info(stages)
         # reads all of the file, for seconds: the map is in use meanwhile
         threading.Thread(target=self._verify, args=(path, places), daemon=True).start()
 

@@ -216,7 +216,7 @@ class Int8Strips:
             strips.numpy(), _longest(d), np.float32(MAP_PEAK), first, self.values, self.reciprocals
         )
 
-    def __getitem__(self, index: tuple[slice, slice]) -> torch.Tensor:
+    def __getitem__(self, index: tuple[slice, slice | np.ndarray]) -> torch.Tensor:
         """Return strips of some places, [:, places], float32, of unit norm again."""
         places = np.arange(self.shape[1])[index[1]]
         rounded = self.values[:, places // LANES, :, places % LANES]  # (m, W, quads, QUAD)
@@ -341,3 +341,27 @@ def strip_distances(features, queries, x, d):
         part = np.empty((d.shape[0], d.shape[1], IMAGES), np.float32)
         block_distances(features, queries, x, first, count, part)
         d[:, :, first : first + count] = part[:, :, :count]
+
+
+@parallel_kernel
+def smallest_distances(features, queries, chunk, out, nearest):
+    """
+    Smallest distance of any strip of one image to the one strip of each place.
+
+    :param features, queries: as in :func:`block_distances`; W = 1 and Q = 1.
+    :param chunk: places, a divisor of ``IMAGES``.
+    :param out: shape (n,), written.
+    :param nearest: shape (chunks,), written: the smallest of each chunk.
+    """
+    n = len(out)
+    for block in nb.prange((n + IMAGES - 1) // IMAGES):
+        first = block * IMAGES
+        count = min(IMAGES, n - first)
+        d = np.empty((queries[1].shape[1], 1, IMAGES), np.float32)
+        block_distances(features, queries, 0, first, count, d)
+        for i in range(1, len(d)):
+            for y in range(count):
+                d[0, 0, y] = min(d[0, 0, y], d[i, 0, y])
+        out[first : first + count] = d[0, 0, :count]
+        for low in range(0, count, chunk):
+            nearest[(first + low) // chunk] = d[0, 0, low : min(low + chunk, count)].min()
