@@ -344,6 +344,34 @@ def strip_distances(features, queries, x, d):
 
 
 @parallel_kernel
+def cosine_distances(features, queries, out):
+    """
+    Distances of images that are one vector each (W = 1), equal to those of the other kernels.
+
+    :param features, queries: as in :func:`block_distances`.
+    :param out: shape (Q, m), written; m <= n: only so many places are looked at.
+    """
+    values, reciprocals = features
+    packed, query_reciprocals, query_sums = queries
+    flat, lengths, quads, n = values.reshape(-1), reciprocals[0], values.shape[2], out.shape[1]
+    for block in nb.prange((n + IMAGES - 1) // IMAGES):
+        first = block * IMAGES
+        count = min(IMAGES, n - first)
+        lanes = np.empty(IMAGES, np.float32)
+        for x in range(out.shape[0]):
+            query, one = packed[x].reshape(-1), splat(np.float32(1))
+            for y in range(0, count, LANES):
+                sums = splat(np.int32(0))
+                for t in range(quads):
+                    places = load(flat, (first + y) * quads + t * LANES)
+                    sums = _multiply_add(sums, places, load_splat(query, t * TILE))
+                whole = _total(sums, splat(query_sums[x, 0]))
+                cosine = whole * load(lengths, first + y) * splat(query_reciprocals[x, 0])
+                store(lanes, y, one - cosine)
+            out[x, first : first + count] = lanes[:count]
+
+
+@parallel_kernel
 def smallest_distances(features, queries, chunk, out, nearest):
     """
     Smallest distance of any strip of one image to the one strip of each place.
