@@ -84,6 +84,11 @@ class FirstStage:
         out[places[inside]] = exact.ravel()[inside]
         return torch.from_numpy(out)
 
+    @property
+    def dimension(self) -> int:
+        """Return the number of bytes of a place."""
+        return self._reduced.shape[2]
+
     def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Return the exact distances of Q images to every place, (Q, n)."""
         return self._matcher.distance_matrix(strips, weights)

@@ -359,12 +359,12 @@ def cosine_distances(features, queries, out):
         count = min(IMAGES, n - first)
         lanes = np.empty(IMAGES, np.float32)
         for x in range(out.shape[0]):
-            query, one = packed[x].reshape(-1), splat(np.float32(1))
+            query, one = packed[x, 0, :, 0].copy(), splat(np.float32(1))  # fits into the cache
             for y in range(0, count, LANES):
                 sums = splat(np.int32(0))
                 for t in range(quads):
                     places = load(flat, (first + y) * quads + t * LANES)
-                    sums = _multiply_add(sums, places, load_splat(query, t * TILE))
+                    sums = _multiply_add(sums, places, load_splat(query, t))
                 whole = _total(sums, splat(query_sums[x, 0]))
                 cosine = whole * load(lengths, first + y) * splat(query_reciprocals[x, 0])
                 store(lanes, y, one - cosine)
