@@ -10,6 +10,7 @@ from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping.place_map import Session
 from stavpr_ros.recognition import first_stage, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.first_stage import CHUNK, FirstStage
@@ -117,9 +118,13 @@ def test_distances_of_chunks_end_with_map():
     np.testing.assert_array_equal(found[1], expected[32:64])
 
 
-def recognizer(features, **changes):
+def recognizer(features, sessions=1, **changes):
     n = len(features)
     place_map = PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
+    if sessions > 1:
+        index = (np.arange(n) * sessions // n).astype(np.int32)
+        names = tuple(Session(str(i)) for i in range(sessions))
+        place_map = replace(place_map, sessions=names, session_index=index)
     return PlaceRecognizer(place_map, replace(SETTINGS, **changes))
 
 
@@ -128,11 +133,12 @@ def matches(one, query):
     return [(m.accepted, m.sequence and m.sequence.middle) for m in found]
 
 
-def test_recognizer_over_time_budget_matches_as_exact_one(few):
+@pytest.mark.parametrize('sessions', [1, 3])
+def test_recognizer_over_time_budget_matches_as_exact_one(few, sessions):
     features = random_features(3000)
     query = noisy(features[2000:2040], 1.5)
-    exact = recognizer(features, time_budget_ms=60000)
-    coarse = recognizer(features, time_budget_ms=1e-6)
+    exact = recognizer(features, sessions, time_budget_ms=60000)
+    coarse = recognizer(features, sessions, time_budget_ms=1e-6)
     assert isinstance(coarse._matcher, FirstStage)
     assert isinstance(exact._matcher, CpuMatcher)
     assert 'exact matching takes' in exact.stages
