@@ -194,8 +194,8 @@ class Runtime:
     def _update_odometry(self) -> None:
         """Subscribe to odometry while it is needed."""
         places, settings = self.pipeline.places, self.settings
-        needed = settings.needs_odometry or (  # edges to places of a map
-            settings.relative_pose in ('auto', 'aligned')
+        needed = settings.needs_odometry or (  # edges to places of a map, and their paths
+            (settings.relative_pose in ('auto', 'aligned') or settings.pipeline.compares_odometry)
             and isinstance(places, PlaceMap)
             and places.has_poses
         )
@@ -367,17 +367,22 @@ class Runtime:
         self._navigation.publish(header, match, self.pipeline.places, pose, odometry_frame)
         if match.status is Status.NOT_READY and (path := self._maps.path):
             match = replace(match, reason=f'map {path} is being loaded')
-        self._publish(header, match, frames, waited)
-
-    def _publish(self, header: Header, match: Match, frames: PoseFrames, waited: float) -> None:
         began = time.monotonic()
-        self._views.publish(header, match, self.pipeline, frames.frame)
+        self._views.publish(header, match, self.pipeline, frames.frame, pose)
+        self._publish(header, match, frames, waited, began)
+
+    def _publish(
+        self, header: Header, match: Match, frames: PoseFrames, waited: float, began: float
+    ) -> None:
         pair = self.pipeline.matched_pair(match)
         # a match does not wait for PnP
         edge = self._edges.aligned(pair) if pair is not None else None
         message = self._output.publish(header, match, self.pipeline.places, frames, edge)
         if pair is not None:
             self._put_closure(header, match, frames, pair)
+        late = self.pipeline.matched_pair(match.late) if match.late is not None else None
+        if match.late is not None and late is not None:
+            self._put_closure(header, match.late, frames, late)
         stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
         if match.cause:
             self._statistics.dropped(match.cause)
