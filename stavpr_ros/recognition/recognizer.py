@@ -30,7 +30,6 @@ from stavpr_ros.recognition.relative_motion import Positions, RelativeMotion
 from stavpr_ros.recognition.robust import (
     blocks,
     converted,
-    less_alike,
     MeanCentering,
     options_of,
     RobustOptions,
@@ -270,11 +269,7 @@ class SequenceRecognizer:
         return self._motion.compared(match, self._positions, first, session)
 
     def _z_normalized(self, row: np.ndarray) -> np.ndarray:
-        runs = [slice(None)] if self._layout is None else self._layout.runs
-        z = [z_normalized(row[run]) for run in runs]  # of each session alone
-        if self._settings.applied_options.look_alikes:
-            z = [less_alike(each) for each in z]
-        return z[0] if len(z) == 1 else np.concatenate(z)
+        return z_normalized(row) if self._layout is None else self._layout.z_normalized(row)
 
     def _match_window(self) -> Match:
         threshold, length = self._settings.threshold, self._settings.sequence.length
