@@ -234,6 +234,15 @@ def test_loop_closure_message_of_a_match(places, first_image, has_poses):
     assert message.threshold == pytest.approx(0.3)
 
 
+def test_loop_closure_message_of_a_late_match_is_of_the_oldest_image(places):
+    late = accepted(image_index=59, is_late=True)
+    message = loop_closure_message(HEADER, late, places)
+    assert message.is_late
+    assert (message.query_index, message.query_stamp) == (55, Time(sec=56))
+    assert (message.place_index, message.place_stamp) == (32, Time(sec=33))
+    assert not loop_closure_message(HEADER, replace(late, is_late=False), places).is_late
+
+
 def test_loop_closure_message_on_a_map_has_poses_of_two_frames(places):
     query = np.array([7.0, 8, 0, 0, 0, 0, 1])
     frames = PoseFrames('map', 'base')

@@ -178,7 +178,7 @@ def loop_closure_message(
 
     :param places: the route, whose places the images of the window are, or a map.
     :param frames: of the poses of the places.
-    :param query: pose of the middle image of the window, shape (7,), and its frame; for maps only,
+    :param query: pose of the image that matched, shape (7,), and its frame; for maps only,
         a route has it.
     """
     if not match.accepted or places is None:
@@ -195,7 +195,7 @@ def loop_closure_message(
         )
         for q, m in match.path.tolist()
     ]
-    middle = (len(stamps) - 1) // 2
+    middle = match.position
     query_stamp, place = stamps[middle], places.place(match.place_index)
     if is_route:
         own = places.place(first + middle)
@@ -205,6 +205,7 @@ def loop_closure_message(
         **origin(robot_id, places),
         query_index=first + middle if is_route else -1,
         query_stamp=time_message(query_stamp),
+        is_late=match.is_late,
         place_session=place.session,
         place_index=match.place_index,
         place_stamp=time_message(place.stamp),
