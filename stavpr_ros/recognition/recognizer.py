@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frame by frame: distances of the newest image, nearest sequence of the window, status."""
 
+from collections import deque
 from dataclasses import dataclass, field, replace
 import math
 import time
@@ -145,6 +146,7 @@ class SequenceRecognizer:
         self._motion: RelativeMotion | None = None
         self._window = WindowMatch()  # of the newest image
         self._nearest: SequenceMatch | None = None
+        self._changes: deque[float] = deque(maxlen=sequence.length)  # of the window
 
     @property
     def settings(self) -> RecognizerSettings:
@@ -222,6 +224,7 @@ class SequenceRecognizer:
         if self._motion is not None:
             self._motion.reset()
         self._window, self._nearest = WindowMatch(), None
+        self._changes.clear()
 
     def _require_one_image(self, features: LocalFeatures, where: str) -> None:
         features.require_same_settings(self._feature_settings, where)
@@ -248,9 +251,12 @@ class SequenceRecognizer:
         if self._filter is not None:
             change = self._filter.change.next_query(strips.cpu().numpy())
             self._filter.update(row.cpu().numpy(), change)
+            self._changes.append(change)
         match = self._compared(self._match_window(), position)
         self._nearest = match.sequence
-        return replace(match, window_stamps=self._buffer.stamps)
+        return replace(
+            match, window_stamps=self._buffer.stamps, window_changes=tuple(self._changes)
+        )
 
     def _compare(self, positions: Positions) -> None:
         """Compare matches with odometry, if the settings want it, by the positions of places."""
