@@ -234,15 +234,6 @@ def test_loop_closure_message_of_a_match(places, first_image, has_poses):
     assert message.threshold == pytest.approx(0.3)
 
 
-def test_loop_closure_message_has_changes_of_the_images(places):
-    changes = (1.0, 0.25, 0.5, 0.125, 0.75)
-    match = accepted(image_index=59, window_changes=changes)
-    message = loop_closure_message(HEADER, match, places)
-    assert [pair.query_change for pair in message.pairs] == [changes[q] for q in PATH[:, 0]]
-    plain = loop_closure_message(HEADER, accepted(image_index=59), places)
-    assert np.isnan([pair.query_change for pair in plain.pairs]).all()
-
-
 def test_loop_closure_message_of_a_late_match_is_of_the_oldest_image(places):
     late = accepted(image_index=59, is_late=True)
     message = loop_closure_message(HEADER, late, places)
@@ -250,6 +241,15 @@ def test_loop_closure_message_of_a_late_match_is_of_the_oldest_image(places):
     assert (message.query_index, message.query_stamp) == (55, Time(sec=56))
     assert (message.place_index, message.place_stamp) == (32, Time(sec=33))
     assert not loop_closure_message(HEADER, replace(late, is_late=False), places).is_late
+
+
+def test_loop_closure_message_has_changes_of_the_images(places):
+    changes = (1.0, 0.25, 0.5, 0.125, 0.75)
+    match = accepted(image_index=59, window_changes=changes)
+    message = loop_closure_message(HEADER, match, places)
+    assert [pair.query_change for pair in message.pairs] == [changes[q] for q in PATH[:, 0]]
+    plain = loop_closure_message(HEADER, accepted(image_index=59), places)
+    assert np.isnan([pair.query_change for pair in plain.pairs]).all()
 
 
 def test_loop_closure_message_on_a_map_has_poses_of_two_frames(places):

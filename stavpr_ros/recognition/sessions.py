@@ -17,7 +17,7 @@ from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.match import ranked_candidates
 from stavpr_ros.recognition.place_filter import Belief
-from stavpr_ros.recognition.robust import FilterSettings
+from stavpr_ros.recognition.robust import FilterSettings, z_normalized
 import torch
 
 Sequences = tuple[np.ndarray, np.ndarray]
@@ -39,7 +39,7 @@ class SessionLayout:
         farthest = int(np.ceil(max(FilterSettings().speeds))) + 1  # places from image to image
         self._gap, self._radius = max(farthest, nms_radius) + 1, nms_radius
         self.firsts = firsts
-        self.runs = [slice(*pair) for pair in zip(firsts, [*firsts[1:], n], strict=True)]
+        self._runs = [slice(*pair) for pair in zip(firsts, [*firsts[1:], n], strict=True)]
         run = np.repeat(np.arange(len(firsts)), np.diff(firsts, append=n))
         self.columns = np.arange(n) + run * self._gap
         self.width = n + (len(firsts) - 1) * self._gap
@@ -50,6 +50,10 @@ class SessionLayout:
         is_gap = np.ones(self.width, bool)
         is_gap[self.columns] = False
         self.gaps = np.flatnonzero(is_gap)
+
+    def z_normalized(self, row: np.ndarray) -> np.ndarray:
+        """Return a row with mean 0 and deviation 1 in each session, (n,)."""
+        return np.concatenate([z_normalized(row[run]) for run in self._runs])
 
     def spread(self, row: torch.Tensor) -> torch.Tensor:
         """Return distances to places (n,) as those to columns, (width,)."""
@@ -64,7 +68,7 @@ class SessionLayout:
 
     def session_of(self, place: int) -> tuple[int, int]:
         """Return the first place of a place's session, and the first one behind it."""
-        run = self.runs[int(np.searchsorted(self.firsts, place, 'right')) - 1]
+        run = self._runs[int(np.searchsorted(self.firsts, place, 'right')) - 1]
         return int(run.start), int(run.stop)
 
     def summed(self, weights: np.ndarray, close: int) -> np.ndarray:
