@@ -95,7 +95,11 @@ class SequenceRecognizer:
     :param feature_settings: how the features are made.
     :param places: number of places n.
     :param layout: of a map of several sessions.
+
+    ``problem`` is why places of the map cannot be reached; empty while they can.
     """
+
+    problem = ''
 
     def __init__(
         self,

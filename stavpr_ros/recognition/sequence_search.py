@@ -249,6 +249,15 @@ class ImageChange:
             self._sums[1 : len(changes) + 1] += changes
             self._counts[1 : len(changes) + 1] += 1
 
+    def adopt(self, learned: 'ImageChange', from_before: np.ndarray) -> None:
+        """
+        Take what was learned from a sample, for some places of its map.
+
+        :param from_before: change of each place from the one before, (n,), float32.
+        """
+        self._sums, self._counts = learned._sums, learned._counts
+        self._from_before = from_before
+
     def grow(self, places: int) -> None:
         """Make room for more places."""
         more = np.ones(places - len(self._from_before), np.float32)

@@ -63,8 +63,8 @@ class SessionLayout:
 
     def first_column(self, column: int) -> int:
         """Return the first column of a column's session."""
-        place = self._places[column]
-        return int(self.columns[self.firsts[np.searchsorted(self.firsts, place, 'right') - 1]])
+        firsts = self.columns[self.firsts]
+        return int(firsts[np.searchsorted(firsts, column, 'right') - 1])
 
     def summed(self, weights: np.ndarray, close: int) -> np.ndarray:
         """

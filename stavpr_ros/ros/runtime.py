@@ -244,6 +244,8 @@ class Runtime:
             f'map {path}: {len(places)} places, features {places.settings.kind}, '
             f'{places.settings.strips} strips of {places.dimension} dimensions'
         )
+        if places.partial:
+            return
         # reads all of the file, for seconds: the map is in use meanwhile
         threading.Thread(target=self._verify, args=(path, places), daemon=True).start()
 
@@ -322,7 +324,7 @@ class Runtime:
         pipeline, images, odometry = self.pipeline, self.images, self.odometry
         return replace(
             health,
-            problem=health.problem or self.problem,
+            problem=health.problem or self.problem or pipeline.problem,
             loading=self.loading,
             input=InputStatus() if images is None else images.status(),
             odometry='' if odometry is None else odometry.freshness(),
