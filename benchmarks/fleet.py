@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Recognition on a fleet's map beside exact recognition: Gardens Point among distractors.
+Recognition on a fleet's map beside exact recognition: two real routes among distractors.
 
 The distractors are real images of other places (``DISTRACTORS``) and routes that are generated of
 them: each a walk of 500 places, a mean of the features of two of the traverses, of a random start
@@ -23,9 +23,12 @@ from stavpr_ros.recognition.robust import unit_norm
 from stavpr_ros.sources import open_source
 import torch
 
-MAP, QUERY = 'gardens_point/day_left', 'gardens_point/day_right'
-NIGHT = 'walk_by_night/right_night'
-DISTRACTORS = ('walk_by_night/left_day', 'corridor/ref', 'nordland_64x32/summer', 'tower/floor3')
+ROUTES = {
+    'gardens_point/day_left': ('gardens_point/day_right',),
+    'walk_by_night/left_day': ('walk_by_night/right_night',),
+}
+OFF_THE_MAP = 'tower/floor5'
+DISTRACTORS = ('corridor/ref', 'nordland_64x32/summer')
 ROUTE = 500  # places of a generated route
 TOLERANCE = 2
 SETTINGS = RecognizerSettings(0.5, mode='robust')
@@ -51,68 +54,76 @@ def generated(traverses: list[LocalFeatures], count: int, seed: int = 0) -> Loca
     return LocalFeatures(strips, weights, traverses[0].settings)
 
 
-def city(real: PlaceMap, distractors: list[PlaceMap], count: int) -> PlaceMap:
-    """Return a map of ``count`` places, with the real ones at its middle."""
-    features = [one.features for one in distractors]
-    extra = max(0, count - len(real) - sum(map(len, features)))
-    if extra:
-        features.append(generated(features, extra))
-    others = LocalFeatures.concatenate(features)
-    middle = len(others) // 2
-    parts = [others[:middle], real.features, others[middle:]]
-    return descriptor_map(LocalFeatures.concatenate(parts))
+def city(opened: dict[str, PlaceMap], count: int) -> tuple[PlaceMap, dict[str, int]]:
+    """Return a map of ``count`` places, and the first place of each of ``ROUTES``."""
+    others = [opened[name].features for name in DISTRACTORS]
+    extra = count - sum(len(opened[name]) for name in (*ROUTES, *DISTRACTORS))
+    if extra > 0:
+        others.append(generated(others, extra))
+    distractors = LocalFeatures.concatenate(others)
+    parts, firsts, share = [], {}, len(distractors) // (len(ROUTES) + 1)
+    for i, name in enumerate(ROUTES):
+        parts.append(distractors[i * share : (i + 1) * share])
+        firsts[name] = sum(map(len, parts))
+        parts.append(opened[name].features)
+    parts.append(distractors[len(ROUTES) * share :])
+    return descriptor_map(LocalFeatures.concatenate(parts)), firsts
 
 
-def run(
-    recognizer: PlaceRecognizer | FleetRecognizer, query: LocalFeatures, first: int
-) -> tuple[str, list[float]]:
-    """Drive the query; return precision, recall and accepted images, and ms of each image."""
-    accepted, right, times = 0, 0, []
+def accepted(
+    recognizer: PlaceRecognizer | FleetRecognizer, query: LocalFeatures, times: list[float]
+) -> list[int]:
+    """Drive a query; return the place of each window, -1 = not matched."""
+    recognizer.reset()
+    places = []
     for i in range(len(query)):
         began = time.perf_counter()
         match = recognizer.update(query[i : i + 1])
         times.append((time.perf_counter() - began) * 1e3)
-        if match.accepted and match.sequence is not None:
-            accepted += 1
-            middle = i - (SETTINGS.sequence.length - 1) + (SETTINGS.sequence.length - 1) // 2
-            right += abs(match.sequence.middle - first - middle) <= TOLERANCE
-    windows = len(query) - SETTINGS.sequence.length + 1
-    precision = f'{right / accepted:.3f}' if accepted else '-'
-    return f'{precision} | {right / windows:.3f}', times
+        nearest = match.sequence
+        places.append(nearest.middle if match.accepted and nearest is not None else -1)
+    return places[SETTINGS.sequence.length - 1 :]
+
+
+def run(
+    recognizer: PlaceRecognizer | FleetRecognizer,
+    opened: dict[str, PlaceMap],
+    firsts: dict[str, int],
+) -> str:
+    """Return the cells of a row: precision / recall of each query, images matched off the map."""
+    times: list[float] = []
+    cells = []
+    for name, queries in ROUTES.items():
+        for query in queries:
+            places = np.array(accepted(recognizer, opened[query].features, times))
+            middles = firsts[name] + np.arange(len(places)) + (SETTINGS.sequence.length - 1) // 2
+            right = np.count_nonzero(abs(places - middles) <= TOLERANCE)
+            matched = np.count_nonzero(places >= 0)
+            cells.append(f'{right / max(matched, 1):.3f} / {right / len(places):.3f}')
+    off = accepted(recognizer, opened[OFF_THE_MAP].features, times)
+    cells.append(f'{sum(place >= 0 for place in off)} of {len(off)}')
+    cells.append(f'{np.median(times):.0f} / {np.percentile(times, 99):.0f}')
+    return ' | '.join(cells)
 
 
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--places', type=int, nargs='+', default=[5_000, 20_000])
+    parser.add_argument('--places', type=int, nargs='+', default=[20_000])
     parser.add_argument('--homes', nargs='+', default=['memory', 'faiss', 'qdrant'])
     arguments = parser.parse_args()
     extractor = FeatureExtractor()
+    queries = [query for some in ROUTES.values() for query in some]
     opened = {
         name: build_map(open_source(data_folder() / name), extractor, progress=False)
-        for name in (MAP, QUERY, *DISTRACTORS)
+        for name in (*ROUTES, *queries, OFF_THE_MAP, *DISTRACTORS)
     }
-    distractors = [opened[name] for name in DISTRACTORS]
-    query = opened[QUERY].features
-    print('| places | home | precision | recall | ms, median | ms, 99 % | s, upload |')
-    print('|---|---|---|---|---|---|---|')
+    print(f'| places | home | {" | ".join(queries)} | off the map | ms, p50 / p99 | upload, s |')
+    print(f'|{"---|" * (5 + len(queries))}')
     for places in arguments.places:
-        whole = city(opened[MAP], distractors, places)
-        first = (len(whole) - len(opened[MAP])) // 2
-        first = (
-            int(
-                np.argmax(
-                    [
-                        torch.equal(whole.features.strips[:, i], opened[MAP].features.strips[:, 0])
-                        for i in range(first - 2, first + 3)
-                    ]
-                )
-            )
-            + first
-            - 2
-        )
-        exact = PlaceRecognizer(whole, SETTINGS)
-        _row(places, 'exact', *run(exact, query, first))
+        whole, firsts = city(opened, places)
+        exact = run(PlaceRecognizer(whole, SETTINGS), opened, firsts)
+        print(f'| {places:,} | exact | {exact} | |', flush=True)
         for home in arguments.homes:
             with tempfile.TemporaryDirectory() as folder:
                 began = time.perf_counter()
@@ -123,16 +134,8 @@ def main() -> None:
                     upload(whole, f'{home}:{path}')
                     place_map = open_city_map(f'{home}:{path}')
                 spent = time.perf_counter() - began
-                recognizer = FleetRecognizer(place_map, SETTINGS, patience=60)
-                _row(places, home, *run(recognizer, query, first), spent)
-
-
-def _row(
-    places: int, home: str, numbers: str, times: list[float], spent: float | None = None
-) -> None:
-    middle, high = np.median(times), np.percentile(times, 99)
-    upload_time = '' if spent is None else f'{spent:.1f}'
-    print(f'| {places:,} | {home} | {numbers} | {middle:.0f} | {high:.0f} | {upload_time} |')
+                found = run(FleetRecognizer(place_map, SETTINGS, patience=60), opened, firsts)
+                print(f'| {places:,} | {home} | {found} | {spent:.1f} |', flush=True)
 
 
 if __name__ == '__main__':

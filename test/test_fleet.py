@@ -9,10 +9,14 @@ import subprocess
 import sys
 import threading
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from map_examples import example_map
 import numpy as np
 from pipelines import message, MIN_PROBABILITY, SECOND, settings_of
 import pytest
+from robot import image_message
+from stavpr_msgs.msg import PlaceMatch
+from stavpr_msgs.srv import LoadMap
 import stavpr_ros
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import FleetError, InputError, OutputTakenError, SettingsError
@@ -307,6 +311,38 @@ def test_map_upload_command_and_pipeline_localize(route, small_map, tmp_path, ca
         pipeline.change(operation='mapping')
     with pytest.raises(SettingsError, match='precision int8'):
         pipeline.change(settings_of(precision='int8'), loaded=read_map(address, settings_of()))
+
+
+def test_node_whose_server_is_cut_off_goes_on_and_reports_it(robot, start, route, small_map):
+    server = QdrantServer()
+    upload(small_map, server.address('route'))
+    start(map_path=server.address('route'))
+    assert robot.until_map(state='loaded').places == 60
+    for image in route[10:30]:
+        last = robot.show(image_message(image), SECOND)
+    assert last.status == PlaceMatch.MATCH
+    assert abs(last.newest_index - 29) <= 1
+    assert last.place_id == f'place {last.place_index}'
+    server.close()
+    for image in route[30:45]:
+        last = robot.show(image_message(image), SECOND)
+    assert last.status == PlaceMatch.MATCH
+    assert abs(last.newest_index - 44) <= 1
+
+    def reported():
+        status = robot.diagnostics['map']
+        return status.level == DiagnosticStatus.WARN and 'Qdrant server' in status.message
+
+    robot.until(reported, 'the finding on the map')
+
+
+def test_load_map_service_rejects_addresses(robot, start, server):
+    start()
+    robot.until_map(state='loaded')
+    before = len(server.requests)
+    for name in (server.address('route'), 'faiss:route.stavpr'):
+        assert 'does not exist' in robot.refuses(LoadMap, 'load_map', path=name)
+    assert len(server.requests) == before
 
 
 def test_fleet_is_imported_within_functions_only():
