@@ -132,7 +132,7 @@ def main() -> None:
                         upload(whole, address)
                         place_map = open_city_map(address)
                     spent = time.perf_counter() - began
-                    found = run(FleetRecognizer(place_map, SETTINGS, patience=60), *given)
+                    found = run(FleetRecognizer(place_map, SETTINGS, timeout=60), *given)
                 print(f'| {driven} | {count:,} | {home} | {found} | {spent:.1f} |', flush=True)
 
 

@@ -11,7 +11,7 @@ from test_fleet import CITY, DRIVEN, seen_again, walk
 address, first = sys.argv[1], int(sys.argv[2])
 query = seen_again(walk(CITY)[first : first + DRIVEN])
 recognizer = FleetRecognizer(
-    open_city_map(address), RecognizerSettings(0.5, mode='robust'), patience=60
+    open_city_map(address), RecognizerSettings(0.5, mode='robust'), timeout=60
 )
 accepted = right = 0
 for i in range(DRIVEN):

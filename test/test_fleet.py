@@ -160,7 +160,7 @@ def test_votes_follow_the_speed():
 @pytest.mark.parametrize('home', ['memory', 'faiss'])
 def test_recognizer_in_neighborhoods_matches_as_exact_one(home, city, query, tmp_path):
     exact = drive(PlaceRecognizer(city, SETTINGS), query)
-    recognizer = FleetRecognizer(home_of(city, home, tmp_path, None), SETTINGS, patience=60)
+    recognizer = FleetRecognizer(home_of(city, home, tmp_path, None), SETTINGS, timeout=60)
     found = drive(recognizer, query)
     assert [m.status for m in found[:19]] == [Status.WARMING_UP] * 19
     accepted = [i for i, match in enumerate(exact) if match.accepted]
@@ -183,7 +183,7 @@ def test_recognizer_in_neighborhoods_matches_as_exact_one(home, city, query, tmp
 
 
 def test_recognizer_off_the_map_matches_nothing(city):
-    recognizer = FleetRecognizer(CityMap.of(MemoryStore(city)), SETTINGS, patience=60)
+    recognizer = FleetRecognizer(CityMap.of(MemoryStore(city)), SETTINGS, timeout=60)
     assert not any(match.accepted for match in drive(recognizer, walk(40, seed=9)))
 
 
@@ -206,7 +206,7 @@ class Faulty(MemoryStore):
 
 def test_recognizer_cut_off_goes_on_in_last_neighborhood_and_recovers(city, query):
     store = Faulty(city)
-    recognizer = FleetRecognizer(CityMap.of(store), SETTINGS, patience=60)
+    recognizer = FleetRecognizer(CityMap.of(store), SETTINGS, timeout=60)
     drive(recognizer, query[:40])
     store.cut = True
     cut = drive(recognizer, query[40:50])
@@ -223,17 +223,17 @@ def test_recognizer_cut_off_goes_on_in_last_neighborhood_and_recovers(city, quer
 def test_recognizer_cut_off_from_the_start_publishes_why(city, query):
     store = Faulty(city)
     store.cut = True
-    matches = drive(FleetRecognizer(CityMap.of(store), SETTINGS, patience=60), query[:21])
+    matches = drive(FleetRecognizer(CityMap.of(store), SETTINGS, timeout=60), query[:21])
     assert {match.status for match in matches} == {Status.WARMING_UP, Status.NO_MATCH}
     assert 'cut off' in matches[-1].reason
 
 
 def test_recognizer_does_not_wait_for_a_slow_home(city, query):
     store = Faulty(city)
-    recognizer = FleetRecognizer(CityMap.of(store), SETTINGS, patience=60)
+    recognizer = FleetRecognizer(CityMap.of(store), SETTINGS, timeout=60)
     drive(recognizer, query[:30])
     store.open.clear()
-    recognizer._patience = 0
+    recognizer._timeout = 0
     assert all(match.accepted for match in drive(recognizer, query[30:45]))
     store.open.set()
 

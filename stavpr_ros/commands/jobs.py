@@ -9,6 +9,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 import importlib
 import io
+import logging
 import os
 from pathlib import Path
 import re
@@ -129,7 +130,7 @@ def _on_ray(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, int, str]]
             error
         )
     try:
-        ray.init(address=address, log_to_driver=False, logging_level='error')
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:  # ConnectionError, ValueError, and others
         raise UnavailableError(f'--ray {address}: no cluster there: {error}') from error
     try:

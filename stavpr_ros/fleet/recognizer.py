@@ -51,7 +51,7 @@ NEAREST = 64  # places of an image that vote
 HISTORY = 60  # latest images that the filter runs over again
 LIKELY = 8  # most probable places whose neighborhoods are kept
 LEAST = 1e-3  # their least probability
-PATIENCE = 0.25  # seconds that an image waits for a lookup
+TIMEOUT = 0.25  # seconds that an image waits for a lookup
 
 
 class CityLayout(SessionLayout):
@@ -110,7 +110,7 @@ class FleetRecognizer(SequenceRecognizer):
 
     :param city: the map.
     :param settings: mode robust with all its options.
-    :param patience: seconds that an image waits for the lookup of neighborhoods; it goes on with
+    :param timeout: seconds that an image waits for the lookup of neighborhoods; it goes on with
         those held, and they are used when they have arrived.
     :raises SettingsError: other settings than those of mode robust, or vertical alignment.
 
@@ -118,7 +118,7 @@ class FleetRecognizer(SequenceRecognizer):
     """
 
     def __init__(
-        self, city: CityMap, settings: RecognizerSettings, patience: float = PATIENCE
+        self, city: CityMap, settings: RecognizerSettings, timeout: float = TIMEOUT
     ) -> None:
         if settings.applied_options != ROBUST or settings.spatial.vertical:
             raise SettingsError(
@@ -126,7 +126,7 @@ class FleetRecognizer(SequenceRecognizer):
                 'is matched in mode robust, without vertical alignment'
             )
         super().__init__(settings, city.settings, 0)
-        self._city, self._patience = city, patience
+        self._city, self._timeout = city, timeout
         index = city.store.index
         self._centering = index.centering()
         sample, places = index.sample.features, sample_places(index.places)
@@ -242,7 +242,7 @@ class FleetRecognizer(SequenceRecognizer):
             self._pending = call_on_thread(
                 lambda: self._look_up(asked, votes, held, likely), 'neighborhoods'
             )
-            wait([self._pending], 0 if self.problem else self._patience)
+            wait([self._pending], 0 if self.problem else self._timeout)
         if not self._pending.done():
             return False
         pending, self._pending = self._pending, None

@@ -205,18 +205,28 @@ class SequenceRecognizer:
 
         :param strips: the image's features, centered, shape (W, d).
         """
+        on_device = self._filter is not None and self._filter.on_device
         if self._settings.applied_options.query_znorm:
-            row = torch.from_numpy(self._z_normalized(row.cpu().numpy()))
+            row = self._z_normalized_on(row) if on_device else self._z_normalized_here(row)
         if self._layout is not None:
             row = self._layout.spread(row)
         self._buffer.push(row.to(self._buffer.memory.device), stamp)
         if self._filter is not None:
             change = self._filter.change.next_query(strips.cpu().numpy())
-            self._filter.update(row.cpu().numpy(), change)
+            self._filter.update(row if on_device else row.cpu().numpy(), change)
         return replace(self._match_window(), window_stamps=self._buffer.stamps)
 
     def _z_normalized(self, row: np.ndarray) -> np.ndarray:
         return z_normalized(row) if self._layout is None else self._layout.z_normalized(row)
+
+    def _z_normalized_here(self, row: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(self._z_normalized(row.cpu().numpy()))
+
+    def _z_normalized_on(self, row: torch.Tensor) -> torch.Tensor:
+        from stavpr_ros.recognition.cuda_filter import z_normalized_on_device
+
+        runs = [slice(None)] if self._layout is None else self._layout.runs
+        return torch.cat([z_normalized_on_device(row[run]) for run in runs])
 
     def _match_window(self) -> Match:
         threshold, length = self._settings.threshold, self._settings.sequence.length
@@ -255,8 +265,8 @@ class PlaceRecognizer(SequenceRecognizer):
 
     :param place_map: the reference map.
     :param settings: see :class:`RecognizerSettings`.
-    :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``. In mode robust, image
-        distances are computed there and sequences on the CPU.
+    :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``. On ``cuda``, mode robust
+        requires its place filter; of other options, LM-DTW runs on the CPU.
     :param precision: of the map's features in the matcher, ``float32``, ``float16`` or ``int8``;
         see :func:`stavpr_ros.recognition.matcher.make_matcher`.
     :raises UnavailableError: no such backend here.
@@ -288,11 +298,23 @@ class PlaceRecognizer(SequenceRecognizer):
         if self._filter is not None:
             firsts = (0,) if layout is None else layout.firsts
             self._filter.change.learn(held.strips, firsts)
+        if backend == 'cuda' and self._filter is not None:
+            self._match_on_device(self._filter)
         if backend == 'cuda' and not options.any:
             from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
             search = CudaLmDtwSearch(self._buffer.places, settings.sequence)
             self._search, self._buffer = search, search.buffer
+
+    def _match_on_device(self, search: FilterSearch) -> None:
+        from stavpr_ros.alignment.cuda.compilation import runtime
+
+        sequence, places = self._settings.sequence, self._buffer.places
+        device = runtime().torch_device
+        self._buffer = SequenceBuffer(sequence.length, places, sequence.k, device=device)
+        self._filter = FilterSearch(self._buffer, layout=self._layout, on_device=True)
+        self._filter.change = search.change
+        self._search = self._filter
 
     def _held(self, features: LocalFeatures, precision: str) -> LocalFeatures | Int8Features:
         """Return the features for the matcher, in memory once; those of a map are not copied."""

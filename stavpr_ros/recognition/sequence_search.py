@@ -11,6 +11,7 @@ places in between is learned from the map, so that the query's changes show how 
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -330,6 +331,7 @@ class FilterSearch:
 
     :param buffer: the window.
     :param layout: of the places of several sessions in the columns of the buffer.
+    :param on_device: the filter is computed on the CUDA device where the buffer is.
     """
 
     def __init__(
@@ -337,14 +339,21 @@ class FilterSearch:
         buffer: SequenceBuffer,
         settings: FilterSettings | None = None,
         layout: SessionLayout | None = None,
+        on_device: bool = False,
     ) -> None:
-        self.buffer, self._layout = buffer, layout
+        self.buffer, self._layout, self.on_device = buffer, layout, on_device
         settings = settings or FilterSettings()
         self._middle = (buffer.length - 1) // 2
         gaps, places = None, buffer.places
         if layout is not None:
             gaps, places = layout.gaps, len(layout.columns)
-        self.filter = PlaceFilter(buffer.places, buffer.length - 1 - self._middle, settings, gaps)
+        filter_class: Any = PlaceFilter
+        if on_device:
+            from stavpr_ros.recognition.cuda_filter import CudaPlaceFilter
+
+            filter_class = CudaPlaceFilter
+        lag = buffer.length - 1 - self._middle
+        self.filter = filter_class(buffer.places, lag, settings, gaps)
         self.change = ImageChange(places, settings)
         self._speeds = settings.speeds
         self._images: deque[int] = deque(maxlen=buffer.length)  # the filter's image of each
@@ -365,14 +374,14 @@ class FilterSearch:
         self.filter.evict(count)
         self.change.evict(count)
 
-    def update(self, z: np.ndarray, change: float) -> None:
+    def update(self, z: np.ndarray | torch.Tensor, change: float) -> None:
         """
         Advance by an image.
 
         An image of a camera that stands adds nothing. Where the map's own images are equal, in a
         dark tunnel, it may move: the filter goes on at its speed, without evidence.
 
-        :param z: z-normalized distances to the places, (m,), float32.
+        :param z: z-normalized distances to the places, (m,), float32; on the filter's device.
         :param change: of the image, from :class:`ImageChange`.
         """
         if not (self.filter.count and self.change.is_standstill(change)):
