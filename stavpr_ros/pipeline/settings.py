@@ -152,14 +152,12 @@ class PipelineSettings:
         if operation == 'mapping':
             return stages
         matching = self.matching_backend(operation)
-        # mode robust matches sequences on the CPU only
-        sequences = 'cpu' if options_of(self.mode).any else matching
         held = self.precision
         if held == 'int8' and matching == 'cpu':
             from stavpr_ros.alignment.cpu.int8 import INSTRUCTION
 
             held = f'int8, {INSTRUCTION} kernel'
-        return f'{stages}, image distances on {matching} ({held}), sequences on {sequences}'
+        return f'{stages}, image distances on {matching} ({held}), sequences on {matching}'
 
     def extractor(self) -> FeatureExtractor:
         """
