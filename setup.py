@@ -27,6 +27,7 @@ EXECUTABLES = (
     'record',
     'monitor',
     'pose_graph',
+    'bridge',
     'evaluate',
     'experiments',
 )

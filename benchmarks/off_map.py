@@ -19,7 +19,8 @@ from typing import Any
 from accuracy import extractors, FEATURES, long_cases, short_cases
 from data import data_folder, NoDataError
 import numpy as np
-from results import environment, heading, RESULTS, ROOT, table
+from off_map_page import DAY, markdown, NIGHT, Results, summary_section
+from results import environment, RESULTS, ROOT
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.evaluation.calibration import calibrate
 from stavpr_ros.evaluation.drive import DriveChanges
@@ -41,12 +42,10 @@ STEP, LONG_STEP = 10, 100  # places from one removed stretch to the next
 BEFORE, AFTER = 80, 60  # images driven around the removed stretch of a long route
 COARSER = 4  # of --quick: so many times coarser steps, every fourth pair of floors
 START_IMAGES, SMALL_MAP = 30, 40
-DAY, NIGHT, TOWER = 'gardens_point', 'walk_night', 'tower'
+TOWER = 'tower'
 WARPED = (DAY, 'walk_day', NIGHT, 'walk_night_map')
 SETS = (*WARPED, 'corridor', 'nordland', TOWER)
 CHANGES = ('same', '0.5x', 'varying', '2x', '3x', 'stop 30', 'stop 100', 'drop 0.3')
-LEVEL = 0.95  # declared probability whose precision the summary gives
-Results = dict[str, dict[str, Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,201 +320,6 @@ class Measurement:
             pooled = Outcome.pooled(self.driven + self.left)
             self.add('calibration', 'with detours and floors', pooled.calibration())
         return self.rows
-
-
-# ------------------------------------------------ the table
-
-
-def percent(part: float, whole: float) -> str:
-    """Return a share with the counts."""
-    return f'{part / whole:.1%} of {whole:,}' if whole else '-'
-
-
-def _rows(results: Results, section: str) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    for key, values in results.items():
-        head, feature, name = key.split('/', 2)
-        if head == section:
-            yield feature, name, values
-
-
-def summary(results: Results, feature: str) -> dict[str, tuple[str, str]]:
-    """Return value and aim of each row of the summary, for one kind of features."""
-
-    def of(section: str) -> dict[str, dict[str, Any]]:
-        return {name: v for f, name, v in _rows(results, section) if f == feature}
-
-    def total(rows: dict[str, dict[str, Any]], name: str) -> int:
-        return sum(row[name] for row in rows.values())
-
-    g = feature == 'g'
-    found: dict[str, tuple[str, str]] = {}
-    left, driven, reverse = of('detours'), of('drives'), of('reverse')
-    single = {k: v for k, v in driven.items() if not k.endswith('/all')}
-    if left:
-        text = percent(total(left, 'unseen_matched'), total(left, 'unseen'))
-        found['detours: unseen images matched'] = text, '<= 2 %' if g else '<= 3 %'
-    for row in of('floors').values():
-        text = f'{percent(row["matched"], row["images"])} (worst pair {row["worst"]:.1%})'
-        found['other floors: images matched'] = text, '<= 1 %' if g else '<= 2 %'
-
-    def best(label: str, names: Sequence[str], aim: float, value: str = 'f1') -> None:
-        values = [driven[name][value] for name in names if name in driven]
-        if values:
-            found[label] = f'{min(values):.3f}', f'>= {aim}'
-
-    best('day / night: best F1', [f'{NIGHT}/same'], 0.97 if g else 0.99)
-    slow = [f'{NIGHT}/0.5x', f'{NIGHT}/varying']
-    best('day / night at half and varying speed: lowest best F1', slow, 0.9 if g else 0.95)
-    best('three times the speed by day: best F1', [f'{DAY}/3x'], 0.95)
-    best('4.5 times the speed (Nordland): best F1', ['nordland/4.5x'], 0.95)
-    if single:
-        worst = min(single, key=lambda name: single[name]['precision'])
-        text = f'{single[worst]["precision"]:.3f} ({worst})'
-        found['lowest precision at the default'] = text, '>= 0.95'
-    if reverse:
-        text = percent(total(reverse, 'wrong'), total(reverse, 'images'))
-        found['reverse order: images matched wrongly'] = text, '<= 3 %'
-    label, value = 'recall at 100 % precision, all speeds', 'recall_at_100_precision'
-    best(f'{label}, by day', [f'{DAY}/all'], 0.9 if g else 0.95, value)
-    best(f'{label}, day / night', [f'{NIGHT}/all'], 0.7 if g else 0.9, value)
-    begun = of('start')
-    if begun:
-        right = percent(total(begun, 'right'), total(begun, 'starts'))
-        longest = max((row['longest'] or 0 for row in begun.values()), default=0)
-        text = f'{right}; at most {longest} images'
-        found['start in the middle: right within 30 images'] = text, f'{25 if g else 20} images'
-    for name, row in of('calibration').items():
-        if row['images']:
-            text = f'{row["expected_calibration_error"]:.3f}'
-            found[f'calibration: expected error, {name}'] = text, ''
-            for level in row['levels']:
-                if level['probability'] == LEVEL and level['matched']:
-                    label = f'precision where {LEVEL} or more is declared, {name}'
-                    found[label] = f'{level["precision"]:.3f}', '>= 0.93'
-    return found
-
-
-def summary_section(results: Results) -> list[str]:
-    """Return the summary: a row a question, a column a kind of features."""
-    features = sorted({key.split('/')[1] for key in results}, key=list(FEATURES).index)
-    columns = {feature: summary(results, feature) for feature in features}
-    labels = list(dict.fromkeys(label for column in columns.values() for label in column))
-    lines = []
-    for label in labels:
-        cells = [columns[feature].get(label, ('-', '')) for feature in features]
-        lines.append([label, *(text for cell in cells for text in cell)])
-    head = [title for feature in features for title in (FEATURES[feature], 'wanted')]
-    return table(['', *head], lines)
-
-
-def _drive_cells(row: dict[str, Any]) -> list[str]:
-    names = ('f1', 'precision', 'recall', 'recall_at_100_precision')
-    return [f'{row["images"]:,}', *(f'{row[name]:.3f}' for name in names)]
-
-
-def _detour_cells(row: dict[str, Any]) -> list[str]:
-    shares = [percent(row['unseen_matched'], row['unseen']), f'{row["worst"]:.1%}']
-    return [str(row['positions']), *shares, f'{row["precision"]:.3f}', f'{row["recall"]:.3f}']
-
-
-def _floor_cells(row: dict[str, Any]) -> list[str]:
-    worst = f'{row["worst"]:.1%} ({row["worst_pair"]})'
-    return [str(row['pairs']), percent(row['matched'], row['images']), worst]
-
-
-def _reverse_cells(row: dict[str, Any]) -> list[str]:
-    wrong = percent(row['wrong'], row['images'])
-    return [str(row['matched']), wrong, f'{row["precision"]:.3f}']
-
-
-def _start_cells(row: dict[str, Any]) -> list[str]:
-    counts = ['-' if row[name] is None else f'{row[name]:g}' for name in ('median', 'longest')]
-    return [str(row['starts']), str(row['right']), *counts]
-
-
-SECTIONS: tuple[tuple[str, str, str, tuple[str, ...], Callable[..., list[str]]], ...] = (
-    (
-        'detours',
-        'Detours: a stretch is missing in the map',
-        'The map is made without a stretch, which the query drives all the same; all positions of '
-        'the stretch (steps of 10 places, Nordland 100) are pooled. Unseen are images more than 5 '
-        'places from each place of the map. Precision counts all matches, recall the images '
-        'whose place the map has.',
-        (
-            'map and query / places removed',
-            'positions',
-            'unseen images matched',
-            'worst position',
-            'precision',
-            'recall',
-        ),
-        _detour_cells,
-    ),
-    (
-        'floors',
-        'Floors on maps of other floors',
-        'Eight floors of a building that look alike; every match is wrong.',
-        ('data set', 'pairs', 'images matched', 'worst pair'),
-        _floor_cells,
-    ),
-    (
-        'drives',
-        'Drives at other speeds, with stops and dropped images',
-        'Half speed shows every image twice; "stop" repeats the image in the middle so many '
-        'times; "drop" leaves images out with this probability; "all" pools the rows above it. '
-        'Best F1 is over all thresholds, P and R are those of the default.',
-        ('map and query / change', 'images', 'best F1', 'P', 'R', 'R at 100 % P'),
-        _drive_cells,
-    ),
-    (
-        'reverse',
-        'The route in reverse order',
-        'The images of the query, the last one first: places are right, the direction is not.',
-        ('map and query', 'matched', 'wrong', 'precision'),
-        _reverse_cells,
-    ),
-    (
-        'start',
-        'Start in the middle',
-        'Thirty images from a start on the route, with an empty window; images until the first '
-        'match is right (a window has 20). The small map has the places around the start.',
-        ('map and query / map', 'starts', 'with a right match', 'median images', 'most images'),
-        _start_cells,
-    ),
-)
-
-
-def calibration_section(results: Results) -> list[str]:
-    """Return the tables of declared probabilities."""
-    lines = []
-    for feature, name, values in _rows(results, 'calibration'):
-        for row in values['bins']:
-            cells = [f'{row["from"]:.1f} - {row["to"]:.1f}', f'{row["images"]:,}']
-            cells += [f'{row[key]:.3f}' for key in ('declared', 'right')]
-            lines.append([FEATURES[feature], name, *cells])
-    text = 'Probabilities that the best place of an image is right, beside the share that is.'
-    head = ('features', 'images of', 'declared', 'images', 'mean', 'right')
-    return ['## Calibration', '', text, '', *table(head, lines)]
-
-
-def markdown(about: dict[str, Any], results: Results) -> list[str]:
-    """Return the lines of the page."""
-    steps, coarse = about.get('steps', 1), []
-    if steps > 1:
-        coarse = [f'Steps between positions are {steps} times as coarse as below.', '']
-    lines = [
-        *heading('Off the map, at night, at other speeds', about),
-        'Mode robust with its defaults on all data sets, by `make off-map`. '
-        'Data sets: benchmarks/README.md; the method: [robust mode](robust_mode.md).',
-        '',
-        *coarse,
-        *summary_section(results),
-    ]
-    for section, title, text, head, cells in SECTIONS:
-        rows = [[FEATURES[f], name, *cells(row)] for f, name, row in _rows(results, section)]
-        if rows:
-            lines += [f'## {title}', '', text, '', *table(('features', *head), rows)]
-    return [*lines, *calibration_section(results)]
 
 
 def opened(

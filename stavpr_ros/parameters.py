@@ -263,6 +263,14 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             (8, 100000),
         ),
         NodeParameter(
+            'odometry_error',
+            0.1,
+            'Mode robust: error of a distance by odometry, as a share of it. Matches whose path '
+            'disagrees with the odometry become less probable, where the places have poses in '
+            'meters, z up; 0 = never.',
+            bounds=(0.0, 1.0),
+        ),
+        NodeParameter(
             'exclude_seconds',
             0.0,
             'loop_closure: minimum age of the places that are compared, in addition to '

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Signal handling of every executable."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import os
 import signal
@@ -37,6 +37,20 @@ def obey_signals() -> None:
     """
     signal.signal(signal.SIGINT, _on_signal)
     signal.signal(signal.SIGTERM, _on_signal)
+
+
+def run_until_signal(run: Callable[[], int]) -> int:
+    """Return the exit code of ``run``; a signal ends the process when ``run`` has cleaned up."""
+    obey_signals()
+    code = 0
+    try:
+        code = run()
+    except BaseException:  # an interrupt inside a foreign library may be raised as another one
+        if not interrupted():
+            raise
+    if interrupted():
+        end_process(code)
+    return code
 
 
 def interrupted() -> bool:

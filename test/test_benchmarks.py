@@ -23,6 +23,7 @@ import lower_bounds as bounds
 import matching
 import memory
 import off_map
+import off_map_page
 import peaks
 import report
 import results
@@ -345,7 +346,7 @@ def test_table_of_synthetic_route_has_every_section(route, monkeypatch):
     assert (floors['pairs'], floors['images']) == (2, 120)
     assert floors['matched'] >= 100  # the same place under another name
     about = results.environment(named_commit='abc')
-    text = '\n'.join(off_map.markdown(about, json.loads(json.dumps(rows, allow_nan=False))))
+    text = '\n'.join(off_map_page.markdown(about, json.loads(json.dumps(rows, allow_nan=False))))
     for title in ('Detours', 'Floors', 'Drives', 'The route in reverse', 'Start', 'Calibration'):
         assert f'## {title}' in text
     assert (

@@ -84,14 +84,14 @@ def test_build_journal_memory_does_not_grow_with_the_places(tmp_path):
     n, d, memory = 20_000, 224, []
     image = np.zeros((96, 128, 3), np.uint8)
 
-    def anonymous():
+    def resident():
         with open('/proc/self/status') as file:
-            return int(re.search(r'RssAnon:\s+(\d+) kB', file.read())[1]) / 1e3
+            return int(re.search(r'VmRSS:\s+(\d+) kB', file.read())[1]) / 1e3
 
     def frames():
         for i in range(n):
             if i % 1000 == 0:
-                memory.append(anonymous())
+                memory.append(resident())
             yield Frame(image, i, f'{i}')
 
     class Extractor(SimpleNamespace):
@@ -102,11 +102,13 @@ def test_build_journal_memory_does_not_grow_with_the_places(tmp_path):
 
     extractor = Extractor(settings=EXTRACTOR.settings, projection=None)
     journal = build_journal(frames(), extractor, tmp_path / 'x', 'drive', progress=False)
-    memory.append(anonymous())
+    memory.append(resident())
     place_map = journal_map(journal)
-    memory.append(anonymous())
+    memory.append(resident())
+    save_map(place_map, tmp_path / 'map.stavpr')
+    memory.append(resident())
     assert len(place_map) == n
-    assert max(memory) - memory[1] < 40
+    assert max(memory) - memory[1] < 60
 
 
 def test_recover_map_of_an_interrupted_build_has_the_places_so_far(frames, tmp_path, capsys):

@@ -316,8 +316,9 @@ def test_demo_of_loop_closure_reports_closures(run, tmp_path):
     assert [i for i, match in enumerate(records) if match['status'] == 'SKIPPED'] == [36]
     lines = (output / 'loop_closures.jsonl').read_text().splitlines()
     closures = [json.loads(line) for line in lines]
-    assert len(closures) == sum(match['status'] == 'MATCH' for match in records) > 20
-    last = closures[-1]
+    on_time = [closure for closure in closures if not closure['is_late']]
+    assert len(on_time) == sum(match['status'] == 'MATCH' for match in records) > 20
+    last = on_time[-1]
     assert (last['query_index'], last['place_index']) == (67, 31)  # the fourth of 64 to 71
     assert [pair[0] - pair[2] for pair in last['pairs']] == [36] * len(last['pairs'])
     assert last['query_pose'] is None

@@ -12,7 +12,7 @@ from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
 from stavpr_ros.alignment.spatial import adaptive_weights
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.recognition import RecognizerSettings, Status
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import (
     AROUND,
     choose_loop_backend,
@@ -291,6 +291,56 @@ def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
             middle = first + int(near[np.argmax(probabilities)])
             assert answer.place_index == pytest.approx(middle, abs=2)
     assert first > 0
+
+
+def test_late_matches_close_what_was_not_certain_at_first():
+    """
+    A second lap in bad light, where evidence grows slowly.
+
+    Each late match is that of a filter which is read at the oldest image, and none of an image
+    that had one before.
+    """
+    length, lap, exclude = 20, 60, 20
+    strips = laps_of(2 * lap, lap).strips.numpy()
+    rng = np.random.default_rng(1)
+    strips[:, lap:] += 0.5 * rng.standard_normal(strips[:, lap:].shape).astype(np.float32)
+    strips /= np.maximum(np.linalg.norm(strips, axis=2, keepdims=True), 1e-12)
+    features = features_of(torch.from_numpy(strips))
+    settings = RecognizerSettings(
+        THRESHOLD, sequence=SequenceSettings(length), nms_radius=5, mode='robust'
+    )
+    closer = LoopCloser(settings, exclude, features.settings)
+    middle, closed, late = (length - 1) // 2, set(), {}
+    for i in range(len(features)):
+        match = closer.update(features[i : i + 1])
+        if match.accepted:
+            closed.add(i - (length - 1) + middle)
+        if match.late is None:
+            continue
+        found, oldest = match.late, i - (length - 1)
+        assert match.accepted
+        assert (found.status, found.is_late) == (Status.MATCH, True)
+        assert (match.position, found.position) == (middle, 0)
+        assert oldest not in closed
+        assert abs(int(found.path[0, 1]) - found.place_index) <= CLOSE
+        late[oldest] = found.place_index
+        state = closer._filter
+        belief = state.filter.belief(state.buffer.known, length - 1)
+        assert found.probability == pytest.approx(
+            belief.probabilities(state.buffer.known)[1].max()
+        )
+    assert len(late) >= 5
+    assert all(abs(query - lap - place) <= CLOSE for query, place in late.items())
+    closer.reset()
+    again = drive(closer, features[: length - 1])  # no window is full
+    assert all(match.late is None for match in again)
+
+
+def test_mode_paper_and_localization_have_no_late_matches(laps, small_map):
+    paper = LoopCloser(RecognizerSettings(10.0, sequence=SHORT), 12, laps.settings)
+    assert all(match.late is None for match in drive(paper, laps[:150]))
+    localizer = PlaceRecognizer(small_map, RecognizerSettings(THRESHOLD, mode='robust'))
+    assert {match.late for match in drive(localizer, small_map.features)} == {None}
 
 
 def test_loop_closer_closes_no_loop_within_another_light():

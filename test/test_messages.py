@@ -19,11 +19,11 @@ from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Session
 from stavpr_ros.pipeline import overlay
 from stavpr_ros.recognition import Candidate, Match, Status
 from stavpr_ros.relative_pose.edge import Edge, Source
+from stavpr_ros.ros.map_info import map_info_message
 from stavpr_ros.ros.output import (
     candidates_message,
     image_message,
     loop_closure_message,
-    map_info_message,
     match_message,
     matched_pose_message,
     nanoseconds,
@@ -232,6 +232,15 @@ def test_loop_closure_message_of_a_match(places, first_image, has_poses):
     message.relative_pose = expected.relative_pose
     assert message == expected
     assert message.threshold == pytest.approx(0.3)
+
+
+def test_loop_closure_message_of_a_late_match_is_of_the_oldest_image(places):
+    late = accepted(image_index=59, is_late=True)
+    message = loop_closure_message(HEADER, late, places)
+    assert message.is_late
+    assert (message.query_index, message.query_stamp) == (55, Time(sec=56))
+    assert (message.place_index, message.place_stamp) == (32, Time(sec=33))
+    assert not loop_closure_message(HEADER, replace(late, is_late=False), places).is_late
 
 
 def test_loop_closure_message_on_a_map_has_poses_of_two_frames(places):

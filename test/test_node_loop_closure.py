@@ -26,7 +26,7 @@ def x_of(i):
 
 @pytest.fixture
 def laps(robot, start):
-    """Two laps and a half: matches, loop closures by their last image, stamps."""
+    """Two laps and a half: matches, loop closures by last image and is_late, stamps."""
     closures = robot.listen(LoopClosure, '/stavpr/loop_closure', 1000)
     poses = robot.listen(PoseWithCovarianceStamped, '/stavpr/pose')
     start(operation='loop_closure', map_path='', exclude_places=EXCLUDED, keyframe_distance=0.001)
@@ -38,10 +38,13 @@ def laps(robot, start):
         matches.append(robot.show(image) if i in BLIND else robot.show_at(x_of(i), image))
         stamps.append(robot.stamp)
     count = sum(match.status == PlaceMatch.MATCH for match in matches)
-    robot.until(lambda: len(closures) >= count, 'a loop closure for each match')
+    robot.until(
+        lambda: sum(not each.is_late for each in closures) >= count,
+        'a loop closure for each match',
+    )
     robot.until(lambda: bool(poses), 'poses')
     assert {pose.header.frame_id for pose in poses} == {'wheels'}  # of the odometry
-    return matches, {closure.header.stamp.sec: closure for closure in closures}, stamps
+    return matches, {(each.header.stamp.sec, each.is_late): each for each in closures}, stamps
 
 
 def test_loop_closures_of_the_node_are_those_of_the_library(robot, laps, tmp_path):
@@ -55,7 +58,13 @@ def test_loop_closures_of_the_node_are_those_of_the_library(robot, laps, tmp_pat
         match, core = matches[i], closer.update(extractor.extract([image]), stamps[i])
         assert match.status == core.status
         assert (match.place_index, match.newest_index) == (core.place_index, core.newest_index)
-        closure = closures.get(stamps[i] // SECOND)
+        late = closures.get((stamps[i] // SECOND, True))
+        assert (late is None) == (core.late is None)
+        if late is not None:
+            assert late.query_index == i - LENGTH + 1
+            assert late.place_index == core.late.place_index
+            assert late.query_stamp == match.window_first
+        closure = closures.get((stamps[i] // SECOND, False))
         assert (closure is not None) == core.accepted
         if closure is None:
             continue
@@ -75,7 +84,7 @@ def test_loop_closures_of_the_node_are_those_of_the_library(robot, laps, tmp_pat
             assert (closure.pose_frame, closure.pose_child_frame) == ('wheels', 'base')
             x = closure.query_pose.position.x, closure.place_pose.position.x
             assert x == pytest.approx([x_of(place) for place in places])
-    assert len(closures) == closed >= IMAGES - LAP - 2 * LENGTH
+    assert sum(not is_late for _, is_late in closures) == closed >= IMAGES - LAP - 2 * LENGTH
 
     path = tmp_path / 'route.stavpr'
     assert robot.does(SaveMap, 'save_map', path=str(path)).places == IMAGES

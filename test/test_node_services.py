@@ -16,7 +16,7 @@ from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping import load_map, save_map
-from stavpr_ros.ros import runtime
+from stavpr_ros.ros import map_loading, runtime
 from std_srvs.srv import Trigger
 import torch
 
@@ -63,7 +63,7 @@ def test_load_map_that_takes_too_long_fails(robot, start, tmp_path, monkeypatch)
     start(map_path='')
     end = threading.Event()
     monkeypatch.setattr(runtime, 'read_map', lambda path, settings: end.wait())
-    monkeypatch.setattr(runtime, 'LOAD_TIMEOUT', 0.1)
+    monkeypatch.setattr(map_loading, 'LOAD_TIMEOUT', 0.1)
     message = robot.refuses(LoadMap, 'load_map', path=str(tmp_path / 'slow.stavpr'))
     end.set()
     assert message == f'{tmp_path}/slow.stavpr was not read within 0.1 s: copy it to a faster disk'

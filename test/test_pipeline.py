@@ -136,9 +136,8 @@ def test_loop_closure_returns_the_matches_of_the_loop_closer(route, exclude_seco
         exclude_seconds=exclude_seconds,
     )
     for i, match in enumerate(process(pipeline, images, poses=True)):
-        same_recognition(
-            match, core.update(pipeline.extractor.extract([images[i]]), (i + 1) * SECOND)
-        )
+        features = pipeline.extractor.extract([images[i]])
+        same_recognition(match, core.update(features, (i + 1) * SECOND, at(i)))
         assert (match.image_index, len(match.window_stamps)) == (i, min(i + 1, LENGTH))
         assert match.first_image_index == max(0, i - LENGTH + 1)
         if match.sequence is not None:

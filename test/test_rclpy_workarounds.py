@@ -258,6 +258,14 @@ def test_managed_node_at_an_invalid_transition_stays_in_its_state(context):
     node.destroy_node()
 
 
+def test_managed_node_destroyed_before_a_transition_logs_no_error(context, capfd):
+    """As a signal right after the start does, before the timer that configures the node."""
+    node = ManagedNode('managed', context=context)
+    node.destroy_node()
+    assert not node.advance(node.trigger_configure)
+    assert 'no transition' not in capfd.readouterr().err
+
+
 def test_destroyed_lifecycle_node_of_upstream_keeps_its_state_machine(context):
     """And with it the services of the life cycle, which other nodes then still discover."""
     node = LifecycleNode('upstream', context=context)

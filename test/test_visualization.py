@@ -132,6 +132,28 @@ def test_visualization_of_loop_closures_connects_query_and_place(route):
     assert all(message.header.frame_id == 'odom' for message in publishers.messages('map_path'))
 
 
+def test_visualization_on_a_map_connects_odometry_and_place(map_file, route):
+    """The odometry drifts by .1 m an image, across; the frames differ by a quarter turn."""
+    pipeline = localizing(map_file)
+    views, publishers = views_of('markers')
+    matches = process(pipeline, route[: LENGTH + 4])
+    for i, match in enumerate(matches):
+        odometry = np.array([0.1 * i, i, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)])
+        views.publish(header(i), match, pipeline, 'map', odometry)
+    accepted = [match for match in matches if match.accepted]
+    assert len(accepted) > 2
+    lines = publishers.messages('markers')[-1].markers[1]
+    assert lines.type == Marker.LINE_LIST
+    assert len(lines.points) == len(lines.colors) == 2 * len(accepted) - 2
+    assert lines.colors[-1] == color(accepted[-1].probability)
+    query, place = lines.points[-2:]
+    pose = pipeline.places.place(accepted[-1].newest_index).pose
+    assert place.x == pose[0]
+    assert np.hypot(query.x - place.x, query.y - place.y) == pytest.approx(0.1, abs=1e-6)
+    views.publish(header(99), matches[0], localizing(map_file), 'map', odometry)
+    assert len(publishers.messages('markers')[-1].markers) == 1  # another map: deleted
+
+
 def test_visualization_of_a_growing_route_is_published_when_it_has_grown(route):
     pipeline = recorded(route, count=30)
     views, publishers = views_of('map_path')

@@ -94,6 +94,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar='N',
         help=f'the latest N images are not part of that map ({EXCLUDE_PLACES})',
     )
+    late = 'count closures that are published late, too: see the message LoopClosure'
+    add('--late-closures', action='store_true', help=late)
+    odometry = (
+        'poses of the images of the query by odometry, as --query-poses: compared with paths'
+    )
+    add('--odometry', metavar='CSV', help=odometry)
     for name, side in (('map', 'right'), ('query', 'left')):
         add(
             f'--crop-{name}',
@@ -193,20 +199,25 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
             '--dataset has map, query and ground truth: leave --map, --query, --truth and '
             '--loop-closure out'
         )
+    if dataset and arguments.odometry:
+        parser.error('--odometry: the data set has no poses; give --map and --query')
     if not dataset and arguments.query is None:
         parser.error('--query is required')
     if not dataset and (arguments.map is None) != loop:
         parser.error('give --map or, for the query on its own past, --loop-closure')
     if arguments.exclude_places is not None and not loop:
         parser.error('--exclude-places goes with --loop-closure')
+    if arguments.late_closures and not loop:
+        parser.error('--late-closures goes with --loop-closure')
     if loop:
         _check_loop_closure(parser, arguments)
     if arguments.warp and arguments.speed is not None:
         parser.error('--warp and --speed: give one of them')
     if arguments.tolerance is not None and arguments.tolerance < 0:
         parser.error(f'--tolerance {arguments.tolerance} must be at least 0')
-    if arguments.truth != 'poses' and (arguments.query_poses or arguments.map_poses):
-        parser.error('--query-poses and --map-poses go with --truth poses')
+    of_map = arguments.map_poses and not arguments.odometry
+    if arguments.truth != 'poses' and (arguments.query_poses or of_map):
+        parser.error('--query-poses and --map-poses go with --truth poses (or --odometry)')
 
 
 def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
@@ -257,7 +268,14 @@ def _evaluate(
     query, ground_truth = sequences.query.features, sequences.drive.truth
     if sequences.reference is None:
         return evaluate_loop_closures(
-            query, ground_truth, settings, arguments.exclude_places, shown, progress=True
+            query,
+            ground_truth,
+            settings,
+            arguments.exclude_places,
+            shown,
+            progress=True,
+            odometry=sequences.odometry,
+            late=arguments.late_closures,
         )
     return evaluate_on_map(
         sequences.reference,
@@ -269,6 +287,7 @@ def _evaluate(
         arguments.backend,
         arguments.precision,
         progress=True,
+        odometry=sequences.odometry,
     )
 
 
@@ -283,7 +302,7 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
         *('crop_map', 'crop_query', 'truth', *poses),
         *('mode', 'min_probability', 'sequence_length', 'beta', 'nms_radius'),
         *('strategy', 'sigma', 'xi', 'vertical'),
-        *('backend', 'precision'),
+        *('backend', 'precision', 'late_closures', 'odometry'),
     ]
     settings: dict[str, Any] = {}
     for name in names:

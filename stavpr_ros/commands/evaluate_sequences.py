@@ -54,6 +54,7 @@ class Sequences:
     :param posed: the ground truth comes from poses.
     :param title: names of the inputs, a line.
     :param times: of the extraction of features, milliseconds an image.
+    :param odometry: poses of the query's images by odometry, (N, 7); None = unknown.
     """
 
     reference: PlaceMap | None
@@ -64,6 +65,7 @@ class Sequences:
     posed: bool
     title: str
     times: dict[str, float] = field(default_factory=dict)
+    odometry: np.ndarray | None = None
 
 
 def load_sequences(arguments: argparse.Namespace) -> Sequences:
@@ -231,7 +233,14 @@ def _of_paths(
     posed = arguments.truth == 'poses'
     unknown = opened.get('unknown')
     drive = DriveChanges().apply(ground_truth)
-    return Sequences(reference, query, unknown, drive, tolerance, posed, title, times)
+    odometry = None
+    if arguments.odometry is not None:
+        odometry = _poses(arguments.odometry, query, 'query', None)
+        if reference is not None:
+            reference = replace(
+                reference, poses=_poses(arguments.map_poses, reference, 'map', None)
+            )
+    return Sequences(reference, query, unknown, drive, tolerance, posed, title, times, odometry)
 
 
 def _name(path: str) -> str:
@@ -258,7 +267,7 @@ def _poses(path: str | None, place_map: PlaceMap, name: str, degrees: float | No
     """Return the poses of an input, from a file or from the saved map."""
     if path is None:
         if place_map.poses is None or not place_map.has_poses:
-            raise SettingsError(f'--truth poses: the {name} has none, give --{name}-poses')
+            raise SettingsError(f'the {name} has no poses: give --{name}-poses')
         return place_map.poses
     poses, oriented = read_poses(Path(path))
     if len(poses) != len(place_map):
@@ -293,7 +302,17 @@ def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
         reference = select_places(reference, drive.places)
     title = f'{sequences.title}, {_description(arguments)}'
     query = select_places(query, drive.images)
-    return replace(sequences, reference=reference, query=query, drive=drive, title=title)
+    odometry = sequences.odometry
+    if odometry is not None:
+        odometry = odometry[drive.images]
+    return replace(
+        sequences,
+        reference=reference,
+        query=query,
+        drive=drive,
+        title=title,
+        odometry=odometry,
+    )
 
 
 def _description(arguments: argparse.Namespace) -> str:

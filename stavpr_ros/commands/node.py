@@ -3,15 +3,10 @@
 """``ros2 run stavpr_ros node``: the place-recognition node."""
 
 import sys
-from typing import TYPE_CHECKING
 
-from stavpr_ros.errors import StavprError
 from stavpr_ros.parameters import PARAMETERS
-from stavpr_ros.signals import end_process, interrupted, obey_signals
+from stavpr_ros.signals import run_until_signal
 from stavpr_ros.threads import wait_passively
-
-if TYPE_CHECKING:
-    from stavpr_ros.ros.node import PlaceRecognitionNode
 
 HELP = """usage: node [--ros-args -p map_path:=FILE [-p NAME:=VALUE ...] [-r image:=TOPIC]]
 
@@ -49,40 +44,15 @@ def main(args: list[str] | None = None) -> int:
     if arguments[:1] in (['-h'], ['--help']):
         print(_help())
         return 0
-    obey_signals()
     wait_passively()
-    nodes: list[PlaceRecognitionNode] = []
-    try:
-        if code := _run(args, nodes):
-            return code
-    except KeyboardInterrupt:
-        pass
-    except Exception:  # an interrupt inside a foreign library may be raised as another exception
-        if not interrupted():
-            raise
-    code = int(any(node.failed for node in nodes))
-    if interrupted():
-        end_process(code)
-    return code
+    return run_until_signal(lambda: _run(args))
 
 
-def _run(args: list[str] | None, nodes: 'list[PlaceRecognitionNode]') -> int:
-    from rclpy.exceptions import ParameterException
-    from rclpy.logging import get_logger
+def _run(args: list[str] | None) -> int:
     from stavpr_ros.ros.node import PlaceRecognitionNode
-    from stavpr_ros.ros.process import ros_node, spin_until
+    from stavpr_ros.ros.process import run_node
 
-    def make() -> PlaceRecognitionNode:
-        nodes.append(PlaceRecognitionNode())
-        return nodes[0]
-
-    try:
-        with ros_node(make, args) as node:
-            spin_until(node, threads=node.THREADS)
-    except (StavprError, ParameterException) as error:
-        get_logger('stavpr').fatal(f'cannot start: {error}')
-        return 1
-    return 0
+    return run_node(PlaceRecognitionNode, args)
 
 
 if __name__ == '__main__':

@@ -4,8 +4,7 @@
 
 import sys
 
-from stavpr_ros.errors import StavprError
-from stavpr_ros.signals import end_process, interrupted, obey_signals
+from stavpr_ros.signals import run_until_signal
 
 HELP = """usage: pose_graph [--ros-args -p NAME:=VALUE ... -r odom:=TOPIC]
 
@@ -33,33 +32,14 @@ def main(args: list[str] | None = None) -> int:
         )
         print(HELP.format(parameters=''.join(rows)))
         return 0
-    obey_signals()
-    code = 0
-    try:
-        code = _run(args)
-    except KeyboardInterrupt:
-        pass
-    except Exception:  # an interrupt inside a foreign library may be raised as another exception
-        if not interrupted():
-            raise
-    if interrupted():
-        end_process(code)
-    return code
+    return run_until_signal(lambda: _run(args))
 
 
 def _run(args: list[str] | None) -> int:
-    from rclpy.exceptions import ParameterException
-    from rclpy.logging import get_logger
     from stavpr_ros.ros.graph_node import PoseGraphNode
-    from stavpr_ros.ros.process import ros_node, spin_until
+    from stavpr_ros.ros.process import run_node
 
-    try:
-        with ros_node(PoseGraphNode, args) as node:
-            spin_until(node, threads=node.THREADS)
-    except (StavprError, ParameterException) as error:
-        get_logger('pose_graph').fatal(f'cannot start: {error}')
-        return 1
-    return 0
+    return run_node(PoseGraphNode, args)
 
 
 if __name__ == '__main__':

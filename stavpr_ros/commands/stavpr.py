@@ -23,9 +23,10 @@ COMMANDS = {
     'record': 'write matches or loop closures to a JSON Lines file (ROS 2)',
     'monitor': 'show the node in a web browser (ROS 2)',
     'pose_graph': 'correct odometry by loop closures (ROS 2)',
+    'bridge': 'pass loop closures on to RTAB-Map and others (ROS 2)',
     'demo': 'build, run and evaluate everything on a synthetic street (ROS 2)',
 }
-NEED_ROS = ('node', 'replay', 'record', 'monitor', 'pose_graph', 'demo')
+NEED_ROS = ('node', 'replay', 'record', 'monitor', 'pose_graph', 'bridge', 'demo')
 
 
 def usage() -> str:

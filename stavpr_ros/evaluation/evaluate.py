@@ -167,6 +167,8 @@ def recognize_traverse(
     settings: RecognizerSettings,
     shown: Collection[int] = (),
     progress: str = '',
+    odometry: np.ndarray | None = None,
+    late: bool = False,
 ) -> TraverseResults:
     """
     Match every image of a traverse.
@@ -177,6 +179,8 @@ def recognize_traverse(
     :param settings: those of ``online``.
     :param shown: images whose windows' distances are kept in any case.
     :param progress: label of the progress bar; none without.
+    :param odometry: poses of the images, (N, 7), NaN = unknown; None = of all.
+    :param late: late matches count for the images that had none.
     """
     count, ranks = len(features), max(RANKS)
     length = settings.sequence.length
@@ -191,7 +195,8 @@ def recognize_traverse(
     every = -(-count // WINDOWS)
     for i in tqdm(range(count), desc=progress, unit='image', disable=None if progress else True):
         began = time.perf_counter()
-        match = online.update(features[i : i + 1])
+        pose = None if odometry is None or np.isnan(odometry[i]).any() else odometry[i]
+        match = online.update(features[i : i + 1], pose=pose)
         seconds[i] = time.perf_counter() - began
         matches.append(match)
         row = np.array(online.newest_row())  # a copy: the recognizer overwrites it
@@ -206,7 +211,7 @@ def recognize_traverse(
             candidates[image, : len(found)] = found
             if i % every == 0 or image in shown:
                 windows.append(_window_distances(image, i, length, rows, match.path))
-    matched = image_matches(matches, length)
+    matched = image_matches(matches, length, late)
     ranked = np.stack([_ranked(*pair) for pair in zip(matched.places, candidates, strict=True)])
     sequence = Ranking(ranked, matched.distances)
     return TraverseResults(
@@ -230,6 +235,7 @@ def evaluate_on_map(
     backend: str = 'cpu',
     precision: str = 'float32',
     progress: bool = False,
+    odometry: np.ndarray | None = None,
 ) -> Evaluation:
     """
     Recognize a traverse on a map and compute its metrics.
@@ -240,17 +246,20 @@ def evaluate_on_map(
     :param unknown: features of a traverse through places that are not in the map.
     :param shown: images whose windows' distances are kept in any case.
     :param backend, precision: see :class:`stavpr_ros.recognition.PlaceRecognizer`.
+    :param odometry: poses of the query's images, (N, 7), compared with those of the places.
     :raises InputError: fewer images than one window, or ground truth of another length.
     """
 
-    def results(features: LocalFeatures, label: str) -> TraverseResults:
+    def results(
+        features: LocalFeatures, label: str, poses: np.ndarray | None = None
+    ) -> TraverseResults:
         # a new recognizer for each: mode robust keeps statistics of the images so far
         one = PlaceRecognizer(place_map, settings, backend, precision)
         bar = label if progress else ''
-        return recognize_traverse(one, features, len(place_map), settings, shown, bar)
+        return recognize_traverse(one, features, len(place_map), settings, shown, bar, poses)
 
     centered_images(len(query), settings.sequence.length)
-    known = results(query, 'recognizing')
+    known = results(query, 'recognizing', odometry)
     elsewhere = None if unknown is None else results(unknown, 'false alarms')
     return evaluate_traverse(known, ground_truth, settings.sequence.length, elsewhere)
 
@@ -262,19 +271,22 @@ def evaluate_loop_closures(
     exclude_places: int,
     shown: Collection[int] = (),
     progress: bool = False,
+    odometry: np.ndarray | None = None,
+    late: bool = False,
 ) -> Evaluation:
     """
     Recognize a traverse on its own past and compute its metrics.
 
     :param ground_truth: of the same images: the earlier images that are correct.
     :param exclude_places: the latest images that are not part of the map.
+    :param late: late matches count for the images that had none.
 
     The others are as in :func:`evaluate_on_map`.
     """
     centered_images(len(query), settings.sequence.length)
     closer = LoopCloser(settings, exclude_places, query.settings)
     label = 'closing loops' if progress else ''
-    results = recognize_traverse(closer, query, len(query), settings, shown, label)
+    results = recognize_traverse(closer, query, len(query), settings, shown, label, odometry, late)
     return evaluate_traverse(results, ground_truth, settings.sequence.length)
 
 

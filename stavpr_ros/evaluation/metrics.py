@@ -241,7 +241,7 @@ def _counts(
     ]
 
 
-def image_matches(matches: Sequence[Match], length: int) -> ImageMatches:
+def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> ImageMatches:
     """
     Assign the matches of windows to images: each to the image in the middle of its window.
 
@@ -250,6 +250,7 @@ def image_matches(matches: Sequence[Match], length: int) -> ImageMatches:
 
     :param matches: one an image, in order: that of the window that ends with the image.
     :param length: images in a window, l.
+    :param late: images whose window was not matched take their late match, where they have one.
     """
     found = ImageMatches.none(len(matches))
     middle = (length - 1) // 2
@@ -269,6 +270,11 @@ def image_matches(matches: Sequence[Match], length: int) -> ImageMatches:
             assign(ends[0], position, aligned_index(matches[ends[0]].path, position))
         for position in range(middle + 1, length):
             assign(ends[-1], position, aligned_index(matches[ends[-1]].path, position))
+    for end, match in enumerate(matches if late else ()):
+        if match.late is not None and match.late.sequence is not None:
+            image = end - (length - 1)
+            found.places[image], found.distances[image] = match.late.place_index, match.late.score
+            found.accepted[image], found.probabilities[image] = True, match.late.probability
     return found
 
 

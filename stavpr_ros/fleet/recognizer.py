@@ -30,8 +30,8 @@ from stavpr_ros.fleet.store import place_vectors, sample_places
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import Match, RecognizerSettings, Status
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
-from stavpr_ros.recognition.recognizer import SequenceRecognizer
-from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION, ROBUST
+from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
+from stavpr_ros.recognition.robust import FilterSettings, less_alike, MIN_DEVIATION, ROBUST
 from stavpr_ros.recognition.sequence_search import (
     change_between,
     FilterSearch,
@@ -73,6 +73,11 @@ class CityLayout(SessionLayout):
     def positions(self, places: np.ndarray | int) -> np.ndarray:
         """See :meth:`SessionLayout.positions`; of places that are held."""
         return super().positions(np.searchsorted(self.held, places))
+
+    def session_of(self, place: int) -> tuple[int, int]:
+        """Return the first place held of a run of neighboring ones, and the one behind it."""
+        first, end = super().session_of(int(np.searchsorted(self.held, place)))
+        return int(self.held[first]), int(self.held[end - 1]) + 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +131,8 @@ class FleetRecognizer(SequenceRecognizer):
                 'is matched in mode robust, without vertical alignment'
             )
         super().__init__(settings, city.settings, 0)
+        if city.poses is not None:
+            self._compare(city.poses[:, :2])
         self._city, self._timeout = city, timeout
         index = city.store.index
         self._centering = index.centering()
@@ -173,15 +180,19 @@ class FleetRecognizer(SequenceRecognizer):
         self._clear_window()
         self._rebuild()
 
-    def update(self, features: LocalFeatures, stamp: int = 0) -> Match:
+    def update(
+        self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
+    ) -> Match:
         """
         Add the next image and match the window that ends with it.
 
         :param features: those of one image, strips (W, 1, d).
         :param stamp: when it was taken, ns; 0 = unknown.
+        :param pose: by odometry, shape (7,), z is up; None = unknown.
         :raises FeatureMismatchError: made with other settings than the map's.
-        :raises InputError: not one image, or features that are not finite.
+        :raises InputError: not one image, features that are not finite, or an invalid pose.
         """
+        position = position_of(pose)
         self._require_one_image(features, 'the map')
         if features.dimension != self._city.dimension:
             raise FeatureMismatchError(
@@ -198,12 +209,15 @@ class FleetRecognizer(SequenceRecognizer):
         self._images.append(image)
         self._count += 1
         self._unasked.append((self._count, place_vectors(strips[:, None])))
+        if self._motion is not None:
+            self._motion.way.append(position)
         if self._look_around():
             self._rebuild()
         elif self._layout is not None:
             self._push(image)
         if self._layout is not None:
-            match = self._match_window()
+            match = self._compared(self._match_window(), position)
+            self._nearest = match.sequence
             return replace(match, window_stamps=self._buffer.stamps)
         status = Status.WARMING_UP
         if self.window_fill == self._settings.sequence.length:
@@ -327,7 +341,11 @@ class FleetRecognizer(SequenceRecognizer):
         if not len(places):
             self._layout = None
             return
-        firsts = _firsts(places, self._city.store.index.runs(places))
+        index = self._city.store.index
+        runs = index.runs(places)
+        firsts = _firsts(places, runs)
+        sizes = np.diff(index.firsts, append=index.places)
+        self._sessions = [(runs == run, int(sizes[run])) for run in np.unique(runs)]
         same_as = np.searchsorted(places, self._same_as[self._order])
         same_as = np.minimum(same_as, len(places) - 1)
         here = places[same_as] == self._same_as[self._order]
@@ -346,7 +364,10 @@ class FleetRecognizer(SequenceRecognizer):
     def _push(self, image: _Image) -> None:
         assert self._layout is not None
         assert self._filter is not None
-        row = self._layout.spread(torch.from_numpy(image.z[self._order]))
+        z, held = image.z[self._order], self._places[self._order]
+        for run, places in self._sessions:
+            z[run] = less_alike(z[run], held[run], places)
+        row = self._layout.spread(torch.from_numpy(z))
         self._buffer.push(row, image.stamp)
         self._filter.update(row.numpy(), image.change)
 

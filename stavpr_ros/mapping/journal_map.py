@@ -3,6 +3,7 @@
 """A map of the places in a journal that does not fit into memory: its features stay on disk."""
 
 from collections.abc import Sequence
+import mmap
 import os
 from pathlib import Path
 import tempfile
@@ -10,10 +11,12 @@ from typing import overload
 
 import numpy as np
 from stavpr_ros.errors import JournalError
-from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.journal import JournalReader
 from stavpr_ros.mapping.place_map import PlaceMap
+from stavpr_ros.mapping.stored_features import MappedFeatures
 import torch
+
+PLACES_AT_ONCE = 8192  # whose pages count as memory of this process
 
 
 class _Thumbnails(Sequence[bytes]):
@@ -54,21 +57,26 @@ def journal_map(path: Path) -> PlaceMap:
         template = reader.template
         W, d = template.settings.strips, template.dimension
         with tempfile.TemporaryFile(dir=path.parent) as file:
-            strips = np.memmap(file, np.float32, 'w+', shape=(W, n, d))
+            file.truncate(4 * W * n * d)
+            pages = mmap.mmap(file.fileno(), 0)
+        strips = np.frombuffer(pages, np.float32).reshape(W, n, d)
         weights = np.empty((W, n), np.float32)
         stamps, poses = np.empty(n, np.int64), np.full((n, 7), np.nan)
         ids, ends, sizes = [], [], []
         for i, place in enumerate(reader.places()):
+            if i % PLACES_AT_ONCE == 0:
+                pages.madvise(mmap.MADV_DONTNEED)  # they stay in the file
             strips[:, i], weights[:, i], stamps[i] = place.strips, place.weights, place.stamp
             if place.pose is not None:
                 poses[i] = place.pose
             ids.append(place.identifier)
             ends.append(reader.size)
             sizes.append(len(place.thumbnail))
-    features = LocalFeatures(
+    features = MappedFeatures(
         torch.from_numpy(strips), torch.from_numpy(weights), template.settings,
         template.features.cells,
     )  # fmt: skip
+    object.__setattr__(features, 'pages', pages)
     return PlaceMap(
         features=features,
         projection=template.projection,

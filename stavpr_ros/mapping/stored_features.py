@@ -3,6 +3,7 @@
 """Features and thumbnails of a map that stay in its file, and are read by position on use."""
 
 from collections.abc import Sequence
+import mmap
 from typing import Any, overload
 
 import numpy as np
@@ -38,6 +39,21 @@ class StoredThumbnails(Sequence[bytes]):
             return self._file.bytes_at(
                 self._file.parts['thumbnails'].start + start, int(self._ends[i]) - start
             )
+
+
+class MappedFeatures(LocalFeatures):
+    """
+    Features whose strips are mapped from a file.
+
+    ``pages`` is the mapping, set by its maker.
+    """
+
+    pages: mmap.mmap
+
+    def stored_strip(self, j: int) -> np.ndarray:
+        """Return one strip, shape (n, d), float32; pages of those before are released."""
+        self.pages.madvise(mmap.MADV_DONTNEED)
+        return self.strips[j].numpy()
 
 
 class StoredFeatures(LocalFeatures):

@@ -43,7 +43,7 @@ class Localization:
 
     def update(self, observation: Observation) -> Match:
         """Match the window that ends with an image."""
-        return self.recognizer.update(observation.features, observation.stamp)
+        return self.recognizer.update(observation.features, observation.stamp, observation.pose)
 
 
 @dataclass(eq=False)
@@ -78,9 +78,11 @@ class LoopClosing:
         """Add an image as a place, and match the window that ends with it."""
         # first, since it may fail: recognizer and route stay in step
         thumbnail = _encoded(observation)
-        match = self.recognizer.update(observation.features, observation.stamp)
+        match = self.recognizer.update(observation.features, observation.stamp, observation.pose)
         self.places.forget(self.recognizer.first - self.places.first)
-        return replace(match, image_index=_add(self.places, observation, thumbnail))
+        index = _add(self.places, observation, thumbnail)
+        late = match.late and replace(match.late, image_index=index)
+        return replace(match, image_index=index, late=late)
 
 
 Operation = Localization | Mapping | LoopClosing

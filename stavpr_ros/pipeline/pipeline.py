@@ -222,13 +222,16 @@ class Pipeline:
         return self._last.with_candidates(recognizer.ranked(count))
 
     def matched_pair(self, match: Match) -> MatchedPair | None:
-        """Return the middle pair of the newest match, for its edge; None without a match."""
+        """Return the pair of the newest match, or its late one, for its edge; None without."""
         places = self.places
         if not match.accepted or places is None or match.cause:
             return None
         unknown = np.full(7, np.nan)
         poses = np.array([unknown if pose is None else pose for pose in self._poses])
-        return matched_pair(match, places, self._thumbnails[0], poses, self.window_distances())
+        query = self._thumbnails[0]
+        if match.is_late:
+            query = places.thumbnail(match.first_image_index)
+        return matched_pair(match, places, query, poses, self.window_distances())
 
     def window_distances(self) -> tuple[np.ndarray, int]:
         """
@@ -293,7 +296,9 @@ class Pipeline:
         if operation.recognizer is None:
             return replace(match, image=image)
         with _timed(stages, 'verification'):
-            match = self._verified(match, operation.places)
+            match = self._verified(match, operation.places, self._thumbnails[0])
+            if match.late is not None:
+                match = replace(match, late=self._verified_late(match, operation.places))
         if self.list_candidates and match.sequence is not None:
             ranked = operation.recognizer.ranked(self.settings.candidates)
             match = match.with_candidates(ranked)
@@ -318,9 +323,19 @@ class Pipeline:
         width = self._thumbnail_width(operation)
         return thumbnail_of(image, width) if width else None
 
-    def _verified(self, match: Match, places: PlaceMap | GrowingMap) -> Match:
+    def _verified_late(self, match: Match, places: PlaceMap | GrowingMap) -> Match | None:
+        """Return the late match beside an accepted one, if it passes the same check."""
+        if not match.accepted or match.late is None:
+            return None
+        query = places.thumbnail(match.late.first_image_index)
+        late = self._verified(match.late, places, query)
+        return late if late.accepted else None
+
+    def _verified(
+        self, match: Match, places: PlaceMap | GrowingMap, query: np.ndarray | None
+    ) -> Match:
         """
-        Check the middle pair of a match by their thumbnails; without these, nothing changes.
+        Check a match by the thumbnails of query and place; without these, nothing changes.
 
         Matches with too few inliers are rejected. Localization in mode robust weighs the result
         instead (:class:`GeometricEvidence`), where the match is doubtful.
@@ -329,7 +344,6 @@ class Pipeline:
             return match
         weighed = match.relative and self._name == 'localization'
         checked = self._evidence.wants(match.probability) if weighed else match.accepted
-        query = self._thumbnails[0]
         if not checked or query is None:
             return match
         inliers = self._verifier.inliers(query, places, match.sequence.middle)

@@ -46,6 +46,7 @@ class PipelineSettings:
     spatial: SpatialSettings = field(default_factory=SpatialSettings)
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
     nms_radius: int = 20
+    odometry_error: float = 0.1
     mode: str = 'robust'
     backend: str = 'auto'
     precision: str = 'float32'
@@ -95,8 +96,18 @@ class PipelineSettings:
         """Return settings of the recognizer; without a threshold, with one that is not applied."""
         threshold = self.applied_threshold or 1.0
         return RecognizerSettings(
-            threshold, self.spatial, self.sequence, self.nms_radius, self.mode
+            threshold,
+            self.spatial,
+            self.sequence,
+            self.nms_radius,
+            self.mode,
+            odometry_error=self.odometry_error,
         )
+
+    @property
+    def compares_odometry(self) -> bool:
+        """Whether odometry is compared with the paths of matches, where places have poses."""
+        return self._has_probability and self.odometry_error > 0
 
     def require_operation(self, operation: str) -> None:
         """

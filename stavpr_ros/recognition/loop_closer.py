@@ -13,7 +13,11 @@ from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.match import Match, Status
-from stavpr_ros.recognition.recognizer import RecognizerSettings, SequenceRecognizer
+from stavpr_ros.recognition.recognizer import (
+    position_of,
+    RecognizerSettings,
+    SequenceRecognizer,
+)
 from stavpr_ros.recognition.robust import z_normalized
 from stavpr_ros.recognition.route_features import RouteFeatures
 from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
@@ -77,7 +81,7 @@ class LoopCloser(SequenceRecognizer):
     ) -> None:
         _require_fitting(settings, exclude, limit, exclude_seconds)
         choose_loop_backend(backend, precision)
-        super().__init__(settings, feature_settings, 0)
+        super().__init__(settings, feature_settings, 0, to_oldest=True)
         W = feature_settings.strips
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
         self._band = settings.spatial.band(W)
@@ -86,6 +90,10 @@ class LoopCloser(SequenceRecognizer):
         self._route = RouteFeatures(
             feature_settings, options.mean_centering, options.whitening, limit
         )
+        # of the images of the window: each one had a match as the middle one
+        self._closed: deque[bool] = deque(maxlen=settings.sequence.length)
+        self._track: list[np.ndarray] = []  # position of each place held
+        self._compare(self._track)
         # stamps of the latest places, not yet old enough in seconds
         self._young: deque[int] = deque()
         self._places = 0  # the newest image may be matched with so many of the oldest places
@@ -117,8 +125,11 @@ class LoopCloser(SequenceRecognizer):
         """
         self._clear_window()
         self._young.clear()
+        self._closed.clear()
 
-    def update(self, features: LocalFeatures, stamp: int = 0) -> Match:
+    def update(
+        self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
+    ) -> Match:
         """
         Add the next image and match the window that ends with it; places are earlier images.
 
@@ -127,16 +138,43 @@ class LoopCloser(SequenceRecognizer):
         :param features: those of one image, strips (W, 1, d).
         :param stamp: when it was taken, ns; 0 = unknown: it is then excluded by the count of
             images alone.
+        :param pose: by odometry, shape (7,), z is up; None = unknown.
         :raises FeatureMismatchError: made with other settings.
-        :raises InputError: not one image, or features that are not finite.
+        :raises InputError: not one image, features that are not finite, or an invalid pose.
         """
+        position = position_of(pose)
         self._require_one_image(features, 'the route so far')
         self._append(features, stamp)
+        self._track.append(position)
         newest = self._route.newest[:, 0]
-        match = self._match(torch.from_numpy(self._distances()), newest, stamp)
+        match = self._match(torch.from_numpy(self._distances()), newest, stamp, position)
         if match.status is Status.NO_MATCH and match.sequence is None:
             return replace(match, reason='no earlier place is old enough to be matched with')
-        return match
+        return replace(match, late=self._late(match))
+
+    def _late(self, match: Match) -> Match | None:
+        """
+        Return the match of the oldest image, if it had none as the middle one, but is certain now.
+
+        It is a backward pass over the window. Windows without a match have no late one either.
+        """
+        self._closed.append(False)
+        if self._filter is None or not self._buffer.full:
+            return None
+        self._closed[match.position] = match.accepted
+        if self._closed[0] or not match.accepted:
+            return None
+        window = self._filter.at(0, self._settings.nms_radius)
+        nearest = window.nearest
+        if nearest is None or not nearest.distance < match.threshold:
+            return None
+        return replace(
+            match,
+            sequence=nearest,
+            path=window.path,
+            probability=1 - nearest.distance,
+            is_late=True,
+        )
 
     def newest_row(self) -> np.ndarray:
         """
@@ -153,6 +191,7 @@ class LoopCloser(SequenceRecognizer):
             evicted = max(1, self._limit // EVICTED)
             for part in (route, *self._parts()):
                 part.evict(evicted)
+            del self._track[:evicted]
             while len(self._young) > route.count:
                 self._young.popleft()
         if route.append(features):

@@ -58,6 +58,9 @@ class Match:
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
     :param relative: distances are those of mode robust, 1 - probability.
     :param probability: that the nearest sequence is the right place; NaN = unknown (mode paper).
+    :param is_late: the place is that of the oldest image of the window instead of the middle one.
+    :param late: the match of the oldest image, where it had none as the middle one; None = it had,
+        or is not certain now either.
     :param window_stamps: stamps (ns) of the images in the window, oldest first, this one the last.
     :param image_index: place of a growing map that this image has become, -1 = none.
     :param inliers: of the geometric verification, -1 = not verified.
@@ -75,6 +78,8 @@ class Match:
     path: np.ndarray = field(default_factory=lambda: NO_PATH, repr=False)
     relative: bool = False
     probability: float = math.nan
+    is_late: bool = False
+    late: 'Match | None' = field(default=None, repr=False)
     window_stamps: tuple[int, ...] = field(default=(), repr=False)
     image_index: int = -1
     inliers: int = -1
@@ -92,6 +97,11 @@ class Match:
     def place_index(self) -> int:
         """Return the matched place, the middle of the matched sequence; -1 unless matched."""
         return self.sequence.middle if self.sequence and self.accepted else -1
+
+    @property
+    def position(self) -> int:
+        """Position in the window of the image that the place is of."""
+        return 0 if self.is_late else (len(self.window_stamps) - 1) // 2
 
     @property
     def newest_index(self) -> int:

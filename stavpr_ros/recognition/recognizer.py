@@ -13,6 +13,7 @@ from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
+from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.recognition.int8_features import Int8Features, rounded
 from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
 from stavpr_ros.recognition.match import (
@@ -24,9 +25,11 @@ from stavpr_ros.recognition.match import (
     Status,
 )
 from stavpr_ros.recognition.matcher import make_matcher
+from stavpr_ros.recognition.relative_motion import Positions, RelativeMotion
 from stavpr_ros.recognition.robust import (
     blocks,
     converted,
+    less_alike,
     MeanCentering,
     options_of,
     RobustOptions,
@@ -55,6 +58,9 @@ class RecognizerSettings:
     :param mode: ``paper``, or ``robust``, with all options of
         :class:`stavpr_ros.recognition.robust.RobustOptions`.
     :param robust_options: another choice of options than the mode's.
+    :param odometry_error: of a distance by odometry, as a share of it; where query and places have
+        poses, the path of a match is compared with them; 0 = never. See
+        :mod:`stavpr_ros.recognition.relative_motion`.
     """
 
     threshold: float
@@ -63,6 +69,7 @@ class RecognizerSettings:
     nms_radius: int = 20
     mode: str = 'paper'
     robust_options: RobustOptions | None = None
+    odometry_error: float = 0.1
 
     def __post_init__(self) -> None:
         if not self.threshold > 0 or math.isnan(self.threshold):
@@ -71,6 +78,10 @@ class RecognizerSettings:
             )
         if self.nms_radius < 0:
             raise SettingsError(f'nms_radius = {self.nms_radius} must be at least 0 places')
+        if not 0 <= self.odometry_error <= 1:
+            raise SettingsError(
+                f'odometry_error = {self.odometry_error} must be a share of the distance, 0 to 1'
+            )
         if (
             options_of(self.mode).place_filter
             and self.robust_options is None
@@ -95,6 +106,7 @@ class SequenceRecognizer:
     :param feature_settings: how the features are made.
     :param places: number of places n.
     :param layout: of a map of several sessions.
+    :param to_oldest: see :class:`stavpr_ros.recognition.sequence_search.FilterSearch`.
 
     ``problem`` is why places of the map cannot be reached; empty while they can.
     """
@@ -107,14 +119,20 @@ class SequenceRecognizer:
         feature_settings: FeatureSettings,
         places: int,
         layout: SessionLayout | None = None,
+        to_oldest: bool = False,
     ) -> None:
         options, sequence = settings.applied_options, settings.sequence
         self._settings, self._feature_settings = settings, feature_settings
         self._layout = layout
         columns = places if layout is None else layout.width
         self._buffer = SequenceBuffer(sequence.length, columns, sequence.k)
-        self._filter = FilterSearch(self._buffer, layout=layout) if options.place_filter else None
+        self._filter = None
+        if options.place_filter:
+            self._filter = FilterSearch(self._buffer, layout=layout, to_oldest=to_oldest)
         self._search: Search = self._filter or LmDtwSearch(self._buffer)
+        # x and y of each place, or of the places held; empty = unknown
+        self._positions: Positions = ()
+        self._motion: RelativeMotion | None = None
         self._window = WindowMatch()  # of the newest image
         self._nearest: SequenceMatch | None = None
 
@@ -191,6 +209,8 @@ class SequenceRecognizer:
         self._buffer.clear()
         if self._filter is not None:
             self._filter.reset()
+        if self._motion is not None:
+            self._motion.reset()
         self._window, self._nearest = WindowMatch(), None
 
     def _require_one_image(self, features: LocalFeatures, where: str) -> None:
@@ -199,11 +219,14 @@ class SequenceRecognizer:
             raise InputError(f'features of {len(features)} images came: expected those of one')
         require_finite(features, 'the image')
 
-    def _match(self, row: torch.Tensor, strips: torch.Tensor, stamp: int) -> Match:
+    def _match(
+        self, row: torch.Tensor, strips: torch.Tensor, stamp: int, position: np.ndarray
+    ) -> Match:
         """
         Push the distances of the newest image; match the window, if it is full.
 
         :param strips: the image's features, centered, shape (W, d).
+        :param position: of the image by odometry, (2,).
         """
         on_device = self._filter is not None and self._filter.on_device
         if self._settings.applied_options.query_znorm:
@@ -211,13 +234,37 @@ class SequenceRecognizer:
         if self._layout is not None:
             row = self._layout.spread(row)
         self._buffer.push(row.to(self._buffer.memory.device), stamp)
+        if self._motion is not None:
+            self._motion.way.append(position)
         if self._filter is not None:
             change = self._filter.change.next_query(strips.cpu().numpy())
             self._filter.update(row if on_device else row.cpu().numpy(), change)
-        return replace(self._match_window(), window_stamps=self._buffer.stamps)
+        match = self._compared(self._match_window(), position)
+        self._nearest = match.sequence
+        return replace(match, window_stamps=self._buffer.stamps)
+
+    def _compare(self, positions: Positions) -> None:
+        """Compare matches with odometry, if the settings want it, by the positions of places."""
+        error, length = self._settings.odometry_error, self._settings.sequence.length
+        if error and self._filter is not None:
+            self._positions, self._motion = positions, RelativeMotion(length, error)
+
+    def _compared(self, match: Match, position: np.ndarray) -> Match:
+        """Return a match, less probable if odometry disagrees with its path."""
+        if self._motion is None or match.sequence is None or np.isnan(position[0]):
+            return match
+        first = self._buffer.first
+        session = first, first + len(self._positions)
+        if self._layout is not None:
+            session = self._layout.session_of(match.sequence.middle)
+        return self._motion.compared(match, self._positions, first, session)
 
     def _z_normalized(self, row: np.ndarray) -> np.ndarray:
-        return z_normalized(row) if self._layout is None else self._layout.z_normalized(row)
+        runs = [slice(None)] if self._layout is None else self._layout.runs
+        z = [z_normalized(row[run]) for run in runs]  # of each session alone
+        if self._settings.applied_options.look_alikes:
+            z = [less_alike(each) for each in z]
+        return z[0] if len(z) == 1 else np.concatenate(z)
 
     def _z_normalized_here(self, row: torch.Tensor) -> torch.Tensor:
         return torch.from_numpy(self._z_normalized(row.cpu().numpy()))
@@ -226,7 +273,8 @@ class SequenceRecognizer:
         from stavpr_ros.recognition.cuda_filter import z_normalized_on_device
 
         runs = [slice(None)] if self._layout is None else self._layout.runs
-        return torch.cat([z_normalized_on_device(row[run]) for run in runs])
+        look_alikes = self._settings.applied_options.look_alikes
+        return torch.cat([z_normalized_on_device(row[run], look_alikes) for run in runs])
 
     def _match_window(self) -> Match:
         threshold, length = self._settings.threshold, self._settings.sequence.length
@@ -283,6 +331,8 @@ class PlaceRecognizer(SequenceRecognizer):
     ) -> None:
         layout = layout_of(place_map, settings.nms_radius)
         super().__init__(settings, place_map.settings, len(place_map), layout)
+        if place_map.poses is not None and place_map.has_poses:
+            self._compare(place_map.poses[:, :2])
         features, options = place_map.features, settings.applied_options
         if not isinstance(features, StoredFeatures):  # these are checked whenever they are read
             for _, some in blocks(features):
@@ -365,7 +415,9 @@ class PlaceRecognizer(SequenceRecognizer):
                 'was not made with this network; build it again'
             )
 
-    def update(self, features: LocalFeatures, stamp: int = 0) -> Match:
+    def update(
+        self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
+    ) -> Match:
         """
         Add the next image and match the window that ends with it.
 
@@ -373,15 +425,27 @@ class PlaceRecognizer(SequenceRecognizer):
 
         :param features: those of one image, strips (W, 1, d).
         :param stamp: when it was taken, ns; 0 = unknown.
+        :param pose: by odometry, shape (7,), z is up; None = unknown.
         :raises FeatureMismatchError: made with other settings than the map's.
-        :raises InputError: not one image, or features that are not finite.
+        :raises InputError: not one image, features that are not finite, or an invalid pose.
         """
+        position = position_of(pose)
         self._require_one_image(features, 'the map')
         self._require_dimension(features)
         strips = features.strips[:, 0]
         if self._centering is not None:
             strips = self._centering.next_query(strips)
-        return self._match(self._matcher.distances(strips, features.weights[:, 0]), strips, stamp)
+        row = self._matcher.distances(strips, features.weights[:, 0])
+        return self._match(row, strips, stamp, position)
+
+
+def position_of(pose: np.ndarray | None) -> np.ndarray:
+    """
+    Return x and y of a pose, (2,); NaN of none.
+
+    :raises InputError: an invalid pose.
+    """
+    return np.full(2, np.nan) if pose is None else checked_pose(pose)[:2]
 
 
 def require_finite(features: LocalFeatures, where: str) -> None:

@@ -331,6 +331,8 @@ class FilterSearch:
 
     :param buffer: the window.
     :param layout: of the places of several sessions in the columns of the buffer.
+    :param to_oldest: states are followed back to the oldest image of the window, instead of the
+        middle one: :meth:`at` any image.
     :param on_device: the filter is computed on the CUDA device where the buffer is.
     """
 
@@ -339,6 +341,7 @@ class FilterSearch:
         buffer: SequenceBuffer,
         settings: FilterSettings | None = None,
         layout: SessionLayout | None = None,
+        to_oldest: bool = False,
         on_device: bool = False,
     ) -> None:
         self.buffer, self._layout, self.on_device = buffer, layout, on_device
@@ -347,12 +350,12 @@ class FilterSearch:
         gaps, places = None, buffer.places
         if layout is not None:
             gaps, places = layout.gaps, len(layout.columns)
+        lag = buffer.length - 1 - (0 if to_oldest else self._middle)
         filter_class: Any = PlaceFilter
         if on_device:
             from stavpr_ros.recognition.cuda_filter import CudaPlaceFilter
 
             filter_class = CudaPlaceFilter
-        lag = buffer.length - 1 - self._middle
         self.filter = filter_class(buffer.places, lag, settings, gaps)
         self.change = ImageChange(places, settings)
         self._speeds = settings.speeds
@@ -400,11 +403,20 @@ class FilterSearch:
         return self.change.speed_weights(change)
 
     def __call__(self, nms_radius: int) -> WindowMatch:
+        return self.at(self._middle, nms_radius)
+
+    def at(self, position: int, nms_radius: int) -> WindowMatch:
+        """
+        Return the match of an image by all images of the window.
+
+        :param position: of the image in the window, not before the lag of the filter.
+        :param nms_radius: see :data:`Search`.
+        """
         n, first = self.buffer.known, self.buffer.first
         if not n:
             return WindowMatch()
         newest = self._images[-1]
-        belief = self.filter.belief(n, newest - self._images[self._middle])
+        belief = self.filter.belief(n, newest - self._images[position])
         places, probabilities = belief.probabilities(n)
         if not places.size:
             return self._nowhere(n, first)
@@ -414,7 +426,7 @@ class FilterSearch:
         near = np.abs(belief.places - places[best]) <= CLOSE
         weights = belief.weights[near]
         middle = round(float(belief.places[near] @ weights / weights.sum()))
-        path = self._path(belief.ways[near][np.argmax(weights)])
+        path = self._path(belief.ways[near][np.argmax(weights)], position)
         second, found = self._second_best(n, places, probabilities, middle, nms_radius)
         path[:, 1] += first
         match = SequenceMatch(
@@ -458,11 +470,11 @@ class FilterSearch:
         path = np.stack([np.arange(length), np.full(length, place)], axis=1).astype(np.int32)
         return WindowMatch(match, path, lambda: self._sequences(n, first, nothing, np.empty(0)))
 
-    def _path(self, way: np.ndarray) -> np.ndarray:
-        """Return the place of each image of the window, (l, 2); before the middle at one speed."""
+    def _path(self, way: np.ndarray, position: int) -> np.ndarray:
+        """Return the place of each image, (l, 2); before the one at a position at one speed."""
         images = np.array(self._images)
         back = images[-1] - images
-        lag = int(back[self._middle])
+        lag = int(back[position])
         places = self.filter.way(way, lag)
         slope = (places[0] - places[lag]) / lag if lag else self._speeds[way[3]]
         earlier = np.maximum(back - lag, 0) * slope

@@ -17,7 +17,7 @@ from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.match import ranked_candidates
 from stavpr_ros.recognition.place_filter import Belief
-from stavpr_ros.recognition.robust import FilterSettings, z_normalized
+from stavpr_ros.recognition.robust import FilterSettings
 import torch
 
 Sequences = tuple[np.ndarray, np.ndarray]
@@ -51,10 +51,6 @@ class SessionLayout:
         is_gap[self.columns] = False
         self.gaps = np.flatnonzero(is_gap)
 
-    def z_normalized(self, row: np.ndarray) -> np.ndarray:
-        """Return a row with mean 0 and deviation 1 in each session, (n,)."""
-        return np.concatenate([z_normalized(row[run]) for run in self.runs])
-
     def spread(self, row: torch.Tensor) -> torch.Tensor:
         """Return distances to places (n,) as those to columns, (width,)."""
         out = torch.full((self.width,), torch.inf, dtype=row.dtype, device=row.device)
@@ -65,6 +61,11 @@ class SessionLayout:
         """Return the first column of a column's session."""
         firsts = self.columns[self.firsts]
         return int(firsts[np.searchsorted(firsts, column, 'right') - 1])
+
+    def session_of(self, place: int) -> tuple[int, int]:
+        """Return the first place of a place's session, and the first one behind it."""
+        run = self.runs[int(np.searchsorted(self.firsts, place, 'right')) - 1]
+        return int(run.start), int(run.stop)
 
     def summed(self, weights: np.ndarray, close: int) -> np.ndarray:
         """

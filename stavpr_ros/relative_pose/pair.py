@@ -18,7 +18,9 @@ AROUND = NEIGHBORS + BESIDE
 @dataclass(frozen=True, eq=False)
 class MatchedPair:
     """
-    The middle image of a window, and its place; nothing in it changes when the map grows.
+    An image of a window and its place; nothing in it changes when the map grows.
+
+    It is the middle image, or the oldest of a late match.
 
     :param source: the map that the place is of.
     :param place: its index.
@@ -91,9 +93,8 @@ def matched_pair(
         for index in range(max(low, place - AROUND), min(high, place + AROUND + 1)):
             if places.place(index).session == session:
                 thumbnails[index] = _thumbnail(places, index - start)
-    middle = (len(match.window_stamps) - 1) // 2
     return MatchedPair(
-        places, place, query, query_poses, middle, distances, low, poses, thumbnails
+        places, place, query, query_poses, match.position, distances, low, poses, thumbnails
     )
 
 

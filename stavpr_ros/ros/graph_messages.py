@@ -32,13 +32,13 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
     on_map = message.query_index < 0 and message.has_poses
     known: dict[str, Any] = {
         'map_id': (message.map_id or 'map') if on_map else '',
-        'place_pose': _pose(message.place_pose) if on_map else None,
+        'place_pose': pose_array(message.place_pose) if on_map else None,
     }
     if message.has_relative_pose and relative.source != RelativePose.NONE:
         covariance = np.array(relative.pose.covariance).reshape(6, 6)
         return Closure(
             nanoseconds(relative.query_stamp), nanoseconds(relative.place_stamp),
-            _pose(relative.pose.pose), covariance, relative.is_independent, **known,
+            pose_array(relative.pose.pose), covariance, relative.is_independent, **known,
         )  # fmt: skip
     if not appearance:
         return None
@@ -46,7 +46,8 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
     return Closure(*stamps, IDENTITY, APPEARANCE, False, **known)
 
 
-def _pose(pose: object) -> np.ndarray:
+def pose_array(pose: object) -> np.ndarray:
+    """Return a pose message as x y z and quaternion x y z w, shape (7,)."""
     p, o = pose.position, pose.orientation  # type: ignore[attr-defined]
     return np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w])
 

@@ -24,7 +24,7 @@ from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import STOP_TIMEOUT
-from stavpr_ros.ros.output import MapInfoPublisher
+from stavpr_ros.ros.map_info import MapInfoPublisher
 from stavpr_ros.ros.parameters import (
     declare_parameters,
     inside_maps_folder,

@@ -3,10 +3,8 @@
 """The messages of results, and their publishers."""
 
 import array
-from collections.abc import Callable
 from dataclasses import dataclass
 import math
-import threading
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -14,7 +12,6 @@ from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 import numpy as np
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, qos_policy_name_from_kind, QoSProfile, ReliabilityPolicy
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
@@ -22,15 +19,12 @@ from stavpr_msgs.msg import (
     AlignedPair,
     AlignedPlaces,
     LoopClosure,
-    MapInfo,
     PlaceCandidate,
     PlaceCandidates,
     PlaceMatch,
     RelativePose,
 )
-from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap
-from stavpr_ros.mapping.map_version2 import VERSION
 from stavpr_ros.pipeline.overlay import draw_match
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.relative_pose.edge import Edge, Source
@@ -38,8 +32,8 @@ from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from std_msgs.msg import Float32, Header, Int32
 
 DEPTH = 50  # matches kept for slower subscribers
-IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 SECOND = 1_000_000_000
 MIN_VARIANCE = 0.01  # of a pose: (0.1 m)^2 and (0.1 rad)^2
 
@@ -79,7 +73,7 @@ def pose_message(pose: np.ndarray) -> Pose:
     return message
 
 
-def _origin(robot_id: str, places: PlaceMap | GrowingMap | None) -> dict[str, str]:
+def origin(robot_id: str, places: PlaceMap | GrowingMap | None) -> dict[str, str]:
     """Return the fields that name the robot, and the map that indices refer to."""
     return {'robot_id': robot_id, 'map_id': '' if places is None else places.map_id}
 
@@ -101,7 +95,7 @@ def match_message(
     """
     message = PlaceMatch(
         header=header,
-        **_origin(robot_id, places),
+        **origin(robot_id, places),
         status=match.status,
         reason=match.reason,
         place_index=match.place_index,
@@ -155,9 +149,7 @@ def candidates_message(
     """Return the message of the candidates of a match, None without any."""
     if not match.candidates or places is None:
         return None
-    message = PlaceCandidates(
-        header=header, **_origin(robot_id, places), threshold=match.threshold
-    )
+    message = PlaceCandidates(header=header, **origin(robot_id, places), threshold=match.threshold)
     for candidate in match.candidates:
         place = places.place(candidate.place)
         message.candidates.append(
@@ -186,7 +178,7 @@ def loop_closure_message(
 
     :param places: the route, whose places the images of the window are, or a map.
     :param frames: of the poses of the places.
-    :param query: pose of the middle image of the window, shape (7,), and its frame; for maps only,
+    :param query: pose of the image that matched, shape (7,), and its frame; for maps only,
         a route has it.
     """
     if not match.accepted or places is None:
@@ -203,16 +195,17 @@ def loop_closure_message(
         )
         for q, m in match.path.tolist()
     ]
-    middle = (len(stamps) - 1) // 2
+    middle = match.position
     query_stamp, place = stamps[middle], places.place(match.place_index)
     if is_route:
         own = places.place(first + middle)
         query_stamp, query = own.stamp, (own.pose, frames.frame)
     message = LoopClosure(
         header=header,
-        **_origin(robot_id, places),
+        **origin(robot_id, places),
         query_index=first + middle if is_route else -1,
         query_stamp=time_message(query_stamp),
+        is_late=match.is_late,
         place_session=place.session,
         place_index=match.place_index,
         place_stamp=time_message(place.stamp),
@@ -297,41 +290,6 @@ def image_message(header: Header, image: np.ndarray) -> Image:
     height, width = image.shape[:2]
     message = Image(header=header, height=height, width=width, encoding='rgb8', step=width * 3)
     message.data = array.array('B', np.ascontiguousarray(image).tobytes())
-    return message
-
-
-def map_info_message(
-    operation: str,
-    state: str,
-    path: str,
-    places: PlaceMap | GrowingMap | None,
-    extractor: FeatureExtractor | None,
-    stamp: Time,
-    robot_id: str = '',
-) -> MapInfo:
-    """Return the description of the map in use."""
-    message = MapInfo(
-        header=Header(stamp=stamp),
-        **_origin(robot_id, places),
-        operation=operation,
-        state=state,
-        path=path,
-        format_version=VERSION,
-    )
-    if extractor is not None:
-        settings = extractor.settings
-        message.features, message.settings = settings.kind, settings.to_json()
-        message.feature_version = settings.feature_version
-        message.strips = settings.strips
-        message.projected = settings.projection is not None
-    if places is not None:
-        message.places = len(places)
-        message.sessions = [session.id for session in places.sessions]
-        if len(places):
-            message.dimension = places.dimension
-        message.has_stamps, message.has_ids = bool(np.any(places.stamps)), any(places.ids)
-        message.has_poses = places.poses is not None and bool(np.isfinite(places.poses).any())
-        message.has_thumbnails = any(places.thumbnails)
     return message
 
 
@@ -431,26 +389,3 @@ class Output:
             *(self.pose, self.loop_closure, self.match_image),
         ):
             self._node.destroy_lifecycle_publisher(publisher)
-
-
-class MapInfoPublisher:
-    """Publishes ``~/map_info`` when it has changed, in the order of the changes."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._publisher = node.create_publisher(MapInfo, '~/map_info', LATCHED)
-        self._lock = threading.RLock()
-        self.last: MapInfo | None = None
-
-    def publish(self, describe: Callable[[], MapInfo | None]) -> None:
-        """Publish the description if it differs from the last one; None = there is none."""
-        with self._lock:
-            info = describe()
-            if info is None:
-                return
-            info.header.stamp = self._node.get_clock().now().to_msg()
-            last, self.last = self.last, info
-            if last is not None:
-                last.header = info.header  # a new stamp alone is no change
-            if last != info and self._node.context.ok():
-                self._publisher.publish(info)

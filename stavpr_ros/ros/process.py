@@ -13,13 +13,15 @@ from ament_index_python.packages import get_package_share_directory, PackageNotF
 from rcl_interfaces.srv import GetParameters
 import rclpy
 from rclpy.client import Client
+from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
-from stavpr_ros.errors import SettingsError, UnavailableError
+from stavpr_ros.errors import SettingsError, StavprError, UnavailableError
 from stavpr_ros.ros.rclpy_workarounds import PromptExecutor
 from stavpr_ros.signals import end_process, interrupted, signals_deferred, time_left
 
@@ -138,6 +140,32 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
             # shutdown takes the entities from under running callbacks
             executor.finish(time_left(CALLBACK_SECONDS))
         executor.shutdown()
+
+
+def run_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> int:
+    """
+    Run a node until a signal stops the process; return the exit code.
+
+    :param make: returns the node; it has ``THREADS`` for callbacks, 1 by default, and ``failed``
+        if its end may lose something.
+    :param arguments: without the program's name; the process's own if None.
+    """
+    nodes: list[AnyNode] = []
+
+    def kept() -> AnyNode:
+        nodes.append(make())
+        return nodes[0]
+
+    try:
+        with ros_node(kept, arguments) as node:
+            spin_until(node, threads=getattr(node, 'THREADS', 1))
+    except (StavprError, ParameterException) as error:
+        get_logger('stavpr').fatal(f'cannot start: {error}')
+        return 1
+    except BaseException:  # an interrupt inside a foreign library may be raised as another one
+        if not interrupted():
+            raise
+    return int(any(getattr(node, 'failed', False) for node in nodes))
 
 
 class Discovery:

@@ -182,6 +182,8 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return response
 
     def _guarded(self, requested: str | int, change: Callable[[], bool]) -> bool:
+        if self._destroyed:  # a timer may have been due; the state machine must not be used
+            return False
         if not self._in_transition.acquire(blocking=False):
             self.get_logger().warning(
                 f'transition {requested!r} rejected: another is under way ({self.state})'

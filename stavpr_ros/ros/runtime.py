@@ -2,21 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The configured node: the pipeline on its worker, the subscriptions and the publishers."""
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import wait
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
-import threading
 import time
 import traceback
 from typing import Any
 
 import numpy as np
 from stavpr_msgs.msg import MapInfo, PlaceMatch
-from stavpr_ros.errors import JournalError, MapFileError, SettingsError, StavprError
-from stavpr_ros.mapping import PlaceMap, verify_map
+from stavpr_ros.errors import JournalError, SettingsError
+from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
@@ -28,11 +26,12 @@ from stavpr_ros.relative_pose.pair import MatchedPair
 from stavpr_ros.ros.camera import CameraInput
 from stavpr_ros.ros.edges import EdgePublisher
 from stavpr_ros.ros.health import Health
-from stavpr_ros.ros.input import END_POLL, ImageInput, InputStatus, STOP_TIMEOUT, Worker
+from stavpr_ros.ros.input import ImageInput, InputStatus, STOP_TIMEOUT, Worker
+from stavpr_ros.ros.map_info import map_info_message
+from stavpr_ros.ros.map_loading import MapLoader
 from stavpr_ros.ros.navigation import Navigation
 from stavpr_ros.ros.output import (
     loop_closure_message,
-    map_info_message,
     nanoseconds,
     Output,
     PoseFrames,
@@ -41,11 +40,10 @@ from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import OdometryInput
 from stavpr_ros.ros.visualization import Visualization
 from stavpr_ros.signals import time_left
-from stavpr_ros.threads import call_on_thread, limit_threads
+from stavpr_ros.threads import limit_threads
 from std_msgs.msg import Header
 
 RECORDED = 'recorded.stavpr'  # in the maps folder, where no save_path is set
-LOAD_TIMEOUT = 120.0  # seconds to read a map
 REPORT_PERIOD = 10.0  # seconds between repeated warnings
 
 
@@ -65,9 +63,8 @@ class Runtime:
     :param on_map_change: called when the map, or its loading state, has changed.
     :raises StavprError: invalid settings, or an invalid map or model.
 
-    ``problem`` is the error of the last map or subscription, for the diagnostics; ``loading`` the
-    path of the map that is being loaded, '' = none. ``images`` and ``odometry`` are subscriptions
-    while the node is active. ``settings`` are those in force.
+    ``problem`` is the error of the last subscription to odometry, '' = none. ``images`` and
+    ``odometry`` are subscriptions while the node is active. ``settings`` are those in force.
     """
 
     def __init__(
@@ -85,8 +82,14 @@ class Runtime:
         self._epoch = self._pipeline_epoch = 0
         self._explained: set[str] = set()
         self.last_match = PlaceMatch()  # published for the last image in the window
-        self.loading = self.problem = ''
-        self._load_lock = threading.Lock()
+        self.problem = ''
+        self._maps = MapLoader(
+            node,
+            lambda path: read_map(path, self.settings.pipeline),
+            self._use_map,
+            lambda: self.pipeline.places,
+            on_map_change,
+        )
         self._navigation = Navigation(node, settings)
         self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size, settings.robot_id)
@@ -191,8 +194,8 @@ class Runtime:
     def _update_odometry(self) -> None:
         """Subscribe to odometry while it is needed."""
         places, settings = self.pipeline.places, self.settings
-        needed = settings.needs_odometry or (  # edges to places of a map
-            settings.relative_pose in ('auto', 'aligned')
+        needed = settings.needs_odometry or (  # edges to places of a map, and their paths
+            (settings.relative_pose in ('auto', 'aligned') or settings.pipeline.compares_odometry)
             and isinstance(places, PlaceMap)
             and places.has_poses
         )
@@ -220,6 +223,7 @@ class Runtime:
             self.images.stamps.gap = settings.max_stamp_gap
             try:
                 self._update_odometry()
+                self.problem = ''
             except SettingsError as error:
                 self.problem = str(error)
                 self._node.get_logger().error(self.problem)
@@ -232,60 +236,13 @@ class Runtime:
         :raises StavprError: an invalid file, model or setting, or a file that takes too long; the
             old map stays in use.
         """
-        with self._loading(path):
-            loaded = self._read_in_time(path)
-            with lock or nullcontext():
-                self.worker.run(lambda: self.pipeline.change(loaded=loaded))
-                if self.images is not None:
-                    self._update_odometry()
-            self.worker.call(self._publish_route)
-        places = loaded.places
-        self._node.get_logger().info(
-            f'map {path}: {len(places)} places, features {places.settings.kind}, '
-            f'{places.settings.strips} strips of {places.dimension} dimensions'
-        )
-        if places.partial:
-            return
-        # reads all of the file, for seconds: the map is in use meanwhile
-        threading.Thread(target=self._verify, args=(path, places), daemon=True).start()
+        self._maps.load(path, lock)
+        self.worker.call(self._publish_route)
 
-    def _verify(self, path: str, places: PlaceMap) -> None:
-        """Compare the file of the map in use with its hashes; log damage, and keep it."""
-        try:
-            verify_map(places)
-            self._node.get_logger().info(f'map {path} is verified')
-        except MapFileError as error:
-            if self.pipeline.places is places:
-                self.problem = f'the map in use is not reliable: {error}'
-                self._node.get_logger().error(self.problem)
-                self.on_map_change()
-
-    def _read_in_time(self, path: str) -> LoadedMap:
-        """Read a map on a thread that is abandoned when it takes too long, or the node ends."""
-        reading = call_on_thread(lambda: read_map(path, self.settings.pipeline), 'reading')
-        end = time.monotonic() + LOAD_TIMEOUT
-        while not wait([reading], END_POLL).done:
-            if self._node.ending.is_set():
-                raise StavprError('the node ends')
-            if time.monotonic() > end:
-                raise StavprError(
-                    f'{path} was not read within {LOAD_TIMEOUT:g} s: copy it to a faster disk'
-                )
-        return reading.result()
-
-    @contextmanager
-    def _loading(self, path: str) -> Iterator[None]:
-        with self._load_lock:
-            self.loading, self.problem = path, ''
-            self.on_map_change()
-            try:
-                yield
-            except Exception as error:
-                self.problem = f'cannot load {path}: {error}'
-                raise
-            finally:
-                self.loading = ''
-                self.on_map_change()
+    def _use_map(self, loaded: LoadedMap) -> None:
+        self.worker.run(lambda: self.pipeline.change(loaded=loaded))
+        if self.images is not None:
+            self._update_odometry()
 
     def restart(self, reason: str) -> None:
         """Empty the window before the images that arrive from now on."""
@@ -311,7 +268,7 @@ class Runtime:
         pipeline = self.pipeline
         return map_info_message(
             pipeline.operation,
-            'loading' if self.loading else pipeline.map_state,
+            'loading' if self._maps.path else pipeline.map_state,
             pipeline.path,
             pipeline.places,
             pipeline.extractor,
@@ -324,8 +281,8 @@ class Runtime:
         pipeline, images, odometry = self.pipeline, self.images, self.odometry
         return replace(
             health,
-            problem=health.problem or self.problem or pipeline.problem,
-            loading=self.loading,
+            problem=health.problem or self._maps.problem or self.problem or pipeline.problem,
+            loading=self._maps.path,
             input=InputStatus() if images is None else images.status(),
             odometry='' if odometry is None else odometry.freshness(),
             queue=self.worker.waiting,
@@ -406,19 +363,24 @@ class Runtime:
             match = Match(Status.INVALID_IMAGE, reason, cause='internal error')
         odometry_frame = '' if odometry is None else odometry.frame
         self._navigation.publish(header, match, self.pipeline.places, pose, odometry_frame)
-        if match.status is Status.NOT_READY and self.loading:
-            match = replace(match, reason=f'map {self.loading} is being loaded')
-        self._publish(header, match, frames, waited)
-
-    def _publish(self, header: Header, match: Match, frames: PoseFrames, waited: float) -> None:
+        if match.status is Status.NOT_READY and (path := self._maps.path):
+            match = replace(match, reason=f'map {path} is being loaded')
         began = time.monotonic()
-        self._views.publish(header, match, self.pipeline, frames.frame)
+        self._views.publish(header, match, self.pipeline, frames.frame, pose)
+        self._publish(header, match, frames, waited, began)
+
+    def _publish(
+        self, header: Header, match: Match, frames: PoseFrames, waited: float, began: float
+    ) -> None:
         pair = self.pipeline.matched_pair(match)
         # a match does not wait for PnP
         edge = self._edges.aligned(pair) if pair is not None else None
         message = self._output.publish(header, match, self.pipeline.places, frames, edge)
         if pair is not None:
             self._put_closure(header, match, frames, pair)
+        late = self.pipeline.matched_pair(match.late) if match.late is not None else None
+        if match.late is not None and late is not None:
+            self._put_closure(header, match.late, frames, late)
         stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
         if match.cause:
             self._statistics.dropped(match.cause)

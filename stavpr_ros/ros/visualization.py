@@ -20,12 +20,13 @@ from sensor_msgs.msg import CompressedImage, Image
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each
+from stavpr_ros.pose_graph.transforms import inverse, matrices, to_poses
 from stavpr_ros.recognition import Match
 from stavpr_ros.ros.output import image_message, LATCHED, pose_message
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-KEPT = 200  # matched poses and loop closures that are shown
+KEPT = 200  # matched poses, and lines from queries to places, that are shown
 COLUMNS = 512  # of ~/distances, at most
 GROWTH = 1.05  # a growing route is published again when it has grown by this factor
 QUALITY = 80  # of JPEG
@@ -54,21 +55,31 @@ class Visualization:
         self._published: tuple[Places, int, str] = (None, 0, '')
         self.frame = ''
         self._poses: deque[PoseStamped] = deque(maxlen=KEPT)
-        self._closures: deque[tuple[Point, Point, ColorRGBA]] = deque(maxlen=KEPT)
+        self._lines: deque[tuple[Point, Point, ColorRGBA]] = deque(maxlen=KEPT)
+        self._map: PlaceMap | None = None  # of the poses and lines; None = the route
+        self._correction: np.ndarray | None = None  # from the odometry to the map, (4, 4)
 
     @property
     def needs_candidates(self) -> bool:
         """Whether the markers, which show candidates, have a subscriber."""
         return self._is_requested(self._markers)
 
-    def publish(self, header: Header, match: Match, pipeline: Pipeline, frame: str) -> None:
+    def publish(
+        self,
+        header: Header,
+        match: Match,
+        pipeline: Pipeline,
+        frame: str,
+        odometry: np.ndarray | None = None,
+    ) -> None:
         """
         Publish what is requested for one image; on the worker.
 
         :param frame: of the poses of the places.
+        :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
         """
         try:
-            self._publish(header, match, pipeline, frame)
+            self._publish(header, match, pipeline, frame, odometry)
         except rclpy_implementation.RCLError:
             if self._node.context.ok():  # else ROS was shut down before the node
                 raise
@@ -93,20 +104,29 @@ class Visualization:
     def close(self) -> None:
         """Destroy the publishers, and release the map: the executor may keep them for a while."""
         self._on_subscriber, self._published = lambda: None, (None, 0, '')
+        self._map = None
         for publisher in (
             *(self._route, self._matched, self._markers),
             *(self._image, self._window, self._distances),
         ):
             self._node.destroy_publisher(publisher)
 
-    def _publish(self, header: Header, match: Match, pipeline: Pipeline, frame: str) -> None:
+    def _publish(
+        self,
+        header: Header,
+        match: Match,
+        pipeline: Pipeline,
+        frame: str,
+        odometry: np.ndarray | None,
+    ) -> None:
         places = pipeline.places
-        if frame != self.frame:
-            self.frame = frame
+        fixed = places if isinstance(places, PlaceMap) else None
+        if frame != self.frame or fixed is not self._map:
+            self.frame, self._map, self._correction = frame, fixed, None
             self._poses.clear()
-            self._closures.clear()
+            self._lines.clear()
         self.publish_route(places, frame)
-        self._note(header, match, places)
+        self._note(header, match, places, odometry)
         if self._is_requested(self._matched) and match.accepted:
             own = Header(stamp=header.stamp, frame_id=frame)
             self._matched.publish(Path(header=own, poses=list(self._poses)))
@@ -137,21 +157,33 @@ class Visualization:
             message.data = array.array('B', columns.tobytes())
             self._distances.publish(message)
 
-    def _note(self, header: Header, match: Match, places: Places) -> None:
-        """Keep the pose of the matched place, and on a growing route the loop closure."""
+    def _note(
+        self, header: Header, match: Match, places: Places, odometry: np.ndarray | None
+    ) -> None:
+        """
+        Keep the pose of the matched place, and the line from the query to it.
+
+        On a map, the query is where the odometry leads to from the last match: a long line is a
+        jump.
+        """
         if not match.accepted or places is None:
             return
         pose = places.place(match.newest_index).pose
         if pose is not None:
             stamped = Header(stamp=header.stamp, frame_id=self.frame)
             self._poses.append(PoseStamped(header=stamped, pose=pose_message(pose)))
+        query = None
         if match.image_index >= 0:
             query = places.place(match.image_index).pose
-            if pose is not None and query is not None:
-                self._closures.append((_point(query), _point(pose), color(match.probability)))
+        elif pose is not None and odometry is not None:
+            if self._correction is not None:
+                query = to_poses(self._correction @ matrices(odometry))
+            self._correction = matrices(pose) @ inverse(matrices(odometry))
+        if pose is not None and query is not None:
+            self._lines.append((_point(query), _point(pose), color(match.probability)))
 
     def _markers_message(self, header: Header, match: Match, places: Places) -> MarkerArray:
-        """Return the closures, the matched place with its text, and the candidates."""
+        """Return the lines, the matched place with its text, and the candidates."""
         own = Header(stamp=header.stamp, frame_id=self.frame)
         markers = [Marker(header=own, action=Marker.DELETEALL)]
 
@@ -161,11 +193,11 @@ class Visualization:
             markers.append(marker)
             return marker
 
-        if self._closures:
+        if self._lines:
             lines = add(Marker.LINE_LIST)
             lines.scale.x = 0.05
-            lines.points = [point for a, b, _ in self._closures for point in (a, b)]
-            lines.colors = [shade for *_, shade in self._closures for _ in range(2)]
+            lines.points = [point for a, b, _ in self._lines for point in (a, b)]
+            lines.colors = [shade for *_, shade in self._lines for _ in range(2)]
         if places is not None:
             best = [] if not match.accepted else [(match.newest_index, match.probability, 0.8)]
             for place, probability, size in best + [

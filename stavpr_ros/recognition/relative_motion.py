@@ -1,0 +1,156 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Relative motion: whether the way of the query, by odometry, fits its path on the map.
+
+Look-alike corridors are told apart by where they turn. Only positions are compared, in the plane
+of x and y (z is up), relative to each other: the frames of odometry and map may differ, and so may
+the bodies whose poses they are.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import chdtrc
+from stavpr_ros.recognition.match import Match
+
+ALONG = 0.5  # deviation of a matched place along the track, places
+TURNS = 2  # degrees of freedom of the shape of the way; its length has one
+UNUSUAL = 0.05  # of right paths, so many disagree more: from there on, probabilities are lowered
+LEAST_IMAGES = 3
+LONGEST = 5  # windows that the way is compared over
+FARTHEST = 5  # places from image to image
+LEAST_DOUBT = 1e-9  # no probability is 1
+Positions = Sequence[np.ndarray] | np.ndarray
+
+
+class RelativeMotion:
+    """
+    Compares the way of a query with the paths of its matches.
+
+    What disagreed once lasts: while matches continue each other, the way since the first of them
+    is compared, at most ``LONGEST`` windows, beside that of the window alone.
+
+    :param length: images in a window, l.
+    :param error: see :func:`agreement`.
+
+    ``way`` takes x and y of each image by odometry, (2,), meters; NaN = unknown.
+    """
+
+    def __init__(self, length: int, error: float) -> None:
+        self._length, self._error = length, error
+        self.way: deque[np.ndarray] = deque(maxlen=LONGEST * length)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the query."""
+        self.way.clear()
+        self._followed, self._last = 0, 0  # matches that continued each other; place of the last
+
+    def compared(
+        self, match: Match, positions: Positions, first: int, session: tuple[int, int]
+    ) -> Match:
+        """
+        Return a match of mode robust, less probable if odometry disagrees with its path.
+
+        :param positions: x and y of the places held, meters; NaN = unknown.
+        :param first: the first of them.
+        :param session: first place of the match's session, and the first one behind it.
+        """
+        assert match.sequence is not None
+        place, newest = match.sequence.middle, int(match.path[-1, 1])
+        follows = match.accepted and 0 <= place - self._last <= FARTHEST
+        self._followed = self._followed + 1 if follows else 0
+        self._last = place
+        low, high = max(session[0], place - self._reach), min(session[1], place + self._reach)
+        track = np.array(positions[low - first : high - first])
+        way, after = np.array(self.way), self._length - 1 - (self._length - 1) // 2
+        agreed = 1.0
+        for count in {self._length, min(len(way), self._length + self._followed)}:
+            found = agreement(
+                track, (place - low, newest - low), way[-count:], count - 1 - after, self._error
+            )
+            agreed = agreed if np.isnan(found) else min(agreed, found)
+        return less_probable(match, agreed)
+
+    @property
+    def _reach(self) -> int:
+        """Return the places to either side that the way may lead along."""
+        return FARTHEST * len(self.way) + 1
+
+
+def less_probable(match: Match, agreed: float) -> Match:
+    """
+    Return a match whose way agrees so far with its path.
+
+    Agreement is no evidence: other places have a track of that shape as well.
+    """
+    if agreed >= UNUSUAL:
+        return match
+    odds = match.probability / max(1 - match.probability, LEAST_DOUBT) * agreed / UNUSUAL
+    found = match.with_probability(odds / (1 + odds))
+    if match.accepted and not found.accepted:
+        return replace(found, reason=f'{found.reason}: odometry disagrees with its path')
+    return found
+
+
+def agreement(
+    track: np.ndarray, places: tuple[int, int], way: np.ndarray, middle: int, error: float
+) -> float:
+    """
+    Return how often the way of a query on its right path would fit the map less than this one.
+
+    From the middle image of the window on, the way by odometry is laid along the track. Two things
+    are compared: its shape, less one rotation and shift, and its length from the middle image to
+    the newest with that of the path. With the deviations sigma_i = hypot(``ALONG`` spacings,
+    ``error`` s_i) of an image s_i meters from the middle one, the sum
+
+        chi^2 = 2 mean_i (|r_i| / sigma_i)^2 + (length - length of path)^2 / sigma^2
+
+    of the distances r_i that remain has three degrees of freedom, since successive images deviate
+    alike. The path has two places to be wrong about: its sigma has 2 ``ALONG``.
+
+    :param track: positions of successive places, meters, (k, 2); NaN = unknown.
+    :param places: rows of the track matched with the middle image and with the newest.
+    :param way: positions of successive images by odometry, meters, (m, 2); NaN = unknown.
+    :param middle: row of the middle image in ``way``.
+    :param error: of a distance by odometry, as a share of it.
+    :returns: 0 to 1; NaN where too little is known.
+    """
+    at, lengths = _lengths(track)
+    images, driven = _lengths(way)
+    ends = [np.flatnonzero(at == place) for place in places]
+    own = np.flatnonzero(images == middle)
+    if not (own.size and images[-1] == len(way) - 1 and all(end.size for end in ends)):
+        return float('nan')
+    if not lengths[-1] > 0:  # the map's camera stood
+        return float('nan')
+    start, end = (float(lengths[found[0]]) for found in ends)
+    driven = driven - driven[own[0]]
+    spacing = float(lengths[-1]) / (len(lengths) - 1)
+    length_error = driven[-1] - (end - start)
+    total = length_error**2 / _variance(2 * ALONG * spacing, error * driven[-1])
+    inside = (start + driven >= 0) & (start + driven <= lengths[-1])
+    if np.count_nonzero(inside) < LEAST_IMAGES:
+        return float('nan')
+    images, driven = images[inside], driven[inside]
+    mine = way[images] @ (1, 1j)
+    theirs = np.interp(start + driven, lengths, track[at] @ (1, 1j))
+    mine, theirs = mine - mine.mean(), theirs - theirs.mean()
+    turn = np.vdot(mine, theirs)
+    rest = np.abs(theirs - mine * (turn / abs(turn) if turn else 1))
+    total += TURNS * np.mean(rest**2 / _variance(ALONG * spacing, error * driven))
+    return float(chdtrc(TURNS + 1, total))
+
+
+def _variance(along: float, drift: np.ndarray | float) -> np.ndarray:
+    return np.maximum(along**2 + np.square(drift), 1e-12)
+
+
+def _lengths(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of (m, 2) that are known, and the distance driven until each, meters."""
+    known = np.flatnonzero(np.isfinite(positions[:, 0]))
+    steps = np.linalg.norm(np.diff(positions[known], axis=0), axis=1)
+    return known, np.concatenate([[0.0], np.cumsum(steps)])[: len(known)]

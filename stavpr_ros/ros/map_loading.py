@@ -1,0 +1,104 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Loading of the node's map from a file, while the old one stays in use."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import wait
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+import threading
+import time
+
+from stavpr_ros.errors import MapFileError, StavprError
+from stavpr_ros.mapping import GrowingMap, PlaceMap, verify_map
+from stavpr_ros.pipeline.start import LoadedMap
+from stavpr_ros.ros.input import END_POLL
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode
+from stavpr_ros.threads import call_on_thread
+
+LOAD_TIMEOUT = 120.0  # seconds to read a map
+
+
+class MapLoader:
+    """
+    Loads maps, one at a time.
+
+    :param node: it logs, and stops waiting for a file when it ends.
+    :param read: returns the map of a file; called on a thread of its own.
+    :param use: takes a map into use.
+    :param in_use: returns the places in use.
+    :param on_change: called when ``path`` or ``problem`` has changed.
+
+    ``path`` is that of the map that is being loaded, '' = none; ``problem`` the error of the last
+    map, for the diagnostics.
+    """
+
+    def __init__(
+        self,
+        node: ManagedNode,
+        read: Callable[[str], LoadedMap],
+        use: Callable[[LoadedMap], None],
+        in_use: Callable[[], PlaceMap | GrowingMap | None],
+        on_change: Callable[[], None],
+    ) -> None:
+        self._node, self._read, self._use, self._in_use = node, read, use, in_use
+        self._on_change = on_change
+        self._lock = threading.Lock()
+        self.path = self.problem = ''
+
+    def load(self, path: str, lock: AbstractContextManager[object] | None = None) -> None:
+        """
+        Load a map and use it; its hashes are compared later, on a thread.
+
+        :param lock: held while the map comes into use, but not while its file is read.
+        :raises StavprError: an invalid file, model or setting, or a file that takes too long.
+        """
+        with self._loading(path):
+            loaded = self._read_in_time(path)
+            with lock or nullcontext():
+                self._use(loaded)
+        places = loaded.places
+        self._node.get_logger().info(
+            f'map {path}: {len(places)} places, features {places.settings.kind}, '
+            f'{places.settings.strips} strips of {places.dimension} dimensions'
+        )
+        # reads all of the file, for seconds: the map is in use meanwhile
+        if not places.partial:
+            threading.Thread(target=self._verify, args=(path, places), daemon=True).start()
+
+    @contextmanager
+    def _loading(self, path: str) -> Iterator[None]:
+        with self._lock:
+            self.path, self.problem = path, ''
+            self._on_change()
+            try:
+                yield
+            except Exception as error:
+                self.problem = f'cannot load {path}: {error}'
+                raise
+            finally:
+                self.path = ''
+                self._on_change()
+
+    def _read_in_time(self, path: str) -> LoadedMap:
+        """Read a map on a thread that is abandoned when it takes too long, or the node ends."""
+        reading = call_on_thread(lambda: self._read(path), 'reading')
+        end = time.monotonic() + LOAD_TIMEOUT
+        while not wait([reading], END_POLL).done:
+            if self._node.ending.is_set():
+                raise StavprError('the node ends')
+            if time.monotonic() > end:
+                raise StavprError(
+                    f'{path} was not read within {LOAD_TIMEOUT:g} s: copy it to a faster disk'
+                )
+        return reading.result()
+
+    def _verify(self, path: str, places: PlaceMap) -> None:
+        """Compare the file of the map in use with its hashes; log damage, and keep it."""
+        try:
+            verify_map(places)
+            self._node.get_logger().info(f'map {path} is verified')
+        except MapFileError as error:
+            if self._in_use() is places:
+                self.problem = f'the map in use is not reliable: {error}'
+                self._node.get_logger().error(self.problem)
+                self._on_change()

@@ -1,0 +1,219 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Stand-in for the targets of the bridges, and for the recognition node, as a process of its own.
+
+``bridge_target.py TARGET`` publishes a drive of two laps, its keyframes in the messages of the
+target, and loop closures; it writes the edges that come back as JSON.
+"""
+
+import json
+import sys
+import time
+
+from nav_msgs.msg import Odometry
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from stavpr_msgs.msg import LoopClosure, RelativePose
+from stavpr_ros.pose_graph.transforms import inverse, matrices, to_poses
+from stavpr_ros.ros.graph_messages import pose_array
+from stavpr_ros.ros.output import pose_message, time_message
+from test_pose_graph import circle, LAP, planar_poses, SECOND
+
+EDGES = 10
+KEYFRAME = 4  # images, and a keyframe is 0.3 s after an image
+DEVIATIONS = np.array([0.2, 0.1, 0.3, 0.01, 0.02, 0.03])
+TIMEOUT = 120.0
+QOS = QoSProfile(depth=1000)
+
+
+def stamp_of(image: float) -> int:
+    return round((image + 1) * SECOND)
+
+
+class Drive:
+    """Poses of two laps at any fraction of an image."""
+
+    def __init__(self) -> None:
+        self._poses = matrices(planar_poses(circle()))
+
+    def at(self, image: float) -> np.ndarray:
+        whole = int(image)
+        angle = (image - whole) * 2 * np.pi / LAP
+        turn = np.eye(4)
+        turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        moved: np.ndarray = turn @ self._poses[whole]  # the circle is around the origin
+        return moved
+
+
+def closures(drive: Drive, on_map: bool) -> list[LoopClosure]:
+    """Return closures with known errors; every other one is not independent, one is aligned."""
+    found = []
+    for i, query in enumerate(range(LAP + 1, LAP + 1 + 2 * EDGES * KEYFRAME, KEYFRAME)):
+        place = query - LAP + 1
+        message = LoopClosure(query_index=-1 if on_map else query, place_index=place)
+        message.has_relative_pose = message.has_poses = True
+        message.query_pose = pose_message(to_poses(drive.at(query)))
+        message.place_pose = pose_message(to_poses(drive.at(place)))
+        message.pose_frame, relative = 'map', message.relative_pose
+        relative.source, relative.is_independent = RelativePose.PNP, i % 2 == 0
+        relative.query_stamp = message.query_stamp = time_message(stamp_of(query))
+        relative.place_stamp = message.place_stamp = time_message(stamp_of(place))
+        relative.frame = 'base_link'
+        relative.pose.pose = pose_message(to_poses(inverse(drive.at(place)) @ drive.at(query)))
+        relative.pose.covariance = np.diag(DEVIATIONS**2).ravel()
+        found.append(message)
+    found[2].relative_pose.source = RelativePose.ALIGNED
+    return found
+
+
+class Target(Node):
+    """The target of one bridge."""
+
+    def __init__(self, target: str) -> None:
+        super().__init__('target')
+        self.edges: list[dict] = []
+        self.keyframes = {'rtabmap': self._rtabmap, 'pose_graph_tools': self._graph}.get(
+            target, self._swarm
+        )()
+        topics = {'odom': Odometry, 'stavpr/loop_closure': LoopClosure}
+        self.odometry, self.closures = (
+            self.create_publisher(kind, topic, QOS) for topic, kind in topics.items()
+        )
+
+    def _rtabmap(self):
+        from rtabmap_msgs.msg import Info
+        from rtabmap_msgs.srv import AddLink
+
+        def add_link(request, response):
+            link = request.link
+            t, o = link.transform.translation, link.transform.rotation
+            pose = [t.x, t.y, t.z, o.x, o.y, o.z, o.w]
+            information = np.array(link.information).reshape(6, 6)
+            self._add(link.from_id, link.to_id, pose, np.linalg.inv(information), link.type)
+            return response
+
+        self.create_service(AddLink, 'rtabmap/add_link', add_link)
+        publisher = self.create_publisher(Info, 'rtabmap/info', QOS)
+
+        def publish(number: int, stamp: int, pose) -> None:
+            message = Info(ref_id=number)
+            message.header.stamp = time_message(stamp)
+            publisher.publish(message)
+
+        return publisher, publish
+
+    def _graph(self):
+        from pose_graph_tools_msgs.msg import PoseGraph, PoseGraphEdge, PoseGraphNode
+
+        def on_graph(message) -> None:
+            for edge in message.edges:
+                covariance = np.array(edge.covariance).reshape(6, 6)
+                assert (edge.robot_from, edge.robot_to) == (3, 3)
+                assert edge.type == PoseGraphEdge.LOOPCLOSE
+                self._add(edge.key_from, edge.key_to, pose_array(edge.pose), covariance, edge.type)
+
+        self.create_subscription(PoseGraph, 'external_loop_closures', on_graph, QOS)
+        publisher = self.create_publisher(PoseGraph, 'pose_graph', QOS)
+
+        def publish(number: int, stamp: int, pose) -> None:
+            nodes = [PoseGraphNode(robot_id=robot, key=number + robot - 3) for robot in (3, 4)]
+            for node in nodes:
+                node.header.stamp = time_message(stamp)
+            publisher.publish(PoseGraph(nodes=nodes))
+
+        return publisher, publish
+
+    def _swarm(self):
+        from cslam_common_interfaces.msg import (
+            InterRobotLoopClosure,
+            IntraRobotLoopClosure,
+            KeyframeOdom,
+        )
+
+        def on_closure(message) -> None:
+            t, o = message.transform.translation, message.transform.rotation
+            pose, within = [t.x, t.y, t.z, o.x, o.y, o.z, o.w], hasattr(message, 'keyframe0_id')
+            assert message.success
+            if within:
+                numbers = message.keyframe0_id, message.keyframe1_id
+            else:
+                assert (message.robot0_id, message.robot1_id) == (1, 0)
+                numbers = message.robot0_keyframe_id, message.robot1_keyframe_id
+            self._add(*numbers, pose, np.eye(6), 0 if within else 1)
+
+        for kind, topic in (
+            (IntraRobotLoopClosure, 'cslam/intra_robot_loop_closure'),
+            (InterRobotLoopClosure, '/cslam/inter_robot_loop_closure'),
+        ):
+            self.create_subscription(kind, topic, on_closure, QOS)
+        publishers = [
+            self.create_publisher(KeyframeOdom, topic, QOS)
+            for topic in ('cslam/keyframe_odom', '/r1/cslam/keyframe_odom')
+        ]
+        other = self.create_publisher(Odometry, 'place_odom', QOS)
+
+        def publish(number: int, stamp: int, pose) -> None:
+            message = KeyframeOdom(id=number)
+            message.odom = odometry_message(stamp, pose)
+            for publisher in publishers:
+                other.publish(message.odom)
+                publisher.publish(message)
+
+        return publishers[0], publish
+
+    def _add(self, place: int, query: int, pose, covariance: np.ndarray, kind: int) -> None:
+        deviations = np.sqrt(np.linalg.eigvalsh(covariance)).tolist()
+        self.edges.append(
+            {
+                'place': place, 'query': query, 'pose': np.asarray(pose).tolist(), 'type': kind,
+                'deviations': deviations,
+            }
+        )  # fmt: skip
+
+
+def odometry_message(stamp: int, pose: np.ndarray) -> Odometry:
+    message = Odometry(child_frame_id='base_link')
+    message.header.stamp, message.header.frame_id = time_message(stamp), 'odom'
+    message.pose.pose = pose_message(to_poses(pose))
+    return message
+
+
+def main(target: str, on_map: bool) -> None:
+    rclpy.init()
+    node, drive = Target(target), Drive()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    publisher, publish = node.keyframes
+
+    def wait_until(done) -> None:
+        end = time.monotonic() + TIMEOUT
+        while not done() and time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.05)
+
+    wait_until(
+        lambda: all(
+            each.get_subscription_count() for each in (publisher, node.odometry, node.closures)
+        )
+    )
+    for message in closures(drive, on_map):
+        node.closures.publish(message)
+    for image in range(2 * LAP - 1):
+        node.odometry.publish(odometry_message(stamp_of(image), drive.at(image)))
+        if image % KEYFRAME == 0:  # known before the odometry after it
+            publish(image // KEYFRAME + 1, stamp_of(image + 0.3), drive.at(image + 0.3))
+        executor.spin_once(timeout_sec=0.01)
+    expected = EDGES - (target == 'swarm_slam')
+    wait_until(lambda: len(node.edges) >= expected)
+    for _ in range(10):  # for edges too many
+        executor.spin_once(timeout_sec=0.05)
+    print(json.dumps(node.edges), flush=True)
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    main(sys.argv[1], 'map' in sys.argv[2:])

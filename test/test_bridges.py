@@ -1,0 +1,227 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The bridges to other SLAM systems: moved edges, poses, and each bridge as a process."""
+
+import importlib.util
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+import time
+
+from bridge_target import closures, DEVIATIONS, Drive, EDGES, KEYFRAME, stamp_of
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from interface_packages import build_interfaces
+import numpy as np
+from processes import DOMAIN, environment, executable, Process, SECOND, TIMEOUT
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from scipy.spatial.transform import Rotation
+from stavpr_msgs.msg import LoopClosure
+from stavpr_ros.commands.bridge import main
+from stavpr_ros.pose_graph import Closure
+from stavpr_ros.pose_graph.foreign import body_information, ForeignKeyframes, keyframe_edge
+from stavpr_ros.pose_graph.transforms import inverse, matrices, to_poses
+from stavpr_ros.ros.graph_messages import pose_array
+from stavpr_ros.ros.output import nanoseconds
+
+PLACE = np.array([0, 0, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)])  # heading y
+COVARIANCE = np.diag([0.2, 0.1, 0.3, 0.01, 0.02, 0.03]) ** 2
+
+
+def closure(pose: np.ndarray, covariance: np.ndarray = COVARIANCE) -> Closure:
+    return Closure(2 * SECOND, SECOND, pose, covariance)
+
+
+def test_keyframe_edge_of_known_motions_is_transform_of_keyframes():
+    poses = matrices(np.concatenate([np.eye(4, 3), Rotation.random(4, 1).as_quat()], axis=1))
+    place, query, place_keyframe, query_keyframe = poses
+    edge = keyframe_edge(
+        closure(to_poses(inverse(place) @ query)),
+        (7, inverse(place_keyframe) @ place),
+        (9, inverse(query_keyframe) @ query),
+    )
+    assert (edge.place, edge.query) == (7, 9)
+    np.testing.assert_allclose(
+        edge.transform, inverse(place_keyframe) @ query_keyframe, atol=1e-12
+    )
+
+
+def test_keyframe_edge_covariance_is_that_of_samples():
+    dice = np.random.default_rng(0)
+    start = matrices(np.array([1.0, 2, 0, 0, 0, 0.6, 0.8]))
+    before = matrices(np.array([0.5, 0, 0, 0, 0.6, 0, 0.8]))
+    way = matrices(np.array([3.0, 1, 0, 0, 0, 0, 1]))  # a long one, so that its lever counts
+    edge = keyframe_edge(closure(to_poses(start)), (1, before), (2, inverse(way)))
+    errors = []
+    for sample in dice.multivariate_normal(np.zeros(6), COVARIANCE, 20000):
+        moved = start.copy()
+        moved[:3, :3] = Rotation.from_rotvec(sample[3:]).as_matrix() @ start[:3, :3]
+        moved[:3, 3] += sample[:3]
+        end = before @ moved @ way
+        turn = Rotation.from_matrix(end[:3, :3] @ edge.transform[:3, :3].T).as_rotvec()
+        errors.append([*(end[:3, 3] - edge.transform[:3, 3]), *turn])
+    np.testing.assert_allclose(np.cov(np.array(errors).T), edge.covariance, atol=2e-3)
+
+
+def test_body_information_of_turned_query_has_swapped_axes():
+    edge = keyframe_edge(closure(PLACE), (1, np.eye(4)), (2, np.eye(4)))
+    expected = 1 / np.array([0.1, 0.2, 0.3, 0.02, 0.01, 0.03]) ** 2
+    np.testing.assert_allclose(body_information(edge), np.diag(expected), atol=1e-8)
+
+
+def test_foreign_keyframes_near_returns_nearest_with_motion():
+    keyframes = ForeignKeyframes(max_gap=2.0)
+    at = lambda x: np.array([x, 0, 0, 0, 0, 0, 1.0])  # noqa: E731
+    keyframes.add_odometry(SECOND, at(1.0))
+    keyframes.add(3 * SECOND // 2, 5)  # before the odometry after it
+    assert keyframes.near(2 * SECOND, at(2.0)) is None
+    for second in (2, 3, 4, 5, 6, 7):
+        keyframes.add_odometry(second * SECOND, at(second))
+    keyframes.add(4 * SECOND, 6)
+    number, motion = keyframes.near(2 * SECOND, at(2.0))
+    assert number == 5
+    np.testing.assert_allclose(motion[:3, 3], [0.5, 0, 0])
+    assert keyframes.near(3 * SECOND, at(3.0))[0] == 6
+    assert keyframes.near(4 * SECOND, None)[0] == 6  # the same stamp: no motion
+    assert keyframes.near(3 * SECOND, None) is None
+    assert keyframes.near(7 * SECOND, at(7.0)) is None  # 3 s away
+
+
+@pytest.mark.parametrize('target', [[], ['rtab'], ['--ros-args']])
+def test_bridge_without_target_is_usage_error(target, capsys):
+    assert main(target) == 2
+    assert 'rtabmap, rtabmap_global_pose' in capsys.readouterr().err
+
+
+@pytest.mark.skipif(bool(importlib.util.find_spec('rtabmap_msgs')), reason='it is installed')
+def test_bridge_without_package_names_it():
+    done = subprocess.run(
+        [executable('bridge'), 'rtabmap'], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert 'package rtabmap_msgs (ros-jazzy-rtabmap-msgs): install' in done.stderr
+    assert 'Traceback' not in done.stderr
+
+
+def test_pose_bridges_publish_pose_on_map(tmp_path):
+    """The prior of RTAB-Map for each independent closure, robot_localization once."""
+    context = Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    node = rclpy.create_node('peer', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    priors: list[PoseWithCovarianceStamped] = []
+    poses: list[PoseWithCovarianceStamped] = []
+    counts: dict[str, dict[str, str]] = {}
+
+    def on_diagnostics(message: DiagnosticArray) -> None:
+        for status in message.status:
+            counts[status.name] = {each.key: each.value for each in status.values}
+
+    def wait_until(done) -> None:
+        end = time.monotonic() + TIMEOUT
+        while not done():
+            assert time.monotonic() < end, (len(priors), len(poses), counts)
+            executor.spin_once(timeout_sec=0.1)
+
+    qos = QoSProfile(depth=100)
+    kind = PoseWithCovarianceStamped
+    subscriptions = [
+        node.create_subscription(kind, 'global_pose', priors.append, qos),
+        node.create_subscription(kind, 'robot_localization_bridge/pose', poses.append, qos),
+    ]
+    node.create_subscription(DiagnosticArray, '/diagnostics', on_diagnostics, 10)
+    publisher = node.create_publisher(LoopClosure, 'stavpr/loop_closure', qos)
+    targets = ('rtabmap_global_pose', 'robot_localization')
+    processes = [Process(tmp_path / name, 'bridge', name) for name in targets]
+    try:
+        wait_until(lambda: publisher.get_subscription_count() == 2)
+        wait_until(lambda: all(node.count_publishers(each.topic_name) for each in subscriptions))
+        wait_until(lambda: len(counts) == 2)  # they have discovered each other's topics
+        sent = closures(Drive(), on_map=True)
+        sent[-1].relative_pose.query_stamp.sec += 100  # lost in between
+        sent[-1].relative_pose.pose.covariance[0] = np.nan
+        sent[-2].relative_pose.query_stamp.sec += 100
+        for message in [*sent, *closures(Drive(), on_map=False)[:3]]:
+            publisher.publish(message)
+        wait_until(
+            lambda: all(int(each.get('closures', 0)) == len(sent) + 3 for each in counts.values())
+        )
+        wait_until(lambda: len(priors) == EDGES and len(poses) == 2)
+        assert counts['rtabmap_global_pose_bridge: bridge']['not_on_a_map'] == '3'
+        assert counts['robot_localization_bridge: bridge']['invalid'] == '1'
+        assert counts['robot_localization_bridge: bridge']['sent'] == '2'
+        assert [each.header.frame_id for each in (priors[0], poses[0])] == ['base_link', 'map']
+        first = poses[0].pose
+        np.testing.assert_allclose(
+            matrices(pose_array(first.pose)), Drive().at(sent[0].place_index + 99), atol=1e-6
+        )
+        assert nanoseconds(poses[1].header.stamp) == nanoseconds(
+            sent[-2].relative_pose.query_stamp
+        )
+        covariance = np.array(first.covariance).reshape(6, 6)
+        assert np.sqrt(np.linalg.eigvalsh(covariance)) == pytest.approx(sorted(DEVIATIONS))
+    finally:
+        for process in processes:
+            process.end()
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture(scope='module')
+def overlay(tmp_path_factory):
+    """Return the workspace with the message packages of the targets."""
+    return build_interfaces(tmp_path_factory.mktemp('interfaces')) / 'local_setup.bash'
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('case', ['rtabmap', 'pose_graph_tools', 'swarm_slam', 'swarm_slam map'])
+def test_bridge_passes_edges_to_target(case, overlay, tmp_path):
+    """The bridge and the target are processes; edges are between keyframes 0.3 s from images."""
+    target, _, on_map = case.partition(' ')
+    options = ['-p', 'robot_id:=3'] if target == 'pose_graph_tools' else []
+    options += ['-p', 'place_robot_id:=1'] if on_map else []
+    options = ['--ros-args', *options] if options else []
+    tests = str(Path(__file__).parent)
+    own = environment() | {'PYTHONPATH': f'{tests}:{os.environ.get("PYTHONPATH", "")}'}
+
+    def start(*command: str) -> subprocess.Popen:
+        return subprocess.Popen(
+            ['bash', '-c', '. "$0" && exec "$@"', str(overlay), *command],
+            env=own, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+
+    bridge = start(executable('bridge'), target, *options)
+    peer = start(sys.executable, f'{tests}/bridge_target.py', *case.split())
+    try:
+        edges = json.loads(peer.communicate(timeout=200)[0])
+    finally:
+        for process in (peer, bridge):
+            process.terminate()
+    assert bridge.wait(TIMEOUT) == 0
+    drive = Drive()
+    queries = [1 + 100 + 2 * KEYFRAME * i for i in range(EDGES)]
+    if target == 'swarm_slam':
+        del queries[1]  # aligned by odometry
+    assert len(edges) == len(queries)
+    for edge, query in zip(edges, queries, strict=True):
+        numbers = edge['place'], edge['query']
+        images = [(number - 1) * KEYFRAME + 0.3 for number in numbers]
+        assert abs(images[1] - query) <= KEYFRAME / 2
+        assert abs(images[0] - (query - 99)) <= KEYFRAME / 2
+        truth = inverse(drive.at(images[0])) @ drive.at(images[1])
+        np.testing.assert_allclose(
+            matrices(np.array(edge['pose'])), truth, atol=0.02
+        )  # chords of the odometry
+        if target == 'rtabmap':
+            assert edge['type'] == 4
+        if target != 'swarm_slam':
+            assert edge['deviations'][:3] == pytest.approx(sorted(DEVIATIONS)[:3], rel=0.2)
+    assert stamp_of(0) == SECOND

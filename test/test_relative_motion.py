@@ -1,0 +1,232 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry against the paths of matches: look-alike corridors, drift, poses that are unknown."""
+
+from dataclasses import replace
+
+import numpy as np
+from pipelines import localizing, message, process
+import pytest
+from scipy.stats import chi2
+from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.mapping import PlaceMap, save_map
+from stavpr_ros.mapping.place_map import Session
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.recognition.relative_motion import agreement
+import torch
+
+pytestmark = pytest.mark.usefixtures('one_thread')
+N, LENGTH, CORNER = 90, 10, 45
+MIDDLE = (LENGTH - 1) // 2
+
+
+def track(turn=0.0, corner=CORNER, count=N, step=1.0, start=0.0):
+    """Return positions of a corridor that turns by so many degrees at a place, (count, 2)."""
+    headings = np.radians(start + turn * (np.arange(1, count) >= corner))
+    steps = step * np.column_stack([np.cos(headings), np.sin(headings)])
+    return np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+
+
+def poses_of(positions):
+    rest = np.tile([0.0, 0, 0, 0, 1], (len(positions), 1))
+    return np.hstack([positions, rest])
+
+
+def corridor(seed=0, noise=0.5):
+    """Return features of places, and of the same places another time, (W, N, d) each."""
+    rng = np.random.default_rng(seed)
+    places = rng.standard_normal((7, N, 32))
+    both = places, places + noise * rng.standard_normal(places.shape)
+    return [features_of(each) for each in both]
+
+
+def features_of(strips):
+    strips = strips / np.linalg.norm(strips, axis=2, keepdims=True)
+    settings = FeatureSettings('gradient', None, 7)
+    return LocalFeatures(torch.from_numpy(strips).float(), torch.ones(strips.shape[:2]), settings)
+
+
+def map_of(features, positions, **changes):
+    poses = None if positions is None else poses_of(positions)
+    n = len(features)
+    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n, poses, **changes)
+
+
+def settings_of(**changes):
+    return RecognizerSettings(
+        0.5, sequence=SequenceSettings(LENGTH), nms_radius=5, mode='robust', **changes
+    )
+
+
+def drive(recognizer, features, positions=None):
+    poses = [None] * len(features) if positions is None else poses_of(positions)
+    return [recognizer.update(features[i : i + 1], pose=poses[i]) for i in range(len(features))]
+
+
+def test_agreement_of_another_length_is_the_tail_of_chi_squared():
+    """Five images after the middle one drive 8 m, where the path is 5 places of 1 m long."""
+    way = track(count=LENGTH, step=1.6)
+    found = agreement(track(), (40, 45), way, MIDDLE, 0.1)
+    assert found == pytest.approx(chi2.sf(3**2 / (1 + 0.8**2), 3))
+    assert agreement(track(), (40, 45), track(count=LENGTH), MIDDLE, 0.1) == 1
+
+
+def test_agreement_of_another_shape_is_the_tail_of_chi_squared():
+    """Five images: 1 m ahead, then 1 m to the side, on a straight track."""
+    way = np.array([[-1.0, 0], [0, 0], [0, 1]])
+    # less mean and rotation: a triangle on a line of three points
+    mine, line = way @ (1, 1j), np.array([-1, 0, 1])
+    mine = (mine - mine.mean()) * np.exp(-1j * np.pi / 4)
+    rest = np.abs(line - mine) ** 2 / (0.25 + np.array([0.1, 0, 0.1]) ** 2)
+    found = agreement(track(), (40, 41), way, 1, 0.1)
+    assert found == pytest.approx(chi2.sf(2 * rest.mean(), 3))
+
+
+@pytest.mark.parametrize('turn', [90, -90])
+def test_agreement_of_turns_is_independent_of_frames(turn):
+    places = CORNER - 1, CORNER + 4
+    own = track(turn, 5, LENGTH, start=70) + np.array([100, -30])
+    other = track(-turn, 5, LENGTH)
+    assert agreement(track(turn), places, own, MIDDLE, 0.1) > 0.99
+    assert agreement(track(turn), places, other, MIDDLE, 0.1) < 1e-3
+    assert agreement(track(), places, own, MIDDLE, 0.1) < 0.05
+
+
+def test_agreement_without_poses_is_unknown():
+    way, unknown = track(count=LENGTH), np.full(2, np.nan)
+    for hole, rows in (('way', (MIDDLE, LENGTH - 1)), ('track', (40, 45))):
+        for row in rows:
+            arrays = {'track': track(), 'way': way.copy()}
+            arrays[hole][row] = unknown
+            found = agreement(arrays['track'], (40, 45), arrays['way'], MIDDLE, 0.1)
+            assert np.isnan(found), (hole, row)
+    others = way.copy()
+    others[[0, 7]] = unknown  # of other images: the rest is compared
+    assert agreement(track(), (40, 45), others, MIDDLE, 0.1) == 1
+    assert np.isnan(agreement(np.zeros((N, 2)), (40, 45), way, MIDDLE, 0.1))  # it stood
+    assert np.isnan(agreement(track(), (40, 45), np.full((LENGTH, 2), np.nan), MIDDLE, 0.1))
+
+
+def test_look_alike_corridors_are_told_apart_by_their_turns():
+    """Equal images; matched until the corner is in the window, and long not after it."""
+    places, query = corridor()
+    place_map = map_of(places, track(90))
+    by_images = drive(PlaceRecognizer(place_map, settings_of()), query)
+    assert all(match.accepted for match in by_images[LENGTH:])
+    matches = drive(PlaceRecognizer(place_map, settings_of()), query, track(-90))
+    accepted = np.array([match.accepted for match in matches])
+    assert accepted[LENGTH : CORNER - 1].all()
+    assert not accepted[CORNER + 4 : CORNER + 3 * LENGTH].any()
+    last = matches[CORNER + LENGTH]
+    assert last.status is Status.NO_MATCH
+    assert last.reason.endswith('not above 0.500: odometry disagrees with its path')
+    assert last.distance == 1 - last.probability > 0.5
+    assert (
+        last.sequence.middle == by_images[CORNER + LENGTH].sequence.middle
+    )  # the place stays the best
+
+
+def test_the_same_corridor_is_matched_in_spite_of_drift():
+    places, query = corridor()
+    rng = np.random.default_rng(1)
+    steps = np.diff(track(90), axis=0) @ (1, 1j) * (1.03 + 0.02 * rng.standard_normal(N - 1))
+    steps *= np.exp(1j * np.cumsum(np.radians(0.3) * rng.standard_normal(N - 1)))
+    way = np.concatenate([[0], np.cumsum(steps)])
+    way = np.column_stack([way.real, way.imag])
+    place_map = map_of(places, track(90))
+    plain = drive(PlaceRecognizer(place_map, settings_of()), query)
+    matches = drive(PlaceRecognizer(place_map, settings_of()), query, way)
+    assert [match.probability for match in matches[LENGTH:]] == [
+        match.probability for match in plain[LENGTH:]
+    ]
+
+
+@pytest.mark.parametrize(
+    ('positions', 'way', 'changes'),
+    [
+        (track(90), None, {}),
+        (None, track(-90), {}),
+        (track(90), track(-90), {'odometry_error': 0.0}),
+        (track(90), track(-90), {'mode': 'paper'}),
+    ],
+    ids=['no odometry', 'no poses of places', 'switched off', 'mode paper'],
+)
+def test_absence_of_odometry_or_poses_changes_nothing(positions, way, changes):
+    places, query = corridor()
+    settings = replace(settings_of(), **changes)
+    expected = drive(PlaceRecognizer(map_of(places, None), settings), query)
+    found = drive(PlaceRecognizer(map_of(places, positions), settings), query, way)
+    assert [repr(one.sequence) for one in found] == [repr(one.sequence) for one in expected]
+    assert [one.reason for one in found] == [one.reason for one in expected]
+
+
+def test_session_of_a_match_ends_its_track():
+    """The second session begins elsewhere: what lies between is no way."""
+    places, query = corridor()
+    positions = track(90)
+    positions[CORNER:] += (1000.0, 0)
+    sessions = Session('a'), Session('b')
+    index = (np.arange(N) >= CORNER).astype(np.int32)
+    place_map = map_of(places, positions, sessions=sessions, session_index=index)
+    way = np.vstack([track(90)[:CORNER], track(90)[CORNER:]])
+    matches = drive(PlaceRecognizer(place_map, settings_of()), query, way)
+    assert all(match.accepted for match in matches[LENGTH : CORNER - 6])
+    assert all(match.accepted for match in matches[CORNER + LENGTH :])
+
+
+def test_reset_forgets_the_way():
+    places, query = corridor()
+    one = PlaceRecognizer(map_of(places, track(90)), settings_of())
+    drive(one, query, track(-90))
+    one.reset()
+    fresh = drive(PlaceRecognizer(map_of(places, track(90)), settings_of()), query, track(90))
+    again = drive(one, query, track(90))
+    assert [match.probability for match in again[LENGTH:]] == [
+        match.probability for match in fresh[LENGTH:]
+    ]
+
+
+@pytest.mark.parametrize('limit', [None, 150], ids=['whole route', 'evicted'])
+def test_loop_closure_compares_the_way_with_its_route(limit):
+    """The second lap turns left where the first turned right; evicted places change nothing."""
+    first, second = corridor()
+    both = features_of(torch.cat([first.strips, second.strips], 1).numpy())
+    results = []
+    for turn in (-90, 90):
+        closer = LoopCloser(settings_of(), 20, first.settings, limit)
+        ways = track(-90, 60), track(turn, 60)
+        matches = drive(closer, both, np.concatenate(ways))
+        assert len(closer._positions) == len(closer)
+        results.append(np.array([match.accepted for match in matches[N:]]))
+    same, other = results
+    assert same[LENGTH:].all()
+    assert other[LENGTH:60].all()
+    assert not other[60 + 8 :].any()
+
+
+def test_pipeline_compares_the_pose_of_each_image(small_map, route, tmp_path):
+    turned = replace(small_map, poses=poses_of(track(90, 14, len(small_map), step=2.0)))
+    save_map(turned, tmp_path / 'turned.stavpr')
+    pipeline = localizing(str(tmp_path / 'turned.stavpr'))
+    images = route[5:25]
+    assert process(pipeline, images)[-1].accepted
+    pipeline.reset()
+    match = None
+    for i, image in enumerate(images):
+        pose = poses_of(track(-90, 9, 20, step=2.0))[i]
+        match = pipeline.process(message(image), (i + 1) * 10**9, pose)
+    assert match.status is Status.NO_MATCH
+    assert 'odometry disagrees' in match.reason
+
+
+def test_invalid_settings_and_poses_are_rejected():
+    places, query = corridor()
+    with pytest.raises(SettingsError, match='odometry_error = 1\\.5 must be a share'):
+        settings_of(odometry_error=1.5)
+    one = PlaceRecognizer(map_of(places, track()), settings_of())
+    with pytest.raises(InputError, match='pose has shape'):
+        one.update(query[:1], pose=np.zeros(3))
+    assert one.window_fill == 0
