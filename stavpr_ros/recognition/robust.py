@@ -358,5 +358,5 @@ def less_alike(
 
 
 def chance_of(n: int) -> float:
-    """Return the least z of n places that is to be expected by chance."""
+    """Return the least z of n places that is to be expected at random."""
     return -math.sqrt(2 * math.log(max(n / INDEPENDENT, 2)))
