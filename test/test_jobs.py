@@ -44,6 +44,7 @@ def built(drives, tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_build_map_of_several_inputs_equals_maps_of_each(drives, built, tmp_path, capfd):
     options = ['--no-thumbnails', '--processes', '2']
     output = ['--output', str(tmp_path / 'maps')]
