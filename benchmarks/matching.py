@@ -9,19 +9,22 @@ benchmarks/matching.py``. Method and tables: benchmarks/README.md.
 
 import argparse
 from dataclasses import asdict
+import importlib.util
 from pathlib import Path
 import sys
 import time
 from typing import TYPE_CHECKING
 
-from results import RESULTS
+from results import RESULTS, ROOT
 
 if TYPE_CHECKING:
     from run import Run
 
-SIZES = (2_000, 20_000, 100_000)
+SIZES = (2_000, 20_000, 100_000, 1_000_000)
+CITY = 200_000  # places from which on only mode robust in int8 is measured, and the first stage
 QUICK_LIMIT = 20_000  # most places of --quick
 DIMENSIONS = (224, 512)  # of the gradient features, and of projected ones
+GRAPH = ROOT / 'docs' / 'performance.png'
 BUSY = 0.5  # load average above which results are not repeatable
 
 
@@ -51,6 +54,7 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
     """Measure all stages of all sizes."""
     from extraction import extraction_stages
     from stages import (
+        city_stages,
         device_retrieval,
         feature_stages,
         memory_problem,
@@ -64,6 +68,10 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
     for n in options.sizes:
         robust_stages(run, n, options.seed)
     for n in options.sizes:
+        if n >= CITY:
+            run.skip('frame', n, 0, 'float32, float16 and mode paper: too large, see first_stage')
+            city_stages(run, n, options.dimensions[0], options.seed)
+            continue
         for d in options.dimensions:
             problem = memory_problem(n, d, run.device, 1e9 * options.memory)
             try:
@@ -73,7 +81,7 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
                 problem = f'out of memory: {str(error).splitlines()[0]}'
             if problem:
                 run.skip('frame', n, d, problem)
-    for n in options.sizes:
+    for n in (size for size in options.sizes if size < CITY):
         paper_stages(run, n, options.seed)
         if run.device == 'cuda':
             device_retrieval(run, n, options.seed)
@@ -92,6 +100,7 @@ def main(arguments: list[str] | None = None) -> int:
     except StavprError as error:
         print(error, file=sys.stderr)
         return 2
+    from graphs import draw
     from memory import CASES, measure_memory
     from peaks import measure_peaks
     from report import report, target_section
@@ -118,6 +127,9 @@ def main(arguments: list[str] | None = None) -> int:
         'skipped': [asdict(skipped) for skipped in run.skipped],
     }
     write(options.output / name, document, report(about, rows, memory, peaks, run.skipped))
+    if importlib.util.find_spec('matplotlib'):
+        documented = options.output == RESULTS and not options.quick and options.device == 'cpu'
+        draw(rows, GRAPH if documented else (options.output / name).with_suffix('.png'))
     print('\n'.join(target_section(rows, options.device)))
     print(f'took {time.perf_counter() - began:.0f} s\nwrote {options.output / name} and its .md')
     return 0

@@ -147,6 +147,7 @@ def main() -> None:
     )
     parser.add_argument('--seconds', type=float, default=300)
     parser.add_argument('--rate', type=float, default=30, help='images per second (%(default)s)')
+    parser.add_argument('--map', help=f'instead of one of {PLACES} synthetic places')
     parser.add_argument(
         '--parameter',
         action='append',
@@ -163,8 +164,9 @@ def main() -> None:
     os.environ.update(environment)
     prepare_transport()
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / 'map.stavpr'
-        make_map(path)
+        path = Path(arguments.map or Path(folder) / 'map.stavpr').resolve()
+        if not arguments.map:
+            make_map(path)
         parameters = [f'map_path:={path}', *arguments.parameter]
         options = [word for parameter in parameters for word in ('-p', parameter)]
         command = [executable('node'), '--ros-args', *options]
@@ -174,7 +176,7 @@ def main() -> None:
         finally:
             node.send_signal(signal.SIGINT)
             node.wait()
-    figures |= {'places': PLACES, 'parameters': arguments.parameter}
+    figures |= {'map': arguments.map or f'{PLACES} places', 'parameters': arguments.parameter}
     figures |= {'cpu': cpu_model(), 'cores': os.cpu_count(), 'commit': commit(), **versions()}
     text = json.dumps(figures, indent=2)
     print(text)

@@ -15,6 +15,7 @@ from lower_bounds import Sizes
 import numpy as np
 from peaks import slower_than_float32
 from run import Peer, Run
+from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.alignment.lm_dtw import (
     best_match,
     match_padded,
@@ -26,6 +27,7 @@ from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.int8_features import Int8Features
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.place_filter import FilterSettings, PlaceFilter
 from stavpr_ros.recognition.robust import MeanCentering, z_normalized
@@ -229,6 +231,33 @@ def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
     return [bounds.mean_centering(sizes), *works, bounds.query_znorm(sizes), *filters]
 
 
+def city_stages(run: Run, n: int, d: int, seed: int) -> None:
+    """Measure the image distances of a map in int8 and its first stage, on a CPU."""
+    from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+    from stavpr_ros.recognition.first_stage import FirstStage
+    from stavpr_ros.recognition.place_filter import BLOCK, TOP
+
+    rounded = Int8Strips(STRIPS, n, d)
+    for low in range(0, n, MATRIX_PLACES):
+        some = make_features(min(MATRIX_PLACES, n - low), d, STRIPS, 'cpu', seed + low)
+        rounded.write(low, some.strips)
+    query = make_features(1, d, STRIPS, 'cpu', seed)
+    weights = torch.full((STRIPS, n), STRIPS**-0.5)
+    places = Int8Features(rounded, weights, query.settings)
+    exact = CpuMatcher(places, SPATIAL, 'int8')
+    probable = np.linspace(0, n - BLOCK, TOP).astype(np.int64)
+    stage = FirstStage(exact, places, lambda: probable)
+    arguments = query.strips[:, 0].contiguous(), query.weights[:, 0]
+    sizes = Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k)
+    works = [bounds.product(sizes, 'int8'), bounds.spatial_alignment(sizes)]
+    call = partial(exact.distances, *arguments)
+    run.measure('image_distances', (n, d), call, works, precision='int8')
+    reduced = [bounds.product(Sizes(n, stage.dimension, 1), 'int8')]
+    call = partial(stage.distances, *arguments)
+    peer = Peer('exact', timed(partial(exact.distances, *arguments)), 'all places exactly')
+    run.measure('first_stage', (n, d), call, reduced, [peer], 'int8', 'robust')
+
+
 def products(
     run: Run, places: LocalFeatures, queries: LocalFeatures, precision: str
 ) -> list[Peer]:
@@ -243,7 +272,24 @@ def products(
         call, form = bare_product(rows, places.strips.to(kind), wait)
         note = f'{form}, all pairs of strips, no alignment'
         peers.append(Peer(f'torch {dtype}', timed(call, wait), note, partial=True))
+    if run.device == 'cpu' and precision == 'float32' and len(queries) == 1:
+        peers += faiss_peer(run, places, queries)
     return peers
+
+
+def faiss_peer(run: Run, places: LocalFeatures, queries: LocalFeatures) -> list[Peer]:
+    """Return FAISS as a peer of the product: whole images as vectors, the nearest one of all."""
+    try:
+        import faiss  # type: ignore[import-not-found]
+    except ImportError:
+        run.skip('faiss', 0, 0, 'not installed (requirements/faiss.txt)')
+        return []
+    vectors = places.strips.transpose(0, 1).flatten(1).contiguous().numpy()
+    index = faiss.IndexFlatIP(vectors.shape[1])
+    index.add(vectors)
+    query = queries.strips.transpose(0, 1).flatten(1).contiguous().numpy()
+    note = 'IndexFlatIP, one product of whole images instead of 49 of strips'
+    return [Peer('faiss flat', timed(partial(index.search, query, 1)), note, partial=True)]
 
 
 def bare_product(

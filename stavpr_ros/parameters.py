@@ -379,6 +379,15 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             choices=('float32', 'float16', 'int8'),
         ),
         NodeParameter(
+            'time_budget_ms',
+            0.0,
+            'Time for one image in localization, mode robust, CPU: where exact matching takes '
+            'longer on this map, measured at the start, a coarse first stage selects the places '
+            'that are compared exactly; 0 = always exact.',
+            'ms',
+            bounds=(0.0, 60000.0),
+        ),
+        NodeParameter(
             'threads',
             0,
             'Number of CPU threads of the numerics; 0 = all.',

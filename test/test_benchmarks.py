@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 import sys
 
+import cv2
 import numpy as np
 import oracle
 import pytest
@@ -17,8 +18,10 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / 'benchmarks'
 sys.path.insert(0, str(BENCHMARKS))
 
 import accuracy
+import city
 import compare
 import data
+import graphs
 import lower_bounds as bounds
 import matching
 import memory
@@ -34,6 +37,7 @@ from stavpr_ros.alignment import match_sequence, SequenceDistances
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.evaluation.drive import DriveChanges
 from stavpr_ros.evaluation.ground_truth import GroundTruth
+from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.match import Match, Status
 import targets
@@ -385,7 +389,8 @@ def test_change_by_name_is_drive(name, changes):
 
 def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     monkeypatch.setattr(peaks, 'measure_peaks', lambda *_: PEAKS)
-    given = '--sizes 50 --dimensions 16 --seconds 0.001 --no-memory --commit abc'
+    monkeypatch.setattr(matching, 'CITY', 200)
+    given = '--sizes 50 300 --dimensions 16 --seconds 0.001 --no-memory --commit abc'
     assert matching.main([*given.split(), '--output', str(tmp_path)]) == 0
     (path,) = tmp_path.glob('matching-*.json')
     document = json.loads(path.read_text())
@@ -393,7 +398,7 @@ def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     robust = {row['stage'] for row in rows if row['mode'] in ('', 'robust')}
     assert robust == {
         *('decoding', 'extraction', '1080p raw to features', '1080p JPEG to features'),
-        *report.ROBUST_STAGES, 'distance_matrix', 'frame',
+        *report.ROBUST_STAGES, 'distance_matrix', 'frame', 'first_stage',
     }  # fmt: skip
     paper = {row['stage'] for row in rows if row['mode'] == 'paper'}
     assert paper == {'lm_dtw', 'selection', 'path_trace', 'frame'}
@@ -408,3 +413,45 @@ def test_command_on_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
     assert matching.main(['--device', 'cuda', '--output', str(tmp_path)]) == 2
     assert 'torch sees no CUDA device here' in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+# ------------------------------------------------ the city
+
+
+def similar_places():
+    """Return places of which each resembles the one before, and all their mean."""
+    strips = data.make_features(60, 16, 7, 'cpu', 0).strips + 0.3
+    strips[:, 1:] += strips[:, :-1].clone()
+    weights = torch.full((7, 60), 7**-0.5)
+    unit = strips / strips.norm(dim=2, keepdim=True)
+    return LocalFeatures(unit, weights, FeatureSettings('synthetic', None))
+
+
+def test_simulated_places_have_mean_and_neighbors_of_real_ones():
+    real = similar_places()
+    strips = torch.cat(list(city.simulated(real, 5000, seed=0)), dim=1)
+    assert strips.shape == (7, 5000, real.dimension)
+    torch.testing.assert_close(strips.norm(dim=2), torch.ones(7, 5000))
+    mean, expected = strips.mean(dim=1), real.strips.mean(dim=1)
+    assert float(torch.cosine_similarity(mean.flatten(), expected.flatten(), dim=0)) > 0.99
+    change = 1 - (strips[:, 1:] * strips[:, :-1]).sum(dim=2).mean()
+    of_real = 1 - (real.strips[:, 1:] * real.strips[:, :-1]).sum(dim=2).mean()
+    assert 0.5 < float(change / of_real) < 2
+
+
+def test_city_holds_real_places_at_its_first():
+    real = similar_places()
+    features, first = city.city(real, 500, seed=0)
+    torch.testing.assert_close(
+        features[first : first + len(real)].strips, real.strips, atol=1e-3, rtol=0
+    )
+    assert features.dimension == real.dimension
+    assert len(features) == 500
+
+
+def test_graph_of_committed_results_is_drawn(tmp_path):
+    path = results.RESULTS / 'matching-amd-epyc-2-cores.json'
+    rows = graphs.read(path)
+    assert {row.stage for row in rows} >= {'image_distances', 'filter_update', 'frame'}
+    graphs.draw(rows, tmp_path / 'graph.png')
+    assert cv2.imread(str(tmp_path / 'graph.png')).shape[1] > 1000

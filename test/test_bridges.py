@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridges to other SLAM systems: moved edges, poses, and each bridge as a process."""
 
-import importlib.util
 import json
 import os
 from pathlib import Path
@@ -24,9 +23,11 @@ from rclpy.qos import QoSProfile
 from scipy.spatial.transform import Rotation
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.commands.bridge import main
+from stavpr_ros.errors import UnavailableError
 from stavpr_ros.pose_graph import Closure
 from stavpr_ros.pose_graph.foreign import body_information, ForeignKeyframes, keyframe_edge
 from stavpr_ros.pose_graph.transforms import inverse, matrices, to_poses
+from stavpr_ros.ros.bridges.bridge import interfaces
 from stavpr_ros.ros.graph_messages import pose_array
 from stavpr_ros.ros.output import nanoseconds
 
@@ -58,15 +59,14 @@ def test_keyframe_edge_covariance_is_that_of_samples():
     before = matrices(np.array([0.5, 0, 0, 0, 0.6, 0, 0.8]))
     way = matrices(np.array([3.0, 1, 0, 0, 0, 0, 1]))  # a long one, so that its lever counts
     edge = keyframe_edge(closure(to_poses(start)), (1, before), (2, inverse(way)))
-    errors = []
-    for sample in dice.multivariate_normal(np.zeros(6), COVARIANCE, 20000):
-        moved = start.copy()
-        moved[:3, :3] = Rotation.from_rotvec(sample[3:]).as_matrix() @ start[:3, :3]
-        moved[:3, 3] += sample[:3]
-        end = before @ moved @ way
-        turn = Rotation.from_matrix(end[:3, :3] @ edge.transform[:3, :3].T).as_rotvec()
-        errors.append([*(end[:3, 3] - edge.transform[:3, 3]), *turn])
-    np.testing.assert_allclose(np.cov(np.array(errors).T), edge.covariance, atol=2e-3)
+    samples = dice.multivariate_normal(np.zeros(6), COVARIANCE, 20000)
+    moved = np.tile(start, (20000, 1, 1))
+    moved[:, :3, :3] = Rotation.from_rotvec(samples[:, 3:]).as_matrix() @ start[:3, :3]
+    moved[:, :3, 3] += samples[:, :3]
+    end = before @ moved @ way
+    turns = Rotation.from_matrix(end[:, :3, :3] @ edge.transform[:3, :3].T).as_rotvec()
+    errors = np.concatenate([end[:, :3, 3] - edge.transform[:3, 3], turns], axis=1)
+    np.testing.assert_allclose(np.cov(errors.T), edge.covariance, atol=2e-3)
 
 
 def test_body_information_of_turned_query_has_swapped_axes():
@@ -99,14 +99,9 @@ def test_bridge_without_target_is_usage_error(target, capsys):
     assert 'rtabmap, rtabmap_global_pose' in capsys.readouterr().err
 
 
-@pytest.mark.skipif(bool(importlib.util.find_spec('rtabmap_msgs')), reason='it is installed')
-def test_bridge_without_package_names_it():
-    done = subprocess.run(
-        [executable('bridge'), 'rtabmap'], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 1
-    assert 'package rtabmap_msgs (ros-jazzy-rtabmap-msgs): install' in done.stderr
-    assert 'Traceback' not in done.stderr
+def test_interfaces_of_missing_package_is_error_that_names_it():
+    with pytest.raises(UnavailableError, match=r'package other_msgs \(its source\): install'):
+        interfaces('other_msgs', 'its source')
 
 
 def test_pose_bridges_publish_pose_on_map(tmp_path):

@@ -13,7 +13,7 @@ from stavpr_ros.features.extractor import FeatureSettings
 from stavpr_ros.mapping import descriptor_map, Session
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.place_filter import PlaceFilter
-from stavpr_ros.recognition.robust import FilterSettings, less_alike, z_normalized
+from stavpr_ros.recognition.robust import FilterSettings, z_normalized
 import torch
 
 N, LAG = 37, 3
@@ -94,16 +94,6 @@ def test_z_normalized_on_device_equals_that_of_the_cpu(cuda_filter):
     for values in (row, np.full(5, 0.5, np.float32), np.full(3, np.inf, np.float32)):
         found = cuda_filter.z_normalized_on_device(torch.from_numpy(values))
         np.testing.assert_allclose(found, z_normalized(values), rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize('n', [8, 29, 60])
-def test_z_normalized_on_device_with_look_alikes_equals_that_of_the_cpu(cuda_filter, n):
-    row = np.random.default_rng(0).uniform(0.9, 1, n).astype(np.float32)
-    row[[2, n - 1]] = 0.1, 0.2
-    found = cuda_filter.z_normalized_on_device(torch.from_numpy(row), look_alikes=True)
-    z = less_alike(z_normalized(row))
-    assert (z[0] > z_normalized(row)[0] + 0.5) == (n == 60)
-    np.testing.assert_allclose(found, z, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(('sessions', 'precision'), [(False, 'int8'), (True, 'float16')])

@@ -70,6 +70,28 @@ def page_data(page):
 # ---------------------------------------------------------------------------------- numbers
 
 
+def test_evaluate_compares_odometry_with_the_map_poses(folders, numbers, tmp_path):
+    """The map turns left at place 30; the query does, too, or turns right."""
+    ways = {}
+    for name, side in (('left', 1), ('right', -1)):
+        steps = np.array([[1, 0]] * 30 + [[0, side]] * (PLACES - 30))
+        ways[name] = tmp_path / f'{name}.csv'
+        np.savetxt(ways[name], np.column_stack([np.cumsum(steps, 0), np.zeros(PLACES)]), '%g', ',')
+    options = [*pair(folders), '--map-poses', ways['left']]
+    plain = numbers(*pair(folders))['decision']
+    same = numbers(*options, '--odometry', ways['left'])
+    assert same['decision'] == plain
+    assert same['settings']['odometry'] == str(ways['left'])
+    other = numbers(*options, '--odometry', ways['right'])['decision']
+    assert other['matched'] < plain['matched'] - 15
+    short = tmp_path / 'short.csv'
+    short.write_text('0,0,0\n' * 9)
+    with pytest.raises(AssertionError, match='9 poses for 60 images'):
+        numbers(*options, '--odometry', short)
+    with pytest.raises(AssertionError, match='the map has no poses: give --map-poses'):
+        numbers(*pair(folders), '--odometry', ways['left'])
+
+
 def test_evaluate_of_two_folders_writes_numbers_and_settings(folders, numbers):
     found = numbers(*pair(folders), '--features', 'gradient', '--mode', 'paper', '--tolerance', 1)
     for kind in KINDS:
@@ -446,6 +468,8 @@ LOOP = ['--query', 'x', '--loop-closure', '--truth', 'y']
         ([*LOOP, '--backend', 'auto'], 2, '--backend'),
         ([*LOOP[:-1], 'poses', '--map-poses', 'y'], 2, '--map-poses'),
         (['--map', 'x', '--query', 'y', '--exclude-places', '9'], 2, 'goes with --loop-closure'),
+        (['--map', 'x', '--query', 'y', '--late-closures'], 2, 'goes with --loop-closure'),
+        (['--dataset', 'a=b', '--odometry', 'x.csv'], 2, 'give --map and --query'),
         (['--map', 'x', '--query', 'y', '--tolerance', '-1'], 2, '--tolerance'),
         (['--map', 'x', '--query', 'y', '--nms-radius', '-1'], 2, 'nms_radius'),
         (['--map', 'x', '--query', 'y', '--map-poses', 'z'], 2, '--truth poses'),
@@ -494,12 +518,14 @@ def test_evaluate_on_gardens_point_gives_the_measured_f1(data_folder, numbers):
 def test_evaluate_of_loop_closures_in_the_hallway_gives_the_measured_recall(data_folder, numbers):
     folder = data_folder / 'rtabmap_hallway_loop'
     options = ['--loop-closure', '--exclude-places', 20, '--sequence-length', 10]
-    found = numbers(
-        *('--query', folder / 'samples', '--truth', folder / 'samples_GT.bmp'), *options
-    )
+    options += ['--query', folder / 'samples', '--truth', folder / 'samples_GT.bmp']
+    found = numbers(*options)
     assert found['sequence']['recall_at_1'] > 0.8
     assert found['default_threshold']['threshold'] == 0.5  # 1 - min_probability
     assert found['decision']['precision'] == found['default_threshold']['precision'] == 1
+    late = numbers(*options, '--late-closures')
+    assert late['decision']['precision'] == 1
+    assert late['decision']['recall'] > found['decision']['recall']
 
 
 def test_reports_and_numbers_are_replaced_only_by_force(run, folders, tmp_path):

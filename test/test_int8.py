@@ -82,6 +82,18 @@ def test_strip_distances_equal_oracle_bit_for_bit(W, n, d, seed):
         np.testing.assert_array_equal(found, expected_distances(held, queries, x))
 
 
+@pytest.mark.parametrize(('n', 'd'), [(1, 5), (9, 30), (300, 1000)])
+def test_vectors_equal_single_strips_bit_for_bit(n, d):
+    """The kernel of one vector an image, and that of strips."""
+    reference, queries = random_strips(1, n, d), random_strips(1, 2, d, seed=10)
+    held = rounded(features_of(reference), lambda some: some).strips
+    out = np.empty((2, n), np.float32)
+    int8.cosine_distances(held.kernel_arguments(), int8.tiled(queries), out)
+    for x in range(2):
+        found, _ = kernel_distances(reference, queries, x)
+        np.testing.assert_array_equal(out[x], found[0, 0])
+
+
 @pytest.mark.parametrize('d', [1, 2, 8, 224, 1000])
 def test_products_of_extreme_strips_neither_saturate_nor_overflow(d):
     """Strips with one value, all equal, two neighbors, in all signs: the largest products."""

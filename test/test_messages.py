@@ -243,6 +243,15 @@ def test_loop_closure_message_of_a_late_match_is_of_the_oldest_image(places):
     assert not loop_closure_message(HEADER, replace(late, is_late=False), places).is_late
 
 
+def test_loop_closure_message_has_changes_of_the_images(places):
+    changes = (1.0, 0.25, 0.5, 0.125, 0.75)
+    match = accepted(image_index=59, window_changes=changes)
+    message = loop_closure_message(HEADER, match, places)
+    assert [pair.query_change for pair in message.pairs] == [changes[q] for q in PATH[:, 0]]
+    plain = loop_closure_message(HEADER, accepted(image_index=59), places)
+    assert np.isnan([pair.query_change for pair in plain.pairs]).all()
+
+
 def test_loop_closure_message_on_a_map_has_poses_of_two_frames(places):
     query = np.array([7.0, 8, 0, 0, 0, 0, 1])
     frames = PoseFrames('map', 'base')

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executable ``pose_graph`` over ROS, and its messages."""
 
+import math
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -13,7 +14,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from stavpr_msgs.msg import LoopClosure, RelativePose
+from stavpr_msgs.msg import AlignedPlaces, LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.pose_graph.transforms import planar_poses
 from stavpr_ros.ros.graph_messages import closure_of
@@ -132,6 +133,18 @@ def test_closure_of_appearance_is_edge_of_meters_only_on_request():
     assert found is not None
     assert np.sqrt(found.covariance[0, 0]) == pytest.approx(3)
     assert not found.is_independent
+
+
+def test_closure_of_message_has_changes_of_the_images():
+    message = LoopClosure(query_index=3, place_index=1)
+    message.query_stamp, message.place_stamp = time_message(3 * SECOND), time_message(SECOND)
+    message.pairs = [
+        AlignedPlaces(query_stamp=time_message(stamp * SECOND), query_change=change)
+        for stamp, change in ((2, math.nan), (3, 0.25), (4, 0.5))
+    ]
+    found = closure_of(message, appearance=True)
+    assert found is not None
+    assert found.changes == ((3 * SECOND, 0.25), (4 * SECOND, 0.5))
 
 
 def test_closure_of_map_has_pose_of_place():

@@ -196,8 +196,15 @@ def test_match_has_stamps_of_its_window(small_map, mode):
     for i in range(7):
         match = one.update(small_map.features[i : i + 1], 100 + i)
         assert match.window_stamps == tuple(range(100 + max(0, i - 4), 101 + i))
+        changes = match.window_changes
+        if mode == 'robust':
+            assert len(changes) == len(match.window_stamps)
+            assert changes[-1] > 0
+    assert bool(changes) is (mode == 'robust')
     one.reset()
-    assert one.update(small_map.features[:1], 3).window_stamps == (3,)
+    match = one.update(small_map.features[:1], 3)
+    assert match.window_stamps == (3,)
+    assert len(match.window_changes) == (mode == 'robust')
 
 
 def test_recognizer_separates_route_in_other_light_from_other_route(small_map, route):

@@ -8,6 +8,7 @@ import numpy as np
 from pipelines import localizing, message, process
 import pytest
 from scipy.stats import chi2
+from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
@@ -16,6 +17,7 @@ from stavpr_ros.mapping.place_map import Session
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.relative_motion import agreement
+from std_srvs.srv import Trigger
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -110,7 +112,7 @@ def test_agreement_without_poses_is_unknown():
     assert np.isnan(agreement(track(), (40, 45), np.full((LENGTH, 2), np.nan), MIDDLE, 0.1))
 
 
-def test_look_alike_corridors_are_told_apart_by_their_turns():
+def test_look_alike_corridors_are_distinguished_by_their_turns():
     """Equal images; matched until the corner is in the window, and long not after it."""
     places, query = corridor()
     place_map = map_of(places, track(90))
@@ -189,14 +191,13 @@ def test_reset_forgets_the_way():
     ]
 
 
-@pytest.mark.parametrize('limit', [None, 150], ids=['whole route', 'evicted'])
-def test_loop_closure_compares_the_way_with_its_route(limit):
+def test_loop_closure_compares_the_way_with_its_route():
     """The second lap turns left where the first turned right; evicted places change nothing."""
     first, second = corridor()
     both = features_of(torch.cat([first.strips, second.strips], 1).numpy())
     results = []
     for turn in (-90, 90):
-        closer = LoopCloser(settings_of(), 20, first.settings, limit)
+        closer = LoopCloser(settings_of(), 20, first.settings, limit=150)
         ways = track(-90, 60), track(turn, 60)
         matches = drive(closer, both, np.concatenate(ways))
         assert len(closer._positions) == len(closer)
@@ -230,3 +231,16 @@ def test_invalid_settings_and_poses_are_rejected():
     with pytest.raises(InputError, match='pose has shape'):
         one.update(query[:1], pose=np.zeros(3))
     assert one.window_fill == 0
+
+
+def test_node_compares_odometry_with_the_path(robot, start, route):
+    """Ten meters an image, where the places are one meter apart; then as the places are."""
+    start(relative_pose='none')
+    robot.until(lambda: robot.odometry.get_subscription_count() > 0, 'a subscriber of odometry')
+    far = [robot.show_at(10.0 * i, image) for i, image in enumerate(route[:20])]
+    assert far[-1].status == PlaceMatch.NO_MATCH
+    assert far[-1].reason.endswith('odometry disagrees with its path')
+    assert far[-1].probability < 0.5
+    robot.does(Trigger, 'reset')
+    near = [robot.show_at(500.0 + i, image) for i, image in enumerate(route[:20])]
+    assert (near[-1].status, near[-1].newest_index) == (PlaceMatch.MATCH, 19)

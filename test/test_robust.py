@@ -46,7 +46,7 @@ def test_robust_options_by_name():
     assert options_of('robust') == ROBUST == RobustOptions()
     assert options_of('paper') == PAPER
     assert not PAPER.any
-    assert RobustOptions.only('place_filter') == RobustOptions(False, False, False, False, True)
+    assert RobustOptions.only('place_filter') == RobustOptions(False, False, False, True)
     assert not ROBUST.without('mean_centering', 'place_filter').mean_centering
     assert ROBUST.without('mean_centering').place_filter
     for wrong in (

@@ -200,10 +200,11 @@ def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajecto
 
 def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     """Return the map, and the journal that it is in."""
-    from stavpr_ros.commands.feature_options import make_extractor
+    from stavpr_ros.commands.feature_options import make_extractor, principal_dimension
     from stavpr_ros.mapping.builder import build_journal
     from stavpr_ros.mapping.journal_map import journal_map
     from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
+    from stavpr_ros.mapping.reduction import with_principal_components
     from stavpr_ros.sources import open_source
 
     skipped = []
@@ -213,7 +214,10 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
         print(f'skipped: {error}', file=sys.stderr)
 
     _check(arguments)
-    keyframes, extractor = _keyframes(arguments), make_extractor(arguments)
+    keyframes, projection = _keyframes(arguments), arguments.projection
+    learned = isinstance(projection, str)
+    plain = argparse.Namespace(**vars(arguments) | ({'projection': None} if learned else {}))
+    extractor = make_extractor(plain)
     source = open_source(
         arguments.input, arguments.topic, skip if arguments.skip_bad_images else None
     )
@@ -230,6 +234,8 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
         thumbnail_width=width,
     )
     place_map = journal_map(journal)
+    if learned:
+        place_map = with_principal_components(place_map, principal_dimension(projection))
     if arguments.odometry and not place_map.has_poses:
         raise SourceError(
             f'--odometry {arguments.odometry}: no image has a pose; are the stamps of both from '

@@ -187,6 +187,8 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     radius = 'other candidates are farther from the match than this (%(default)s)'
     add('--nms-radius', type=int, default=20, metavar='PLACES', help=radius)
     add('--backend', choices=('auto', 'cpu', 'cuda'), default='cpu', help='(%(default)s)')
+    budget = 'for an image; a coarse first stage where it takes longer; 0 = exact (%(default)g)'
+    add('--time-budget-ms', type=float, default=0.0, metavar='MS', help=budget)
     precision = 'of the map (%(default)s)'
     add('--precision', choices=('float32', 'float16', 'int8'), default='float32', help=precision)
 
@@ -256,6 +258,7 @@ def node_settings(arguments: argparse.Namespace) -> 'PipelineSettings':
         ),
         sequence=SequenceSettings(arguments.sequence_length, arguments.beta),
         nms_radius=arguments.nms_radius,
+        time_budget_ms=arguments.time_budget_ms,
     )
 
 
@@ -302,7 +305,7 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
         *('crop_map', 'crop_query', 'truth', *poses),
         *('mode', 'min_probability', 'sequence_length', 'beta', 'nms_radius'),
         *('strategy', 'sigma', 'xi', 'vertical'),
-        *('backend', 'precision', 'late_closures', 'odometry'),
+        *('backend', 'precision', 'time_budget_ms', 'late_closures', 'odometry'),
     ]
     settings: dict[str, Any] = {}
     for name in names:

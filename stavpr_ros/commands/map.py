@@ -68,6 +68,12 @@ def _parser() -> argparse.ArgumentParser:
         help='of the features; float16 is half of float32 (%(default)s)',
     )
     action.add_argument(
+        '--pca',
+        type=int,
+        metavar='D',
+        help='strips of D dimensions, by the principal components of the map',
+    )
+    action.add_argument(
         '--drop-duplicates',
         action='store_true',
         help='without places that show what the one before shows, where the camera stood; of a '
@@ -206,6 +212,7 @@ def _compact(arguments: argparse.Namespace) -> None:
     from dataclasses import replace
 
     from stavpr_ros.mapping import open_map, verify_map
+    from stavpr_ros.mapping.reduction import with_principal_components
     from stavpr_ros.mapping.stored_features import StoredFeatures
     from stavpr_ros.recognition.near_duplicates import without_duplicates
 
@@ -216,6 +223,9 @@ def _compact(arguments: argparse.Namespace) -> None:
     if arguments.drop_duplicates:
         place_map = without_duplicates(place_map, progress=True)
         print(f'{n - len(place_map)} of {n} places dropped: they show what the one before shows')
+    if arguments.pca is not None:
+        print(f'strips of {place_map.dimension} dimensions become {arguments.pca}')
+        place_map = with_principal_components(place_map, arguments.pca)
     if arguments.drop_thumbnails:
         size = sum(map(len, place_map.thumbnails)) / 1e6
         place_map = replace(place_map, thumbnails=())

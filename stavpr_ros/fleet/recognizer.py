@@ -31,7 +31,7 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import Match, RecognizerSettings, Status
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
-from stavpr_ros.recognition.robust import FilterSettings, less_alike, MIN_DEVIATION, ROBUST
+from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION, ROBUST
 from stavpr_ros.recognition.sequence_search import (
     change_between,
     FilterSearch,
@@ -207,6 +207,7 @@ class FleetRecognizer(SequenceRecognizer):
         z = (row[self._sampled :] - np.float32(mean)) / np.float32(deviation)
         image = _Image(strips, features.weights[:, 0], change, stamp, mean, deviation, z)
         self._images.append(image)
+        self._changes.append(change)
         self._count += 1
         self._unasked.append((self._count, place_vectors(strips[:, None])))
         if self._motion is not None:
@@ -218,7 +219,8 @@ class FleetRecognizer(SequenceRecognizer):
         if self._layout is not None:
             match = self._compared(self._match_window(), position)
             self._nearest = match.sequence
-            return replace(match, window_stamps=self._buffer.stamps)
+            stamps, changes = self._buffer.stamps, tuple(self._changes)
+            return replace(match, window_stamps=stamps, window_changes=changes)
         status = Status.WARMING_UP
         if self.window_fill == self._settings.sequence.length:
             status = Status.NO_MATCH
@@ -341,11 +343,7 @@ class FleetRecognizer(SequenceRecognizer):
         if not len(places):
             self._layout = None
             return
-        index = self._city.store.index
-        runs = index.runs(places)
-        firsts = _firsts(places, runs)
-        sizes = np.diff(index.firsts, append=index.places)
-        self._sessions = [(runs == run, int(sizes[run])) for run in np.unique(runs)]
+        firsts = _firsts(places, self._city.store.index.runs(places))
         same_as = np.searchsorted(places, self._same_as[self._order])
         same_as = np.minimum(same_as, len(places) - 1)
         here = places[same_as] == self._same_as[self._order]
@@ -364,10 +362,7 @@ class FleetRecognizer(SequenceRecognizer):
     def _push(self, image: _Image) -> None:
         assert self._layout is not None
         assert self._filter is not None
-        z, held = image.z[self._order], self._places[self._order]
-        for run, places in self._sessions:
-            z[run] = less_alike(z[run], held[run], places)
-        row = self._layout.spread(torch.from_numpy(z))
+        row = self._layout.spread(torch.from_numpy(image.z[self._order]))
         self._buffer.push(row, image.stamp)
         self._filter.update(row.numpy(), image.change)
 

@@ -115,6 +115,12 @@ class Pipeline:
         return operation.recognizer.window_fill if operation and operation.recognizer else 0
 
     @property
+    def stages(self) -> str:
+        """Return how a time budget is kept; empty without one."""
+        operation = self._operation
+        return operation.recognizer.stages if isinstance(operation, Localization) else ''
+
+    @property
     def missing(self) -> str:
         """Return why no match is possible yet; empty when nothing is missing."""
         if self._name == 'localization' and self._map is None:

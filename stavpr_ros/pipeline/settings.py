@@ -50,6 +50,7 @@ class PipelineSettings:
     mode: str = 'robust'
     backend: str = 'auto'
     precision: str = 'float32'
+    time_budget_ms: float = 0.0
     model_path: str = ''
     allow_torchscript: bool = False
     features: str = 'gradient'
@@ -102,6 +103,7 @@ class PipelineSettings:
             self.nms_radius,
             self.mode,
             odometry_error=self.odometry_error,
+            time_budget_ms=self.time_budget_ms,
         )
 
     @property

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loop closures with a relative pose: the measurements of the graph."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from stavpr_ros.errors import InputError
@@ -20,6 +20,8 @@ class Closure:
     :param is_independent: its error does not correlate with that of the edge before.
     :param map_id: of the map that the place is in, whose pose there is ``place_pose``, shape (7,);
         empty = the place is on the same drive.
+    :param changes: stamps (ns) of the images of the window, the newest last, and how much each
+        differs from the image before it; more than usual where the robot was carried.
     """
 
     query_stamp: int
@@ -29,6 +31,7 @@ class Closure:
     is_independent: bool = True
     map_id: str = ''
     place_pose: np.ndarray | None = None
+    changes: tuple[tuple[int, float], ...] = ()
 
     def checked(self) -> 'Closure':
         """
@@ -47,10 +50,7 @@ class Closure:
             raise InputError('a closure has a stamp of 0: expected those of the two images')
         if self.map_id and self.place_pose is None:
             raise InputError('a closure with a map has no pose of the place in the map')
-        return Closure(
-            self.query_stamp, self.place_stamp, checked_pose(self.pose), covariance,
-            self.is_independent, self.map_id, self.place_pose,
-        )  # fmt: skip
+        return replace(self, pose=checked_pose(self.pose), covariance=covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +59,8 @@ class ResolvedClosure:
     A closure between two nodes of the graph.
 
     :param query, place: nodes.
+    :param stamp: of the images that the closure is evidence of, ns: recognition follows the newest
+        images of a window more than those before its middle, the query.
     :param transform: of the query's node in the place's, shape (4, 4).
     :param covariance: in the axes of the query's node, rotation first, shape (6, 6).
     :param at: distance travelled at the query, m.
@@ -71,4 +73,5 @@ class ResolvedClosure:
     covariance: np.ndarray
     at: float
     number: int
+    stamp: int
     is_independent: bool

@@ -30,9 +30,8 @@ class ConsistencySettings:
     :param span: meters that the query travels at most in a cluster.
     :param support: least closures of a cluster.
     :param join_support: least closures that join two sessions.
-    :param break_support, break_distance: closures, and meters that the query travels, in
-        successive clusters that contradict the graph and nothing between that agrees with it,
-        which prove that the odometry has a break.
+    :param break_support, break_distance: closures, and meters that the query travels, in each of
+        two runs that contradict each other, which prove that the odometry has a break between.
     """
 
     gap: float = 15.0
@@ -188,6 +187,11 @@ class ConsistentSet:
     def __init__(self, settings: ConsistencySettings) -> None:
         self._settings = settings
         self._conflicts = np.zeros((64, 64), bool)
+
+    @property
+    def conflicts(self) -> np.ndarray:
+        """Return which clusters contradict each other, (m, m), bool, m >= n."""
+        return self._conflicts
 
     def update(
         self,

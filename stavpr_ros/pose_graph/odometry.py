@@ -75,6 +75,7 @@ class KeyframeChain:
         self.sessions = 0
         self._tail: tuple[int, np.ndarray] | None = None  # stamp and pose of the newest odometry
         self._fixed: dict[tuple[str, int], int] = {}
+        self._cuts: dict[int, int] = {}  # first nodes after splits, and their stamps
         self.breaks: list[str] = []
 
     def __len__(self) -> int:
@@ -200,7 +201,8 @@ class KeyframeChain:
         """
         Return the keyframe before a stamp, and the transform (4, 4) from it to the stamp.
 
-        None = no odometry at this stamp; the latest recording counts where stamps repeat.
+        After a split it is the keyframe after the stamp, where that is on the same side. None
+        = no odometry at this stamp; the latest recording counts where stamps repeat.
         """
         for number in range(len(self._recorded) - 1, -1, -1):
             stamps, nodes = self._recorded[number]
@@ -211,24 +213,32 @@ class KeyframeChain:
             i = bisect_right(stamps, stamp) - 1
             if stamps[i] == stamp:
                 return nodes[i], np.eye(4)
-            start = to_poses(self.transforms[nodes[i]])
+            node, start = nodes[i], to_poses(self.transforms[nodes[i]])
             if i + 1 < len(stamps):
                 after, pose = stamps[i + 1], to_poses(self.transforms[nodes[i + 1]])
+                if stamp >= self._cuts.get(nodes[i + 1], after):
+                    node = nodes[i + 1]
             else:
                 assert end is not None
                 after, pose = end[0], end[1]
             at = interpolate(start, pose, (stamp - stamps[i]) / (after - stamps[i]))
-            return nodes[i], inverse(matrices(start)) @ matrices(at)
+            return node, inverse(self.transforms[node]) @ matrices(at)
         return None
 
     def is_ahead(self, stamp: int) -> bool:
         """Return whether odometry of this stamp may still arrive."""
         return self._tail is None or stamp > self._tail[0]
 
-    def split(self, node: int) -> None:
-        """Let a new session begin at a keyframe."""
+    def split(self, node: int, stamp: int) -> None:
+        """
+        Let a new session begin.
+
+        :param node: its first keyframe.
+        :param stamp: of its first odometry, ns, after the keyframe before.
+        """
         old = self.session[node]
         later = (self.session == old) & (np.arange(self._count) >= node)
         self.session[later] = self.sessions
         self.previous[node] = -1
+        self._cuts[node] = stamp
         self.sessions += 1

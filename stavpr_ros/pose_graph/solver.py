@@ -62,13 +62,20 @@ class Solver:
         """
         Bring the estimate up to date.
 
-        :param initial: of all nodes; those of known nodes do not matter, shape (N, 4, 4).
+        Nodes after the last edge are where the odometry has them: they wait for the next edge.
+
+        :param initial: of all nodes; the last estimate and what the odometry adds to it, shape
+            (N, 4, 4).
         :param edges: the accepted closures by their numbers.
         :param links: first node of each session that no edge joins to others: the node that it is
             tied to loosely; -1 = it is the anchor.
         :returns: transforms of all nodes in the map, shape (N, 4, 4).
         """
         gtsam = self._gtsam
+        removed = [self._factors.pop(k) for k in list(self._factors) if k not in edges]
+        added = [k for k in edges if k not in self._factors]
+        if self._isam is not None and not added and not removed:
+            return initial
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         if self._isam is None:
             options = gtsam.ISAM2Params()
@@ -77,8 +84,6 @@ class Solver:
             options.relinearizeSkip = 1
             self._isam = gtsam.ISAM2(options)
         self._add_nodes(graph, values, chain, initial, noise, links)
-        removed = [self._factors.pop(k) for k in list(self._factors) if k not in edges]
-        added = [k for k in edges if k not in self._factors]
         first = graph.size()
         for number in added:
             graph.add(self._edge(edges[number]))
@@ -86,8 +91,7 @@ class Solver:
         indices = result.getNewFactorsIndices()
         for i, number in enumerate(added):
             self._factors[number] = indices[first + i]
-        for _ in range(3 if added or removed else 0):
-            self._isam.update()
+        self._isam.update()  # once more: the first one moves the points of linearization
         return _matrices(gtsam, self._isam.calculateEstimate(), len(chain))
 
     def solve(

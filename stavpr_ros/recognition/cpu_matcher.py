@@ -86,9 +86,11 @@ class CpuMatcher:
     def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Return the distances of Q images to every place, (Q, n)."""
         out = np.empty((strips.shape[1], self.places), np.float32)
-        if not isinstance(self._map, tuple) and len(self._map) == 1:
-            # one vector an image: its alignment is its cosine distance
-            dot.cosine_distances(self._map[0], strips[0].contiguous().numpy(), out)
+        if len(self._weights) == 1:  # one vector an image: its alignment is its cosine distance
+            if isinstance(self._map, tuple):
+                int8.cosine_distances(self._map, int8.tiled(strips), out)
+            else:
+                dot.cosine_distances(self._map[0], strips[0].contiguous().numpy(), out)
             return torch.from_numpy(out)
         strips = strips if self._cells is None else cut_cells(strips.cpu(), self._cells)
         queries = int8.tiled(strips) if isinstance(self._map, tuple) else dot.tiled(strips)
@@ -102,6 +104,20 @@ class CpuMatcher:
             for x in range(len(out)):
                 out[x] = self._without_dtw(queries, x, weights[:, x])
         return torch.from_numpy(out)
+
+    def distances_at(self, strips: torch.Tensor, firsts: np.ndarray, size: int) -> np.ndarray:
+        """
+        Return the distances of one image to chunks of places, strategies with DTW only.
+
+        :param firsts: first place of each chunk, multiples of the kernels' lanes, (m,).
+        :returns: shape (m, size), float32; +inf behind the last place.
+        """
+        out = np.full((len(firsts), size), np.inf, np.float32)
+        tiled = int8.tiled if isinstance(self._map, tuple) else dot.tiled
+        dot.image_distances_at(
+            self._map, tiled(strips[:, None]), self._a, self._band, self.places, firsts, out
+        )
+        return out
 
     def _without_dtw(self, queries: Any, x: int, weights: torch.Tensor) -> np.ndarray:
         """Return the distances of image x without DTW, (n,)."""

@@ -5,36 +5,20 @@
 import numpy as np
 from stavpr_ros.alignment.cuda.compilation import runtime
 from stavpr_ros.recognition.place_filter import Belief, belief_of, NEGLIGIBLE, TOP
-from stavpr_ros.recognition.robust import (
-    chance_of,
-    ELSEWHERE,
-    FilterSettings,
-    LEAST_ELSEWHERE,
-    MIN_DEVIATION,
-)
+from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION
 import torch
 
 MOST = 512  # most probable places that are copied back: more than are ever excluded
 
 
-def z_normalized_on_device(row: torch.Tensor, look_alikes: bool = False) -> torch.Tensor:
-    """
-    Return a row as :func:`stavpr_ros.recognition.robust.z_normalized`, without waiting.
-
-    :param look_alikes: and as :func:`stavpr_ros.recognition.robust.less_alike`.
-    """
+def z_normalized_on_device(row: torch.Tensor) -> torch.Tensor:
+    """Return a row as :func:`stavpr_ros.recognition.robust.z_normalized`, without waiting."""
     known = torch.isfinite(row)
     count = known.sum().clamp(min=1)
     values = torch.where(known, row, 0)
     mean = values.sum() / count
     off = torch.where(known, row - mean, 0)
-    z = (row - mean) / (off.square().sum() / count).sqrt().clamp(min=MIN_DEVIATION)
-    if not look_alikes or not len(z):
-        return z
-    apart = torch.abs(torch.arange(len(z), device=z.device) - torch.argmin(z)) > ELSEWHERE
-    elsewhere = torch.where(apart, z, torch.inf).min()
-    grown = (chance_of(len(z)) - elsewhere).clamp(min=0)
-    return z + torch.where(apart.sum() < LEAST_ELSEWHERE, 0, grown)
+    return (row - mean) / (off.square().sum() / count).sqrt().clamp(min=MIN_DEVIATION)
 
 
 class CudaPlaceFilter:

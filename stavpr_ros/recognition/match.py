@@ -62,6 +62,8 @@ class Match:
     :param late: the match of the oldest image, where it had none as the middle one; None = it had,
         or is not certain now either.
     :param window_stamps: stamps (ns) of the images in the window, oldest first, this one the last.
+    :param window_changes: how much each of them differs from the image before it, 0 = equal; empty
+        in mode paper.
     :param image_index: place of a growing map that this image has become, -1 = none.
     :param inliers: of the geometric verification, -1 = not verified.
     :param candidates: nearest places, nearest first.
@@ -81,6 +83,7 @@ class Match:
     is_late: bool = False
     late: 'Match | None' = field(default=None, repr=False)
     window_stamps: tuple[int, ...] = field(default=(), repr=False)
+    window_changes: tuple[float, ...] = field(default=(), repr=False)
     image_index: int = -1
     inliers: int = -1
     candidates: tuple[Candidate, ...] = ()

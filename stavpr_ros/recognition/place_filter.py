@@ -21,10 +21,10 @@ Recognition for Hierarchical Localization", RA-L 2021, with speeds, levels and s
 
 All states advance in one pass over the places, in place and on all lanes. A thread takes
 ``PLACES`` places, from the last to the first ``BLOCK`` of them, since states only move up; the
-last places before its own are copied beforehand. States are not normalized: the factor that makes
-their sum 1 is part of the next image's level changes. Where a state came from in speed travels in
-the lowest two bits of its probability, which no answer depends on; two origins share a byte, those
-of an even speed and of the next.
+last places before its own are copied beforehand. The states of a block lie together. They are not
+normalized: the factor that makes their sum 1 is part of the next image's level changes. Where a
+state came from in speed travels in the lowest two bits of its probability, which no answer depends
+on; two origins share a byte, those of an even speed and of the next.
 """
 
 from collections.abc import Iterable
@@ -119,13 +119,12 @@ class PlaceFilter:
 
     def _allocate(self, room: int) -> None:
         K, V = len(self._levels), len(self._speeds)
-        self._room, pitch = room, -(-room // LANES) * LANES
+        self._room, blocks = room, max(1, -(-room // BLOCK))
         # not normalized: times scale, the states are probabilities
-        self._a: np.ndarray = np.zeros((K, V, pitch), np.float32)
-        blocks = max(1, -(-room // BLOCK))
+        self._a: np.ndarray = np.zeros((blocks, K, V, BLOCK), np.float32)
         self._by_place: np.ndarray = np.zeros(blocks * BLOCK, np.float32)  # sums of the states
         self._maxima: np.ndarray = np.zeros(blocks, np.float32)  # of these, by block
-        shape = len(self._steps), K, (V + 1) // 2, pitch
+        shape = len(self._steps), blocks, K, (V + 1) // 2, BLOCK
         self._origins: np.ndarray = np.full(shape, ALL_BORN, np.uint8)
         self._halos: np.ndarray = np.zeros((-(-room // PLACES), K, V, self._reach), np.float32)
 
@@ -148,16 +147,16 @@ class PlaceFilter:
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
-        a, origins, by_place, n = self._a, self._origins, self._by_place, self._room
+        a, origins, by_place = self._a, self._origins, self._by_place
         self._allocate(places)
-        self._a[:, :, :n], self._origins[..., :n] = a[:, :, :n], origins[..., :n]
+        self._a[: len(a)], self._origins[:, : len(a)] = a, origins
         self._set_by_place(by_place)
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
-        for values, none in ((self._a, 0), (self._origins, ALL_BORN)):
-            values[..., :-count] = values[..., count:].copy()
-            values[..., -count:] = none
+        _move_up(self._a, count, 0)
+        for origins in self._origins:
+            _move_up(origins, count, ALL_BORN)
         self._set_by_place(self._by_place[count:].copy())
 
     def _set_by_place(self, by_place: np.ndarray) -> None:
@@ -187,10 +186,12 @@ class PlaceFilter:
         real = max(n - len(self._gaps), 1)
         states = len(self._levels) * len(self._speeds) * real
         if not self._count and n:
-            self._a[:, :, :n], self._off[:] = s.start / states, (1 - s.start) / len(self._levels)
-            self._a[:, :, self._gaps] = 0
+            self._a[: -(-n // BLOCK)] = s.start / states
+            self._off[:] = (1 - s.start) / len(self._levels)
+            self._clear_from(n)
+            self._a[self._gaps // BLOCK, :, :, self._gaps % BLOCK] = 0
         if n < self._known:
-            self._a[:, :, n:] = self._by_place[n:] = self._maxima[-(-n // BLOCK) :] = 0
+            self._clear_from(n)
         totals = np.zeros((-(-n // BLOCK), len(self._levels), 3))
         off = self._off @ self._level_changes
         births = (off * s.enter / (len(self._speeds) * real)).astype(np.float32)
@@ -206,17 +207,24 @@ class PlaceFilter:
             )  # fmt: skip
         before, lost, seen = totals.sum(axis=0).T if n else np.zeros((3, len(off)))
         if len(self._gaps):  # likelihoods are 1 there
-            in_gaps = self._a[:, :, self._gaps].sum(axis=(1, 2), dtype=np.float64)
+            gaps = self._gaps // BLOCK, slice(None), slice(None), self._gaps % BLOCK
+            in_gaps = self._a[gaps].sum(axis=(0, 2), dtype=np.float64)
             born = births * (len(self._speeds) * len(self._gaps))
             lost = lost + (in_gaps - born) / (1 - s.leave)
             seen = seen - in_gaps
-            self._a[:, :, self._gaps] = self._by_place[self._gaps] = 0
+            self._a[gaps] = self._by_place[self._gaps] = 0
             self._find_maxima(np.unique(self._gaps // BLOCK))
         off = off * (1 - s.enter) + (before - lost) * s.leave + lost
         total = float(off.sum() + seen.sum())
         self._off, self._scale = off / total, 1 / total
         self._known = n
         self._count += 1
+
+    def _clear_from(self, n: int) -> None:
+        """Set states and sums from place n on to 0."""
+        self._a[n // BLOCK :, :, :, n % BLOCK :] = 0
+        self._a[n // BLOCK + 1 :] = 0
+        self._by_place[n:] = self._maxima[-(-n // BLOCK) :] = 0
 
     def belief(self, n: int, images_ago: int) -> Belief:
         """
@@ -226,7 +234,7 @@ class PlaceFilter:
         :param images_ago: at most ``lag`` and ``count - 1``.
         """
         top = self._top(n)
-        least = NEGLIGIBLE * self._a[:, :, top].max(initial=0)
+        least = NEGLIGIBLE * self._a[top // BLOCK, :, :, top % BLOCK].max(initial=0)
         most = len(top) * len(self._levels) * len(self._speeds)
         ways, states = np.empty((most, 5), np.int64), np.empty(most, np.float32)
         count = followed_back(
@@ -242,6 +250,11 @@ class PlaceFilter:
         places = (some[:, None] * BLOCK + np.arange(BLOCK)).ravel()
         places = places[places < n]
         return places[np.argpartition(self._by_place[places], max(len(places) - TOP, 0))[-TOP:]]
+
+    def probable_blocks(self) -> np.ndarray:
+        """Return the first places of the ``TOP`` blocks with the most probable places, (m,)."""
+        count = min(TOP, len(self._maxima))
+        return np.argpartition(self._maxima, -count)[-count:] * BLOCK
 
     def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
         """
@@ -284,6 +297,14 @@ def belief_of(ways: np.ndarray, probabilities: np.ndarray) -> Belief:
     places, firsts, each = np.unique(ways[order, 0], return_index=True, return_inverse=True)
     weights = np.bincount(each, probabilities[order], len(places))
     return Belief(places, weights, ways[order[firsts], 1:])
+
+
+def _move_up(values: np.ndarray, count: int, none: int) -> None:
+    """Drop the first places of (blocks, K, ., BLOCK); ``none`` from the others' new end on."""
+    for row in np.ndindex(values.shape[1:3]):
+        places = values[:, *row].ravel()  # a copy
+        places[:-count], places[-count:] = places[count:].copy(), none
+        values[:, *row] = places.reshape(len(values), -1)
 
 
 # ------------------------------------------------ kernels
@@ -350,12 +371,18 @@ def _mix(source, at, pitch, count, levels, speeds, b, mixed, to, width, sums):
     mask = splat(INT(-4))
     for x in range(0, count, LANES):
         for k in range(K):
+            lower, upper = max(k - 1, 0), min(k + 1, K - 1)
+            # at the ends, the level itself stands for its missing neighbor, and counts 0
+            from_lower = load_splat(changes, lower * K + k) if k else splat(F(0))
+            from_upper = load_splat(changes, upper * K + k) if k + 1 < K else splat(F(0))
+            from_same = load_splat(changes, k * K + k)
+            at_lower, at_same = at + lower * V * pitch + x, at + k * V * pitch + x
+            at_upper = at + upper * V * pitch + x
             anywhere = total = splat(F(0))
             for v in range(V):
-                state = splat(F(0))
-                for j in range(max(k - 1, 0), min(k + 2, K)):
-                    before = load(source, at + (j * V + v) * pitch + x)
-                    state = state + load_splat(changes, j * K + k) * before
+                state = from_lower * load(source, at_lower + v * pitch)
+                state = state + from_same * load(source, at_same + v * pitch)
+                state = state + from_upper * load(source, at_upper + v * pitch)
                 store(b, v * LANES, state)
                 anywhere = anywhere + state * load_splat(speeds, 4 * V + v)
                 total = total + state
@@ -364,12 +391,12 @@ def _mix(source, at, pitch, count, levels, speeds, b, mixed, to, width, sums):
             for v in range(V):
                 above = load(b, (v + 1) * LANES)
                 same = current * load_splat(speeds, v)
-                lower = below * load_splat(speeds, V + v)
-                upper = above * load_splat(speeds, 2 * V + v)
-                target = (same + lower) + (upper + anywhere * load_splat(speeds, 3 * V + v))
-                from_below = same < lower
+                slower = below * load_splat(speeds, V + v)
+                faster = above * load_splat(speeds, 2 * V + v)
+                target = (same + slower) + (faster + anywhere * load_splat(speeds, 3 * V + v))
+                from_below = same < slower
                 code = select(from_below, splat(INT(1)), splat(INT(0)))
-                code = select(select(from_below, lower, same) < upper, splat(INT(2)), code)
+                code = select(select(from_below, slower, same) < faster, splat(INT(2)), code)
                 store(mixed, (k * V + v) * width + to + x, from_bits((bits(target) & mask) | code))
                 below, current = current, above
 
@@ -440,7 +467,7 @@ def advance(
     """
     Advance all states by one image.
 
-    :param a: states, (K, V, pitch), read and written; 0 from place n on.
+    :param a: states, (blocks, K, V, BLOCK), read and written; 0 from place n on.
     :param n: places, at least 1.
     :param z, weight, mu: z-normalized distances (n,), alpha, and mean of right places by level.
     :param levels, speeds: see :func:`_mix`.
@@ -450,18 +477,18 @@ def advance(
     :param births: probability of each state of a level to come from off the map, (K,).
     :param halos: (parts of PLACES, K, V, reach), scratch; reach in whole vectors, more than a step
         and one place; zeros in the first.
-    :param origins: of this image, (K, (V + 1) // 2, pitch), uint8, written.
+    :param origins: of this image, (blocks, K, (V + 1) // 2, BLOCK), uint8, written.
     :param totals: (blocks, K, 3), written: sums before moving, of what moved over the map's end,
         and with the image.
     :param by_place: sum of the states of each place, (n or more,), and maxima: the largest of each
         block, (blocks,); written.
     """
-    K, V, pitch = a.shape
-    reach, halves, parts = halos.shape[3], origins.shape[1], (n + PLACES - 1) // PLACES
-    width = reach + BLOCK
+    _, K, V, _ = a.shape
+    reach, halves, parts = halos.shape[3], origins.shape[2], (n + PLACES - 1) // PLACES
+    width, size = reach + BLOCK, K * V * BLOCK
     states, flat_halos, flat_origins = a.reshape(-1), halos.reshape(-1), origins.reshape(-1)
     for part in nb.prange(1, parts):
-        halos[part] = a[:, :, part * PLACES - reach : part * PLACES]
+        halos[part] = a[part * PLACES // BLOCK - 1, :, :, BLOCK - reach :]
     for part in nb.prange(parts):
         mixed = np.empty(K * V * width, np.float32)
         seen, places = np.empty((K, BLOCK), np.float32), np.empty(BLOCK, np.float32)
@@ -474,14 +501,15 @@ def advance(
             whole = (count + LANES - 1) // LANES * LANES
             _see(z, first, count, weight, mu, seen)
             if block:
-                _mix(states, first - reach, pitch, reach, levels, speeds, b, mixed, 0, width, sums)
+                before = (at - 1) * size + BLOCK - reach
+                _mix(states, before, BLOCK, reach, levels, speeds, b, mixed, 0, width, sums)
             else:
                 _mix(
                     flat_halos, part * K * V * reach, reach, reach, levels, speeds, b, mixed, 0,
                     width, sums,
                 )  # fmt: skip
             sums[:] = 0
-            _mix(states, first, pitch, whole, levels, speeds, b, mixed, reach, width, sums)
+            _mix(states, at * size, BLOCK, whole, levels, speeds, b, mixed, reach, width, sums)
             places[:] = 0
             for k in range(K):
                 totals[at, k, 0], totals[at, k, 1] = _sum_of_lanes(sums, k * LANES), 0
@@ -494,8 +522,8 @@ def advance(
                     total = total + _move(
                         mixed, row + reach - step, 1 if step > 0 else 0, whole, spread, stay_on,
                         births[k], seen.reshape(-1), k * BLOCK, states,
-                        (k * V + v) * pitch + first, flat_origins,
-                        (k * halves + v // 2) * pitch + first, v % 2, places,
+                        at * size + (k * V + v) * BLOCK, flat_origins,
+                        ((at * K + k) * halves + v // 2) * BLOCK, v % 2, places,
                     )  # fmt: skip
                 store(lanes, 0, total)
                 totals[at, k, 2] = _sum_of_lanes(lanes, 0)
@@ -508,7 +536,7 @@ def trace_back(k, v, y, origins, steps, newest, count, places):
     """
     Follow the most probable way to a state back.
 
-    :param origins: ring of the last images' origins, (m, K, (V + 1) // 2, n or more), uint8.
+    :param origins: ring of the last images' origins, (m, blocks, K, (V + 1) // 2, BLOCK), uint8.
     :param steps: ring of their steps, (m, V).
     :param newest: slot of the newest image.
     :param count: images to go back, at most m.
@@ -520,7 +548,7 @@ def trace_back(k, v, y, origins, steps, newest, count, places):
     places[0] = y
     for i in range(count):
         slot = (newest - i) % m
-        origin = (origins[slot, k, v // 2, y] >> (v % 2 * 4)) & 15
+        origin = (origins[slot, y // BLOCK, k, v // 2, y % BLOCK] >> (v % 2 * 4)) & 15
         if origin == BORN:
             places[i + 1 :] = -1
             return v
@@ -545,7 +573,7 @@ def followed_back(a, least, tops, origins, steps, newest, count, ways, probabili
     """
     Follow states back to where they were some images ago.
 
-    :param a: states, (K, V, n or more).
+    :param a: states, (blocks, K, V, BLOCK).
     :param least: states below it are left out.
     :param tops: places whose states count, (m,).
     :param count: images to go back; other parameters: see :func:`trace_back`.
@@ -556,9 +584,9 @@ def followed_back(a, least, tops, origins, steps, newest, count, ways, probabili
     places = np.empty(count + 1, np.int32)
     found = 0
     for y in tops:
-        for k in range(a.shape[0]):
-            for v in range(a.shape[1]):
-                p = a[k, v, y]
+        for k in range(a.shape[1]):
+            for v in range(a.shape[2]):
+                p = a[y // BLOCK, k, v, y % BLOCK]
                 if p < least:
                     continue
                 speed = trace_back(k, v, y, origins, steps, newest, count, places)

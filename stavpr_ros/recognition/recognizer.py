@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frame by frame: distances of the newest image, nearest sequence of the window, status."""
 
+from collections import deque
 from dataclasses import dataclass, field, replace
 import math
+import time
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
@@ -29,7 +31,6 @@ from stavpr_ros.recognition.relative_motion import Positions, RelativeMotion
 from stavpr_ros.recognition.robust import (
     blocks,
     converted,
-    less_alike,
     MeanCentering,
     options_of,
     RobustOptions,
@@ -43,6 +44,8 @@ from stavpr_ros.recognition.sequence_search import (
 )
 from stavpr_ros.recognition.sessions import layout_of, SessionLayout
 import torch
+
+TIMED = 3  # images, to compare the time of one with the time budget
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,9 @@ class RecognizerSettings:
     :param odometry_error: of a distance by odometry, as a share of it; where query and places have
         poses, the path of a match is compared with them; 0 = never. See
         :mod:`stavpr_ros.recognition.relative_motion`.
+    :param time_budget_ms: of :class:`PlaceRecognizer`, for an image; maps whose exact matching
+        takes longer get a first stage (:mod:`stavpr_ros.recognition.first_stage`). 0 = always
+        exact.
     """
 
     threshold: float
@@ -70,6 +76,7 @@ class RecognizerSettings:
     mode: str = 'paper'
     robust_options: RobustOptions | None = None
     odometry_error: float = 0.1
+    time_budget_ms: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.threshold > 0 or math.isnan(self.threshold):
@@ -90,6 +97,14 @@ class RecognizerSettings:
             raise SettingsError(
                 f'threshold = {self.threshold}: distances of mode robust end at 1, '
                 'where no probability is left'
+            )
+        if not 0 <= self.time_budget_ms < math.inf:
+            raise SettingsError(f'time_budget_ms = {self.time_budget_ms} must be at least 0')
+        with_dtw = self.spatial.strategy in ('adaptive', 'vanilla') and not self.spatial.vertical
+        if self.time_budget_ms and not (self.applied_options.place_filter and with_dtw):
+            raise SettingsError(
+                f'time_budget_ms = {self.time_budget_ms}: the first stage is of mode robust with '
+                'strategy adaptive or vanilla, without vertical alignment; take 0'
             )
 
     @property
@@ -135,6 +150,7 @@ class SequenceRecognizer:
         self._motion: RelativeMotion | None = None
         self._window = WindowMatch()  # of the newest image
         self._nearest: SequenceMatch | None = None
+        self._changes: deque[float] = deque(maxlen=sequence.length)  # of the window
 
     @property
     def settings(self) -> RecognizerSettings:
@@ -212,6 +228,7 @@ class SequenceRecognizer:
         if self._motion is not None:
             self._motion.reset()
         self._window, self._nearest = WindowMatch(), None
+        self._changes.clear()
 
     def _require_one_image(self, features: LocalFeatures, where: str) -> None:
         features.require_same_settings(self._feature_settings, where)
@@ -239,9 +256,12 @@ class SequenceRecognizer:
         if self._filter is not None:
             change = self._filter.change.next_query(strips.cpu().numpy())
             self._filter.update(row if on_device else row.cpu().numpy(), change)
+            self._changes.append(change)
         match = self._compared(self._match_window(), position)
         self._nearest = match.sequence
-        return replace(match, window_stamps=self._buffer.stamps)
+        return replace(
+            match, window_stamps=self._buffer.stamps, window_changes=tuple(self._changes)
+        )
 
     def _compare(self, positions: Positions) -> None:
         """Compare matches with odometry, if the settings want it, by the positions of places."""
@@ -260,11 +280,7 @@ class SequenceRecognizer:
         return self._motion.compared(match, self._positions, first, session)
 
     def _z_normalized(self, row: np.ndarray) -> np.ndarray:
-        runs = [slice(None)] if self._layout is None else self._layout.runs
-        z = [z_normalized(row[run]) for run in runs]  # of each session alone
-        if self._settings.applied_options.look_alikes:
-            z = [less_alike(each) for each in z]
-        return z[0] if len(z) == 1 else np.concatenate(z)
+        return z_normalized(row) if self._layout is None else self._layout.z_normalized(row)
 
     def _z_normalized_here(self, row: torch.Tensor) -> torch.Tensor:
         return torch.from_numpy(self._z_normalized(row.cpu().numpy()))
@@ -273,8 +289,7 @@ class SequenceRecognizer:
         from stavpr_ros.recognition.cuda_filter import z_normalized_on_device
 
         runs = [slice(None)] if self._layout is None else self._layout.runs
-        look_alikes = self._settings.applied_options.look_alikes
-        return torch.cat([z_normalized_on_device(row[run], look_alikes) for run in runs])
+        return torch.cat([z_normalized_on_device(row[run]) for run in runs])
 
     def _match_window(self) -> Match:
         threshold, length = self._settings.threshold, self._settings.sequence.length
@@ -355,6 +370,43 @@ class PlaceRecognizer(SequenceRecognizer):
 
             search = CudaLmDtwSearch(self._buffer.places, settings.sequence)
             self._search, self._buffer = search, search.buffer
+        self.stages = ''  # how the time budget is kept, for the log; '' = without one
+        if settings.time_budget_ms and len(features):
+            if backend == 'cuda':
+                raise SettingsError(
+                    f"time_budget_ms = {settings.time_budget_ms} with backend 'cuda': the first "
+                    "stage is of backend 'cpu'; take that, or 0"
+                )
+            self._keep_time_budget(held, features[:1])
+
+    def _keep_time_budget(self, held: LocalFeatures | Int8Features, image: LocalFeatures) -> None:
+        budget, exact = self._settings.time_budget_ms, self._milliseconds(image)
+        self.stages = f'exact matching takes {exact:.3g} ms an image, time_budget_ms = {budget:g}'
+        if exact <= budget:
+            return
+        from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+        from stavpr_ros.recognition.first_stage import FirstStage
+
+        assert isinstance(self._matcher, CpuMatcher)
+        self._matcher = FirstStage(self._matcher, held, self._probable_places)
+        self.stages += f': with a first stage {self._milliseconds(image):.3g} ms'
+
+    def _milliseconds(self, image: LocalFeatures) -> float:
+        """Return the least time of a few updates by an image, after one that compiles."""
+        self.reset()
+        seconds = []
+        for _ in range(1 + TIMED):
+            began = time.perf_counter()
+            self.update(image)
+            seconds.append(time.perf_counter() - began)
+        self.reset()
+        return 1e3 * min(seconds[1:])
+
+    def _probable_places(self) -> np.ndarray:
+        """Return the first places of the most probable blocks of the filter."""
+        assert self._filter is not None
+        columns = self._filter.filter.probable_blocks()
+        return columns if self._layout is None else self._layout.columns.searchsorted(columns)
 
     def _match_on_device(self, search: FilterSearch) -> None:
         from stavpr_ros.alignment.cuda.compilation import runtime

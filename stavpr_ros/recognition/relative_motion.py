@@ -3,9 +3,9 @@
 """
 Relative motion: whether the way of the query, by odometry, fits its path on the map.
 
-Look-alike corridors are told apart by where they turn. Only positions are compared, in the plane
-of x and y (z is up), relative to each other: the frames of odometry and map may differ, and so may
-the bodies whose poses they are.
+Look-alike corridors are distinguished by where they turn. Only positions are compared, in the
+plane of x and y (z is up), relative to each other: the frames of odometry and map may differ, and
+so may the bodies whose poses they are.
 """
 
 from collections import deque

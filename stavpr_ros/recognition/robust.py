@@ -9,7 +9,6 @@ and successive ones are correlated.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-import math
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -25,9 +24,6 @@ PIECE = 256  # images read or centered at a time
 RANK = 64  # directions that whitening shrinks, at most
 SAMPLE = 256  # places that whitening is learned from
 STRENGTH = 1.5  # of whitening: c in the gains of its directions
-ELSEWHERE = 20  # places from the nearest one from which on another is elsewhere
-INDEPENDENT = 5  # places next to each other have about as many distances as one
-LEAST_ELSEWHERE = 10  # places, fewer show no tail
 MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
 
 
@@ -43,8 +39,6 @@ class RobustOptions:
         (:class:`Whitening`): what many places share distinguishes few of them.
     :param query_znorm: z-normalize the distances of an image to all places (:func:`z_normalized`):
         some images are far from all.
-    :param look_alikes: z-normalized distances grow where a second place, elsewhere, is nearer than
-        chance (:func:`less_alike`): the image resembles many places. Not in loop closure.
     :param place_filter: follow place and speed with a Bayes filter that knows of being off the
         map (:mod:`stavpr_ros.recognition.place_filter`) instead of matching each window by LM-DTW,
         where one place may absorb a window.
@@ -53,7 +47,6 @@ class RobustOptions:
     mean_centering: bool = True
     whitening: bool = True
     query_znorm: bool = True
-    look_alikes: bool = True
     place_filter: bool = True
 
     @property
@@ -87,7 +80,7 @@ class RobustOptions:
         return RobustOptions(**values)
 
 
-PAPER = RobustOptions(False, False, False, False, False)
+PAPER = RobustOptions(False, False, False, False)
 ROBUST = RobustOptions()
 
 
@@ -332,31 +325,3 @@ def z_normalized(row: np.ndarray, around: int = 0) -> np.ndarray:
         return z
     clipped = np.where(np.isfinite(z), np.maximum(z, -1), np.float32(0))
     return z - uniform_filter1d(clipped, 2 * around + 1, mode='nearest')
-
-
-def less_alike(
-    z: np.ndarray, places: np.ndarray | None = None, among: int | None = None
-) -> np.ndarray:
-    """
-    Return z-normalized distances as evidence of one place, shape (n,), float32.
-
-    At chance, the least of m independent values is about -(2 ln m)^(1/2). Where the nearest place
-    elsewhere is nearer than that, as in a building of equal floors, the image resembles many
-    places: all its distances grow by the difference.
-
-    :param z: of one image to the places of one session, (n,), finite.
-    :param places: their indices; None = all places of the session.
-    :param among: places of the session; None = n.
-    """
-    n, nearest = among or len(z), int(np.argmin(z)) if len(z) else 0
-    elsewhere = np.concatenate([z[: max(0, nearest - ELSEWHERE)], z[nearest + ELSEWHERE + 1 :]])
-    if places is not None and len(places):
-        elsewhere = z[np.abs(places - places[nearest]) > ELSEWHERE]
-    if len(elsewhere) < LEAST_ELSEWHERE:
-        return z
-    return z + np.float32(max(0.0, chance_of(n) - float(elsewhere.min())))
-
-
-def chance_of(n: int) -> float:
-    """Return the least z of n places that is to be expected at random."""
-    return -math.sqrt(2 * math.log(max(n / INDEPENDENT, 2)))

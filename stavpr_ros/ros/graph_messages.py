@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of the pose graph: loop closures in; paths, poses and markers out."""
 
+import math
 from typing import Any
 
 from geometry_msgs.msg import Point, PoseStamped
@@ -33,6 +34,11 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
     known: dict[str, Any] = {
         'map_id': (message.map_id or 'map') if on_map else '',
         'place_pose': pose_array(message.place_pose) if on_map else None,
+        'changes': tuple(
+            (nanoseconds(pair.query_stamp), pair.query_change)
+            for pair in message.pairs
+            if math.isfinite(pair.query_change)
+        ),
     }
     if message.has_relative_pose and relative.source != RelativePose.NONE:
         covariance = np.array(relative.pose.covariance).reshape(6, 6)

@@ -5,6 +5,7 @@
 from collections import Counter
 import math
 import threading
+import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -36,6 +37,7 @@ ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PERIOD = 1.0  # seconds between two diagnostics, and at least between two paths
+SHARE = 0.1  # of the time, at most, for the publication of paths and edges
 MAX_INBOX = 100_000  # messages that wait for the worker
 STOP_TIMEOUT = 30.0  # seconds for the worker to end
 PARAMETERS = {
@@ -223,7 +225,7 @@ class PoseGraphNode(ManagedNode):
     # worker
 
     def _work(self) -> None:
-        published = True
+        published, due = True, 0.0
         while True:
             with self._wake:
                 self._wake.wait_for(lambda: self._closures() or not self._running, PERIOD)
@@ -238,9 +240,11 @@ class PoseGraphNode(ManagedNode):
                         self._graph.update()
                         self._correction = matrices(self._graph.map_to_odom())
                 published = published and not inbox
-                if not published and (self._idle() or len(inbox)):
+                began = time.monotonic()
+                if not published and began >= due:
                     self._publish_graph()
-                    published = True
+                    published, took = True, time.monotonic() - began
+                    due = began + max(PERIOD, took / SHARE)
             except Exception as error:  # one update failed: the next may succeed
                 self.counts['failed updates'] += 1
                 self.problem = f'{type(error).__name__}: {error}'
@@ -248,9 +252,6 @@ class PoseGraphNode(ManagedNode):
 
     def _closures(self) -> bool:
         return any(isinstance(message, LoopClosure) for message in self._inbox)
-
-    def _idle(self) -> bool:
-        return not self._inbox
 
     def _take(self, message: Odometry | LoopClosure) -> None:
         """Add a message to the graph; invalid input is counted and logged."""

@@ -192,6 +192,7 @@ def loop_closure_message(
             query_stamp=time_message(places.place(first + q).stamp if is_route else stamps[q]),
             place_index=m,
             place_stamp=time_message(places.place(m).stamp),
+            query_change=match.window_changes[q] if match.window_changes else math.nan,
         )
         for q, m in match.path.tolist()
     ]

@@ -238,6 +238,8 @@ class Runtime:
         """
         self._maps.load(path, lock)
         self.worker.call(self._publish_route)
+        if stages := self.pipeline.stages:
+            self._node.get_logger().info(stages)
 
     def _use_map(self, loaded: LoadedMap) -> None:
         self.worker.run(lambda: self.pipeline.change(loaded=loaded))

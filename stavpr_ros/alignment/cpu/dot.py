@@ -144,6 +144,16 @@ def strip_distances(features, query, d):
         _float_block_distances(features, query[None], 0, first, count, d[:, :, first:])
 
 
+@kernel
+def _align_block(features, queries, x, first, count, weights, xi, d, edge, lanes):
+    """Write the image distances of query x to ``count`` map images from ``first`` into lanes."""
+    W, stride = d.shape[1], d.shape[2]
+    _block_distances(features, queries, x, first, count, d)
+    for at in range(0, count, LANES):
+        aligned = align_lanes(d.reshape(-1), at, W * stride, stride, weights, xi, edge)
+        store(lanes, at, aligned)
+
+
 @parallel_kernel
 def image_distances(features, queries, weights, xi, out):
     """
@@ -164,14 +174,27 @@ def image_distances(features, queries, weights, xi, out):
         edge = np.empty((W + 1) * SLOT, np.float32)
         lanes = np.empty(IMAGES, np.float32)
         for x in range(out.shape[0]):
-            _block_distances(features, queries, x, first, count, d)
-            for at in range(0, count, LANES):
-                store(
-                    lanes,
-                    at,
-                    align_lanes(d.reshape(-1), at, W * IMAGES, IMAGES, weights, xi, edge),
-                )
+            _align_block(features, queries, x, first, count, weights, xi, d, edge, lanes)
             out[x, first : first + count] = lanes[:count]
+
+
+@parallel_kernel
+def image_distances_at(features, queries, weights, xi, n, firsts, out):
+    """
+    Image distances of one image to some map images, as :func:`image_distances`.
+
+    :param n: map images.
+    :param firsts: first map image of each chunk, multiples of LANES below n, (m,).
+    :param out: shape (m, map images of a chunk), a multiple of LANES; written up to image n.
+    """
+    W, size = weights.shape[0], out.shape[1]
+    for i in nb.prange(len(firsts)):
+        count = min(size, n - firsts[i])
+        d = np.empty(((W + TILE - 1) // TILE * TILE, W, size), np.float32)
+        edge = np.empty((W + 1) * SLOT, np.float32)
+        lanes = np.empty(size, np.float32)
+        _align_block(features, queries, 0, firsts[i], count, weights, xi, d, edge, lanes)
+        out[i, :count] = lanes[:count]
 
 
 @parallel_kernel

@@ -216,7 +216,7 @@ class Int8Strips:
             strips.numpy(), _longest(d), np.float32(MAP_PEAK), first, self.values, self.reciprocals
         )
 
-    def __getitem__(self, index: tuple[slice, slice]) -> torch.Tensor:
+    def __getitem__(self, index: tuple[slice, slice | np.ndarray]) -> torch.Tensor:
         """Return strips of some places, [:, places], float32, of unit norm again."""
         places = np.arange(self.shape[1])[index[1]]
         rounded = self.values[:, places // LANES, :, places % LANES]  # (m, W, quads, QUAD)
@@ -341,3 +341,55 @@ def strip_distances(features, queries, x, d):
         part = np.empty((d.shape[0], d.shape[1], IMAGES), np.float32)
         block_distances(features, queries, x, first, count, part)
         d[:, :, first : first + count] = part[:, :, :count]
+
+
+@parallel_kernel
+def cosine_distances(features, queries, out):
+    """
+    Distances of images that are one vector each (W = 1), equal to those of the other kernels.
+
+    :param features, queries: as in :func:`block_distances`.
+    :param out: shape (Q, m), written; m <= n: only so many places are looked at.
+    """
+    values, reciprocals = features
+    packed, query_reciprocals, query_sums = queries
+    flat, lengths, quads, n = values.reshape(-1), reciprocals[0], values.shape[2], out.shape[1]
+    for block in nb.prange((n + IMAGES - 1) // IMAGES):
+        first = block * IMAGES
+        count = min(IMAGES, n - first)
+        lanes = np.empty(IMAGES, np.float32)
+        for x in range(out.shape[0]):
+            query, one = packed[x, 0, :, 0].copy(), splat(np.float32(1))  # fits into the cache
+            for y in range(0, count, LANES):
+                sums = splat(np.int32(0))
+                for t in range(quads):
+                    places = load(flat, (first + y) * quads + t * LANES)
+                    sums = _multiply_add(sums, places, load_splat(query, t))
+                whole = _total(sums, splat(query_sums[x, 0]))
+                cosine = whole * load(lengths, first + y) * splat(query_reciprocals[x, 0])
+                store(lanes, y, one - cosine)
+            out[x, first : first + count] = lanes[:count]
+
+
+@parallel_kernel
+def smallest_distances(features, queries, chunk, out, nearest):
+    """
+    Smallest distance of any strip of one image to the one strip of each place.
+
+    :param features, queries: as in :func:`block_distances`; W = 1 and Q = 1.
+    :param chunk: places, a divisor of ``IMAGES``.
+    :param out: shape (n,), written.
+    :param nearest: shape (chunks,), written: the smallest of each chunk.
+    """
+    n = len(out)
+    for block in nb.prange((n + IMAGES - 1) // IMAGES):
+        first = block * IMAGES
+        count = min(IMAGES, n - first)
+        d = np.empty((queries[1].shape[1], 1, IMAGES), np.float32)
+        block_distances(features, queries, 0, first, count, d)
+        for i in range(1, len(d)):
+            for y in range(count):
+                d[0, 0, y] = min(d[0, 0, y], d[i, 0, y])
+        out[first : first + count] = d[0, 0, :count]
+        for low in range(0, count, chunk):
+            nearest[(first + low) // chunk] = d[0, 0, low : min(low + chunk, count)].min()

@@ -1,0 +1,207 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Mode robust in a city: a real map among simulated places, compared exactly and by the first stage.
+
+The simulated places are a route of images whose features have the mean, the covariance (of all
+strips together, its ``RANK`` largest directions) and the correlation from image to image of the
+real map: a first-order autoregressive Gaussian, each strip made unit norm. The real places lie
+together within it. ``PYTHONPATH=. python benchmarks/city.py --places 1000000``.
+"""
+
+import argparse
+from collections.abc import Iterator
+import json
+from pathlib import Path
+import time
+from typing import Any
+
+from data import data_folder
+import numpy as np
+from results import cpu_model, table
+from scipy.signal import lfilter
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.mapping import PlaceMap, save_map
+from stavpr_ros.mapping.builder import extract_features
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.robust import THRESHOLD
+from stavpr_ros.sources import open_source
+import torch
+
+RANK, PIECE = 256, 4096
+AT = 0.37  # where in the city the real places begin
+ALWAYS = 1e-6  # ms: no exact matching is as fast
+CASES = {
+    'gardens_point': ('gardens_point/day_left', 'gardens_point/day_right', 2),
+    'walk_night': ('walk_by_night/left_day', 'walk_by_night/right_night', 2),
+    'corridor': ('corridor/ref', 'corridor/query', 3),
+    'nordland': ('nordland_64x32/summer', 'nordland_64x32/winter', 3),
+}
+
+
+class HalfFeatures(LocalFeatures):
+    """Features in float16, read as float32: a city's fit into memory."""
+
+    def __init__(self, half: torch.Tensor, like: LocalFeatures) -> None:
+        W, n, _ = half.shape
+        for name, value in (
+            ('half', half),
+            ('weights', torch.full((W, n), W**-0.5)),
+            ('settings', like.settings),
+            ('cells', like.cells),
+        ):
+            object.__setattr__(self, name, value)
+
+    half: torch.Tensor
+
+    def __len__(self) -> int:
+        return self.half.shape[1]
+
+    def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
+        return LocalFeatures(
+            self.half[:, images].float(), self.weights[:, images], self.settings, self.cells
+        )
+
+    @property
+    def strips(self) -> torch.Tensor:
+        """Return the features as they are held, float16."""
+        return self.half
+
+    @property
+    def dimension(self) -> int:
+        """Return the number d of dimensions of a strip."""
+        return self.half.shape[2]
+
+
+def simulated(real: LocalFeatures, n: int, seed: int) -> Iterator[torch.Tensor]:
+    """Yield the strips (W, m, d) of n simulated places, some at a time."""
+    rng = np.random.default_rng(seed)
+    W, m, d = real.strips.shape
+    images = real.strips.transpose(0, 1).reshape(m, W * d).double()
+    mean = images.mean(dim=0)
+    images = images - mean
+    keep = float((images[1:] * images[:-1]).sum() / (images**2).sum())
+    _, scales, directions = torch.linalg.svd(images, full_matrices=False)
+    rank = min(RANK, m - 1)
+    basis = (scales[:rank, None] * directions[:rank] / np.sqrt(m - 1)).float()
+    state = rng.standard_normal((1, rank)).astype(np.float32)
+    for low in range(0, n, PIECE):
+        shape = min(PIECE, n - low), rank
+        new = rng.standard_normal(shape, np.float32) * np.float32(np.sqrt(1 - keep**2))
+        route = lfilter([1.0], [1.0, -keep], new, axis=0, zi=keep * state)[0].astype(np.float32)
+        state = route[-1:]
+        strips = (torch.from_numpy(route) @ basis + mean.float()).view(-1, W, d).transpose(0, 1)
+        yield strips / strips.norm(dim=2, keepdim=True).clamp_(min=1e-9)
+
+
+def city(real: LocalFeatures, n: int, seed: int) -> tuple[HalfFeatures, int]:
+    """Return a city of n places, and the first of the real ones."""
+    W, m, d = real.strips.shape
+    half, low = torch.empty((W, n, d), dtype=torch.float16), 0
+    for strips in simulated(real, n, seed):
+        half[:, low : low + strips.shape[1]] = strips
+        low += strips.shape[1]
+    first = int(AT * (n - m))
+    half[:, first : first + m] = real.strips
+    return HalfFeatures(half, real), first
+
+
+def drive(
+    features: LocalFeatures, query: LocalFeatures, first: int, tolerance: int, budget: float
+) -> dict[str, Any]:
+    """Return precision, recall, matches and times of a query whose image i shows place i."""
+    n = len(features)
+    settings = RecognizerSettings(THRESHOLD, mode='robust', time_budget_ms=budget)
+    place_map = PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
+    began = time.perf_counter()
+    recognizer = PlaceRecognizer(place_map, settings, 'cpu', 'int8')
+    start, matches, wall, used = time.perf_counter() - began, [], [], []
+    for i in range(len(query)):
+        before, cpu = time.perf_counter(), time.process_time()
+        matches.append(recognizer.update(query[i : i + 1]))
+        wall.append(time.perf_counter() - before)
+        used.append(time.process_time() - cpu)
+    length = settings.sequence.length
+    middles = [match.sequence.middle for match in matches[length - 1 :] if match.sequence]
+    accepted = np.array([match.accepted for match in matches[length - 1 :]])
+    true = np.arange(len(middles)) + (length - 1) // 2 + first
+    right = np.abs(np.array(middles) - true) <= tolerance
+    return {
+        'precision': float(right[accepted].mean()) if accepted.any() else 1.0,
+        'recall': float((right & accepted).mean()),
+        'answers': np.where(accepted, middles, -1),
+        'wall_ms_p50': 1e3 * float(np.median(wall[length:])),
+        'wall_ms_p99': 1e3 * float(np.percentile(wall[length:], 99)),
+        'processor_ms': 1e3 * float(np.median(used[length:])),
+        'least_processor_ms': 1e3 * min(used[length:]),
+        'start_s': start,
+    }
+
+
+def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dict[str, Any]:
+    """Return the numbers of one case."""
+    folder, (reference, query_folder, tolerance) = data_folder(), CASES[name]
+    extractor = FeatureExtractor()
+    real = extract_features(open_source(folder / reference), extractor, progress=False)
+    query = extract_features(open_source(folder / query_folder), extractor, progress=False)
+    features, first = city(real, n, seed)
+    if save is not None:
+        save_map(PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n), save, force=True)
+    exact, stage = (
+        drive(features, query[:images], first, tolerance, budget) for budget in (0, ALWAYS)
+    )
+    answers = exact.pop('answers'), stage.pop('answers')
+    changed = (answers[0] < 0) != (answers[1] < 0)
+    moved = (~changed) & (np.abs(answers[0] - answers[1]) > tolerance)
+    return {
+        'case': name,
+        'places': n,
+        'images': len(query[:images]),
+        'exact': exact,
+        'first_stage': stage,
+        'statuses_changed': int(changed.sum()),
+        'places_moved': int(moved.sum()),
+    }
+
+
+def lines(found: list[dict[str, Any]]) -> list[str]:
+    """Return the table of the results."""
+    rows = []
+    for one in found:
+        exact, stage = one['exact'], one['first_stage']
+        rows.append([
+            one['case'],
+            f'{one["places"]:,}',
+            f'{exact["precision"]:.3f} / {exact["recall"]:.3f}',
+            f'{stage["precision"]:.3f} / {stage["recall"]:.3f}',
+            f'{one["statuses_changed"]}, {one["places_moved"]}',
+            f'{exact["processor_ms"]:.0f}',
+            f'{stage["processor_ms"]:.0f}',
+        ])  # fmt: skip
+    head = ('case', 'places', 'exact P / R', 'first stage P / R', 'statuses, places changed')
+    return table((*head, 'exact ms', 'first stage ms'), rows)
+
+
+def main() -> None:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser.add_argument('--places', type=int, nargs='+', default=[100_000], metavar='N')
+    parser.add_argument('--cases', nargs='+', choices=CASES, default=list(CASES))
+    parser.add_argument('--images', type=int, default=200, help='of a query (%(default)s)')
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--save-map', type=Path, help='of the last case, for soak.py --map')
+    parser.add_argument('--output', type=Path, help='JSON file')
+    arguments = parser.parse_args()
+    found = []
+    for n in arguments.places:
+        for case in arguments.cases:
+            found.append(measure(case, n, arguments.images, arguments.seed, arguments.save_map))
+            print('\n'.join(lines(found[-1:])[2:3]), flush=True)
+    print(f'{cpu_model()}, {torch.get_num_threads()} threads, processor time of an image')
+    print('\n'.join(lines(found)))
+    if arguments.output:
+        arguments.output.write_text(json.dumps(found, indent=1) + '\n', encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,79 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Graph of a run of ``matching.py``: times over the number of places, beside bounds and peers.
+
+``python benchmarks/graphs.py benchmarks/results/matching-NAME.json docs/performance.png``.
+"""
+
+from collections.abc import Sequence
+import json
+from pathlib import Path
+import sys
+
+from results import PeerTime, Row
+
+COLORS = {'float32': '#1f77b4', 'float16': '#2ca02c', 'int8': '#d62728'}
+PEERS = ('torch float32', 'faiss flat', 'prange')
+
+
+def read(path: Path) -> list[Row]:
+    """Return the rows of a file of results."""
+    rows = []
+    for found in json.loads(path.read_text(encoding='utf-8'))['rows']:
+        del found['ratio_to_lower_bound']
+        rows.append(Row(**found | {'peers': tuple(PeerTime(**peer) for peer in found['peers'])}))
+    return rows
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Draw image distances, the filter, and frames of mode robust, at the least dimensions."""
+    import matplotlib as mpl
+
+    mpl.use('Agg')
+    from matplotlib import pyplot as plt
+
+    least = min((row.d for row in rows if row.d and row.n > 1), default=0)
+    panels = (
+        ('image_distances', f'image distances, {least} dimensions', least),
+        ('filter_update', 'place filter', 0),
+        ('frame', f'an image in mode robust, {least} dimensions', least),
+    )
+    figure, all_axes = plt.subplots(1, 3, figsize=(13, 4.2), layout='constrained')
+    for axes, (stage, title, d) in zip(all_axes, panels, strict=True):
+        own = sorted(
+            (r for r in rows if (r.stage, r.d) == (stage, d) and r.mode in ('', 'robust')),
+            key=lambda row: row.n,
+        )
+        for precision, color in COLORS.items():
+            some = [row for row in own if row.precision == precision]
+            n = [row.n for row in some]
+            if some:
+                ms = [1e3 * row.median_s for row in some]
+                bound = [1e3 * row.lower_bound_s for row in some]
+                axes.plot(n, ms, 'o-', color=color, label=precision)
+                axes.plot(n, bound, ':', color=color, label=f'{precision}, lower bound')
+        for name, style in zip(PEERS, ('s--', 'd--', '^--'), strict=True):
+            peers = [
+                (row.n, 1e3 * peer.median_s)
+                for row in own
+                if row.precision == 'float32'
+                for peer in row.peers
+                if peer.name == name
+            ]
+            if peers:
+                axes.plot(*zip(*peers, strict=True), style, color='gray', ms=4, label=name)
+        if stage == 'image_distances':
+            first = [(row.n, 1e3 * row.median_s) for row in rows if row.stage == 'first_stage']
+            if first:
+                axes.plot(*zip(*first, strict=True), 'k*', ms=10, label='first stage')
+        axes.set(xscale='log', yscale='log', title=title, xlabel='places', ylabel='ms')
+        axes.grid(alpha=0.3)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(fontsize=7)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+if __name__ == '__main__':
+    draw(read(Path(sys.argv[1])), Path(sys.argv[2]))

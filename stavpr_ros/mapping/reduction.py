@@ -1,0 +1,54 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Fewer dimensions for the features of a map, by the principal components of its places."""
+
+from dataclasses import replace
+
+import numpy as np
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.features import LocalFeatures, Projection
+from stavpr_ros.features.extractor import normalize
+from stavpr_ros.mapping.place_map import PlaceMap
+import torch
+
+PIECE = 1024  # places at a time: those of an opened map stay in its file
+
+
+def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
+    """
+    Project a map's features to the directions in which they vary most around their mean.
+
+    The directions are the same for all strips, and learned from all places. They stay as they are
+    when the map grows: images are projected by the matrix that the map holds.
+
+    :param dimension: at least 1 and below that of the features.
+    :raises SettingsError: another dimension.
+    """
+    features = place_map.features
+    d, W, n = place_map.dimension, place_map.settings.strips, len(place_map)
+    if not 1 <= dimension < d:
+        raise SettingsError(
+            f'projection pca:{dimension}: the features have {d} dimensions, take 1 to {d - 1}'
+        )
+    total = torch.zeros((W, d), dtype=torch.float64)
+    squares = torch.zeros((d, d), dtype=torch.float64)
+    for low in range(0, n, PIECE):
+        strips = features[low : low + PIECE].strips
+        total += strips.sum(dim=1)
+        squares += strips.flatten(0, 1).T @ strips.flatten(0, 1)
+    _, vectors = torch.linalg.eigh(squares - total.T @ total / max(n, 1))
+    basis = vectors[:, -dimension:].float()
+    matrix, name = basis.numpy(), f'principal components {d} -> {dimension} of {n} places'
+    if before := place_map.projection:
+        matrix, name = before.matrix @ matrix, f'{before.name}, {name}'
+    projection = Projection(np.ascontiguousarray(matrix), name)
+    strips = torch.empty((W, n, dimension))
+    for low in range(0, n, PIECE):
+        strips[:, low : low + PIECE], _ = normalize(features[low : low + PIECE].strips @ basis)
+    settings = replace(place_map.settings, projection=projection.identity)
+    return replace(
+        place_map,
+        features=LocalFeatures(strips, features.weights, settings),
+        projection=projection,
+        map_id='',
+    )

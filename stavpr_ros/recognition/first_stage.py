@@ -1,0 +1,121 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A first stage for maps too large to be compared exactly within a time budget.
+
+Every strip of every place is reduced to a few principal components, so that an image is one vector
+of ``BYTES`` bytes. The *coarse* distance of two images is 1 less their largest cosine similarity,
+when one is shifted against the other by whole strips. It is computed for all places. Exact
+distances are computed in chunks of places: those with the smallest coarse distances, those that
+the place filter finds probable after the images so far, and a fixed sample. Mean and deviation of
+the sample scale the coarse distances to exact ones, so that z-normalization, the filter and the
+second best see one row with an entry for every place.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from stavpr_ros.alignment.cpu import int8
+from stavpr_ros.alignment.cpu.int8 import Int8Strips, TILE
+from stavpr_ros.features import LocalFeatures
+from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+from stavpr_ros.recognition.int8_features import Int8Features
+from stavpr_ros.recognition.place_filter import BLOCK
+from stavpr_ros.recognition.robust import evenly, MIN_DEVIATION, unit_norm
+import torch
+
+BYTES = 128  # of a place, at most
+LEARNED = 2048  # places that the components are learned from
+PIECE = 1024  # places reduced at a time
+CHUNK = 32  # places compared exactly together; a multiple of all LANES
+SAMPLED, NEAREST = 128, 512  # chunks of the sample, and of small coarse distances
+
+
+class FirstStage:
+    """
+    A matcher that compares images with few places exactly, see the module.
+
+    :param matcher: compares with the places exactly, strategy ``adaptive`` or ``vanilla``.
+    :param features: of the places, as the matcher holds them.
+    :param probable: returns the first places of the blocks of ``BLOCK`` places that the filter
+        finds probable.
+    """
+
+    def __init__(
+        self,
+        matcher: CpuMatcher,
+        features: LocalFeatures | Int8Features,
+        probable: Callable[[], np.ndarray],
+    ) -> None:
+        self._matcher, self._probable = matcher, probable
+        W, n, d = features.strips.shape
+        learned = torch.as_tensor(features.strips[:, evenly(n, LEARNED)]).float()
+        _, vectors = torch.linalg.eigh(learned.transpose(1, 2) @ learned)
+        self._basis = vectors[..., -min(d, max(1, BYTES // W)) :]  # (W, d, p)
+        self._reduced = Int8Strips(1, n, W * self._basis.shape[2])
+        for low in range(0, n, PIECE):
+            strips = torch.as_tensor(features.strips[:, low : low + PIECE]).float()
+            reduced = unit_norm(strips @ self._basis).transpose(0, 1).flatten(1)  # (m, W p)
+            self._reduced.write(low, reduced[None].contiguous())
+        self._chunks = -(-n // CHUNK)
+        self._sample = evenly(self._chunks, SAMPLED)
+
+    @property
+    def places(self) -> int:
+        """Return the number of places n."""
+        return self._matcher.places
+
+    def distances(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        """Return the distances of one image to every place, (n,); exact ones where they count."""
+        n = self.places
+        out, nearest = np.empty(n, np.float32), np.empty(self._chunks, np.float32)
+        query = int8.tiled(self._shifted(strips)[:, None])
+        int8.smallest_distances(self._reduced.kernel_arguments(), query, CHUNK, out, nearest)
+        coarse = self._of_sample(out)
+        chunks = np.union1d(self._sample, self._candidates(nearest))
+        exact = self._matcher.distances_at(strips, chunks * CHUNK, CHUNK)
+        sampled = exact[np.searchsorted(chunks, self._sample)].ravel()
+        sampled = sampled[np.isfinite(sampled)]
+        scale = sampled.std() / max(coarse.std(), np.float32(MIN_DEVIATION))
+        out *= scale
+        out += sampled.mean() - scale * coarse.mean()
+        places = (chunks[:, None] * CHUNK + np.arange(CHUNK)).ravel()
+        inside = places < n
+        out[places[inside]] = exact.ravel()[inside]
+        return torch.from_numpy(out)
+
+    @property
+    def dimension(self) -> int:
+        """Return the number of bytes of a place."""
+        return self._reduced.shape[2]
+
+    def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        """Return the exact distances of Q images to every place, (Q, n)."""
+        return self._matcher.distance_matrix(strips, weights)
+
+    def _of_sample(self, row: np.ndarray) -> np.ndarray:
+        places = (self._sample[:, None] * CHUNK + np.arange(CHUNK)).ravel()
+        return row[places[places < len(row)]]
+
+    def _candidates(self, nearest: np.ndarray) -> np.ndarray:
+        count = min(NEAREST, self._chunks)
+        near = np.argpartition(nearest, count - 1)[:count]
+        # a camera that moves on leaves its block by a chunk at most
+        probable = (self._probable() // CHUNK)[:, None] + np.arange(BLOCK // CHUNK + 1)
+        return np.append(near, probable[probable < self._chunks])
+
+    def _shifted(self, strips: torch.Tensor) -> torch.Tensor:
+        """
+        Return an image, shifted by up to so many strips that one tile has, reduced as places are.
+
+        :param strips: shape (W, d).
+        :returns: shape (shifts, W p).
+        """
+        W, _, p = self._basis.shape
+        most = min(W - 1, TILE // 2)
+        rows = torch.zeros((2 * most + 1, W, p))
+        for shift in range(-most, most + 1):
+            places = slice(max(0, -shift), min(W, W - shift))  # strips of a place
+            shifted = strips[places.start + shift : places.stop + shift, None]
+            rows[shift + most, places] = (shifted @ self._basis[places])[:, 0]
+        return rows.flatten(1)

@@ -1,0 +1,107 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Projection of a map to its principal components: by hand, in files, when the map grows."""
+
+import cv2
+import numpy as np
+import pytest
+from stavpr_ros.commands import build_map, evaluate
+from stavpr_ros.commands import map as map_command
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import build_map as map_of
+from stavpr_ros.mapping import GrowingMap, load_map, PlaceMap
+from stavpr_ros.mapping.reduction import with_principal_components
+from stavpr_ros.sources.frame import Frame
+
+D = 6
+pytestmark = pytest.mark.usefixtures('one_thread')
+
+
+def images(count):
+    rng = np.random.default_rng(0)
+    wide = cv2.blur(rng.integers(0, 256, (48, 48 + 8 * count, 3), np.uint8), (5, 5))
+    return [np.ascontiguousarray(wide[:, 8 * i : 8 * i + 48]) for i in range(count)]
+
+
+@pytest.fixture(scope='module')
+def whole():
+    frames = [Frame(image, 0, str(i)) for i, image in enumerate(images(30))]
+    return map_of(frames, FeatureExtractor(), thumbnails=False, progress=False)
+
+
+def test_directions_are_those_of_largest_variance(whole):
+    reduced = with_principal_components(whole, D)
+    x = whole.features.strips.double().numpy()
+    centered = (x - x.mean(axis=1, keepdims=True)).reshape(-1, x.shape[2])
+    _, _, directions = np.linalg.svd(centered, full_matrices=False)
+    matrix = reduced.projection.matrix
+    np.testing.assert_allclose(matrix @ matrix.T, directions[:D].T @ directions[:D], atol=1e-4)
+    projected = x @ matrix
+    projected /= np.linalg.norm(projected, axis=2, keepdims=True)
+    np.testing.assert_allclose(reduced.features.strips, projected, atol=1e-5)
+
+
+def test_query_of_reduced_map_is_projected_as_its_places(whole):
+    reduced = with_principal_components(whole, D)
+    query = reduced.extractor().extract(images(30)[7:8])
+    query.require_same_settings(reduced.settings, 'the map')
+    np.testing.assert_allclose(query.strips[:, 0], reduced.features.strips[:, 7], atol=1e-4)
+
+
+def test_second_reduction_follows_the_first(whole):
+    twice = with_principal_components(with_principal_components(whole, 12), D)
+    assert twice.projection.matrix.shape == (whole.dimension, D)
+    query = twice.extractor().extract(images(30)[3:4])
+    np.testing.assert_allclose(query.strips[:, 0], twice.features.strips[:, 3], atol=1e-4)
+
+
+def test_reduced_map_grows_with_its_basis(whole):
+    reduced = with_principal_components(whole, D)
+    growing = GrowingMap.from_map(reduced, 100)
+    growing.add(reduced.extractor().extract(images(30)[:1]))
+    assert len(growing) == 31
+    assert growing.projection.identity == reduced.projection.identity
+
+
+@pytest.mark.parametrize('dimension', [0, -1, 224, 300])
+def test_reduction_to_other_dimension_is_rejected(whole, dimension):
+    with pytest.raises(SettingsError, match=f'pca:{dimension}: the features have 224'):
+        with_principal_components(whole, dimension)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / 'images').mkdir()
+    for i, image in enumerate(images(30)):
+        cv2.imwrite(str(tmp_path / 'images' / f'{i:03}.png'), image)
+    return tmp_path
+
+
+def test_map_is_built_and_compacted_with_principal_components(folder, capsys):
+    source, built = str(folder / 'images'), str(folder / 'built.stavpr')
+    arguments = ['--input', source, '--output', built, '--projection', f'pca:{D}']
+    assert build_map.main(arguments) == 0
+    found = load_map(built)
+    assert isinstance(found, PlaceMap)
+    assert found.features.strips.shape == (7, 30, D)
+    assert found.projection.name == f'principal components 224 -> {D} of 30 places'
+    compact = str(folder / 'compact.stavpr')
+    assert map_command.main(['compact', built, compact, '--pca', '4']) == 0
+    assert load_map(compact).dimension == 4
+    assert 'strips of 6 dimensions become 4' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('projection', ['pca:', 'pca:x', 'grp:4', '-3', 'x'])
+def test_unknown_projection_is_rejected(folder, projection, capsys):
+    with pytest.raises(SystemExit):
+        build_map.main(
+            ['--input', str(folder), '--output', 'x.stavpr', f'--projection={projection}']
+        )
+    assert 'expected D or pca:D' in capsys.readouterr().err
+
+
+def test_evaluation_of_images_refers_to_map_for_principal_components(folder, capsys):
+    source = str(folder / 'images')
+    assert evaluate.main(['--map', source, '--query', source, '--projection', 'pca:4']) != 0
+    assert 'build one by build_map' in capsys.readouterr().err
