@@ -122,6 +122,8 @@ class FleetRecognizer(SequenceRecognizer):
     ``problem`` is why the last lookup failed, '' = it did not.
     """
 
+    stages = ''  # without a time budget
+
     def __init__(
         self, city: CityMap, settings: RecognizerSettings, timeout: float = TIMEOUT
     ) -> None:
