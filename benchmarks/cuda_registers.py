@@ -25,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 # W and its band: the default, restricted alignment, more strips. l and k: the default and others.
 SPATIAL = [(7, 7), (7, 3), (14, 14)]
+LEVELS, SPEEDS = 3, 9  # of the place filter
 SEQUENCES = [(5, 10), (20, 40), (20, 30), (33, 66), (50, 100), (76, 152), (77, 154), (1000, 2000)]
 
 
@@ -34,8 +35,8 @@ class MissingError(Exception):
 
 def kernels() -> list[tuple[str, Any, Any]]:
     """List name, Python function and argument types of each kernel."""
-    from numba import float32, int32, int64
-    from stavpr_ros.alignment.cuda import dtw, lm_dtw
+    from numba import float32, int32, int64, uint8
+    from stavpr_ros.alignment.cuda import dtw, lm_dtw, place_filter
 
     images = (float32[:, :, :], float32, int64, int64, float32[:, ::1])
     floats, whole = float32[::1], int32[::1]
@@ -47,6 +48,15 @@ def kernels() -> list[tuple[str, Any, Any]]:
     found += [
         (f'lm_dtw l={l} k={k}', lm_dtw.lm_dtw(l, k, lm_dtw.BLOCK).py_func, window)
         for l, k in SEQUENCES
+    ]
+    table, codes, steps = float32[:, ::1], uint8[:, ::1], int32[::1]
+    K, V = LEVELS, SPEEDS
+    motion = (table, codes, floats, steps, floats, float32, float32, float32, floats)
+    ways = (int64[::1], table, uint8[:, :, ::1], int32[:, ::1], int64, floats, int32[:, ::1])
+    found += [
+        ('filter mix', place_filter.mix(K, V).py_func, (table,) * 4 + (codes,)),
+        ('filter move', place_filter.move(K, V).py_func, (*motion, table, codes, table)),
+        ('filter trace', place_filter.trace(K, V).py_func, ways),
     ]
     return found
 

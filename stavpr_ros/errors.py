@@ -61,3 +61,7 @@ class JournalError(StavprError):
 
 class FeatureMismatchError(StavprError):
     """The query's features were made with other settings than the map's."""
+
+
+class FleetError(StavprError):
+    """A fleet's map cannot be reached, or its data is damaged."""

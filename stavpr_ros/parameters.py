@@ -68,7 +68,8 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             '',
             'Map file made by build_map or save_map; ~ is the home folder, a relative path is in '
             'the working directory. Without one, localization waits for the service '
-            '~/load_map, and mapping starts a new map.',
+            '~/load_map, and mapping starts a new map. Or the address of the map of a fleet, such '
+            'as qdrant://HOST:6333/NAME (docs/fleet.md).',
         ),
         NodeParameter(
             'save_path',

@@ -27,13 +27,14 @@ MAY_IMPORT = {
     'features': set(),
     'mapping': {'alignment', 'sources', 'features'},
     'recognition': {'alignment', 'features', 'mapping'},
+    'fleet': {'features', 'mapping', 'recognition'},
     'relative_pose': {'alignment', 'features', 'mapping', 'recognition'},
-    'pipeline': set(CORE[:6]),
+    'pipeline': {'fleet', *CORE[:6]},
     'pose_graph': {'mapping'},
     'evaluation': set(CORE[:5]),
     'demonstration': {'evaluation', 'pose_graph', *CORE},
     'ros': {'pose_graph', *CORE},
-    'commands': {'ros', 'demonstration', 'evaluation', 'pose_graph', *CORE},
+    'commands': {'ros', 'demonstration', 'evaluation', 'pose_graph', 'fleet', *CORE},
 }
 # On an image's way as well, but not traced: compiled code does not report its calls, and these
 # files of the node run before and after the pipeline, in the executor's and the worker's thread.

@@ -24,6 +24,8 @@ PACKAGE = ROOT / 'stavpr_ros'
 DISTRIBUTIONS = {
     'cv2': 'opencv-python-headless',
     'faiss': 'faiss-cpu',
+    'qdrant_client': 'qdrant-client',
+    'qdrant_edge': 'qdrant-edge-py',
     'PIL': 'pillow',
     'sklearn': 'scikit-learn',
     'yaml': 'PyYAML',
@@ -41,7 +43,10 @@ ROSDEP_KEYS = {
     'tqdm': 'python3-tqdm',
     'yaml': 'python3-yaml',
 }
-NO_ROSDEP_KEY = {'evo', 'faiss', 'gtsam', 'llvmlite', 'onnx', 'onnxruntime', 'rosbags', 'torch'}
+NO_ROSDEP_KEY = {
+    *('evo', 'faiss', 'gtsam', 'llvmlite', 'onnx', 'onnxruntime', 'qdrant_client', 'qdrant_edge'),
+    *('ray', 'rosbags', 'torch'),
+}
 ROS = re.compile(r'\w+_(msgs|srvs|interfaces)|rclpy|launch|launch_ros|ament_index_python|tf2_ros')
 PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules of another name
 
@@ -103,7 +108,7 @@ def declared(*tags: str) -> set[str]:
 
 def test_every_imported_distribution_is_required(setup_arguments):
     required = distribution_names(setup_arguments['install_requires'])
-    for extra in ('onnx', 'faiss', 'slam'):
+    for extra in ('onnx', 'faiss', 'fleet', 'ray', 'slam'):
         required |= distribution_names(setup_arguments['extras_require'][extra])
     needed = {name for name in imported(PACKAGE) if not ROS.fullmatch(name)}
     assert needed  # the search works

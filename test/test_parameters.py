@@ -182,7 +182,7 @@ def test_network_of_feature_settings_and_model_path_is_accepted():
 @pytest.mark.parametrize(
     ('mode', 'operation', 'backend', 'available', 'stages'),
     [
-        ('robust', 'localization', 'auto', 'cuda', ('cuda', 'cuda', 'cpu')),
+        ('robust', 'localization', 'auto', 'cuda', ('cuda', 'cuda', 'cuda')),
         ('paper', 'localization', 'auto', 'cuda', ('cuda', 'cuda', 'cuda')),
         ('robust', 'loop_closure', 'auto', 'cuda', ('cuda', 'cpu', 'cpu')),
         ('robust', 'localization', 'cpu', 'cuda', ('cpu', 'cpu', 'cpu')),

@@ -32,8 +32,8 @@ LAST_LINES = 25  # of the log of a failed command
 # them: base.txt, and a file for each extra. Those are installed, and their hashes compared.
 # torch and cuda are not locked: their builds depend on the index and on the driver.
 BASE = ('runtime', 'ros', 'build')
-LOCKED_EXTRAS = ('onnx', 'faiss', 'slam', 'evaluation', 'bench', 'dev', 'docs')
-EXTRAS = ('onnx', 'faiss', 'cuda', 'slam', 'evaluation', 'bench', 'dev', 'docs')
+LOCKED_EXTRAS = ('onnx', 'faiss', 'fleet', 'ray', 'slam', 'evaluation', 'bench', 'dev', 'docs')
+EXTRAS = (*LOCKED_EXTRAS, 'cuda')
 
 # The files that a package is built from, in build order: stavpr_ros depends on stavpr_msgs.
 SOURCES = {

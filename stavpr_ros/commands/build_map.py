@@ -10,6 +10,13 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
+from stavpr_ros.commands.jobs import (
+    add_job_options,
+    Job,
+    job_names,
+    other_arguments,
+    run_jobs,
+)
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.output_file import MAP, require_replaceable
@@ -32,6 +39,7 @@ examples:
   build_map --input netvlad.mat:features --output route.stavpr --descriptors-source netvlad
   build_map --input drive/ --output route.stavpr --projection 512 --features onnx \\
       --onnx-model squeezenet.onnx --onnx-layer fire6/concat_1
+  build_map --input drives/*.bag --output maps/ --processes 4
 
 An interrupted command leaves MAP.journal, and the same command continues it.
 
@@ -49,10 +57,17 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--input',
         required=True,
+        nargs='+',
         metavar='FOLDER|BAG|ARRAY',
-        help='images, a ROS 1 or ROS 2 bag, or descriptors: .npy .npz .csv .mat, or FILE:NAME',
+        help='images, a ROS 1 or ROS 2 bag, or descriptors: .npy .npz .csv .mat, or FILE:NAME; '
+        'several: a map of each',
     )
-    parser.add_argument('--output', required=True, metavar='MAP', help='the file to write')
+    parser.add_argument(
+        '--output',
+        required=True,
+        metavar='MAP',
+        help='the file to write; the folder of the maps of several inputs',
+    )
     parser.add_argument('--force', action='store_true', help='replace an existing map')
     parser.add_argument('--topic', help='image topic of the bag, if it has several')
     parser.add_argument(
@@ -83,6 +98,7 @@ def _parser() -> argparse.ArgumentParser:
         help='continue after an image that cannot be read',
     )
     _add_keyframe_options(parser)
+    add_job_options(parser)
     add_feature_options(parser)
     return parser
 
@@ -287,13 +303,30 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
     print(f'suggested threshold for mode paper: {suggestion.threshold:.3f}')
 
 
+def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:
+    """Build a map of each input; return the exit code."""
+    folder = Path(arguments.output)
+    if folder.is_file():
+        raise SettingsError(f'--output {folder} is a file: give a folder for several maps')
+    folder.mkdir(parents=True, exist_ok=True)
+    others = other_arguments(args, '--input')
+    jobs = [
+        Job(name, 'build_map', ('--input', one, '--output', f'{folder / name}.stavpr', *others))
+        for name, one in zip(job_names(arguments.input), arguments.input, strict=True)
+    ]
+    return run_jobs(jobs, arguments.processes, arguments.ray)
+
+
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
     state = 'nothing was written'
 
-    def work() -> None:
+    def work() -> int | None:
         nonlocal state
         arguments = _parser().parse_args(args)
+        if len(arguments.input) > 1:
+            return _build_each(arguments, sys.argv[1:] if args is None else args)
+        arguments.input = arguments.input[0]
         from stavpr_ros.features.descriptors import is_descriptors
         from stavpr_ros.mapping import save_map
 
@@ -307,6 +340,7 @@ def main(args: list[str] | None = None) -> int:
             journal.unlink()
         state = f'{arguments.output} is written, without a suggested threshold'
         _report(place_map, arguments.output)
+        return None
 
     return run_program('build_map', work, lambda: f'interrupted, {state}')
 

@@ -8,6 +8,13 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
+from stavpr_ros.commands.jobs import (
+    add_job_options,
+    Job,
+    job_names,
+    other_arguments,
+    run_jobs,
+)
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import HTML, JSON, NPY, require_replaceable
@@ -58,6 +65,7 @@ examples:
   evaluate --query loop/ --loop-closure --exclude-places 50 --truth closures.png
   evaluate --map summer.csv --query netvlad.mat:winter --tolerance 2
   evaluate --map summer/ --query winter/ --export arrays/
+  evaluate --map summer/ --query drives/*.bag --output reports/ --processes 4
   evaluate --dataset gardens_point=data/gardens_point --strategy vanilla
 
 exit codes: 0 done, 1 failed (the reason is printed), 2 usage, 130 interrupted
@@ -70,7 +78,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = make_parser('evaluate', DESCRIPTION, EPILOG)
     add = parser.add_argument_group('sequences').add_argument
     add('--map', metavar='FOLDER|BAG|MAP|ARRAY', help='first traverse, see below')
-    add('--query', metavar='FOLDER|BAG|MAP|ARRAY', help='second traverse: the same')
+    query = 'second traverse: the same; several: each is evaluated'
+    add('--query', nargs='+', metavar='FOLDER|BAG|MAP|ARRAY', help=query)
     add('--dataset', metavar='NAME=FOLDER', help='map, query and ground truth of a known data set')
     add('--topic', help='image topic of the bags, if they have several')
     add(
@@ -109,6 +118,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--export', metavar='FOLDER', help=export)
     add('--force', action='store_true', help='replace earlier numbers, reports and arrays')
     add('--window', type=int, metavar='I', help='plot the warping path around query image I')
+    add_job_options(parser)
     add_feature_options(parser)
     return parser
 
@@ -414,16 +424,37 @@ def _run(arguments: argparse.Namespace) -> None:
         print(f'report: {write_folder(report, Path(folder), arguments.force)}')
 
 
+def _run_each(
+    parser: argparse.ArgumentParser, arguments: argparse.Namespace, args: list[str]
+) -> int:
+    """Evaluate each query: a report and the numbers in a folder of its name; the exit code."""
+    for option in ('json', 'export', 'window', 'dataset', 'query_poses'):
+        if getattr(arguments, option) is not None:
+            parser.error(f'--{option.replace("_", "-")} goes with one --query')
+    folder, others = Path(arguments.output or OUTPUT), other_arguments(args, '--query')
+    jobs = []
+    for name, query in zip(job_names(arguments.query), arguments.query, strict=True):
+        own = folder / name
+        written = ('--output', str(own), '--json', f'{own}.json')
+        jobs.append(Job(name, 'evaluate', ('--query', query, *written, *others)))
+    folder.mkdir(parents=True, exist_ok=True)
+    return run_jobs(jobs, arguments.processes, arguments.ray)
+
+
 def main(args: list[str] | None = None) -> int:
     """Run the command."""
 
-    def work() -> None:
+    def work() -> int | None:
         parser = _parser()
         # None = not given: a saved map decides these then
         given = argparse.Namespace(features=None, strips=None, seed=None)
         arguments = parser.parse_args(args, given)
+        if arguments.query is not None and len(arguments.query) > 1:
+            return _run_each(parser, arguments, sys.argv[1:] if args is None else args)
+        arguments.query = arguments.query[0] if arguments.query else None
         _check(parser, arguments)
         _run(arguments)
+        return None
 
     return run_program('evaluate', work)
 

@@ -26,6 +26,7 @@ examples:
   map merge both.stavpr day.stavpr night.stavpr
   map sessions both.stavpr day.stavpr --keep day
   map recover route.stavpr.journal
+  map upload route.stavpr qdrant://host:6333/city
 
 exit codes: 0 done, or all maps are sound; 1 not (the reason is printed); 2 usage
 """
@@ -106,6 +107,13 @@ def _parser() -> argparse.ArgumentParser:
     chosen = action.add_mutually_exclusive_group(required=True)
     chosen.add_argument('--keep', metavar='ID', help='only the places of this session')
     chosen.add_argument('--remove', metavar='ID', help='all places but those of this session')
+    action = add('upload', 'Write a map to the home of a fleet, docs/fleet.md.', 'map')
+    action.add_argument(
+        'address',
+        metavar='ADDRESS',
+        help='faiss:FILE, qdrant:FOLDER, or qdrant://HOST:PORT/COLLECTION',
+    )
+    action.add_argument('--force', action='store_true', help='replace what is there')
     map_recover.add_arguments(
         add('recover', 'Make a map of the journal of an interrupted recording.')
     )
@@ -310,6 +318,22 @@ def _recover(arguments: argparse.Namespace) -> int:
     return map_recover.recover_map(arguments.journal, arguments.output)
 
 
+def _upload(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.fleet import upload
+    from stavpr_ros.mapping import open_map, verify_map
+    from stavpr_ros.pipeline.maps_folder import ADDRESSES, is_address
+
+    if not is_address(arguments.address):
+        raise SettingsError(
+            f'{arguments.address} is no address: expected one that begins with '
+            f'{", ".join(ADDRESSES)}'
+        )
+    place_map = open_map(arguments.map)
+    verify_map(place_map)
+    upload(place_map, arguments.address, arguments.force)
+    print(f'{arguments.address}: {len(place_map)} places')
+
+
 def _check_output(arguments: argparse.Namespace) -> None:
     """Reject an output that must not be replaced, or that is one of the inputs."""
     if arguments.action == 'info' and arguments.plot:
@@ -333,6 +357,7 @@ def main(args: list[str] | None = None) -> int:
         actions = {
             'info': _info, 'verify': _verify, 'convert': _convert, 'export': _export,
             'compact': _compact, 'merge': _merge, 'sessions': _sessions, 'recover': _recover,
+            'upload': _upload,
         }  # fmt: skip
         return actions[arguments.action](arguments)
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 import math
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -76,6 +77,7 @@ class PlaceMap:
         read from a file.
     """
 
+    partial: ClassVar[bool] = False  # places are fetched from elsewhere on use
     features: LocalFeatures
     projection: Projection | None
     stamps: np.ndarray

@@ -129,6 +129,12 @@ class Pipeline:
             return NO_THRESHOLD
         return ''
 
+    @property
+    def problem(self) -> str:
+        """Return why places of the map cannot be reached; empty while they can."""
+        operation = self._operation
+        return operation.recognizer.problem if operation and operation.recognizer else ''
+
     def change(
         self,
         settings: PipelineSettings | None = None,
@@ -172,6 +178,8 @@ class Pipeline:
         place_map = self._places_as_map()
         if place_map is None:
             raise InputError(f'there is nothing to save yet: {self.missing or "no places"}')
+        if place_map.partial:
+            raise InputError(f'the map of a fleet stays where it is: {self.path}')
         state = self._map_save_state if place_map is self._map else self.save_state
         return MapSnapshot(place_map, state, state.recorded)
 

@@ -15,7 +15,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class, settings_from_json
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.parameters import BY_NAME
-from stavpr_ros.pipeline.maps_folder import maps_folder
+from stavpr_ros.pipeline.maps_folder import is_address, maps_folder
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.loop_closer import least_limit
 from stavpr_ros.recognition.robust import MIN_PROBABILITY, options_of
@@ -165,14 +165,12 @@ class PipelineSettings:
         if operation == 'mapping':
             return stages
         matching = self.matching_backend(operation)
-        # mode robust matches sequences on the CPU only
-        sequences = 'cpu' if options_of(self.mode).any else matching
         held = self.precision
         if held == 'int8' and matching == 'cpu':
             from stavpr_ros.alignment.cpu.int8 import INSTRUCTION
 
             held = f'int8, {INSTRUCTION} kernel'
-        return f'{stages}, image distances on {matching} ({held}), sequences on {sequences}'
+        return f'{stages}, image distances on {matching} ({held}), sequences on {matching}'
 
     def extractor(self) -> FeatureExtractor:
         """
@@ -236,9 +234,10 @@ def absolute_path(path: str) -> str:
     """
     Return the absolute path of a file, '' of none; launch files leave ``~`` as it is.
 
-    :param path: may begin with ``~``; a relative one is relative to the working directory.
+    :param path: may begin with ``~``; a relative one is relative to the working directory. The
+        address of a fleet's map is returned unchanged.
     """
-    return os.path.abspath(os.path.expanduser(path)) if path else ''
+    return path if not path or is_address(path) else os.path.abspath(os.path.expanduser(path))
 
 
 def node_settings(values: Mapping[str, Any]) -> NodeSettings:

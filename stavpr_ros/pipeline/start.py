@@ -5,16 +5,21 @@
 from dataclasses import dataclass
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.devices import choose_backend
-from stavpr_ros.errors import MapFileError
+from stavpr_ros.errors import MapFileError, SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, open_map, PlaceMap, verify_map
+from stavpr_ros.pipeline.maps_folder import is_address
 from stavpr_ros.pipeline.operations import Localization, LoopClosing, Mapping, Operation
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.recognition import PlaceRecognizer
 from stavpr_ros.recognition.loop_closer import LoopCloser
+
+if TYPE_CHECKING:
+    from stavpr_ros.fleet import FleetRecognizer
 
 BLANK = np.zeros((480, 640, 3), np.uint8)
 
@@ -32,17 +37,26 @@ def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
     """
     Read a map, on any thread; its features stay in the file until an operation takes them.
 
+    :param path: of a file, or the address of a fleet's map.
     :raises StavprError: an invalid file, or a missing model.
     """
     if os.path.isdir(path):
         maps = ', '.join(sorted(file.name for file in Path(path).glob('*.stavpr')))
         remedy = f'name one of its maps: {maps}' if maps else 'build a map of its images'
         raise MapFileError(f'{path} is a folder, not a map: {remedy} (build_map makes map files)')
-    place_map = open_map(path)
+    place_map = _opened(path)
     extractor = place_map.extractor(
         choose_backend(settings.backend), settings.model_path, settings.allow_torchscript
     )
     return LoadedMap(path, place_map, extractor)
+
+
+def _opened(path: str) -> PlaceMap:
+    if not is_address(path):
+        return open_map(path)
+    from stavpr_ros.fleet import open_city_map
+
+    return open_city_map(path)
 
 
 def start_operation(
@@ -62,17 +76,17 @@ def start_operation(
     if name == 'localization':
         if place_map is None or extractor is None:
             return None
-        recognizer = PlaceRecognizer(
-            place_map,
-            settings.recognition(),
-            settings.matching_backend(name),
-            settings.precision,
-        )
+        recognizer = _recognizer(settings, place_map)
         _warm_up(recognizer, extractor, settings.sequence.length)
         return Localization(extractor, place_map, recognizer)
     extractor = extractor or settings.extractor()
     if name == 'mapping':
         extractor.extract([BLANK])
+        if place_map is not None and place_map.partial:
+            raise SettingsError(
+                'operation mapping does not extend the map of a fleet: record a map of its own, '
+                'without map_path'
+            )
         if place_map is not None:
             verify_map(place_map)  # damage would be saved again, with correct hashes
         growing = (
@@ -93,6 +107,23 @@ def start_operation(
     return LoopClosing(extractor, route, closer)
 
 
+def _recognizer(
+    settings: PipelineSettings, place_map: PlaceMap
+) -> 'PlaceRecognizer | FleetRecognizer':
+    if not place_map.partial:
+        backend = settings.matching_backend('localization')
+        return PlaceRecognizer(place_map, settings.recognition(), backend, settings.precision)
+    if settings.backend == 'cuda' or settings.precision != 'float32':
+        raise SettingsError(
+            f'backend {settings.backend}, precision {settings.precision}: the map of a fleet is '
+            'matched on the CPU in float32; take backend auto or cpu, and precision float32'
+        )
+    from stavpr_ros.fleet import CityMap, FleetRecognizer
+
+    assert isinstance(place_map, CityMap)
+    return FleetRecognizer(place_map, settings.recognition())
+
+
 def _loop_closer(
     settings: PipelineSettings, exclude: int, extractor: FeatureExtractor
 ) -> LoopCloser:
@@ -108,7 +139,9 @@ def _loop_closer(
 
 
 def _warm_up(
-    recognizer: PlaceRecognizer | LoopCloser, extractor: FeatureExtractor, images: int
+    recognizer: 'PlaceRecognizer | FleetRecognizer | LoopCloser',
+    extractor: FeatureExtractor,
+    images: int,
 ) -> None:
     """Compile and allocate everything, so that the first image is as fast as the others."""
     features = extractor.extract([BLANK])

@@ -241,11 +241,7 @@ class PlaceFilter:
             self._a, np.float32(least or 1), top, self._origins, self._steps,
             (self._count - 1) % len(self._steps), images_ago, ways, states,
         )  # fmt: skip
-        ways, probabilities = ways[:count], states[:count].astype(np.float64) * self._scale
-        order = np.lexsort((-probabilities, ways[:, 0]))  # the most probable first, of each place
-        places, firsts, each = np.unique(ways[order, 0], return_index=True, return_inverse=True)
-        weights = np.bincount(each, probabilities[order], len(places))
-        return Belief(places, weights, ways[order[firsts], 1:])
+        return belief_of(ways[:count], states[:count].astype(np.float64) * self._scale)
 
     def _top(self, n: int) -> np.ndarray:
         """Return the ``TOP`` most probable places, int64; they lie in blocks with large maxima."""
@@ -288,6 +284,19 @@ class PlaceFilter:
             (self._count - 1) % len(self._steps), images, places,
         )  # fmt: skip
         return places
+
+
+def belief_of(ways: np.ndarray, probabilities: np.ndarray) -> Belief:
+    """
+    Return the belief that some states give.
+
+    :param ways: of each state, (m, 5): place then, level, speed and place now, speed then.
+    :param probabilities: of each state, (m,), float64.
+    """
+    order = np.lexsort((-probabilities, ways[:, 0]))  # the most probable first, of each place
+    places, firsts, each = np.unique(ways[order, 0], return_index=True, return_inverse=True)
+    weights = np.bincount(each, probabilities[order], len(places))
+    return Belief(places, weights, ways[order[firsts], 1:])
 
 
 def _move_up(values: np.ndarray, count: int, none: int) -> None:

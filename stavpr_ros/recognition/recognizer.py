@@ -122,7 +122,11 @@ class SequenceRecognizer:
     :param places: number of places n.
     :param layout: of a map of several sessions.
     :param to_oldest: see :class:`stavpr_ros.recognition.sequence_search.FilterSearch`.
+
+    ``problem`` is why places of the map cannot be reached; empty while they can.
     """
+
+    problem = ''
 
     def __init__(
         self,
@@ -241,8 +245,9 @@ class SequenceRecognizer:
         :param strips: the image's features, centered, shape (W, d).
         :param position: of the image by odometry, (2,).
         """
+        on_device = self._filter is not None and self._filter.on_device
         if self._settings.applied_options.query_znorm:
-            row = torch.from_numpy(self._z_normalized(row.cpu().numpy()))
+            row = self._z_normalized_on(row) if on_device else self._z_normalized_here(row)
         if self._layout is not None:
             row = self._layout.spread(row)
         self._buffer.push(row.to(self._buffer.memory.device), stamp)
@@ -250,7 +255,7 @@ class SequenceRecognizer:
             self._motion.way.append(position)
         if self._filter is not None:
             change = self._filter.change.next_query(strips.cpu().numpy())
-            self._filter.update(row.cpu().numpy(), change)
+            self._filter.update(row if on_device else row.cpu().numpy(), change)
             self._changes.append(change)
         match = self._compared(self._match_window(), position)
         self._nearest = match.sequence
@@ -276,6 +281,15 @@ class SequenceRecognizer:
 
     def _z_normalized(self, row: np.ndarray) -> np.ndarray:
         return z_normalized(row) if self._layout is None else self._layout.z_normalized(row)
+
+    def _z_normalized_here(self, row: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(self._z_normalized(row.cpu().numpy()))
+
+    def _z_normalized_on(self, row: torch.Tensor) -> torch.Tensor:
+        from stavpr_ros.recognition.cuda_filter import z_normalized_on_device
+
+        runs = [slice(None)] if self._layout is None else self._layout.runs
+        return torch.cat([z_normalized_on_device(row[run]) for run in runs])
 
     def _match_window(self) -> Match:
         threshold, length = self._settings.threshold, self._settings.sequence.length
@@ -314,8 +328,8 @@ class PlaceRecognizer(SequenceRecognizer):
 
     :param place_map: the reference map.
     :param settings: see :class:`RecognizerSettings`.
-    :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``. In mode robust, image
-        distances are computed there and sequences on the CPU.
+    :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``. On ``cuda``, mode robust
+        requires its place filter; of other options, LM-DTW runs on the CPU.
     :param precision: of the map's features in the matcher, ``float32``, ``float16`` or ``int8``;
         see :func:`stavpr_ros.recognition.matcher.make_matcher`.
     :raises UnavailableError: no such backend here.
@@ -349,6 +363,8 @@ class PlaceRecognizer(SequenceRecognizer):
         if self._filter is not None:
             firsts = (0,) if layout is None else layout.firsts
             self._filter.change.learn(held.strips, firsts)
+        if backend == 'cuda' and self._filter is not None:
+            self._match_on_device(self._filter)
         if backend == 'cuda' and not options.any:
             from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
@@ -391,6 +407,16 @@ class PlaceRecognizer(SequenceRecognizer):
         assert self._filter is not None
         columns = self._filter.filter.probable_blocks()
         return columns if self._layout is None else self._layout.columns.searchsorted(columns)
+
+    def _match_on_device(self, search: FilterSearch) -> None:
+        from stavpr_ros.alignment.cuda.compilation import runtime
+
+        sequence, places = self._settings.sequence, self._buffer.places
+        device = runtime().torch_device
+        self._buffer = SequenceBuffer(sequence.length, places, sequence.k, device=device)
+        self._filter = FilterSearch(self._buffer, layout=self._layout, on_device=True)
+        self._filter.change = search.change
+        self._search = self._filter
 
     def _held(self, features: LocalFeatures, precision: str) -> LocalFeatures | Int8Features:
         """Return the features for the matcher, in memory once; those of a map are not copied."""

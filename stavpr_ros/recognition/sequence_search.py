@@ -11,6 +11,7 @@ places in between is learned from the map, so that the query's changes show how 
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -249,6 +250,15 @@ class ImageChange:
             self._sums[1 : len(changes) + 1] += changes
             self._counts[1 : len(changes) + 1] += 1
 
+    def adopt(self, learned: 'ImageChange', from_before: np.ndarray) -> None:
+        """
+        Take what was learned from a sample, for some places of its map.
+
+        :param from_before: change of each place from the one before, (n,), float32.
+        """
+        self._sums, self._counts = learned._sums, learned._counts
+        self._from_before = from_before
+
     def grow(self, places: int) -> None:
         """Make room for more places."""
         more = np.ones(places - len(self._from_before), np.float32)
@@ -323,6 +333,7 @@ class FilterSearch:
     :param layout: of the places of several sessions in the columns of the buffer.
     :param to_oldest: states are followed back to the oldest image of the window, instead of the
         middle one: :meth:`at` any image.
+    :param on_device: the filter is computed on the CUDA device where the buffer is.
     """
 
     def __init__(
@@ -331,15 +342,21 @@ class FilterSearch:
         settings: FilterSettings | None = None,
         layout: SessionLayout | None = None,
         to_oldest: bool = False,
+        on_device: bool = False,
     ) -> None:
-        self.buffer, self._layout = buffer, layout
+        self.buffer, self._layout, self.on_device = buffer, layout, on_device
         settings = settings or FilterSettings()
         self._middle = (buffer.length - 1) // 2
         gaps, places = None, buffer.places
         if layout is not None:
             gaps, places = layout.gaps, len(layout.columns)
         lag = buffer.length - 1 - (0 if to_oldest else self._middle)
-        self.filter = PlaceFilter(buffer.places, lag, settings, gaps)
+        filter_class: Any = PlaceFilter
+        if on_device:
+            from stavpr_ros.recognition.cuda_filter import CudaPlaceFilter
+
+            filter_class = CudaPlaceFilter
+        self.filter = filter_class(buffer.places, lag, settings, gaps)
         self.change = ImageChange(places, settings)
         self._speeds = settings.speeds
         self._images: deque[int] = deque(maxlen=buffer.length)  # the filter's image of each
@@ -360,14 +377,14 @@ class FilterSearch:
         self.filter.evict(count)
         self.change.evict(count)
 
-    def update(self, z: np.ndarray, change: float) -> None:
+    def update(self, z: np.ndarray | torch.Tensor, change: float) -> None:
         """
         Advance by an image.
 
         An image of a camera that stands adds nothing. Where the map's own images are equal, in a
         dark tunnel, it may move: the filter goes on at its speed, without evidence.
 
-        :param z: z-normalized distances to the places, (m,), float32.
+        :param z: z-normalized distances to the places, (m,), float32; on the filter's device.
         :param change: of the image, from :class:`ImageChange`.
         """
         if not (self.filter.count and self.change.is_standstill(change)):

@@ -39,7 +39,7 @@ class SessionLayout:
         farthest = int(np.ceil(max(FilterSettings().speeds))) + 1  # places from image to image
         self._gap, self._radius = max(farthest, nms_radius) + 1, nms_radius
         self.firsts = firsts
-        self._runs = [slice(*pair) for pair in zip(firsts, [*firsts[1:], n], strict=True)]
+        self.runs = [slice(*pair) for pair in zip(firsts, [*firsts[1:], n], strict=True)]
         run = np.repeat(np.arange(len(firsts)), np.diff(firsts, append=n))
         self.columns = np.arange(n) + run * self._gap
         self.width = n + (len(firsts) - 1) * self._gap
@@ -53,7 +53,7 @@ class SessionLayout:
 
     def z_normalized(self, row: np.ndarray) -> np.ndarray:
         """Return a row with mean 0 and deviation 1 in each session, (n,)."""
-        return np.concatenate([z_normalized(row[run]) for run in self._runs])
+        return np.concatenate([z_normalized(row[run]) for run in self.runs])
 
     def spread(self, row: torch.Tensor) -> torch.Tensor:
         """Return distances to places (n,) as those to columns, (width,)."""
@@ -63,12 +63,12 @@ class SessionLayout:
 
     def first_column(self, column: int) -> int:
         """Return the first column of a column's session."""
-        place = self._places[column]
-        return int(self.columns[self.firsts[np.searchsorted(self.firsts, place, 'right') - 1]])
+        firsts = self.columns[self.firsts]
+        return int(firsts[np.searchsorted(firsts, column, 'right') - 1])
 
     def session_of(self, place: int) -> tuple[int, int]:
         """Return the first place of a place's session, and the first one behind it."""
-        run = self._runs[int(np.searchsorted(self.firsts, place, 'right')) - 1]
+        run = self.runs[int(np.searchsorted(self.firsts, place, 'right')) - 1]
         return int(run.start), int(run.stop)
 
     def summed(self, weights: np.ndarray, close: int) -> np.ndarray:

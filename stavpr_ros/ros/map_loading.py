@@ -62,7 +62,8 @@ class MapLoader:
             f'{places.settings.strips} strips of {places.dimension} dimensions'
         )
         # reads all of the file, for seconds: the map is in use meanwhile
-        threading.Thread(target=self._verify, args=(path, places), daemon=True).start()
+        if not places.partial:
+            threading.Thread(target=self._verify, args=(path, places), daemon=True).start()
 
     @contextmanager
     def _loading(self, path: str) -> Iterator[None]:

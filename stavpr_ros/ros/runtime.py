@@ -283,7 +283,7 @@ class Runtime:
         pipeline, images, odometry = self.pipeline, self.images, self.odometry
         return replace(
             health,
-            problem=health.problem or self._maps.problem or self.problem,
+            problem=health.problem or self._maps.problem or self.problem or pipeline.problem,
             loading=self._maps.path,
             input=InputStatus() if images is None else images.status(),
             odometry='' if odometry is None else odometry.freshness(),

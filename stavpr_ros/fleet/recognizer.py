@@ -1,0 +1,382 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Recognition on a city's map: exact, over the neighborhoods where the camera may be.
+
+Every few images, the vectors of the latest ones are looked up, and the neighborhoods that they
+agree on are fetched, in chunks of neighboring places that are kept while there is room. Mode
+robust runs over the chunks held as over a map of so many sessions, with three differences:
+
+* The mean, the whitening and the z-normalization come from a sample of the whole map.
+* The filter's probabilities of starting on and entering the map are multiplied by the share m / n
+  of the places held, so that each place has the probability that it has in the whole map: the
+  places held are those most alike of n.
+* When chunks are replaced, the filter runs over the latest images again, over the new places.
+
+While the map cannot be reached, the chunks held are used.
+"""
+
+from collections import deque
+from concurrent.futures import Future, wait
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from stavpr_ros.errors import FeatureMismatchError, SettingsError, StavprError
+from stavpr_ros.features import LocalFeatures
+from stavpr_ros.fleet.city_map import CityMap
+from stavpr_ros.fleet.neighborhoods import Votes
+from stavpr_ros.fleet.store import place_vectors, sample_places
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition import Match, RecognizerSettings, Status
+from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
+from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION, ROBUST
+from stavpr_ros.recognition.sequence_search import (
+    change_between,
+    FilterSearch,
+    ImageChange,
+    SequenceBuffer,
+)
+from stavpr_ros.recognition.sessions import SessionLayout
+from stavpr_ros.threads import call_on_thread
+import torch
+
+CHUNK = 32  # places that are fetched together
+CHUNKS = 128  # held: 4096 places
+NEIGHBORHOODS = 16  # that are looked at
+BEHIND, AHEAD = 16, 48  # places of a neighborhood before and after its middle
+EVERY = 5  # images between lookups
+NEAREST = 64  # places of an image that vote
+HISTORY = 60  # latest images that the filter runs over again
+LIKELY = 8  # most probable places whose neighborhoods are kept
+LEAST = 1e-3  # their least probability
+TIMEOUT = 0.25  # seconds that an image waits for a lookup
+
+
+class CityLayout(SessionLayout):
+    """
+    Columns for some places of a city, with a gap between runs of neighboring ones.
+
+    :param places: ascending, (m,).
+    :param firsts: position of the first place of each run.
+    :param same_as: position of the same place, for each.
+    """
+
+    def __init__(
+        self, places: np.ndarray, firsts: np.ndarray, same_as: np.ndarray, nms_radius: int
+    ) -> None:
+        super().__init__(firsts, same_as, nms_radius)
+        self.held = places
+        self._places = places[self._places]
+
+    def positions(self, places: np.ndarray | int) -> np.ndarray:
+        """See :meth:`SessionLayout.positions`; of places that are held."""
+        return super().positions(np.searchsorted(self.held, places))
+
+    def session_of(self, place: int) -> tuple[int, int]:
+        """Return the first place held of a run of neighboring ones, and the one behind it."""
+        first, end = super().session_of(int(np.searchsorted(self.held, place)))
+        return int(self.held[first]), int(self.held[end - 1]) + 1
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """
+    An image of the query.
+
+    :param strips, weights: centered features, (W, d) and (W,).
+    :param change: from the one before.
+    :param mean, deviation: of its distances to the sample.
+    :param z: normalized distances to the places in the chunks held, by slot.
+    """
+
+    strips: torch.Tensor
+    weights: torch.Tensor
+    change: float
+    stamp: int
+    mean: float
+    deviation: float
+    z: np.ndarray
+
+
+class _Lookup(NamedTuple):
+    """Chunks that are wanted, and the places fetched of those that were not held."""
+
+    wanted: list[int]
+    places: np.ndarray
+    fetched: PlaceMap | None
+    same_as: np.ndarray
+
+
+class FleetRecognizer(SequenceRecognizer):
+    """
+    Recognizes places of a city's map, one image at a time; on the CPU, in float32.
+
+    :param city: the map.
+    :param settings: mode robust with all its options.
+    :param timeout: seconds that an image waits for the lookup of neighborhoods; it goes on with
+        those held, and they are used when they have arrived.
+    :raises SettingsError: other settings than those of mode robust, or vertical alignment.
+
+    ``problem`` is why the last lookup failed, '' = it did not.
+    """
+
+    stages = ''  # without a time budget
+
+    def __init__(
+        self, city: CityMap, settings: RecognizerSettings, timeout: float = TIMEOUT
+    ) -> None:
+        if settings.applied_options != ROBUST or settings.spatial.vertical:
+            raise SettingsError(
+                f'mode {settings.mode}, vertical {settings.spatial.vertical}: the map of a fleet '
+                'is matched in mode robust, without vertical alignment'
+            )
+        super().__init__(settings, city.settings, 0)
+        if city.poses is not None:
+            self._compare(city.poses[:, :2])
+        self._city, self._timeout = city, timeout
+        index = city.store.index
+        self._centering = index.centering()
+        sample, places = index.sample.features, sample_places(index.places)
+        self._sampled, W, d = len(sample), city.settings.strips, city.dimension
+        # the sample, then the chunks: the matcher shares the memory
+        self._strips = torch.zeros(W, self._sampled + CHUNKS * CHUNK, d)
+        self._weights = torch.zeros(W, self._strips.shape[1])
+        centered = self._centering.places(sample)
+        self._strips[:, : self._sampled], self._weights[:, : self._sampled] = (
+            centered.strips,
+            centered.weights,
+        )
+        self._matcher = CpuMatcher(
+            LocalFeatures(self._strips, self._weights, city.settings), settings.spatial
+        )
+        self._learned = ImageChange(self._sampled, FilterSettings())
+        self._learned.learn(centered.strips, _firsts(places, index.runs(places)))
+        self._chunks = np.full(CHUNKS, -1)  # in each slot
+        self._wanted = np.zeros(CHUNKS, np.int64)  # number of the image that wanted it last
+        self._places = np.full(CHUNKS * CHUNK, -1)
+        self._same_as = self._places.copy()
+        self._from_before = np.ones(len(self._places), np.float32)
+        self._pending: Future[_Lookup] | None = None
+        self.problem = ''
+        self._count = 0
+        self.reset()
+
+    @property
+    def places(self) -> int:
+        """Return the number of places n of the map."""
+        return len(self._city)
+
+    @property
+    def window_fill(self) -> int:
+        """Images in the window, up to l."""
+        return min(len(self._images), self._settings.sequence.length)
+
+    def reset(self) -> None:
+        """Drop the images of the query; the chunks held stay."""
+        self._centering.reset()
+        self._images: deque[_Image] = deque(maxlen=HISTORY)
+        self._unasked: deque[tuple[int, np.ndarray]] = deque(maxlen=self._settings.sequence.length)
+        self._votes = Votes(self._settings.sequence.length, FilterSettings().speeds)
+        self._clear_window()
+        self._rebuild()
+
+    def update(
+        self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
+    ) -> Match:
+        """
+        Add the next image and match the window that ends with it.
+
+        :param features: those of one image, strips (W, 1, d).
+        :param stamp: when it was taken, ns; 0 = unknown.
+        :param pose: by odometry, shape (7,), z is up; None = unknown.
+        :raises FeatureMismatchError: made with other settings than the map's.
+        :raises InputError: not one image, features that are not finite, or an invalid pose.
+        """
+        position = position_of(pose)
+        self._require_one_image(features, 'the map')
+        if features.dimension != self._city.dimension:
+            raise FeatureMismatchError(
+                f'strips of {features.dimension} dimensions, the map has {self._city.dimension}'
+            )
+        strips = self._centering.next_query(features.strips[:, 0])
+        row = self._matcher.distances(strips, features.weights[:, 0]).numpy()
+        sampled, change = row[: self._sampled], 1.0
+        if self._images:
+            change = change_between(strips.numpy(), self._images[-1].strips.numpy())
+        mean, deviation = float(sampled.mean()), max(float(sampled.std()), MIN_DEVIATION)
+        z = (row[self._sampled :] - np.float32(mean)) / np.float32(deviation)
+        image = _Image(strips, features.weights[:, 0], change, stamp, mean, deviation, z)
+        self._images.append(image)
+        self._changes.append(change)
+        self._count += 1
+        self._unasked.append((self._count, place_vectors(strips[:, None])))
+        if self._motion is not None:
+            self._motion.way.append(position)
+        if self._look_around():
+            self._rebuild()
+        elif self._layout is not None:
+            self._push(image)
+        if self._layout is not None:
+            match = self._compared(self._match_window(), position)
+            self._nearest = match.sequence
+            stamps, changes = self._buffer.stamps, tuple(self._changes)
+            return replace(match, window_stamps=stamps, window_changes=changes)
+        status = Status.WARMING_UP
+        if self.window_fill == self._settings.sequence.length:
+            status = Status.NO_MATCH
+        reason = self.problem or 'no neighborhood has arrived yet'
+        return Match(status, reason, self._settings.threshold)
+
+    def newest_row(self) -> np.ndarray:
+        """See :meth:`SequenceRecognizer.newest_row`; +inf for places that are not held."""
+        row = np.full(len(self._city), np.inf, np.float32)
+        if self._images:
+            row[self._places[self._order]] = self._images[-1].z[self._order]
+        return row
+
+    def window_rows(self) -> tuple[np.ndarray, int]:
+        """See :meth:`SequenceRecognizer.window_rows`; of the places around the nearest one."""
+        if self._layout is None or self._nearest is None:
+            return np.empty((0, 0), np.float32), 0
+        rows, _ = super().window_rows()
+        held, firsts = self._places[self._order], self._layout.firsts
+        run = np.searchsorted(held[firsts], self._nearest.middle, 'right') - 1
+        ends = [*firsts[1:], len(held)]
+        return rows[:, firsts[run] : ends[run]], int(held[firsts[run]])
+
+    # neighborhoods
+
+    def _look_around(self) -> bool:
+        """Look neighborhoods up if it is time; return whether other places are held."""
+        if self._pending is None:
+            if self._layout is not None and len(self._unasked) < EVERY:
+                return False
+            asked = list(self._unasked)
+            self._unasked.clear()
+            held, likely = set(self._chunks.tolist()), self._likely()
+            votes = self._votes  # of this query, if it is reset meanwhile
+            self._pending = call_on_thread(
+                lambda: self._look_up(asked, votes, held, likely), 'neighborhoods'
+            )
+            wait([self._pending], 0 if self.problem else self._timeout)
+        if not self._pending.done():
+            return False
+        pending, self._pending = self._pending, None
+        try:
+            lookup = pending.result()
+        except StavprError as error:
+            self.problem = f'the neighborhoods held are used: {error}'
+            return False
+        self.problem = ''
+        return self._take(lookup)
+
+    def _look_up(
+        self,
+        asked: list[tuple[int, np.ndarray]],
+        votes: Votes,
+        held: set[int],
+        likely: np.ndarray,
+    ) -> _Lookup:
+        """Return the neighborhoods of images; on a thread of its own, without this object's."""
+        store = self._city.store
+        vectors = np.concatenate([vector for _, vector in asked])
+        for (number, _), found in zip(asked, store.nearest(vectors, NEAREST), strict=True):
+            votes.add(number, found)
+        last = (len(self._city) - 1) // CHUNK
+        wanted: dict[int, None] = {}
+        for place in np.concatenate([likely, votes.best(NEIGHBORHOODS)]).tolist():
+            low, high = max(place - BEHIND, 0) // CHUNK, (place + AHEAD) // CHUNK
+            wanted |= dict.fromkeys(range(low, min(high, last) + 1))
+        chosen = list(wanted)[:CHUNKS]
+        chunks = sorted(set(chosen) - held)
+        if not chunks:
+            return _Lookup(chosen, np.empty(0, np.int64), None, np.empty(0, np.int64))
+        places = (np.array(chunks)[:, None] * CHUNK + np.arange(CHUNK)).ravel()
+        places = places[places < len(self._city)]
+        return _Lookup(chosen, places, *store.fetch(places))
+
+    def _likely(self) -> np.ndarray:
+        """Return the places that are most probable now."""
+        if self._layout is None or self._filter is None:
+            return np.empty(0, np.int64)
+        probabilities = self._filter.filter.places_of_states()[self._layout.columns]
+        top = np.argsort(-probabilities)[:LIKELY]
+        return self._places[self._order][top[probabilities[top] > LEAST]]
+
+    def _take(self, lookup: _Lookup) -> bool:
+        """Put fetched places into the slots that were wanted longest ago."""
+        self._wanted[np.isin(self._chunks, lookup.wanted)] = self._count
+        if lookup.fetched is None:
+            return False
+        self._city.remember(lookup.places, lookup.fetched)
+        centered = self._centering.places(lookup.fetched.features)
+        images = list(self._images)
+        distances = CpuMatcher(centered, self._settings.spatial).distance_matrix(
+            torch.stack([image.strips for image in images], dim=1),
+            torch.stack([image.weights for image in images], dim=1),
+        )
+        changes = _changes_from_before(centered.strips.numpy())
+        chunk_of = lookup.places // CHUNK
+        free = np.lexsort((self._wanted, self._chunks >= 0)).tolist()
+        for slot, chunk in zip(free, np.unique(chunk_of).tolist(), strict=False):
+            here = np.flatnonzero(chunk_of == chunk)
+            all_of_it = slice(slot * CHUNK, (slot + 1) * CHUNK)
+            target = slice(slot * CHUNK, slot * CHUNK + len(here))
+            self._chunks[slot], self._wanted[slot] = chunk, self._count
+            self._places[all_of_it] = -1
+            self._places[target] = lookup.places[here]
+            self._same_as[target] = lookup.same_as[here]
+            # of the chunk's first place it is unknown
+            self._from_before[target] = changes[np.maximum(here, here[:2].max())]
+            rows = slice(self._sampled + target.start, self._sampled + target.stop)
+            self._strips[:, rows] = centered.strips[:, here]
+            self._weights[:, rows] = centered.weights[:, here]
+            for image, row in zip(images, distances[:, here].numpy(), strict=True):
+                image.z[target] = (row - np.float32(image.mean)) / np.float32(image.deviation)
+        return True
+
+    def _rebuild(self) -> None:
+        """Run the filter over the latest images again, over the places held."""
+        filled = np.flatnonzero(self._places >= 0)
+        self._order = filled[np.argsort(self._places[filled])]
+        places = self._places[self._order]
+        if not len(places):
+            self._layout = None
+            return
+        firsts = _firsts(places, self._city.store.index.runs(places))
+        same_as = np.searchsorted(places, self._same_as[self._order])
+        same_as = np.minimum(same_as, len(places) - 1)
+        here = places[same_as] == self._same_as[self._order]
+        same_as = np.where(here, same_as, np.arange(len(places)))
+        layout = CityLayout(places, firsts, same_as, self._settings.nms_radius)
+        sequence = self._settings.sequence
+        self._layout = layout
+        self._buffer = SequenceBuffer(sequence.length, layout.width, sequence.k)
+        model, share = FilterSettings(), len(places) / len(self._city)
+        model = replace(model, start=model.start * share, enter=model.enter * share)
+        self._search = self._filter = FilterSearch(self._buffer, model, layout)
+        self._filter.change.adopt(self._learned, self._from_before[self._order])
+        for image in self._images:
+            self._push(image)
+
+    def _push(self, image: _Image) -> None:
+        assert self._layout is not None
+        assert self._filter is not None
+        row = self._layout.spread(torch.from_numpy(image.z[self._order]))
+        self._buffer.push(row, image.stamp)
+        self._filter.update(row.numpy(), image.change)
+
+
+def _firsts(places: np.ndarray, runs: np.ndarray) -> np.ndarray:
+    """Return the positions where runs of neighboring places of one session begin."""
+    apart = np.diff(places, prepend=-2) != 1
+    return np.flatnonzero(apart | (np.diff(runs, prepend=-1) != 0))
+
+
+def _changes_from_before(strips: np.ndarray) -> np.ndarray:
+    """Return the change of each place of (W, n, d) from the one before, (n,); 1 of the first."""
+    similarity = np.einsum('wnd,wnd->wn', strips[:, 1:], strips[:, :-1])
+    similarity[~(strips[:, 1:].any(axis=2) | strips[:, :-1].any(axis=2))] = 1
+    return np.append(np.float32(1), 1 - similarity.mean(axis=0)).astype(np.float32)

@@ -1,0 +1,163 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The protocol of a map's home, what all homes hold beside the places, and the home in memory.
+
+The vector of a place is made of its centered and whitened strips: the means of three groups of
+neighboring strips, joined, unit norm.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from stavpr_ros.errors import FleetError
+from stavpr_ros.mapping import PlaceMap, select_places, Session
+from stavpr_ros.recognition.robust import blocks, evenly, MeanCentering, unit_norm
+import torch
+
+RUNS, RUN = 256, 8  # the sample of a map: so many runs of so many neighboring places
+GROUPS = 3  # of strips in a place's vector
+MOST_PLACES = 2**31 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class MapIndex:
+    """
+    What a robot holds of a map before it asks for any place.
+
+    :param places: number n of places.
+    :param firsts: first place of every run of places of one session, ascending, int64; the first
+        one is 0.
+    :param sessions: of each run; empty = the map has none.
+    :param sample: the places :func:`sample_places` of the map, with its settings and projection.
+    :param map_id: of the map.
+    """
+
+    places: int
+    firsts: np.ndarray
+    sessions: tuple[Session, ...]
+    sample: PlaceMap
+    map_id: str = ''
+
+    def __post_init__(self) -> None:
+        if not 0 < self.places <= MOST_PLACES:
+            raise FleetError(f'a map of {self.places} places: expected 1 to {MOST_PLACES}')
+        if len(self.sample) != len(sample_places(self.places)):
+            raise FleetError(
+                f'the sample of the map has {len(self.sample)} places: expected '
+                f'{len(sample_places(self.places))} of {self.places}; upload the map again'
+            )
+        firsts = self.firsts
+        if firsts[:1] != [0] or (np.diff(firsts) <= 0).any() or firsts[-1] >= self.places:
+            raise FleetError(f'sessions begin at {firsts[:8].tolist()}: upload the map again')
+        if len(self.sessions) not in (0, len(firsts)):
+            raise FleetError(f'{len(self.sessions)} sessions for {len(firsts)} runs of places')
+
+    @classmethod
+    def of(cls, place_map: PlaceMap) -> 'MapIndex':
+        """Return the index of a map."""
+        numbers = place_map.session_index
+        firsts, sessions = np.zeros(1, np.int64), ()
+        if numbers is not None:
+            firsts = np.flatnonzero(np.diff(numbers, prepend=-1))
+            sessions = tuple(place_map.sessions[number] for number in numbers[firsts])
+        sample = select_places(place_map, sample_places(len(place_map)))
+        return cls(len(place_map), firsts, sessions, sample, place_map.map_id)
+
+    def runs(self, places: np.ndarray) -> np.ndarray:
+        """Return the run of each place, (m,)."""
+        return np.searchsorted(self.firsts, places, 'right') - 1
+
+    @cached_property
+    def dimension(self) -> int:
+        """Return the number of dimensions of a place's vector."""
+        return place_vectors(self.sample.features[:1].strips).shape[1]
+
+    def centering(self) -> MeanCentering:
+        """Return the centering and whitening that the sample gives: the same for all robots."""
+        return MeanCentering(self.sample.features)
+
+
+class PlaceStore(Protocol):
+    """A home of a map. Its calls may come from another thread, one at a time."""
+
+    @property
+    def index(self) -> MapIndex:
+        """Return what is known of the map as a whole."""
+
+    def nearest(self, vectors: np.ndarray, count: int) -> np.ndarray:
+        """
+        Return the places whose vectors are nearest, nearest first.
+
+        :param vectors: of images, (Q, D), float32, unit norm.
+        :returns: shape (Q, count), int64; -1 behind the last.
+        :raises FleetError: the home cannot be reached, or its data is damaged.
+        """
+
+    def fetch(self, places: np.ndarray) -> tuple[PlaceMap, np.ndarray]:
+        """
+        Return some places as a map, and of each itself or the place that shows the same, int64.
+
+        :param places: ascending, int64.
+        :raises FleetError: as for :meth:`nearest`.
+        """
+
+
+def sample_places(n: int) -> np.ndarray:
+    """Return the places that every robot knows: runs of neighbors, evenly spaced, int64."""
+    runs = evenly(max(n - RUN + 1, 1), RUNS)
+    return np.unique(np.minimum(runs[:, None] + np.arange(RUN), n - 1))
+
+
+def place_vectors(strips: torch.Tensor) -> np.ndarray:
+    """
+    Return the vectors of places or images.
+
+    :param strips: centered, unit norm, (W, n, d).
+    :returns: shape (n, D), float32, unit norm; D = 3 d, or d of a single strip.
+    """
+    W = len(strips)
+    size = -(-W // GROUPS)
+    firsts = np.unique(np.rint(np.linspace(0, W - size, GROUPS)).astype(int))
+    groups = [unit_norm(strips[first : first + size].float().mean(dim=0)) for first in firsts]
+    return unit_norm(torch.cat(groups, dim=1)).numpy()
+
+
+def map_vectors(place_map: PlaceMap, index: MapIndex) -> np.ndarray:
+    """Return the vectors of all places, (n, D), float32; features are read block by block."""
+    centering = index.centering()
+    vectors = np.empty((len(place_map), index.dimension), np.float32)
+    for places, some in blocks(place_map.features):
+        vectors[places] = place_vectors(centering.places(some).strips)
+    return vectors
+
+
+class LocalStore:
+    """A map on this machine; the base of homes that differ in the search for vectors."""
+
+    def __init__(self, place_map: PlaceMap) -> None:
+        self._map = place_map
+        self.index = MapIndex.of(place_map)
+
+    def fetch(self, places: np.ndarray) -> tuple[PlaceMap, np.ndarray]:
+        """See :class:`PlaceStore`."""
+        same_as = self._map.same_as
+        return select_places(self._map, places), places if same_as is None else same_as[places]
+
+
+class MemoryStore(LocalStore):
+    """A map in memory, with an exact search."""
+
+    def __init__(self, place_map: PlaceMap) -> None:
+        super().__init__(place_map)
+        self._vectors = map_vectors(place_map, self.index)
+
+    def nearest(self, vectors: np.ndarray, count: int) -> np.ndarray:
+        """See :class:`PlaceStore`."""
+        similarity = vectors @ self._vectors.T
+        count = min(count, similarity.shape[1])
+        found = np.argpartition(-similarity, count - 1, axis=1)[:, :count]
+        order = np.argsort(-np.take_along_axis(similarity, found, axis=1), axis=1, kind='stable')
+        return np.take_along_axis(found, order, axis=1)

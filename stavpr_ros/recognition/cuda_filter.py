@@ -1,0 +1,212 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The place filter on a CUDA device: its state lies there, one copy an answer comes back."""
+
+import numpy as np
+from stavpr_ros.alignment.cuda.compilation import runtime
+from stavpr_ros.recognition.place_filter import Belief, belief_of, NEGLIGIBLE, TOP
+from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION
+import torch
+
+MOST = 512  # most probable places that are copied back: more than are ever excluded
+
+
+def z_normalized_on_device(row: torch.Tensor) -> torch.Tensor:
+    """Return a row as :func:`stavpr_ros.recognition.robust.z_normalized`, without waiting."""
+    known = torch.isfinite(row)
+    count = known.sum().clamp(min=1)
+    values = torch.where(known, row, 0)
+    mean = values.sum() / count
+    off = torch.where(known, row - mean, 0)
+    return (row - mean) / (off.square().sum() / count).sqrt().clamp(min=MIN_DEVIATION)
+
+
+class CudaPlaceFilter:
+    """
+    See :class:`stavpr_ros.recognition.place_filter.PlaceFilter`, on torch's current CUDA device.
+
+    Probabilities differ from those of the CPU in the last digits: sums are formed in another
+    order. Nothing waits for the device but the first of :meth:`belief`, :meth:`most_probable` and
+    :meth:`way` after an image.
+
+    :param places: of the map.
+    :param lag: most images that states are followed back.
+    :param gaps: places that there are none of, between sessions.
+    """
+
+    def __init__(
+        self,
+        places: int,
+        lag: int,
+        settings: FilterSettings | None = None,
+        gaps: np.ndarray | None = None,
+    ) -> None:
+        from stavpr_ros.alignment.cuda import place_filter
+
+        self.settings = s = settings or FilterSettings()
+        self._kernels, self._runtime = place_filter, runtime()
+        self._device = device = self._runtime.torch_device
+        self._n, K, V = places, len(s.levels), len(s.speeds)
+        self._shape, self._speeds = (K, V), np.array(s.speeds, np.float64)
+        self._gaps = torch.from_numpy(np.empty(0, np.int64) if gaps is None else gaps).to(device)
+        self._real = max(places - len(self._gaps), 1)
+        reach = int(np.ceil(self._speeds.max())) + 2
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.zeros(shape, dtype=dtype, device=device)
+
+        self._states, self._mixed = zeros(K * V, places), zeros(K * V, places)
+        self._codes = zeros(K * V, places, dtype=torch.uint8)
+        self._origins = zeros(lag, K * ((V + 1) // 2), places, dtype=torch.uint8)
+        self._steps = zeros(lag, V, dtype=torch.int32)
+        self._sums = zeros(2 * K, places + reach)
+        self._levels = torch.tensor(s.levels, dtype=torch.float32, device=device)
+        self._level_changes = torch.from_numpy(s.level_changes()).to(device)
+        self._factors, self._births = zeros(K, K), zeros(K)
+        self._speed_factors, self._z = zeros(5, V), zeros(places)
+        self._tops, top = min(TOP, places), min(MOST, places)
+        # one buffer of what is copied back: scale; sums and places; states and their ways
+        parts = (8, 8 * top, 4 * top, 4 * self._tops * K * V, 4 * (lag + 1) * self._tops * K * V)
+        ends = np.cumsum([-(-size // 8) * 8 for size in parts]).tolist()
+        self._parts = [
+            slice(end - -(-size // 8) * 8, end - -(-size // 8) * 8 + size)
+            for size, end in zip(parts, ends, strict=True)
+        ]
+        self._buffer = zeros(ends[-1], dtype=torch.uint8)
+        self._host = self._runtime.host_buffer(ends[-1])
+        types = (torch.float64, torch.int64, torch.float32, torch.float32, torch.int32)
+        self._out = [
+            self._buffer[part].view(dtype) for part, dtype in zip(self._parts, types, strict=True)
+        ]
+        self._out[4] = self._out[4].view(lag + 1, -1)
+        self._views = {
+            name: self._runtime.array(getattr(self, name))
+            for name in (
+                *('_states', '_mixed', '_codes', '_sums', '_levels', '_factors', '_births'),
+                *('_speed_factors', '_z', '_origins', '_steps'),
+            )
+        }
+        self._slots = [self._runtime.array(slot) for slot in self._origins]
+        self._slot_steps = [self._runtime.array(slot) for slot in self._steps]
+        self._answer = [self._runtime.array(part) for part in self._out]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget where the camera was."""
+        self._states.zero_()
+        self._sums.zero_()
+        K = len(self.settings.levels)
+        self._off = torch.full((K,), 1 / K, dtype=torch.float64, device=self._device)
+        self._seen = torch.zeros(K, dtype=torch.float64, device=self._device)
+        self._scale = torch.ones((), dtype=torch.float64, device=self._device)
+        self.count, self._read_at = 0, -1
+
+    @property
+    def off_map(self) -> float:
+        """Probability that the camera is off the map."""
+        return float(self._off.sum())
+
+    def places_of_states(self) -> np.ndarray:
+        """Return the probability of each place, (n,), float32; copied from the device."""
+        found: np.ndarray = (self._by_place() * self._scale).float().cpu().numpy()
+        return found
+
+    def _by_place(self) -> torch.Tensor:
+        return self._sums[: self._shape[0], : self._n].sum(dim=0)
+
+    def _launch(self, kernel: object, count: int, *arguments: object) -> None:
+        block = self._kernels.BLOCK
+        self._runtime.launch(kernel, (-(-count // block), 1), block, *arguments)
+
+    def update(self, z: torch.Tensor, weight: float, speed_weights: np.ndarray) -> None:
+        """
+        Advance by an image.
+
+        :param z: z-normalized distances to all places, (n,), float32, on the device; +inf bans a
+            place.
+        :param weight: alpha; 0 = the image is no evidence.
+        :param speed_weights: relative probability of each speed, (V,).
+        """
+        s, (K, V), v = self.settings, self._shape, self._views
+        slot = self.count % len(self._origins)
+        moved = np.rint(self._speeds * (self.count + 1)) - np.rint(self._speeds * self.count)
+        self._steps[slot].copy_(torch.from_numpy(moved.astype(np.int32)))
+        if not self.count:
+            self._states.fill_(s.start / (K * V * self._real))
+            self._states[:, self._gaps] = 0
+            self._off.fill_((1 - s.start) / K)
+            self._seen.fill_(s.start / K)
+        self._z.copy_(z)
+        self._z[self._gaps] = -torch.inf
+        self._speed_factors.copy_(torch.from_numpy(s.speed_changes(speed_weights)))
+        self._factors.copy_(self._level_changes * self._scale.float())
+        off = self._off @ self._level_changes.double()
+        self._births.copy_(off * s.enter / (V * self._real))
+        before = self._seen @ self._factors.double()
+        self._launch(
+            self._kernels.mix(K, V), self._n, v['_states'], v['_factors'], v['_speed_factors'],
+            v['_mixed'], v['_codes'],
+        )  # fmt: skip
+        self._launch(
+            self._kernels.move(K, V), self._sums.shape[1], v['_mixed'], v['_codes'], v['_z'],
+            self._slot_steps[slot], v['_levels'], np.float32(weight), np.float32(s.spread),
+            np.float32(1 - s.leave), v['_births'], v['_states'], self._slots[slot], v['_sums'],
+        )  # fmt: skip
+        self._seen, lost = self._sums.sum(dim=1, dtype=torch.float64).view(2, K)
+        off = off * (1 - s.enter) + (before - lost) * s.leave + lost
+        total = off.sum() + self._seen.sum()
+        self._off, self._scale = off / total, 1 / total
+        self.count += 1
+
+    def _read(self) -> None:
+        """Copy the most probable places, their states and ways back; once an image."""
+        if self._read_at == self.count:
+            return
+        sums, places = torch.topk(self._by_place(), len(self._out[1]))
+        for part, value in zip(self._out, (self._scale, places, sums), strict=False):
+            part.copy_(value)
+        newest = (self.count - 1) % len(self._origins)
+        self._launch(
+            self._kernels.trace(*self._shape), self._out[4].shape[1], self._answer[1],
+            self._views['_states'], self._views['_origins'], self._views['_steps'], newest,
+            self._answer[3], self._answer[4],
+        )  # fmt: skip
+        self._runtime.fetch(self._buffer, self._host)
+        scale, self._top, top_sums, states, ways = (
+            self._host[part].numpy().view(dtype)
+            for part, dtype in zip(
+                self._parts, (np.float64, np.int64, np.float32, np.float32, np.int32), strict=True
+            )
+        )
+        self._top_sums, self._top_states = top_sums * scale[0], states * scale[0]
+        self._ways = ways.reshape(len(self._origins) + 1, -1)
+        self._read_at = self.count
+
+    def belief(self, n: int, images_ago: int) -> Belief:
+        """See :meth:`stavpr_ros.recognition.place_filter.PlaceFilter.belief`."""
+        self._read()
+        K, V = self._shape
+        then = self._ways[images_ago]
+        least = NEGLIGIBLE * self._top_states.max(initial=0)
+        kept = np.flatnonzero((self._top_states >= max(least, 1e-300)) & (then >= 0))
+        ways = np.stack(
+            [
+                *(then[kept] // 16, kept % (K * V) // V, kept % V),
+                *(self._top[kept // (K * V)], then[kept] % 16),
+            ],
+            axis=1,
+        ).astype(np.int64)
+        return belief_of(ways, self._top_states[kept].astype(np.float64))
+
+    def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
+        """See :meth:`stavpr_ros.recognition.place_filter.PlaceFilter.most_probable`."""
+        self._read()
+        left = np.flatnonzero(~np.isin(self._top, excluded))
+        return (int(self._top[left[0]]), float(self._top_sums[left[0]])) if len(left) else (0, 0.0)
+
+    def way(self, state: np.ndarray, images: int) -> np.ndarray:
+        """See :meth:`stavpr_ros.recognition.place_filter.PlaceFilter.way`."""
+        self._read()
+        (K, V), (k, v, y) = self._shape, state[:3]
+        column = (int(np.flatnonzero(self._top == y)[0]) * K + k) * V + v
+        return self._ways[: images + 1, column] // 16

@@ -1,0 +1,388 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps of a fleet: their homes, recognition in neighborhoods, and homes that fail."""
+
+import ast
+from dataclasses import replace
+from pathlib import Path
+import subprocess
+import sys
+import threading
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from map_examples import example_map
+import numpy as np
+from pipelines import message, MIN_PROBABILITY, SECOND, settings_of
+import pytest
+from robot import image_message
+from stavpr_msgs.msg import PlaceMatch
+from stavpr_msgs.srv import LoadMap
+import stavpr_ros
+from stavpr_ros.commands import map as map_command
+from stavpr_ros.errors import FleetError, InputError, OutputTakenError, SettingsError
+from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.features.registry import settings_class
+from stavpr_ros.fleet import CityMap, FleetRecognizer, MemoryStore, open_city_map, upload
+from stavpr_ros.fleet.neighborhoods import Votes
+from stavpr_ros.fleet.store import MapIndex, place_vectors, sample_places
+from stavpr_ros.mapping import descriptor_map, open_map, save_map, Session
+from stavpr_ros.pipeline import Pipeline, read_map
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+import torch
+
+for package in ('faiss', 'qdrant_client', 'qdrant_edge'):
+    pytest.importorskip(package, reason='the extra fleet is not installed')
+from qdrant_server import QdrantServer  # noqa: E402
+
+CITY, SETTINGS = 6000, RecognizerSettings(0.5, mode='robust')
+HOMES = ('memory', 'faiss', 'qdrant', 'server')
+FIRST, DRIVEN = 2500, 60
+SOURCE = FeatureSettings('descriptors', settings_class('descriptors')(), 3)
+
+
+def walk(n, seed=0, d=24):
+    """Unit-norm features of places that resemble their neighbors, (3, n, d)."""
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(3, n + 2, d, generator=generator)
+    strips = noise[:, 2:] + 0.7 * noise[:, 1:-1] + 0.4 * noise[:, :-2]
+    strips /= strips.norm(dim=2, keepdim=True)
+    return LocalFeatures(strips, torch.full((3, n), 3**-0.5), SOURCE)
+
+
+def seen_again(features, noise=0.6, seed=1):
+    """Return the places of features on another day."""
+    generator = torch.Generator().manual_seed(seed)
+    strips = features.strips + noise * torch.randn(
+        features.strips.shape, generator=generator
+    ) / np.sqrt(features.dimension)
+    return replace(features, strips=strips / strips.norm(dim=2, keepdim=True))
+
+
+@pytest.fixture(scope='module')
+def city():
+    features = walk(CITY)
+    sessions = Session('a', 'one'), Session('b')
+    index = np.repeat(np.arange(2, dtype=np.int32), CITY // 2)
+    return replace(descriptor_map(features), sessions=sessions, session_index=index)
+
+
+@pytest.fixture(scope='module')
+def query(city):
+    return seen_again(city.features[FIRST : FIRST + DRIVEN])
+
+
+@pytest.fixture(scope='module')
+def server():
+    server = QdrantServer()
+    yield server
+    server.close()
+
+
+def home_of(place_map, home, tmp_path, server):
+    """Upload a map to a home and open it there."""
+    if home == 'memory':
+        return CityMap.of(MemoryStore(place_map))
+    address = f'{home}:{tmp_path / home}'
+    if home == 'server':
+        address = server.address(tmp_path.name.replace('/', '_'))
+    upload(place_map, address)
+    return open_city_map(address)
+
+
+def drive(recognizer, query):
+    return [recognizer.update(query[i : i + 1], i + 1) for i in range(len(query))]
+
+
+# Homes
+
+
+@pytest.mark.parametrize('home', HOMES)
+def test_fetch_returns_places_of_every_home(home, tmp_path, server):
+    place_map = replace(example_map(), same_as=np.arange(24, dtype=np.int32))
+    place_map.same_as[20] = 5
+    if home == 'faiss':
+        save_map(place_map, tmp_path / 'same')
+        place_map = open_map(tmp_path / 'same')
+    city = home_of(place_map, home, tmp_path, server)
+    places = np.array([2, 3, 4, 20])
+    fetched, same_as = city.store.fetch(places)
+    torch.testing.assert_close(
+        fetched.features.strips, place_map.features.strips[:, places], atol=1e-3, rtol=0
+    )
+    torch.testing.assert_close(fetched.features.weights, place_map.features.weights[:, places])
+    assert same_as.tolist() == [2, 3, 4, 5]
+    assert fetched.ids == ('place 2', 'place 3', 'place 4', 'place 20')
+    np.testing.assert_array_equal(fetched.poses, place_map.poses[places])
+    np.testing.assert_array_equal(fetched.stamps, place_map.stamps[places])
+    city.remember(places, fetched)
+    assert str(city.place(20)) == str(place_map.place(20))
+    assert city.settings == place_map.settings
+    assert city.sessions == place_map.sessions
+    np.testing.assert_array_equal(city.session_index, place_map.session_index)
+    index = MapIndex.of(place_map)
+    vectors = place_vectors(index.centering().places(place_map.features[places]).strips)
+    nearest = city.store.nearest(vectors, 30)
+    assert nearest.shape[0] == 4
+    assert nearest[:, 0].tolist() == places.tolist()
+    assert set(nearest.ravel().tolist()) <= set(range(-1, 24))
+
+
+def test_sample_places_holds_runs_of_neighbors():
+    assert sample_places(3).tolist() == [0, 1, 2]
+    some = sample_places(1_000_000)
+    assert len(some) == 2048
+    assert some[0] == 0
+    assert some[-1] == 999_999
+    assert (np.diff(some.reshape(-1, 8), axis=1) == 1).all()
+
+
+def test_place_vectors_of_one_strip_and_of_seven():
+    strips = walk(4).strips[:1]
+    np.testing.assert_allclose(place_vectors(strips), strips[0], atol=1e-6)
+    seven = torch.cat([walk(4, seed).strips for seed in range(3)])[:7]
+    vectors = place_vectors(seven)
+    assert vectors.shape == (4, 72)
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-6)
+
+
+def test_votes_follow_the_speed():
+    votes = Votes(20, (0.5, 1.0, 2.0))
+    for image in range(10):
+        wrong = [5000 - 300 * image, 77 * image + 3000]
+        votes.add(image, np.array([*wrong, 1000 + 2 * image, -1]))
+    assert abs(votes.best(1)[0] - 1018) <= 8
+    assert Votes(5, (1.0,)).best(3).tolist() == []
+
+
+# Recognition
+
+
+@pytest.mark.parametrize('home', ['memory', 'faiss'])
+def test_recognizer_in_neighborhoods_matches_as_exact_one(home, city, query, tmp_path):
+    exact = drive(PlaceRecognizer(city, SETTINGS), query)
+    recognizer = FleetRecognizer(home_of(city, home, tmp_path, None), SETTINGS, timeout=60)
+    found = drive(recognizer, query)
+    assert [m.status for m in found[:19]] == [Status.WARMING_UP] * 19
+    accepted = [i for i, match in enumerate(exact) if match.accepted]
+    assert len(accepted) > 30
+    for i in accepted[5:]:
+        assert found[i].accepted
+        assert abs(found[i].sequence.middle - exact[i].sequence.middle) <= 1
+        assert abs(found[i].probability - exact[i].probability) < 0.1
+        np.testing.assert_allclose(found[i].path[:, 1], exact[i].path[:, 1], atol=2)
+    rows, first = recognizer.window_rows()
+    newest = found[-1].sequence.middle
+    assert first <= newest < first + rows.shape[1] < CITY
+    row = recognizer.newest_row()
+    assert row.shape == (CITY,)
+    assert np.isfinite(row).sum() < CITY
+    assert int(np.argmin(row)) in range(FIRST + DRIVEN - 3, FIRST + DRIVEN + 2)
+    assert recognizer.ranked(3)[0].place == newest
+    recognizer.reset()
+    assert recognizer.window_fill == 0
+
+
+def test_recognizer_off_the_map_matches_nothing(city):
+    recognizer = FleetRecognizer(CityMap.of(MemoryStore(city)), SETTINGS, timeout=60)
+    assert not any(match.accepted for match in drive(recognizer, walk(40, seed=9)))
+
+
+class Faulty(MemoryStore):
+    """A home that can be cut off, or made slow."""
+
+    cut = False
+
+    def __init__(self, place_map):
+        super().__init__(place_map)
+        self.open = threading.Event()
+        self.open.set()
+
+    def nearest(self, vectors, count):
+        self.open.wait()
+        if self.cut:
+            raise FleetError('cut off')
+        return super().nearest(vectors, count)
+
+
+def test_recognizer_cut_off_goes_on_in_last_neighborhood_and_recovers(city, query):
+    store = Faulty(city)
+    recognizer = FleetRecognizer(CityMap.of(store), SETTINGS, timeout=60)
+    drive(recognizer, query[:40])
+    store.cut = True
+    cut = drive(recognizer, query[40:50])
+    assert 'cut off' in recognizer.problem
+    assert [match.accepted for match in cut] == [True] * 10
+    assert cut[-1].sequence.last == pytest.approx(FIRST + 49, abs=2)
+    store.cut = False
+    drive(recognizer, query[50:])
+    assert recognizer._pending is None or recognizer._pending.result()
+    drive(recognizer, query[59:])
+    assert recognizer.problem == ''
+
+
+def test_recognizer_cut_off_from_the_start_publishes_why(city, query):
+    store = Faulty(city)
+    store.cut = True
+    matches = drive(FleetRecognizer(CityMap.of(store), SETTINGS, timeout=60), query[:21])
+    assert {match.status for match in matches} == {Status.WARMING_UP, Status.NO_MATCH}
+    assert 'cut off' in matches[-1].reason
+
+
+def test_recognizer_does_not_wait_for_a_slow_home(city, query):
+    store = Faulty(city)
+    recognizer = FleetRecognizer(CityMap.of(store), SETTINGS, timeout=60)
+    drive(recognizer, query[:30])
+    store.open.clear()
+    recognizer._timeout = 0
+    assert all(match.accepted for match in drive(recognizer, query[30:45]))
+    store.open.set()
+
+
+def test_recognizer_rejects_mode_paper_and_vertical(city):
+    made = CityMap.of(MemoryStore(city))
+    with pytest.raises(SettingsError, match='mode paper'):
+        FleetRecognizer(made, RecognizerSettings(0.5))
+    spatial = replace(SETTINGS.spatial, vertical=True)
+    with pytest.raises(SettingsError, match='vertical True'):
+        FleetRecognizer(made, replace(SETTINGS, spatial=spatial))
+
+
+# Bad homes
+
+
+def test_open_of_missing_or_interrupted_upload_names_remedy(tmp_path, server):
+    with pytest.raises(FleetError, match='upload'):
+        open_city_map(f'qdrant:{tmp_path}')
+    save_map(example_map(), tmp_path / 'a')
+    with pytest.raises(FleetError, match='map upload'):
+        open_city_map(f'faiss:{tmp_path / "a"}')
+    with pytest.raises(FleetError, match='none'):
+        open_city_map(server.address('none'))
+    with pytest.raises(SettingsError, match='HOST:PORT/COLLECTION'):
+        open_city_map('qdrant://host:1')
+
+
+def test_upload_replaces_only_with_force(tmp_path, server):
+    place_map = example_map()
+    for address in (f'qdrant:{tmp_path / "q"}', f'faiss:{tmp_path / "f"}', server.address('f')):
+        upload(place_map, address)
+        with pytest.raises(OutputTakenError):
+            upload(place_map, address)
+        upload(place_map, address, force=True)
+    (tmp_path / 'mine').mkdir()
+    (tmp_path / 'mine' / 'photo.jpg').touch()
+    with pytest.raises(OutputTakenError, match='another folder'):
+        upload(place_map, f'qdrant:{tmp_path / "mine"}', force=True)
+    assert (tmp_path / 'mine' / 'photo.jpg').exists()
+
+
+@pytest.mark.parametrize(
+    'change', [{'strips': 'AAAA'}, {'pose': [1]}, {'weights': []}, {'stamp': 'x'}, {'id': 'a\0b'}]
+)
+def test_fetch_of_damaged_payload_is_error(change, tmp_path):
+    city = home_of(example_map(), 'qdrant', tmp_path, None)
+    points = city.store._points
+    whole = points.payloads
+    points.payloads = lambda ids: {i: payload | change for i, payload in whole(ids).items()}
+    with pytest.raises(FleetError, match=r'damaged|finite'):
+        city.store.fetch(np.arange(3))
+
+
+# Command and node
+
+
+def test_map_upload_command_and_pipeline_localize(route, small_map, tmp_path, capsys, server):
+    file, address = tmp_path / 'route.stavpr', server.address('route')
+    save_map(small_map, file)
+    assert map_command.main(['upload', str(file), address]) == 0
+    assert '60 places' in capsys.readouterr().out
+    assert map_command.main(['upload', str(file), 'elsewhere']) == 2
+    assert 'faiss:' in capsys.readouterr().err
+    pipeline = Pipeline(settings_of())
+    pipeline.change(loaded=read_map(address, pipeline.settings))
+    matches = [pipeline.process(message(image), (i + 1) * SECOND) for i, image in enumerate(route)]
+    assert [match.probability > MIN_PROBABILITY for match in matches[20:]] == [True] * 40
+    assert abs(matches[-1].newest_index - 59) <= 1
+    assert pipeline.places.place(40).identifier == 'place 40'
+    assert pipeline.problem == ''
+    with pytest.raises(InputError, match='stays where it is'):
+        pipeline.snapshot()
+    with pytest.raises(SettingsError, match='mapping'):
+        pipeline.change(operation='mapping')
+    with pytest.raises(SettingsError, match='precision int8'):
+        pipeline.change(settings_of(precision='int8'), loaded=read_map(address, settings_of()))
+
+
+def test_node_whose_server_is_cut_off_goes_on_and_reports_it(robot, start, route, small_map):
+    server = QdrantServer()
+    upload(small_map, server.address('route'))
+    start(map_path=server.address('route'))
+    assert robot.until_map(state='loaded').places == 60
+    for image in route[10:30]:
+        last = robot.show(image_message(image), SECOND)
+    assert last.status == PlaceMatch.MATCH
+    assert abs(last.newest_index - 29) <= 1
+    assert last.place_id == f'place {last.place_index}'
+    server.close()
+    for image in route[30:45]:
+        last = robot.show(image_message(image), SECOND)
+    assert last.status == PlaceMatch.MATCH
+    assert abs(last.newest_index - 44) <= 1
+
+    def reported():
+        status = robot.diagnostics['map']
+        return status.level == DiagnosticStatus.WARN and 'Qdrant server' in status.message
+
+    robot.until(reported, 'the finding on the map')
+
+
+def test_load_map_service_rejects_addresses(robot, start, server):
+    start()
+    robot.until_map(state='loaded')
+    before = len(server.requests)
+    for name in (server.address('route'), 'faiss:route.stavpr'):
+        assert 'does not exist' in robot.refuses(LoadMap, 'load_map', path=name)
+    assert len(server.requests) == before
+
+
+def test_fleet_is_imported_within_functions_only():
+    package = Path(stavpr_ros.__file__).parent
+    for path in package.rglob('*.py'):
+        if path.parent.name != 'fleet':
+            tree = ast.parse(path.read_text())
+            imported = [ast.unparse(one) for one in tree.body if isinstance(one, ast.ImportFrom)]
+            assert not [one for one in imported if 'stavpr_ros.fleet' in one], path
+
+
+@pytest.mark.long
+def test_four_robots_query_one_map_while_the_server_is_cut_off(tmp_path, city, query):
+    """Four processes; each prints its matches. The server is killed in the middle."""
+    folder = Path(__file__).parent
+    server = subprocess.Popen(
+        [sys.executable, folder / 'qdrant_server.py'], stdout=subprocess.PIPE, text=True
+    )
+    address = f'qdrant://127.0.0.1:{int(server.stdout.readline())}/city'
+    upload(city, address)
+    robots = [
+        subprocess.Popen(
+            [sys.executable, folder / 'fleet_robot.py', address, str(500 + 1200 * robot)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for robot in range(4)
+    ]
+    for robot in robots:
+        assert robot.stdout.readline() == 'half way\n'
+    server.kill()
+    server.wait()
+    for robot in robots:
+        robot.stdin.write('go on\n')
+        robot.stdin.flush()
+    for robot in robots:
+        out, _ = robot.communicate(timeout=120)
+        print(out, end='')
+        accepted, right, problem = out.strip().split(' ', 2)
+        assert int(accepted) >= 35
+        assert int(right) == int(accepted)
+        assert 'Qdrant server' in problem

@@ -1,0 +1,163 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""build_map and evaluate over several inputs: in processes, and on a Ray cluster."""
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+from conftest import route_images
+import cv2
+import pytest
+from stavpr_ros.commands import build_map, evaluate, jobs
+from stavpr_ros.commands.jobs import Job, job_names, other_arguments, run_jobs
+from stavpr_ros.errors import SettingsError
+
+NAMES = ('monday', 'tuesday')
+
+
+@pytest.fixture(scope='module')
+def drives(tmp_path_factory):
+    """Return folders of images of two drives."""
+    root = tmp_path_factory.mktemp('drives')
+    for seed, name in enumerate(NAMES):
+        (root / name).mkdir()
+        for i, image in enumerate(route_images(30, seed)):
+            cv2.imwrite(str(root / name / f'{i:03}.png'), image)
+    return [str(root / name) for name in NAMES]
+
+
+def ids(folder):
+    from stavpr_ros.mapping import open_map
+
+    return [open_map(folder / f'{name}.stavpr').map_id for name in NAMES]
+
+
+@pytest.fixture(scope='module')
+def built(drives, tmp_path_factory):
+    """Build maps of both, one by one."""
+    folder = tmp_path_factory.mktemp('maps')
+    for name, drive in zip(NAMES, drives, strict=True):
+        file = str(folder / f'{name}.stavpr')
+        assert build_map.main(['--input', drive, '--output', file, '--no-thumbnails']) == 0
+    return folder
+
+
+@pytest.mark.long
+def test_build_map_of_several_inputs_equals_maps_of_each(drives, built, tmp_path, capfd):
+    options = ['--no-thumbnails', '--processes', '2']
+    output = ['--output', str(tmp_path / 'maps')]
+    assert build_map.main(['--input', *drives, *output, *options]) == 0
+    text = capfd.readouterr().out
+    assert '--- monday: done' in text
+    assert '--- tuesday: done' in text
+    assert '30 of 30 images became places' in text
+    assert '%|' not in text
+    assert ids(tmp_path / 'maps') == ids(built)
+
+
+@pytest.mark.long
+def test_evaluate_of_several_queries_equals_each(built, tmp_path):
+    monday = str(built / 'monday.stavpr')
+    queries = [monday, str(built / 'tuesday.stavpr')]
+    several = ['--map', monday, '--query', *queries, '--output', str(tmp_path / 'reports')]
+    assert evaluate.main([*several, '--processes', '2']) == 0
+    assert evaluate.main(['--map', monday, '--query', monday, '--json', str(tmp_path / 'a')]) == 0
+    one, other = (
+        json.loads(file.read_text()) for file in (tmp_path / 'a', tmp_path / 'reports/monday.json')
+    )
+    for name in ('sequence', 'single', 'decision', 'calibration', 'map_id'):
+        assert one[name] == other[name]
+    assert (tmp_path / 'reports' / 'tuesday' / 'report.html').is_file()
+
+
+def test_run_jobs_failed_job_does_not_stop_others(monkeypatch, capfd):
+    def run(command, **_):
+        return subprocess.CompletedProcess(command, int(command[-1]), f'{command[-1]}\n')
+
+    monkeypatch.setattr(subprocess, 'run', run)
+    assert run_jobs([Job(f'job{i}', 'build_map', (str(i),)) for i in (1, 0, 2)], 1, None) == 2
+    text = capfd.readouterr().out
+    assert text.splitlines()[::2] == [
+        '--- job1: failed, exit code 1',
+        '--- job0: done',
+        '--- job2: failed, exit code 2',
+    ]
+
+
+def test_run_jobs_killed_job_is_run_again(tmp_path, monkeypatch, capfd):
+    runs = []
+
+    def run(command, **_):
+        runs.append(command)
+        return subprocess.CompletedProcess(command, -9 if len(runs) == 1 else 0, 'fine\n')
+
+    monkeypatch.setattr(subprocess, 'run', run)
+    assert run_jobs([Job('a', 'build_map', ('--help',))], 1, None) == 0
+    assert len(runs) == 2
+    assert capfd.readouterr().out == '--- a: done\nfine\n'
+
+
+def test_job_names_and_arguments():
+    assert job_names(['a/monday.bag', 'b/tuesday/', 'c.mat:x']) == [
+        'monday',
+        'tuesday',
+        'c',
+    ]
+    with pytest.raises(SettingsError, match="'monday'"):
+        job_names(['a/monday.bag', 'b/monday'])
+    given = ['--input', 'a', 'b', '--every', '2', '--output', 'c', '--ray', 'auto', '--force']
+    assert other_arguments(given, '--input') == ['--every', '2', '--force']
+    with pytest.raises(SettingsError, match='--processes 0'):
+        run_jobs([], 0, None)
+
+
+def test_several_queries_reject_options_of_one(capfd):
+    with pytest.raises(SystemExit):
+        evaluate.main(['--map', 'a', '--query', 'b', 'c', '--window', '3'])
+    assert '--window goes with one --query' in capfd.readouterr().err
+
+
+def test_run_here_returns_code_and_output_without_bars():
+    code, text = jobs.run_here(Job('a', 'build_map', ('--input', '/none', '--output', '/none/a')))
+    assert code == 1
+    assert '/none' in text
+    assert jobs.run_here(Job('a', 'build_map', ('--wrong',)))[0] == 2
+
+
+@pytest.mark.long
+def test_ray_with_one_of_two_workers_killed_builds_the_same_maps(
+    drives, built, tmp_path, capfd, monkeypatch
+):
+    """A head without processors, and two machines of one; the first to work is killed."""
+    module = pytest.importorskip('ray', reason='the extra ray is not installed')
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={'num_cpus': 0})
+    workers = [cluster.add_node(num_cpus=1) for _ in range(2)]
+    many = tmp_path / 'many'
+    many.mkdir()
+    inputs = []
+    for i in range(6):
+        link = many / f'{NAMES[i % 2]}{i}'
+        link.symlink_to(drives[i % 2])
+        inputs.append(str(link))
+    command = [sys.executable, '-m', 'stavpr_ros.commands.build_map', '--input', *inputs]
+    command += ['--output', str(tmp_path / 'maps'), '--no-thumbnails', '--ray', cluster.address]
+    running = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        first = running.stdout.readline()
+        cluster.remove_node(workers[0], allow_graceful=False)
+        out = first + running.communicate(timeout=300)[0]
+    finally:
+        running.kill()
+        module.shutdown()
+        cluster.shutdown()
+    print(out)
+    assert running.returncode == 0, out
+    assert out.count(': done') == 6
+    from stavpr_ros.mapping import open_map
+
+    found = [open_map(tmp_path / 'maps' / f'{Path(one).name}.stavpr').map_id for one in inputs]
+    assert found == ids(built) * 3
