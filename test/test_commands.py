@@ -216,12 +216,12 @@ def test_loop_closure_record_is_plain_json():
     message = LoopClosure(query_index=9, distance=math.nan, inliers=-1)
     message.header.stamp.sec = 3
     message.place_stamp.nanosec = 7
-    message.pairs = [AlignedPlaces(query_index=8, place_index=1)]
+    message.pairs = [AlignedPlaces(query_index=8, place_index=1, query_change=0.5)]
     message.pairs[0].query_stamp.sec = 2
     plain = loop_closure_record(message)
     assert json.loads(json.dumps(plain)) == plain
     assert (plain['stamp'], plain['query_index'], plain['place_stamp']) == (3 * SECOND, 9, 7)
-    assert plain['pairs'] == [[8, 2 * SECOND, 1, 0]]
+    assert plain['pairs'] == [[8, 2 * SECOND, 1, 0, 0.5]]
     assert (plain['distance'], plain['query_pose']) == (None, None)
     message.has_poses = True
     message.place_pose.position.y = 2.0

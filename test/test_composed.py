@@ -181,14 +181,14 @@ def test_operation_of_the_service_lasts_until_the_next_configuration(make, map_f
 def test_failed_odometry_subscription_is_the_problem(make, map_file):
     """Live parameters are applied; the error is logged and in the diagnostics."""
     topic = {'qos_overrides./odom.subscription.reliability': 'certain'}
-    node = activated(make(map_path=map_file, relative_pose='none', **topic))
+    node = activated(make(map_path=map_file, relative_pose='none', odometry_error=0.0, **topic))
     assert set_parameter(node, 'keyframe_distance', 1.0).successful
     assert 'correct qos_overrides./odom.subscription' in node.runtime.problem
     assert node.runtime.pipeline.settings.keyframes.distance == 1
 
 
 def test_odometry_is_subscribed_while_it_is_needed(make, map_file):
-    node = activated(make(map_path=map_file, relative_pose='none'))
+    node = activated(make(map_path=map_file, relative_pose='none', odometry_error=0.0))
     for distance, count in ((1.0, 1), (2.0, 1), (0.0, 0)):
         assert set_parameter(node, 'keyframe_distance', distance).successful
         assert node.count_subscribers('/odom') == count

@@ -367,8 +367,8 @@ def test_evaluate_with_declared_probabilities_shows_their_calibration(
     """Every window is declared to be right with 97 %, and is."""
     update = PlaceRecognizer.update
 
-    def declaring(self, *arguments):
-        match = update(self, *arguments)
+    def declaring(self, *arguments, **options):
+        match = update(self, *arguments, **options)
         return replace(match, probability=0.97 if match.sequence else float('nan'))
 
     assert report(*pair(folders), '--mode', 'paper')[0]['calibration'] is None

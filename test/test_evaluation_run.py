@@ -26,7 +26,7 @@ class Scripted:
         self.rows, self.paths, self.listed, self.at = rows, paths, candidates, -1
         self.buffer = np.empty(6, np.float32)
 
-    def update(self, features):
+    def update(self, features, pose=None):
         assert len(features) == 1
         self.at += 1
         if self.paths[self.at] is None:

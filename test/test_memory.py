@@ -114,6 +114,8 @@ def test_growing_map_may_leave_the_features_to_another_owner(small_map):
 
 
 PROGRAM = """
+import ctypes
+import gc
 import sys
 from pathlib import Path
 import torch
@@ -129,6 +131,9 @@ owner, mode, precision, large, small = sys.argv[1:]
 settings = RecognizerSettings(1.0, mode=mode)
 
 def resident():
+    gc.collect()
+    if sys.platform == 'linux':  # what is freed may stay with the allocator
+        ctypes.CDLL(None).malloc_trim(0)
     pages = int(Path('/proc/self/statm').read_text().split()[1])
     return pages * 4096
 

@@ -126,7 +126,7 @@ def test_node_with_publish_tf_without_tf2_msgs_explains_it(robot, start, monkeyp
 
 
 def test_node_publishes_the_initial_pose_and_subscribes_to_no_odometry(robot, start, route):
-    start(publish_initialpose=True, relative_pose='none')
+    start(publish_initialpose=True, relative_pose='none', odometry_error=0.0)
     poses = robot.listen(PoseWithCovarianceStamped, '/initialpose')
     robot.until(lambda: robot.node.count_publishers('/initialpose') == 1, 'the publisher')
     shown = iter(route)

@@ -62,7 +62,8 @@ def test_invalid_images_are_counted_and_explained_once_a_cause(robot, start, rou
 
 def test_keyframes_by_distance_and_angle_use_odometry(robot, start, route):
     """On a topic with another name; poses are valid for half a second."""
-    start('-r', 'odom:=/odom', '-r', 'image:=/image', keyframe_distance=1.0, relative_pose='none')
+    off = {'relative_pose': 'none', 'odometry_error': 0.0}
+    start('-r', 'odom:=/odom', '-r', 'image:=/image', keyframe_distance=1.0, **off)
     match = robot.show(route[0])
     assert (match.status, 'no odometry' in match.reason) == (SKIPPED, True)
     assert 'never' in robot.until_diagnosed('input', WARN, 'odometry').message

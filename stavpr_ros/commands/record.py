@@ -31,8 +31,8 @@ EPILOG = """
 The keys are the fields of stavpr_msgs/PlaceMatch, the status by its name, or with --loop-closures
 those of stavpr_msgs/LoopClosure. Stamps are in nanoseconds, missing numbers are null; the path is
 a list of [query_index, place_index], pairs are [query_index, query_stamp, place_index,
-place_stamp], a pose is [x, y, z, qx, qy, qz, qw], null without odometry. received is the time of
-arrival (ns, system clock).
+place_stamp, query_change], a pose is [x, y, z, qx, qy, qz, qw], null without odometry. received is
+the time of arrival (ns, system clock).
 
 exit codes: 0 stopped by a signal, 1 the file cannot be written, 2 usage, 130 stopped by a signal
 before the start
