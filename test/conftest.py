@@ -6,6 +6,7 @@ from collections import OrderedDict
 import os
 from pathlib import Path
 
+from domain import DOMAIN
 from hypothesis import settings
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from stavpr_ros.threads import wait_passively
 
 wait_passively()  # torch and numba are not imported yet
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+os.environ['ROS_DOMAIN_ID'] = str(DOMAIN)  # of the processes that tests start
 # No deadline: a shared machine may be slow. Examples are random everywhere but in CI, where a
 # failure must be reproducible.
 settings.register_profile('stavpr', deadline=None, derandomize='CI' in os.environ)
@@ -76,7 +78,6 @@ def one_thread():
 @pytest.fixture
 def context():
     """Yield an initialized ROS context."""
-    from processes import DOMAIN
     import rclpy
 
     context = rclpy.Context()

@@ -9,11 +9,8 @@ import subprocess
 import sys
 
 from ament_index_python.packages import get_package_prefix
+from domain import DOMAIN
 
-# pytest-xdist: its processes have numbers, so that none shares a domain with another
-_RUN = os.getppid() if 'PYTEST_XDIST_WORKER' in os.environ else os.getpid()
-_PROCESS = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
-DOMAIN = 1 + (4 * _RUN + _PROCESS) % 100
 TIMEOUT = 60.0  # seconds until an expected event counts as missing
 SECOND = 10**9
 
