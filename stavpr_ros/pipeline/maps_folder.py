@@ -33,11 +33,12 @@ def inside(folder: Path, name: str) -> str:
     """
     Return the absolute path of a file in a folder, without symbolic links.
 
-    :param name: relative to the folder; an absolute path must lead into it.
+    :param name: relative to the folder; an absolute path, or one with ``~``, must lead into it.
     :raises SettingsError: it leads outside, also by ``..`` or a symbolic link.
     """
     root = Path(os.path.realpath(folder))
-    path = Path('\0') if '\0' in name else Path(os.path.realpath(root / name))
+    expanded = os.path.expanduser(name)
+    path = Path('\0') if '\0' in name else Path(os.path.realpath(root / expanded))
     if root not in path.parents:
         raise SettingsError(
             f'{name!r} is no file in the maps folder {folder}: from the ROS graph, name one in '

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Diagnostics of a node: four statuses with level, cause, remedy and values."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import math
 import re
 import threading
@@ -89,6 +89,20 @@ def diagnostic_array(health: Health, node: str, stamp: Time) -> DiagnosticArray:
             )
         )
     return DiagnosticArray(header=Header(stamp=stamp), status=statuses)
+
+
+def one_status(
+    node: Node, part: str, level: bytes, text: str, values: Mapping[str, object]
+) -> DiagnosticArray:
+    """Return the diagnostics of a node with one part, stamped now."""
+    status = DiagnosticStatus(
+        level=level,
+        name=f'{node.get_fully_qualified_name().lstrip("/")}: {part}',
+        message=text,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+    )
+    header = Header(stamp=node.get_clock().now().to_msg())
+    return DiagnosticArray(header=header, status=[status])
 
 
 # the numbers behind the messages

@@ -8,7 +8,7 @@ import threading
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry, Path
 import numpy as np
@@ -24,6 +24,7 @@ from stavpr_ros.pipeline.maps_folder import inside, maps_folder
 from stavpr_ros.pose_graph import ChainSettings, GraphSettings, PoseGraph
 from stavpr_ros.pose_graph.files import save_graph
 from stavpr_ros.pose_graph.transforms import matrices, to_poses
+from stavpr_ros.ros.diagnostics import one_status
 from stavpr_ros.ros.graph_messages import closure_of, edge_markers, paths
 from stavpr_ros.ros.navigation import tf_message, transform_message
 from stavpr_ros.ros.output import nanoseconds, pose_message
@@ -356,11 +357,4 @@ class PoseGraphNode(ManagedNode):
             text = 'most closures have stamps without odometry: is it of the same clock?'
         elif self.counts['failed updates']:
             level, text = DiagnosticStatus.WARN, f'updates failed: {self.problem}'
-        status = DiagnosticStatus(
-            level=level,
-            name=f'{self.get_fully_qualified_name().lstrip("/")}: graph',
-            message=text,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-        )
-        stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=stamp), status=[status]))
+        self._diagnostics.publish(one_status(self, 'graph', level, text, values))

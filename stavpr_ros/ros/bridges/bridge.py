@@ -7,7 +7,7 @@ import importlib
 import math
 from typing import Any, ClassVar
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -16,10 +16,10 @@ from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.pose_graph import Closure
 from stavpr_ros.pose_graph.foreign import ForeignKeyframes, keyframe_edge, KeyframeEdge
+from stavpr_ros.ros.diagnostics import one_status
 from stavpr_ros.ros.graph_messages import closure_of, pose_array
 from stavpr_ros.ros.output import nanoseconds
 from stavpr_ros.ros.subscriptions import odometry_pose
-from std_msgs.msg import Header
 
 CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -110,14 +110,7 @@ class Bridge(Node):
             text = f'no closures on {self.resolve_topic_name("stavpr/loop_closure")}: remap it'
         elif not counts['sent'] and causes:
             level, text = DiagnosticStatus.WARN, REMEDIES[max(causes)[1]]
-        status = DiagnosticStatus(
-            level=level,
-            name=f'{self.get_fully_qualified_name().lstrip("/")}: bridge',
-            message=text,
-            values=[KeyValue(key=key, value=str(count)) for key, count in counts.items()],
-        )
-        stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=stamp), status=[status]))
+        self._diagnostics.publish(one_status(self, 'bridge', level, text, counts))
 
 
 class EdgeBridge(Bridge):
