@@ -4,12 +4,14 @@
 
 import dataclasses
 from pathlib import Path
+from unittest.mock import patch
 
 from conftest import route_images
 import numpy as np
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.mapping import build_map, PlaceMap, save_map, Session
+from stavpr_ros.recognition import held_map
 from stavpr_ros.sources.frame import Frame
 
 VERSION1 = Path(__file__).parent / 'data' / 'version1'
@@ -40,7 +42,10 @@ def example_map(projection: int | None = None) -> PlaceMap:
 def example_files(folder: Path) -> list[bytes]:
     """Return the content of map files of both versions and both storages."""
     save_map(example_map(), folder / 'float32')
-    save_map(example_map(projection=16), folder / 'projected', 'float16')
+    projected = example_map(projection=16)
+    with patch.object(held_map, 'LEAST_PLACES', 1):
+        statistics = held_map.statistics_of_map(projected, 'float16')
+    save_map(projected, folder / 'projected', 'float16', statistics=statistics)
     version1 = VERSION1 / 'gradient.stavpr', VERSION1 / 'gradient_projected.stavpr'
     files = [folder / 'float32', folder / 'projected', *version1]
     return [file.read_bytes() for file in files]

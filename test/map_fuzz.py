@@ -53,6 +53,7 @@ def rejected_or_works(path: Path, thorough: bool = True) -> bool:
         place_map = open_map(path)
         verify_map(place_map)
         if thorough:
+            use(place_map)  # with the statistics in its file
             use(load_map(path))
     except MapFileError as error:
         assert str(path) in str(error)  # noqa: PT017

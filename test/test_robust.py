@@ -93,7 +93,7 @@ def test_whitening_equals_equation_in_numpy():
     rng = np.random.default_rng(0)
     strips = rng.normal(size=(2, 30, 6)) * [3, 2, 1, 1, 0.5, 0.1] @ rng.normal(size=(6, 6))
     strips /= np.linalg.norm(strips, axis=2, keepdims=True)
-    whitening = Whitening(torch.from_numpy(strips).float())
+    whitening = Whitening.learned(torch.from_numpy(strips).float())
     some = rng.normal(size=(2, 4, 6))
     for j in range(2):
         values, directions = np.linalg.eigh(strips[j].T @ strips[j])

@@ -329,13 +329,15 @@ def main(args: list[str] | None = None) -> int:
         arguments.input = arguments.input[0]
         from stavpr_ros.features.descriptors import is_descriptors
         from stavpr_ros.mapping import save_map
+        from stavpr_ros.recognition.held_map import statistics_of_map
 
         if is_descriptors(arguments.input):
             place_map, journal = _build_of_descriptors(arguments), None
         else:
             state = 'nothing was written; the same command continues the work'
             place_map, journal = _build(arguments)
-        save_map(place_map, arguments.output, force=arguments.force)
+        statistics = statistics_of_map(place_map)
+        save_map(place_map, arguments.output, force=arguments.force, statistics=statistics)
         if journal is not None:
             journal.unlink()
         state = f'{arguments.output} is written, without a suggested threshold'

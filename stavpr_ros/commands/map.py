@@ -160,6 +160,7 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
         f'strips of {place_map.dimension} dimensions, {features.storage}',
         'settings': settings.to_json(),
         'projection': place_map.projection.identity if place_map.projection else 'none',
+        'statistics': 'kept for a fast start' if features.statistics else 'none',
         'stamps': f'{_time(int(known.min()))} to {_time(int(known.max()))}'
         if len(known)
         else 'unknown',
@@ -285,9 +286,11 @@ def _sessions(arguments: argparse.Namespace) -> None:
 
 def _write(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import save_map
+    from stavpr_ros.recognition.held_map import statistics_of_map
 
     storage = getattr(arguments, 'storage', '')
-    map_id = save_map(place_map, arguments.output, storage, arguments.force)
+    learned = statistics_of_map(place_map, storage)
+    map_id = save_map(place_map, arguments.output, storage, arguments.force, learned)
     size = Path(arguments.output).stat().st_size / 1e6
     print(f'{arguments.output}: {len(place_map)} places, {size:.1f} MB, id {map_id}')
 

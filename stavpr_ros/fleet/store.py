@@ -14,7 +14,8 @@ from typing import Protocol
 import numpy as np
 from stavpr_ros.errors import FleetError
 from stavpr_ros.mapping import PlaceMap, select_places, Session
-from stavpr_ros.recognition.robust import blocks, evenly, MeanCentering, unit_norm
+from stavpr_ros.recognition.blocks import blocks
+from stavpr_ros.recognition.robust import evenly, MeanCentering, unit_norm
 import torch
 
 RUNS, RUN = 256, 8  # the sample of a map: so many runs of so many neighboring places

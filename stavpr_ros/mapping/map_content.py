@@ -14,6 +14,7 @@ from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.jpeg import jpeg_pixels, MOST_PIXELS
 from stavpr_ros.mapping.map_container import MapFile, Part
 from stavpr_ros.mapping.map_schema import identity_fields, INTRINSICS, Object
+from stavpr_ros.mapping.map_statistics import CHANGES, STATISTICS, statistics_of
 from stavpr_ros.mapping.map_version2 import KNOWN_SECTIONS
 from stavpr_ros.mapping.place_map import PlaceMap, Session
 from stavpr_ros.mapping.stored_features import LONGEST, StoredFeatures, StoredThumbnails
@@ -34,6 +35,10 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
     'thumbnail_ends': (('I64',), ('n',)),
     'session': (('I32',), ('n',)),
     'same_places/same_as': (('I32',), ('n',)),
+    'statistics/mean': (('F32',), ('W', 'd')),
+    'statistics/directions': (('F32',), ('W', 'r', 'd')),
+    'statistics/gains': (('F64',), ('W', 'r')),
+    'statistics/changes': (('F32',), (CHANGES, 'n')),
 }
 _TOGETHER = (('ids', 'id_ends'), ('thumbnails', 'thumbnail_ends'))
 
@@ -47,8 +52,13 @@ def map_content(file: MapFile) -> PlaceMap:
     """
     manifest = file.manifest
     settings = _settings(manifest['settings'])
-    sizes = _require_shapes(file.parts, settings, manifest['sections'])
-    arrays = {name: file.read(name) for name in file.parts if name in PARTS and name not in LARGE}
+    described = {
+        name
+        for name in file.parts.keys() & PARTS.keys()
+        if '/' not in name or _is_known(manifest['sections'], name.partition('/')[0])
+    }
+    sizes = _require_shapes(file.parts, described, settings, manifest['sections'])
+    arrays = {name: file.read(name) for name in sorted(described.difference(LARGE))}
     if (manifest['projection'] is None) is ('projection' in arrays):
         raise ValueError('the manifest and the parts disagree on whether there is a projection')
     projection = None
@@ -67,8 +77,12 @@ def map_content(file: MapFile) -> PlaceMap:
         ends = _ends(arrays['id_ends'], len(arrays['ids']), 'id_ends')
         content = arrays['ids'].tobytes()
         ids = [content[a:b].decode() for a, b in zip([0, *ends], ends, strict=False)]
+    features = StoredFeatures(file, torch.from_numpy(weights), settings, cells)
+    if _is_known(manifest['sections'], STATISTICS):
+        features.statistics = statistics_of(file, arrays)
+        features.has_stale_statistics = features.statistics is None
     return PlaceMap(
-        features=StoredFeatures(file, torch.from_numpy(weights), settings, cells),
+        features=features,
         projection=projection,
         stamps=arrays['stamps'],
         ids=tuple(ids),
@@ -84,11 +98,16 @@ def map_content(file: MapFile) -> PlaceMap:
 
 def _camera(sections: dict[str, Any]) -> Camera | None:
     """Return the camera of section intrinsics, None without one that is known."""
-    section = sections.get('intrinsics')
-    if section is None or section['version'] > KNOWN_SECTIONS['intrinsics']:
+    if not _is_known(sections, 'intrinsics'):
         return None
+    section = sections['intrinsics']
     INTRINSICS.check(section['data'], 'section intrinsics')
     return Camera.from_json(section['data'])
+
+
+def _is_known(sections: dict[str, Any], name: str) -> bool:
+    """Return whether a map has a section, and this program knows its version."""
+    return name in sections and sections[name]['version'] <= KNOWN_SECTIONS.get(name, 0)
 
 
 def _settings(record: dict[str, Any]) -> FeatureSettings:
@@ -106,9 +125,12 @@ def _settings(record: dict[str, Any]) -> FeatureSettings:
 
 
 def _require_shapes(
-    parts: dict[str, Part], settings: FeatureSettings, sections: Collection[str]
+    parts: dict[str, Part],
+    described: Collection[str],
+    settings: FeatureSettings,
+    sections: Collection[str],
 ) -> dict[str, int]:
-    """Check which parts there are, their types and shapes; return the sizes W, n, d and D."""
+    """Check which parts there are, and what is described; return the sizes W, n, d and D."""
     for name in ('strips', 'weights', 'stamps'):
         if name not in parts:
             raise ValueError(f'part {name} is missing')
@@ -121,7 +143,7 @@ def _require_shapes(
         if (slash or name not in PARTS) and section not in sections:
             raise ValueError(f'part {name[:80]} is {"of no section" if slash else "unknown"}')
     for name, (types, axes) in PARTS.items():
-        if name not in parts:
+        if name not in described:
             continue
         dtype, shape = parts[name].dtype, parts[name].shape
         if dtype not in types or len(shape) != len(axes):

@@ -19,6 +19,7 @@ from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile
 from stavpr_ros.mapping.map_content import map_content, PARTS, require_jpegs
 from stavpr_ros.mapping.map_schema import identity_fields
+from stavpr_ros.mapping.map_statistics import MapStatistics, STATISTICS
 from stavpr_ros.mapping.map_version1 import read_version1
 from stavpr_ros.mapping.map_version2 import MOST_HEADER, NewPart, read_version2, write_version2
 from stavpr_ros.mapping.place_map import PlaceMap
@@ -32,7 +33,11 @@ STORAGE = {'float32': 'F32', 'float16': 'F16'}
 
 
 def save_map(
-    place_map: PlaceMap, path: str | Path, storage: str = '', force: Force = False
+    place_map: PlaceMap,
+    path: str | Path,
+    storage: str = '',
+    force: Force = False,
+    statistics: MapStatistics | None = None,
 ) -> str:
     """
     Write a map to a file, all of it or nothing.
@@ -40,11 +45,19 @@ def save_map(
     :param storage: of the features, ``float32`` or ``float16``; '' = that of the file where they
         are, float32 in memory.
     :param force: replace an existing map, see :func:`stavpr_ros.output_file.atomic_output`.
+    :param statistics: what recognition has learned from the features as they will be stored, see
+        :func:`stavpr_ros.recognition.held_map.statistics_of_map`; None = write none.
     :returns: the id of the map, 16 hexadecimal digits of the hash of its content.
     :raises OutputError: the file is there already, or cannot be written.
     :raises SettingsError: no such storage.
     """
     manifest, parts = _manifest(place_map), _parts(place_map, storage)
+    if statistics is not None:
+        data = {'method': statistics.method, 'features': '0' * 64}  # the writer knows their hash
+        manifest['sections'][STATISTICS] = {'version': 1, 'required': False, 'data': data}
+        for name, array in statistics.parts().items():
+            dtype = PARTS[name][0][0]
+            parts[name] = NewPart(dtype, array.shape, [array.astype(DTYPES[dtype], copy=False)])
     with atomic_output(path, MAP, force) as file:
         return write_version2(file, manifest, parts)
 

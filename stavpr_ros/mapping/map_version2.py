@@ -16,7 +16,11 @@ from stavpr_ros.mapping.map_schema import Int, ListOf, MANIFEST, Object, Text
 FORMAT, VERSION = 'stavpr-map', 2
 MOST_HEADER = 2**20  # bytes: parsing takes at most 25 times as much memory
 PIECE = 2**22  # bytes that are hashed together
-KNOWN_SECTIONS = {'intrinsics': 1, 'same_places': 1}  # name: highest known version
+KNOWN_SECTIONS = {
+    'intrinsics': 1,
+    'same_places': 1,
+    'statistics': 1,
+}  # name: highest known version
 _TEXT = Text(MOST_HEADER)
 _METADATA = Object({'format': _TEXT, 'version': _TEXT, 'manifest': _TEXT, 'sha256': _TEXT})
 _TENSOR = Object(
@@ -75,6 +79,11 @@ def read_version2(file: MapFile) -> None:
     MANIFEST.check(file.manifest, 'manifest')
     file.parts = _parts(header, file.manifest['parts'], 8 + length, file.size)
     _require_known_sections(file.manifest['sections'])
+
+
+def features_key(hashes: list[str]) -> str:
+    """Return the hash of features by those of their pieces."""
+    return hashlib.sha256(''.join(hashes).encode()).hexdigest()
 
 
 def _parts(
@@ -147,6 +156,8 @@ def write_version2(file: IO[bytes], manifest: dict[str, Any], parts: dict[str, N
                 hasher.update(view)
                 file.write(view)
         hashes[name] = hasher.hashes()
+    if 'statistics' in manifest['sections']:
+        manifest['sections']['statistics']['data']['features'] = features_key(hashes['strips'])
     header, map_id = _header(manifest, parts, names, hashes)
     file.seek(0)
     file.write(header)

@@ -9,6 +9,7 @@ from typing import Any, overload
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile
+from stavpr_ros.mapping.map_statistics import MapStatistics
 import torch
 
 LONGEST = 1.01  # norm of a strip; float16 rounds it
@@ -50,9 +51,13 @@ class MappedFeatures(LocalFeatures):
 
     pages: mmap.mmap
 
+    def release(self) -> None:
+        """Release the memory of what was read; it is read from the file again."""
+        self.pages.madvise(mmap.MADV_DONTNEED)
+
     def stored_strip(self, j: int) -> np.ndarray:
         """Return one strip, shape (n, d), float32; pages of those before are released."""
-        self.pages.madvise(mmap.MADV_DONTNEED)
+        self.release()
         return self.strips[j].numpy()
 
 
@@ -64,7 +69,13 @@ class StoredFeatures(LocalFeatures):
     open, so that it may be replaced or deleted. Thread-safe.
 
     :param weights: see :class:`LocalFeatures`; in memory.
+
+    ``statistics`` is what recognition has learned from them, None = unknown;
+    ``has_stale_statistics`` whether the file has some of other features.
     """
+
+    statistics: MapStatistics | None = None
+    has_stale_statistics = False
 
     def __init__(
         self,

@@ -12,6 +12,7 @@ from stavpr_ros.mapping import save_map
 from stavpr_ros.mapping.journal import journals, numbered, recover
 from stavpr_ros.output_file import Force, MAP, require_replaceable
 from stavpr_ros.pipeline.pipeline import Pipeline
+from stavpr_ros.recognition.held_map import statistics_of_map
 
 OnWorker = Callable[[Callable[[], Any]], Any]
 
@@ -25,7 +26,8 @@ def write_map(pipeline: Pipeline, on_worker: OnWorker, path: str, overwrite: For
     """
     require_replaceable(path, MAP, overwrite)  # before places are copied
     snapshot = on_worker(pipeline.snapshot)
-    save_map(snapshot.places, path, force=overwrite)
+    places = snapshot.places
+    save_map(places, path, force=overwrite, statistics=statistics_of_map(places))
     on_worker(lambda: snapshot.mark_saved(path))
     return len(snapshot.places)
 

@@ -1,29 +1,152 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The features of a map as a matcher holds them: centered, in its precision."""
+"""
+A map as it is recognized: its features as a matcher holds them, and what is learned from them.
 
+What is learned takes several passes over the features. It is kept in the file of a large map.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping.map_statistics import MapStatistics
+from stavpr_ros.mapping.stored_features import MappedFeatures, StoredFeatures
+from stavpr_ros.recognition.blocks import converted, converted_blocks
 from stavpr_ros.recognition.int8_features import Int8Features, rounded
-from stavpr_ros.recognition.robust import converted, MeanCentering, RobustOptions
+from stavpr_ros.recognition.map_change import APART, PlaceChanges
+from stavpr_ros.recognition.robust import (
+    MeanCentering,
+    RANK,
+    RobustOptions,
+    SAMPLE,
+    STRENGTH,
+)
 import torch
 
+METHOD = f'mean, whitening {RANK} of {SAMPLE} by {STRENGTH}, changes {APART}, 1'
+LEAST_PLACES = 1000  # of a map whose statistics are kept: they take the room of some 70 places
 
-def centering_of(features: LocalFeatures, options: RobustOptions) -> MeanCentering | None:
-    """Learn the mean and the whitening that the options ask for, None without any."""
+
+@dataclass(frozen=True, eq=False)
+class HeldMap:
+    """
+    What a recognizer takes from a map.
+
+    :param features: as the matcher holds them, in memory once.
+    :param centering: learned from them; None without.
+    :param changes: see :attr:`stavpr_ros.mapping.map_statistics.MapStatistics.changes`.
+    :param note: why statistics in the map's file are not used, for the log; empty = they are, or
+        there are none.
+    """
+
+    features: LocalFeatures | Int8Features
+    centering: MeanCentering | None
+    changes: np.ndarray
+    note: str = ''
+
+
+def hold(features: LocalFeatures, options: RobustOptions, precision: str) -> HeldMap:
+    """
+    Read and convert the features of a map.
+
+    :param precision: see :func:`stavpr_ros.recognition.matcher.make_matcher`.
+    """
+    statistics, note, centering = None, '', None
+    if isinstance(features, StoredFeatures) and options.mean_centering and options.whitening:
+        statistics, note = _usable(features)
     if options.mean_centering or options.whitening:
-        return MeanCentering(features, options.mean_centering, options.whitening)
-    return None
+        centering = MeanCentering(features, options.mean_centering, options.whitening, statistics)
+    seen = PlaceChanges(len(features) if options.place_filter and statistics is None else 0)
+    held = _held(features, centering, precision, seen)
+    return HeldMap(held, centering, statistics.changes if statistics else seen.changes, note)
 
 
-def held_features(
-    features: LocalFeatures, centering: MeanCentering | None, precision: str
+def _usable(features: StoredFeatures) -> tuple[MapStatistics | None, str]:
+    found = features.statistics
+    if features.has_stale_statistics:
+        why = 'are of other features'
+    elif found is not None and found.method != METHOD:
+        why = f'were learned by another version ({found.method!a})'
+    else:
+        return found, ''
+    path = features.file.path
+    return None, f'the statistics in {path} {why}: learned again; map compact renews them'
+
+
+def _held(
+    features: LocalFeatures, centering: MeanCentering | None, precision: str, seen: PlaceChanges
 ) -> LocalFeatures | Int8Features:
-    """Return the features for the matcher, in memory once; those of a map are not copied."""
+    """Return the features for the matcher; those of a map are not copied."""
     if precision == 'int8':
-        return rounded(features, centering.places if centering else lambda some: some)
+        return rounded(features, centering.places if centering else lambda some: some, seen.add)
     dtype = torch.float16 if precision == 'float16' else torch.float32
     if centering is not None:
-        return centering.places(features, dtype)
+        return centering.places(features, dtype, seen.add)
     if dtype == torch.float32:
-        return features[:]
-    return converted(features, lambda strips: strips, dtype)
+        held = features[:]
+        seen.add(held.strips)
+        return held
+    return converted(features, lambda strips: strips, dtype, seen.add)
+
+
+def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics | None:
+    """
+    Learn from a map what :func:`stavpr_ros.mapping.save_map` keeps in its file.
+
+    :param storage: of the features in the file; '' = as :func:`stavpr_ros.mapping.save_map` does.
+    :returns: None for a small map, whose file they would lengthen much.
+    """
+    if len(place_map) < LEAST_PLACES:
+        return None
+    features = place_map.features
+    stored = features.storage if isinstance(features, StoredFeatures) else 'float32'
+    if (storage or stored) == stored and getattr(features, 'statistics', None) is not None:
+        known, note = _usable(features)  # type: ignore[arg-type]
+        if not note:
+            return known
+    features = _AsStored(features, storage or stored)
+    centering, seen = MeanCentering(features), PlaceChanges(len(features))
+    for _, some in converted_blocks(features, lambda some: centering.places(some).strips):
+        seen.add(some)
+    assert centering.whitening is not None
+    whitening = centering.whitening
+    return MapStatistics(
+        METHOD,
+        centering.mean.numpy(),
+        whitening.directions.numpy(),
+        whitening.gains.numpy(),
+        seen.changes,
+    )
+
+
+class _AsStored(LocalFeatures):
+    """
+    Features, read a block at a time, as they will be in a file.
+
+    :param storage: see :func:`stavpr_ros.mapping.save_map`.
+    """
+
+    def __init__(self, features: LocalFeatures, storage: str) -> None:
+        for name in ('weights', 'settings', 'cells'):
+            object.__setattr__(self, name, getattr(features, name))
+        object.__setattr__(self, 'whole', features)
+        object.__setattr__(self, 'dtype', getattr(torch, storage))
+
+    whole: LocalFeatures
+    dtype: torch.dtype
+
+    def __len__(self) -> int:
+        return len(self.whole)
+
+    def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
+        some = self.whole[images]
+        some = replace(some, strips=some.strips.cpu().to(self.dtype).float())
+        if isinstance(self.whole, MappedFeatures):
+            self.whole.release()
+        return some
+
+    @property
+    def dimension(self) -> int:
+        return self.whole.dimension

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.recognition.robust import blocks
+from stavpr_ros.recognition.blocks import converted_blocks
 import torch
 
 
@@ -29,11 +29,18 @@ class Int8Features:
 
 
 def rounded(
-    features: LocalFeatures, convert: Callable[[LocalFeatures], LocalFeatures]
+    features: LocalFeatures,
+    convert: Callable[[LocalFeatures], LocalFeatures],
+    see: Callable[[torch.Tensor], None] = lambda strips: None,
 ) -> Int8Features:
-    """Return features rounded to int8: one block after the other, converted before."""
+    """
+    Return features rounded to int8: one block after the other, converted before.
+
+    :param see: called with the strips of each block, before they are rounded.
+    """
     W, n = features.weights.shape
     strips = Int8Strips(W, n, features.dimension)
-    for places, some in blocks(features):
-        strips.write(places.start, convert(some).strips.cpu().contiguous())
+    for places, some in converted_blocks(features, lambda some: convert(some).strips.cpu()):
+        see(some)
+        strips.write(places.start, some.contiguous())
     return Int8Features(strips, features.weights, features.settings, features.cells)

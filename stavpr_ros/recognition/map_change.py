@@ -49,24 +49,29 @@ class MapChange:
         :param firsts: first place of each session.
         """
         n = strips.shape[1]
+        seen = PlaceChanges(n)
+        for low in range(0, n, LEARNED_AT_ONCE):
+            seen.add(torch.as_tensor(strips[:, low : low + LEARNED_AT_ONCE]))
+        self.take(seen.changes, firsts)
+
+    def take(self, changes: np.ndarray, firsts: np.ndarray | tuple[int, ...] = (0,)) -> None:
+        """
+        Take the changes of all places of a map.
+
+        :param changes: of each place from the ones 1 to ``APART`` places before, (``APART``, n).
+        :param firsts: first place of each session.
+        """
+        n = changes.shape[1]
         if not n:
             return
-        changes = np.empty((APART + 1, n), np.float32)
-        for low in range(0, n, LEARNED_AT_ONCE):
-            first, high = max(0, low - APART), min(low + LEARNED_AT_ONCE, n)
-            block = torch.as_tensor(strips[:, first:high]).float().contiguous().cpu().numpy()
-            out = np.empty(high - first, np.float32)
-            for apart in range(1, min(APART, n - 1) + 1):
-                _changes(block, apart, out)
-                changes[apart, low:high] = out[low - first :]
         for apart in range(1, min(APART, n - 1) + 1):
-            crossing = np.zeros(n, bool)
+            inside = np.ones(n, bool)
             for first in firsts:
-                crossing[first : first + apart] = True
-            changes[apart, crossing] = 0
-            self._sums[apart] = changes[apart, apart:].sum(dtype=np.float64)
-            self._counts[apart] = n - np.count_nonzero(crossing)
-        self._from_before[1:] = changes[1, 1:]
+                inside[first : first + apart] = False
+            known = np.where(inside, changes[apart - 1], np.float32(0))
+            self._sums[apart] = known[apart:].sum(dtype=np.float64)
+            self._counts[apart] = np.count_nonzero(inside)
+        self._from_before[1:] = changes[0, 1:]
         self._from_before[list(firsts)] = 1
         self._update_curve()
 
@@ -123,6 +128,38 @@ class MapChange:
         for places in range(min(AHEAD, n)):
             ahead[: n - places] |= equal[places:]
         return bool(by_place[ahead].sum() > UNLIT * by_place.sum())
+
+
+class PlaceChanges:
+    """
+    Changes of places that come in blocks, in their order.
+
+    :param n: places; 0 = blocks are not looked at.
+
+    ``changes`` holds those of each place from the ones 1 to ``APART`` places before, shape
+    (``APART``, n), float32; 0 where there are no such.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.changes: np.ndarray = np.zeros((APART, n), np.float32)
+        self._count = 0
+        self._latest: torch.Tensor | None = None
+
+    def add(self, strips: torch.Tensor) -> None:
+        """Add the next places, unit-norm strips (W, m, d), of any type."""
+        m, n = strips.shape[1], self.changes.shape[1]
+        if not n or not m:
+            return
+        strips = strips.float().cpu()
+        block = strips if self._latest is None else torch.cat([self._latest, strips], dim=1)
+        before = block.shape[1] - m
+        out = np.empty(block.shape[1], np.float32)
+        for apart in range(1, min(APART, block.shape[1] - 1) + 1):
+            _changes(block.contiguous().numpy(), apart, out)
+            first = max(before, apart)
+            self.changes[apart - 1, self._count + first - before : self._count + m] = out[first:]
+        self._count += m
+        self._latest = block[:, -APART:].clone()
 
 
 @parallel_kernel

@@ -15,7 +15,8 @@ from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.recognition.held_map import centering_of, held_features
+from stavpr_ros.recognition.blocks import blocks
+from stavpr_ros.recognition.held_map import hold
 from stavpr_ros.recognition.int8_features import Int8Features
 from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
 from stavpr_ros.recognition.match import (
@@ -28,7 +29,7 @@ from stavpr_ros.recognition.match import (
 )
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.relative_motion import Positions, RelativeMotion
-from stavpr_ros.recognition.robust import blocks, z_normalized
+from stavpr_ros.recognition.robust import z_normalized
 from stavpr_ros.recognition.sequence_search import (
     FilterSearch,
     Search,
@@ -283,15 +284,16 @@ class PlaceRecognizer(SequenceRecognizer):
             for _, some in blocks(features):
                 require_finite(some, 'the map')
         self._dimension = features.dimension
-        self._centering = centering_of(features, self._options)
         # cells are made of float32 strips
-        held_in = 'float32' if settings.spatial.vertical else precision
-        held = held_features(features, self._centering, held_in)
+        held_map = hold(
+            features, self._options, 'float32' if settings.spatial.vertical else precision
+        )
+        self._centering, held = held_map.centering, held_map.features
         backend = choose_backend(backend)
         self._matcher = make_matcher(held, settings.spatial, backend, precision)
         if self._filter is not None:
             firsts = (0,) if layout is None else layout.firsts
-            self._filter.change.learn(held.strips, firsts)
+            self._filter.change.take(held_map.changes, firsts)
         if backend == 'cuda' and self._filter is not None:
             self._match_on_device(self._filter)
         if backend == 'cuda' and not self._options.any:
@@ -299,7 +301,8 @@ class PlaceRecognizer(SequenceRecognizer):
 
             search = CudaLmDtwSearch(self._buffer.places, settings.sequence)
             self._search, self._buffer = search, search.buffer
-        self.stages = ''  # how the time budget is kept, for the log; '' = without one
+        # of the start, for the log: statistics that were learned again, and the time budget
+        self.stages = held_map.note
         if settings.time_budget_ms and len(features):
             if backend == 'cuda':
                 raise SettingsError(
@@ -310,15 +313,15 @@ class PlaceRecognizer(SequenceRecognizer):
 
     def _keep_time_budget(self, held: LocalFeatures | Int8Features, image: LocalFeatures) -> None:
         budget, exact = self._settings.time_budget_ms, self._milliseconds(image)
-        self.stages = f'exact matching takes {exact:.3g} ms an image, time_budget_ms = {budget:g}'
-        if exact <= budget:
-            return
-        from stavpr_ros.recognition.cpu_matcher import CpuMatcher
-        from stavpr_ros.recognition.first_stage import FirstStage
+        text = f'exact matching takes {exact:.3g} ms an image, time_budget_ms = {budget:g}'
+        if exact > budget:
+            from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+            from stavpr_ros.recognition.first_stage import FirstStage
 
-        assert isinstance(self._matcher, CpuMatcher)
-        self._matcher = FirstStage(self._matcher, held, self._probable_places)
-        self.stages += f': with a first stage {self._milliseconds(image):.3g} ms'
+            assert isinstance(self._matcher, CpuMatcher)
+            self._matcher = FirstStage(self._matcher, held, self._probable_places)
+            text += f': with a first stage {self._milliseconds(image):.3g} ms'
+        self.stages = '; '.join(filter(None, [self.stages, text]))
 
     def _milliseconds(self, image: LocalFeatures) -> float:
         """Return the least time of a few updates by an image, after one that compiles."""

@@ -7,20 +7,21 @@ Everything is causal: only images that have arrived count. The probability of a 
 and successive ones are correlated.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.mapping.map_statistics import MapStatistics
+from stavpr_ros.recognition.blocks import converted, converted_blocks, one_thread
 import torch
 
 MODES = ('paper', 'robust')
 MIN_PROBABILITY = 0.5  # above which mode robust matches a window
 THRESHOLD = 1 - MIN_PROBABILITY  # of the distance, 1 less the probability
 PRIOR = 20  # images that the statistics of the map count for in those of the query
-PIECE = 256  # images read or centered at a time
 RANK = 64  # directions that whitening shrinks, at most
 SAMPLE = 256  # places that whitening is learned from
 STRENGTH = 1.5  # of whitening: c in the gains of its directions
@@ -176,14 +177,22 @@ class Whitening:
     all kinds of features. Whitening in full, c to infinity, would make noise of weak directions as
     strong as the others: a map of one light does not show what other lights change.
 
-    :param strips: unit-norm features of some places, (W, m, d), m > 0.
+    :param directions: u_i, shape (W, rank, d), float32.
+    :param gains: g_i, shape (W, rank), float64.
     """
 
-    def __init__(self, strips: torch.Tensor) -> None:
-        learned = [_principal_directions(strip) for strip in strips]  # one by one: less memory
-        self._directions = torch.stack([directions for directions, _ in learned])  # (W, rank, d)
-        gains = torch.stack([gains for _, gains in learned])[:, None]
+    def __init__(self, directions: torch.Tensor, gains: torch.Tensor) -> None:
+        self.directions, self.gains = directions, gains
+        gains = gains[:, None]
         self._change, self._inverse = (gains - 1).float(), (1 / gains - 1).float()
+
+    @staticmethod
+    def learned(strips: torch.Tensor) -> 'Whitening':
+        """Learn from unit-norm features of some places, (W, m, d), m > 0."""
+        with one_thread():  # so that the result does not depend on how many there are
+            found = [_principal_directions(strip) for strip in strips]  # one by one: less memory
+        directions, gains = zip(*found, strict=True)
+        return Whitening(torch.stack(directions), torch.stack(gains))
 
     def __call__(self, strips: torch.Tensor) -> torch.Tensor:
         """Return features (W, n, d) with the directions shrunk, of less than unit norm."""
@@ -195,15 +204,15 @@ class Whitening:
 
     def _scaled(self, strips: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
         if strips.shape[1] == 1 and not strips.is_cuda:  # torch would wake its threads for it
-            strip, directions = strips.numpy(), self._directions.numpy()
+            strip, directions = strips.numpy(), self.directions.numpy()
             parts = (strip @ directions.transpose(0, 2, 1)) * change.numpy()
             return torch.from_numpy(strip + parts @ directions)
-        parts = torch.bmm(strips, self._directions.mT) * change
-        return torch.baddbmm(strips, parts, self._directions)
+        parts = torch.bmm(strips, self.directions.mT) * change
+        return torch.baddbmm(strips, parts, self.directions)
 
     def to(self, device: torch.device) -> 'Whitening':
         """Return this, moved to a device."""
-        for name in ('_directions', '_change', '_inverse'):
+        for name in ('directions', '_change', '_inverse'):
             setattr(self, name, getattr(self, name).to(device))
         return self
 
@@ -228,36 +237,59 @@ class MeanCentering:
 
     :param features: those of the map, strips (W, n, d).
     :param centering, whitening: which of the two to apply.
+    :param statistics: what was learned from the features before, both applied; None = learn it.
     """
 
     def __init__(
-        self, features: LocalFeatures, centering: bool = True, whitening: bool = True
+        self,
+        features: LocalFeatures,
+        centering: bool = True,
+        whitening: bool = True,
+        statistics: MapStatistics | None = None,
     ) -> None:
         self._centering = centering
+        self.whitening: Whitening | None = None
+        if statistics is not None:
+            self.mean = torch.from_numpy(statistics.mean)
+            found = torch.from_numpy(statistics.directions), torch.from_numpy(statistics.gains)
+            self.whitening = Whitening(*found)
+        else:
+            self._learn(features, whitening)
+        self.reset()
+
+    def _learn(self, features: LocalFeatures, whitening: bool) -> None:
         total = torch.zeros((len(features.weights), features.dimension), dtype=torch.float64)
         total = total.to(features.weights.device)
-        for _, piece in blocks(features) if centering else ():
-            total += piece.strips.sum(dim=1)
-        self._mean = (total / max(len(features), 1)).float()  # (W, d)
-        self._whitening: Whitening | None = None
+        if self._centering:
+            for _, sums in converted_blocks(features, lambda some: some.strips.sum(dim=1)):
+                total += sums
+        self.mean = (total / max(len(features), 1)).float()  # (W, d)
         if whitening and len(features):
             some = evenly(len(features), SAMPLE)
             centered = self.places(features[some]).strips
-            self._whitening = Whitening(centered.cpu()).to(centered.device)
-        self.reset()
+            self.whitening = Whitening.learned(centered.cpu()).to(centered.device)
 
     def reset(self) -> None:
         """Drop the images of the query."""
         # float64: in float32, the images of a long traverse would be rounded away
-        self._sum, self._count = self._mean.double() * PRIOR, PRIOR
+        self._sum, self._count = self.mean.double() * PRIOR, PRIOR
 
-    def places(self, features: LocalFeatures, dtype: torch.dtype = torch.float32) -> LocalFeatures:
-        """Return features of the map, or of single images, less the map's mean, whitened."""
-        return converted(features, lambda strips: self._converted(strips, self._mean), dtype)
+    def places(
+        self,
+        features: LocalFeatures,
+        dtype: torch.dtype = torch.float32,
+        see: Callable[[torch.Tensor], None] = lambda strips: None,
+    ) -> LocalFeatures:
+        """
+        Return features of the map, or of single images, less the map's mean, whitened.
+
+        :param see: called with the strips of each block in float32.
+        """
+        return converted(features, lambda strips: self._converted(strips, self.mean), dtype, see)
 
     def _converted(self, strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
         centered = without_mean(strips, mean)
-        return centered if self._whitening is None else unit_norm(self._whitening(centered))
+        return centered if self.whitening is None else normalize(self.whitening(centered))
 
     def next_query(self, strips: torch.Tensor) -> torch.Tensor:
         """
@@ -265,7 +297,7 @@ class MeanCentering:
 
         :param strips: shape (W, d); the same is returned.
         """
-        strips = strips.to(self._mean.device)
+        strips = strips.to(self.mean.device)
         if self._centering:
             self._sum = self._sum + strips
             self._count += 1
@@ -279,34 +311,20 @@ def evenly(n: int, count: int) -> np.ndarray:
 
 def unit_norm(strips: torch.Tensor) -> torch.Tensor:
     """Return features (..., d) with unit norm; zero ones stay zero."""
-    return strips / strips.norm(dim=-1, keepdim=True).clamp_(min=1e-12)
+    return normalize(strips.clone())
 
 
-def blocks(features: LocalFeatures) -> Iterator[tuple[slice, LocalFeatures]]:
-    """Yield features some places at a time: those of a map may be in its file."""
-    for low in range(0, len(features), PIECE):
-        places = slice(low, min(low + PIECE, len(features)))
-        yield places, features[places]
-
-
-def converted(
-    features: LocalFeatures,
-    convert: Callable[[torch.Tensor], torch.Tensor],
-    dtype: torch.dtype,
-) -> LocalFeatures:
-    """Return new features of another type: those of one block after the other, converted."""
-    shape = (*features.weights.shape, features.dimension)
-    strips = torch.empty(shape, dtype=dtype, device=features.weights.device)
-    for places, some in blocks(features):
-        strips[:, places] = convert(some.strips)
-    return LocalFeatures(strips, features.weights, features.settings, features.cells)
+def normalize(strips: torch.Tensor) -> torch.Tensor:
+    """Give features (..., d) unit norm, in place, and return them; zero ones stay zero."""
+    strips /= strips.norm(dim=-1, keepdim=True).clamp_(min=1e-12)
+    return strips
 
 
 def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
     """Return unit-norm (W, n, d) less (W, d)."""
     centered = strips - mean[:, None]
     centered *= strips.any(dim=2, keepdim=True)
-    return unit_norm(centered)
+    return normalize(centered)
 
 
 def z_normalized(row: np.ndarray, around: int = 0) -> np.ndarray:

@@ -154,7 +154,7 @@ class RouteFeatures:
         self._mean = mean
         if self._whitens and self.count <= SETTLED:
             some = evenly(self.count, SAMPLE)
-            whitening = Whitening(unit_norm(self._centered(some)))
+            whitening = Whitening.learned(unit_norm(self._centered(some)))
             for low in range(0, self.count, AT_ONCE):
                 places = slice(low, min(low + AT_ONCE, self.count))
                 strips, norms = whitening(self._centered(places)), self._norms[:, places]

@@ -1,0 +1,223 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What recognition learns from a map, kept in its file: the same answers, and never wrong ones."""
+
+import dataclasses
+import hashlib
+from unittest.mock import patch
+
+from conftest import route_images
+from map_examples import example_map
+from map_files import parts_of, tensor, version2
+import numpy as np
+import pytest
+from stavpr_ros.commands.build_map import main as build_map_main
+from stavpr_ros.commands.map import main as map_main
+from stavpr_ros.errors import MapFileError
+from stavpr_ros.features import LocalFeatures
+from stavpr_ros.mapping import load_map, open_map, save_map
+from stavpr_ros.recognition import held_map, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.held_map import METHOD, statistics_of_map
+from stavpr_ros.recognition.map_change import APART
+from stavpr_ros.recognition.robust import MeanCentering
+import torch
+
+SETTINGS = RecognizerSettings(0.5, mode='robust')
+
+
+@pytest.fixture(autouse=True)
+def small_maps(monkeypatch):
+    """Keep the statistics of small maps, too."""
+    monkeypatch.setattr(held_map, 'LEAST_PLACES', 1)
+
+
+@pytest.fixture(scope='module')
+def place_map():
+    """Return a map of 600 places in two sessions: several blocks."""
+    small = example_map()
+    rng = np.random.default_rng(5)
+    strips = torch.from_numpy(rng.normal(size=(2, 600, 32)).cumsum(1).astype(np.float32))
+    strips[1, 7] = 0
+    strips /= strips.norm(dim=2, keepdim=True).clamp(min=1e-9)
+    features = LocalFeatures(
+        strips, torch.full((2, 600), 0.5), small.settings, small.features.cells
+    )
+    return dataclasses.replace(
+        small, features=features, stamps=np.zeros(600, np.int64), ids=('',) * 600, poses=None,
+        thumbnails=(), session_index=np.repeat(np.arange(2, dtype=np.int32), 300),
+    )  # fmt: skip
+
+
+def save(place_map, path, storage='float32'):
+    save_map(place_map, path, storage, True, statistics_of_map(place_map, storage))
+    return path
+
+
+def answers(place_map, precision):
+    recognizer = PlaceRecognizer(place_map, SETTINGS, 'cpu', precision)
+    found = []
+    for i in range(40):
+        match = recognizer.update(place_map.features[i + 100 : i + 101])
+        found += [recognizer.newest_row().tobytes(), match.probability, match.path.tobytes()]
+        found.append(match.sequence)
+    return repr(found), recognizer.stages
+
+
+@pytest.mark.parametrize('storage', ['float32', 'float16'])
+@pytest.mark.parametrize('precision', ['float32', 'float16', 'int8'])
+def test_answers_with_statistics_are_those_without_bit_for_bit(
+    place_map, tmp_path, storage, precision
+):
+    path = save(place_map, tmp_path / 'with', storage)
+    save_map(place_map, tmp_path / 'without', storage)
+    assert open_map(tmp_path / 'without').features.statistics is None
+    with patch.object(MeanCentering, '_learn', side_effect=AssertionError):
+        found = answers(open_map(path), precision)
+    assert found == answers(open_map(tmp_path / 'without'), precision)
+    assert found[1] == ''
+
+
+def test_several_threads_learn_the_same_as_one(place_map):
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found.append(statistics_of_map(place_map).parts())
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    for name, array in found[0].items():
+        np.testing.assert_array_equal(array, found[1][name])
+
+
+def test_changes_are_those_of_neighbors_up_to_five_places_apart(place_map):
+    found = statistics_of_map(place_map)
+    centered = MeanCentering(place_map.features).places(place_map.features).strips.numpy()
+    assert found.changes.shape == (APART, 600)
+    for place, apart in ((8, 1), (256, 1), (258, 4), (599, 5), (3, 3)):
+        similarity = np.einsum('jd,jd->j', centered[:, place], centered[:, place - apart])
+        assert found.changes[apart - 1, place] == pytest.approx(1 - similarity.mean(), abs=1e-5)
+    assert found.changes[4, :5].tolist() == [0] * 5
+
+
+def test_small_map_keeps_none(place_map, monkeypatch):
+    monkeypatch.setattr(held_map, 'LEAST_PLACES', 601)
+    assert statistics_of_map(place_map) is None
+
+
+def changed(path, change=lambda data: None, **parts):
+    """Change the data of the section, and its parts; None drops a part."""
+    manifest, tensors = parts_of(path.read_bytes())
+    del manifest['parts']
+    change(manifest['sections']['statistics'])
+    for name, array in parts.items():
+        name = name if name == 'strips' else f'statistics/{name}'
+        del tensors[name]
+        if array is not None:
+            tensors[name] = tensor(array)
+    path.write_bytes(version2(manifest, tensors))
+
+
+def test_statistics_of_other_features_are_learned_again_and_logged(place_map, tmp_path):
+    path = save(place_map, tmp_path / 'map')
+    other = place_map.features.strips.flip(1).numpy()
+    changed(path, strips=other)
+    opened = open_map(path)
+    found, note = answers(opened, 'float32')
+    assert f'the statistics in {path} are of other features: learned again' in note
+    assert 'map compact' in note
+    reversed_map = load_map(path)
+    assert found == answers(reversed_map, 'float32')[0]
+    # what is written again has those of these features
+    save(opened, tmp_path / 'again')
+    assert open_map(tmp_path / 'again').features.statistics is not None
+
+
+def test_statistics_of_another_method_are_learned_again_and_logged(place_map, tmp_path):
+    path = save(place_map, tmp_path / 'map')
+    changed(path, lambda section: section['data'].update(method='by\nguess'))
+    opened = open_map(path)
+    found, note = answers(opened, 'float32')
+    assert r"learned by another version ('by\nguess')" in note
+    assert found == answers(load_map(path), 'float32')[0]
+    assert statistics_of_map(opened).method == METHOD
+
+
+def test_statistics_of_a_later_version_of_the_section_are_not_looked_at(place_map, tmp_path):
+    path = save(place_map, tmp_path / 'map')
+    changed(path, lambda section: section.update(version=2, data=None), gains=np.zeros(3))
+    opened = open_map(path)
+    assert opened.features.statistics is None
+    assert answers(opened, 'float32') == answers(load_map(path), 'float32')
+
+
+@pytest.mark.parametrize(
+    ('change', 'parts', 'text'),
+    [
+        (None, {'mean': None}, 'part statistics/mean is missing'),
+        (None, {'changes': None}, 'part statistics/changes is missing'),
+        (None, {'mean': np.zeros((2, 31), np.float32)}, 'expected 32 for d'),
+        (None, {'mean': np.zeros((2, 32))}, 'part statistics/mean is F64'),
+        (None, {'mean': np.full((2, 32), np.nan, np.float32)}, 'mean is not between'),
+        (None, {'gains': np.zeros((2, 64))}, 'gains is not between|expected'),
+        (None, {'gains': np.full((2, 3), 0.5)}, 'for r'),
+        (None, {'directions': np.full((2, 64, 32), np.inf, np.float32)}, 'directions is not'),
+        (None, {'directions': np.zeros((2, 2**10, 32), np.float32)}, 'for r'),
+        (None, {'changes': np.zeros((5, 599), np.float32)}, 'expected 600 for n'),
+        (None, {'changes': np.zeros((4, 600), np.float32)}, 'expected 5 for 5'),
+        (None, {'changes': np.full((5, 600), -9, np.float32)}, 'changes is not between'),
+        (lambda section: section.update(data=None), {}, 'section statistics is'),
+        (lambda section: section['data'].pop('features'), {}, "lacks 'features'"),
+        (lambda section: section['data'].update(features='x'), {}, 'features is'),
+        (lambda section: section['data'].update(method='m' * 999), {}, 'at most 128'),
+        (lambda section: section['data'].update(code=1), {}, "unknown 'code'"),
+    ],
+)
+def test_hand_made_statistics_are_rejected_by_name(place_map, tmp_path, change, parts, text):
+    path = save(place_map, tmp_path / 'map')
+    changed(path, change or (lambda section: None), **parts)
+    with pytest.raises(MapFileError, match=text):
+        open_map(path)
+
+
+def test_reader_written_from_the_documentation_finds_the_statistics(place_map, tmp_path):
+    from map_reader import read
+
+    path = save(place_map, tmp_path / 'map', 'float16')
+    manifest, arrays = read(path)
+    data = manifest['sections']['statistics']['data']
+    hashes = ''.join(manifest['parts']['strips']['sha256'])
+    assert data == {'method': METHOD, 'features': hashlib.sha256(hashes.encode()).hexdigest()}
+    mean = arrays['strips'].astype(float).mean(axis=1)
+    np.testing.assert_allclose(arrays['statistics/mean'], mean, atol=1e-6)
+    assert arrays['statistics/directions'].shape == (2, 64, 32)
+    assert arrays['statistics/gains'].shape == (2, 64)
+
+
+def test_commands_write_statistics(place_map, tmp_path, capsys):
+    old = tmp_path / 'old'
+    save_map(place_map, old)
+    for action, *files in (('compact', old), ('convert', old), ('merge', old, old)):
+        output = tmp_path / action
+        paths = (files[0], output) if action != 'merge' else (output, *files)
+        options = ['--different-routes'] if action == 'merge' else []
+        assert map_main([action, *map(str, paths), *options]) == 0
+        found = open_map(output).features.statistics
+        assert found.changes.shape[1] == (600 if action != 'merge' else 1200)
+        assert not open_map(output).features.has_stale_statistics
+    assert map_main(['info', str(tmp_path / 'compact')]) == 0
+    assert 'kept for a fast start' in capsys.readouterr().out
+
+
+def test_build_map_writes_statistics(tmp_path):
+    from PIL import Image
+
+    (tmp_path / 'images').mkdir()
+    for i, image in enumerate(route_images(12)):
+        Image.fromarray(image).save(tmp_path / 'images' / f'{i:02}.png')
+    output = tmp_path / 'map'
+    assert build_map_main(['--input', str(tmp_path / 'images'), '--output', str(output)]) == 0
+    found = open_map(output)
+    learned = statistics_of_map(load_map(output)).parts()
+    for name, array in found.features.statistics.parts().items():
+        np.testing.assert_array_equal(array, learned[name])
