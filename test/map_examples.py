@@ -45,6 +45,8 @@ def example_files(folder: Path) -> list[bytes]:
     projected = example_map(projection=16)
     with patch.object(held_map, 'LEAST_PLACES', 1):
         statistics = held_map.statistics_of_map(projected, 'float16')
+        assert statistics is not None
+        statistics = held_map.with_codes(statistics, projected, 'float16')
     save_map(projected, folder / 'projected', 'float16', statistics=statistics)
     version1 = VERSION1 / 'gradient.stavpr', VERSION1 / 'gradient_projected.stavpr'
     files = [folder / 'float32', folder / 'projected', *version1]

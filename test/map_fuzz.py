@@ -40,8 +40,9 @@ def use(place_map: PlaceMap) -> None:
         assert place.pose is None or 0.98 < np.linalg.norm(place.pose[3:]) < 1.02
         place_map.session(i)
         place_map.thumbnail(i)
-    for mode in ('paper', 'robust') if n else ():
-        recognizer = PlaceRecognizer(place_map, RecognizerSettings(0.5, mode=mode))
+    for mode, precision in (('paper', 'float32'), ('robust', 'int8')) if n else ():
+        settings = RecognizerSettings(0.5, mode=mode)
+        recognizer = PlaceRecognizer(place_map, settings, 'cpu', precision)
         for i in range(22):
             match = recognizer.update(place_map.features[[i % n]])
         assert np.isfinite(match.distance) or mode == 'paper'

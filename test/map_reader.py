@@ -8,7 +8,15 @@ import math
 
 import numpy as np
 
-TYPES = {'F64': '<f8', 'I64': '<i8', 'F32': '<f4', 'I32': '<i4', 'F16': '<f2', 'U8': 'u1'}
+TYPES = {
+    'F64': '<f8',
+    'I64': '<i8',
+    'F32': '<f4',
+    'I32': '<i4',
+    'F16': '<f2',
+    'U8': 'u1',
+    'I8': 'i1',
+}
 
 
 def read(path):

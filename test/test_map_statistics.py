@@ -110,9 +110,9 @@ def changed(path, change=lambda data: None, **parts):
     manifest, tensors = parts_of(path.read_bytes())
     del manifest['parts']
     change(manifest['sections']['statistics'])
-    for name, array in parts.items():
-        name = name if name == 'strips' else f'statistics/{name}'
-        del tensors[name]
+    for key, array in parts.items():
+        name = key if key == 'strips' else f'statistics/{key}'
+        tensors.pop(name, None)
         if array is not None:
             tensors[name] = tensor(array)
     path.write_bytes(version2(manifest, tensors))
@@ -207,6 +207,40 @@ def test_commands_write_statistics(place_map, tmp_path, capsys):
         assert not open_map(output).features.has_stale_statistics
     assert map_main(['info', str(tmp_path / 'compact')]) == 0
     assert 'kept for a fast start' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('storage', ['float32', 'float16'])
+def test_answers_of_codes_are_those_of_features_bit_for_bit(place_map, tmp_path, storage):
+    save_map(place_map, tmp_path / 'old', storage)
+    files = [str(tmp_path / name) for name in ('old', 'codes')]
+    assert map_main(['compact', *files, '--codes', '--storage', storage]) == 0
+    opened = open_map(files[1])
+    found = []
+    with patch.object(type(opened.features), '_read', side_effect=AssertionError):
+        recognizer = PlaceRecognizer(opened, SETTINGS, 'cpu', 'int8')
+    query = place_map.features
+    for one in (recognizer, PlaceRecognizer(open_map(files[0]), SETTINGS, 'cpu', 'int8')):
+        matches = [one.update(query[i : i + 1]) for i in range(130, 160)]
+        found.append([one.newest_row().tobytes(), [(m.probability, m.sequence) for m in matches]])
+    assert found[0] == found[1]
+    # other precisions take the features
+    assert answers(opened, 'float16') == answers(open_map(files[0]), 'float16')
+
+
+@pytest.mark.parametrize(
+    ('codes', 'text'),
+    [
+        (np.full((2, 600, 32), 127, np.int8), 'codes of strip 0, from place 0 on, have length'),
+        (np.zeros((2, 600, 31), np.int8), 'statistics/codes has shape'),
+        (np.zeros((2, 600, 32), np.uint8), 'statistics/codes is U8'),
+    ],
+)
+def test_hand_made_codes_are_rejected_by_name(place_map, tmp_path, codes, text):
+    """Longer ones would overflow the sums of the kernels."""
+    path = save(place_map, tmp_path / 'map')
+    changed(path, codes=codes)
+    with pytest.raises(MapFileError, match=text):
+        PlaceRecognizer(open_map(path), SETTINGS, 'cpu', 'int8')
 
 
 def test_build_map_writes_statistics(tmp_path):

@@ -84,6 +84,11 @@ def _parser() -> argparse.ArgumentParser:
         action='store_true',
         help='without the images of the places, which the geometric check and viewers need',
     )
+    action.add_argument(
+        '--codes',
+        action='store_true',
+        help='also as precision int8 holds them, for its fastest start; of 1,000 places or more',
+    )
     add('export', 'Write the arrays of a map for NumPy.', 'map', 'output', output=True)
     action = add('merge', 'Make one map of several: each is a session of it.', output=True)
     action.add_argument('output', metavar='OUTPUT')
@@ -160,7 +165,9 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
         f'strips of {place_map.dimension} dimensions, {features.storage}',
         'settings': settings.to_json(),
         'projection': place_map.projection.identity if place_map.projection else 'none',
-        'statistics': 'kept for a fast start' if features.statistics else 'none',
+        'statistics': 'none'
+        if features.statistics is None
+        else f'kept for a fast start{", with codes for int8" if features.has_codes else ""}',
         'stamps': f'{_time(int(known.min()))} to {_time(int(known.max()))}'
         if len(known)
         else 'unknown',
@@ -286,10 +293,12 @@ def _sessions(arguments: argparse.Namespace) -> None:
 
 def _write(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import save_map
-    from stavpr_ros.recognition.held_map import statistics_of_map
+    from stavpr_ros.recognition.held_map import statistics_of_map, with_codes
 
     storage = getattr(arguments, 'storage', '')
     learned = statistics_of_map(place_map, storage)
+    if learned is not None and getattr(arguments, 'codes', False):
+        learned = with_codes(learned, place_map, storage)
     map_id = save_map(place_map, arguments.output, storage, arguments.force, learned)
     size = Path(arguments.output).stat().st_size / 1e6
     print(f'{arguments.output}: {len(place_map)} places, {size:.1f} MB, id {map_id}')

@@ -20,7 +20,11 @@ from stavpr_ros.mapping.place_map import PlaceMap, Session
 from stavpr_ros.mapping.stored_features import LONGEST, StoredFeatures, StoredThumbnails
 import torch
 
-LARGE = ('strips', 'thumbnails')  # parts that are read, and compared with their hashes, later
+LARGE = (
+    'strips',
+    'thumbnails',
+    'statistics/codes',
+)  # parts that are read, and compared with their hashes, later
 THUMBNAILS_AT_ONCE = 2**24  # bytes
 # Types and shape of each part; W, n, d are known from the others, a letter alone is any number.
 PARTS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
@@ -39,6 +43,7 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
     'statistics/directions': (('F32',), ('W', 'r', 'd')),
     'statistics/gains': (('F64',), ('W', 'r')),
     'statistics/changes': (('F32',), (CHANGES, 'n')),
+    'statistics/codes': (('I8',), ('W', 'n', 'd')),
 }
 _TOGETHER = (('ids', 'id_ends'), ('thumbnails', 'thumbnail_ends'))
 

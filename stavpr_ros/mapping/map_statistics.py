@@ -31,6 +31,8 @@ class MapStatistics:
     :param gains: of the directions, over 0, at most 1, shape (W, r), float64.
     :param changes: change of each place from the ones 1 to ``CHANGES`` places before, shape
         (``CHANGES``, n), float32.
+    :param codes: the features, centered, whitened and rounded to int8, shape (W, n, d); None =
+        not kept, or not read.
     """
 
     method: str
@@ -38,10 +40,14 @@ class MapStatistics:
     directions: np.ndarray
     gains: np.ndarray
     changes: np.ndarray
+    codes: np.ndarray | None = None
 
     def parts(self) -> dict[str, np.ndarray]:
         """Return the arrays by the names of their parts in the file."""
-        return {f'{STATISTICS}/{name}': getattr(self, name) for name in LIMITS}
+        arrays = {name: getattr(self, name) for name in (*LIMITS, 'codes')}
+        return {
+            f'{STATISTICS}/{name}': array for name, array in arrays.items() if array is not None
+        }
 
 
 def statistics_of(file: MapFile, arrays: dict[str, np.ndarray]) -> MapStatistics | None:

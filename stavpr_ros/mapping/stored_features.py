@@ -9,10 +9,11 @@ from typing import Any, overload
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile
-from stavpr_ros.mapping.map_statistics import MapStatistics
+from stavpr_ros.mapping.map_statistics import MapStatistics, STATISTICS
 import torch
 
 LONGEST = 1.01  # norm of a strip; float16 rounds it
+CODES = f'{STATISTICS}/codes'
 PLACES_AT_ONCE = 512  # of one strip: they stay in the cache while they are checked
 
 
@@ -128,6 +129,18 @@ class StoredFeatures(LocalFeatures):
             self.file.fill(strip, self._part.start + j * strip.nbytes)
             self._require_normalized(torch.from_numpy(strip), j, 0)
         return strip
+
+    @property
+    def has_codes(self) -> bool:
+        """Whether the file has the features as codes, too, that its statistics are of."""
+        return self.statistics is not None and CODES in self.file.parts
+
+    def codes(self, j: int, first: int, count: int) -> np.ndarray:
+        """Return the codes of one strip of some places, shape (count, d), int8."""
+        _, n, d = self._part.shape
+        codes: np.ndarray = np.empty((count, d), np.int8)
+        self.file.fill(codes, self.file.parts[CODES].start + (j * n + first) * d)
+        return codes
 
     def _read(self, places: np.ndarray) -> torch.Tensor:
         """Return the features of some places, shape (W, len(places), d), float32."""

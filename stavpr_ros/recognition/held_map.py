@@ -9,8 +9,10 @@ What is learned takes several passes over the features. It is kept in the file o
 from dataclasses import dataclass, replace
 
 import numpy as np
+from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping.map_container import errors_of
 from stavpr_ros.mapping.map_statistics import MapStatistics
 from stavpr_ros.mapping.stored_features import MappedFeatures, StoredFeatures
 from stavpr_ros.recognition.blocks import converted, converted_blocks
@@ -26,6 +28,7 @@ from stavpr_ros.recognition.robust import (
 import torch
 
 METHOD = f'mean, whitening {RANK} of {SAMPLE} by {STRENGTH}, changes {APART}, 1'
+CODES_AT_ONCE = 4096  # places; a multiple of all LANES
 LEAST_PLACES = 1000  # of a map whose statistics are kept: they take the room of some 70 places
 
 
@@ -59,7 +62,16 @@ def hold(features: LocalFeatures, options: RobustOptions, precision: str) -> Hel
     if options.mean_centering or options.whitening:
         centering = MeanCentering(features, options.mean_centering, options.whitening, statistics)
     seen = PlaceChanges(len(features) if options.place_filter and statistics is None else 0)
-    held = _held(features, centering, precision, seen)
+    held: LocalFeatures | Int8Features
+    if (
+        statistics is not None
+        and precision == 'int8'
+        and isinstance(features, StoredFeatures)
+        and features.has_codes
+    ):
+        held = _of_codes(features)
+    else:
+        held = _held(features, centering, precision, seen)
     return HeldMap(held, centering, statistics.changes if statistics else seen.changes, note)
 
 
@@ -89,6 +101,29 @@ def _held(
         seen.add(held.strips)
         return held
     return converted(features, lambda strips: strips, dtype, seen.add)
+
+
+def _of_codes(features: StoredFeatures) -> Int8Features:
+    """
+    Return the features that are kept as codes in the map's file.
+
+    :raises MapFileError: they are longer than codes can be.
+    """
+    W, n = features.weights.shape
+    strips = Int8Strips(W, n, features.dimension)
+    with errors_of(features.file.path):
+        for j in range(W):
+            for first in range(0, n, CODES_AT_ONCE):
+                count = min(CODES_AT_ONCE, n - first)
+                strips.copy(j, first, features.codes(j, first, count))
+    return Int8Features(strips, features.weights, features.settings, features.cells)
+
+
+def with_codes(statistics: MapStatistics, place_map: PlaceMap, storage: str) -> MapStatistics:
+    """Add the features as precision int8 holds them; see :func:`statistics_of_map`."""
+    features = _AsStored(place_map.features, storage)
+    centering = MeanCentering(features, statistics=statistics)
+    return replace(statistics, codes=rounded(features, centering.places).strips.rounded().numpy())
 
 
 def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics | None:

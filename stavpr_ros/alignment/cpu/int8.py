@@ -186,6 +186,29 @@ def _round_places(strips, longest, peak, first, values, reciprocals):
             reciprocals[j, y] = np.float32(1 / np.sqrt(squares)) if squares else np.float32(0)
 
 
+@parallel_kernel
+def _copy_places(codes, j, first, values, reciprocals):
+    """
+    Copy rounded strips (m, d) to places from ``first`` on, a multiple of LANES.
+
+    :returns: the largest square of a length.
+    """
+    m, d = codes.shape
+    most = np.zeros((m + LANES - 1) // LANES, np.int64)
+    for group in nb.prange(len(most)):
+        for y in range(group * LANES, min(m, (group + 1) * LANES)):
+            squares = np.int64(0)
+            for t in range(d):
+                value = np.int64(codes[y, t])
+                squares += value * value
+                values[j, first // LANES + group, t // QUAD, y % LANES, t % QUAD] = value
+            reciprocals[j, first + y] = (
+                np.float32(1 / np.sqrt(squares)) if squares else np.float32(0)
+            )
+            most[group] = max(most[group], squares)
+    return most.max()
+
+
 def _longest(d: int) -> np.float32:
     """Return N: rounding lengthens a strip by sqrt(d) / 2 at most."""
     return np.float32(max(LONGEST - np.sqrt(d) / 2, 1))
@@ -215,6 +238,21 @@ class Int8Strips:
         _round_places(
             strips.numpy(), _longest(d), np.float32(MAP_PEAK), first, self.values, self.reciprocals
         )
+
+    def copy(self, j: int, first: int, codes: np.ndarray) -> None:
+        """
+        Copy strips that were rounded before.
+
+        :param first: their first place, a multiple of LANES.
+        :param codes: strip j of some places, shape (m, d), int8, as of :meth:`rounded`.
+        :raises ValueError: a strip is longer than rounding makes it: sums could overflow.
+        """
+        longest = _copy_places(codes, j, first, self.values, self.reciprocals)
+        if longest > LONGEST**2:
+            raise ValueError(
+                f'codes of strip {j}, from place {first} on, have length {longest**0.5:.0f}: at '
+                f'most {LONGEST:.0f}'
+            )
 
     def __getitem__(self, index: tuple[slice, slice | np.ndarray]) -> torch.Tensor:
         """Return strips of some places, [:, places], float32, of unit norm again."""
