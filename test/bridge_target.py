@@ -11,6 +11,7 @@ import json
 import sys
 import time
 
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 import numpy as np
 import rclpy
@@ -83,6 +84,13 @@ class Target(Node):
         self.odometry, self.closures = (
             self.create_publisher(kind, topic, QOS) for topic, kind in topics.items()
         )
+        self.received = False  # the bridge has received a closure
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            counts = {pair.key: pair.value for pair in status.values}
+            self.received |= int(counts.get('closures', 0)) > 0
 
     def _rtabmap(self):
         from rtabmap_msgs.msg import Info
@@ -199,6 +207,9 @@ def main(target: str, on_map: bool) -> None:
             each.get_subscription_count() for each in (publisher, node.odometry, node.closures)
         )
     )
+    while not node.received:  # the bridge may not know these publishers yet
+        node.closures.publish(LoopClosure())  # has no relative pose: becomes no edge
+        executor.spin_once(timeout_sec=0.2)
     for message in closures(drive, on_map):
         node.closures.publish(message)
     for image in range(2 * LAP - 1):

@@ -1,10 +1,22 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The ROS domain of this process of the tests, and of all that it starts."""
+"""The ROS domain of this process of the tests, and of all that it starts: no other run has it."""
 
-import os
+import fcntl
+import tempfile
+from typing import TextIO
 
-# pytest-xdist: its processes have numbers, so that none shares a domain with another
-_RUN = os.getppid() if 'PYTEST_XDIST_WORKER' in os.environ else os.getpid()
-_PROCESS = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
-DOMAIN = 1 + (4 * _RUN + _PROCESS) % 100
+
+def claim() -> tuple[int, TextIO]:
+    """Return a domain that no process of any tests on this machine has, and its lock."""
+    for domain in range(1, 101):
+        try:
+            lock = open(f'{tempfile.gettempdir()}/stavpr_test_domain_{domain}', 'w')  # noqa: SIM115
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            continue
+        return domain, lock
+    raise RuntimeError('all ROS domains from 1 to 100 are in use by other tests')
+
+
+DOMAIN, _LOCK = claim()

@@ -1,0 +1,207 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Map files: time to the first answer, memory, damaged files, killed nodes; both format versions.
+
+Every start is a process of its own, after imports and a start on a tiny map, which loads compiled
+kernels. The times are those of ``open_map``, of the recognizer, and of its first match; *cold*:
+the file was dropped from the page cache before. The floor is the time to read the bytes that the
+matcher holds, or is made of, from the same file. ``PYTHONPATH=. python benchmarks/maps.py``.
+"""
+
+import argparse
+from dataclasses import dataclass
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any
+
+import numpy as np
+from results import cpu_model, table
+import torch
+
+TESTS = Path(__file__).resolve().parents[1] / 'test'
+TINY = 300  # places
+CACHES = ('cold', 'warm')
+
+
+@dataclass(frozen=True)
+class Case:
+    """A start: file, and precision of the matcher."""
+
+    file: str
+    precision: str
+
+
+CASES = (
+    Case('version 1', 'float32'),
+    Case('version 2', 'float32'),
+    Case('version 2', 'int8'),
+    Case('statistics', 'float32'),
+    Case('statistics', 'float16'),
+    Case('statistics', 'int8'),
+    Case('codes', 'int8'),
+)
+
+
+def write_files(folder: Path, places: int) -> None:
+    """Write maps of simulated places, float16, and float32 in version 1."""
+    sys.path.insert(0, str(TESTS))
+    from city import city
+    from data import data_folder
+    from map_files import version1
+    from stavpr_ros.commands.map import main as map_main
+    from stavpr_ros.features import FeatureExtractor
+    from stavpr_ros.mapping import PlaceMap, save_map
+    from stavpr_ros.mapping.builder import extract_features
+    from stavpr_ros.sources import open_source
+
+    source = open_source(data_folder() / 'gardens_point/day_left')
+    features, _ = city(extract_features(source, FeatureExtractor(), progress=False), places, 0)
+    place_map = PlaceMap(features, None, np.zeros(places, np.int64), ('',) * places)
+    save_map(place_map, folder / 'version 2', 'float16')
+    settings = json.loads(features.settings.to_json())
+    settings.pop('feature_version', None)
+    manifest = {
+        'format': 'stavpr-map', 'version': 1, 'settings': json.dumps(settings),
+        'projection': None, 'cells': features.cells, 'ids': [''] * places,
+    }  # fmt: skip
+    arrays = {
+        'strips': features.half.float().numpy(), 'weights': features.weights.numpy(),
+        'stamps': place_map.stamps,
+    }  # fmt: skip
+    (folder / 'version 1').write_bytes(version1(manifest, arrays))
+    for name, options in (('statistics', []), ('codes', ['--codes'])):
+        assert map_main(['compact', str(folder / 'version 2'), str(folder / name), *options]) == 0
+
+
+def start(path: Path, precision: str, cache: str) -> dict[str, Any]:
+    """Return the times of a start in this process, s, and what it took, MB."""
+    from memory import resident_bytes
+    from stavpr_ros.mapping import open_map, PlaceMap
+    from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+
+    settings = RecognizerSettings(0.5, mode='robust')
+    tiny = open_map(path).features[:TINY]
+    warm = PlaceRecognizer(
+        PlaceMap(tiny, None, np.zeros(TINY, np.int64), ('',) * TINY), settings, 'cpu', precision
+    )
+    for i in range(settings.sequence.length + 1):
+        warm.update(tiny[i : i + 1])
+    with path.open('rb') as file:
+        os.fsync(file.fileno())
+        if cache == 'cold':
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        else:
+            while file.read(2**24):
+                pass
+    before = resident_bytes()
+    times, used = [time.perf_counter()], time.process_time()
+    place_map = open_map(path)
+    times.append(time.perf_counter())
+    recognizer = PlaceRecognizer(place_map, settings, 'cpu', precision)
+    times.append(time.perf_counter())
+    recognizer.update(tiny[:1])
+    times.append(time.perf_counter())
+    used = time.process_time() - used
+    taken = resident_bytes() - before
+    file = place_map.features.file
+    part = file.parts['statistics/codes' if path.name == 'codes' else 'strips']
+    content: np.ndarray = np.ones(part.size, np.uint8)  # pages that are in memory
+    began = time.perf_counter()
+    file.fill(content, part.start)
+    read = time.perf_counter() - began
+    names = ('open', 'recognizer', 'first')
+    return {
+        **dict(zip(names, np.diff(times).tolist(), strict=True)),
+        'all': times[-1] - times[0],
+        'processor': used,
+        'read_once': read,
+        'megabytes': taken / 1e6,
+        'load': os.getloadavg()[0],
+    }
+
+
+def measure(path: Path, case: Case, cache: str, runs: int) -> dict[str, Any]:
+    """Return the run of the least time of several, each a process of its own."""
+    command = [sys.executable, __file__, '--start', str(path), case.precision, cache]
+    found = []
+    for _ in range(runs):
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+        found.append(json.loads(done.stdout))
+    best: dict[str, Any] = min(found, key=lambda one: one['all'])
+    return {'file': case.file, 'precision': case.precision, 'cache': cache, **best}
+
+
+def lines(rows: list[dict[str, Any]]) -> list[str]:
+    """Return the table of the starts."""
+    head = ('file', 'precision', 'page cache', 'open', 'recognizer', 'first match', 'all')
+    cells = [
+        [
+            row['file'], row['precision'], row['cache'],
+            *(f'{row[name]:.2f}' for name in ('open', 'recognizer', 'first', 'all')),
+            *(f'{row[name]:.2f}' for name in ('processor', 'read_once')),
+            f'{row["megabytes"]:.0f}', f'{row["load"]:.1f}',
+        ]
+        for row in rows
+    ]  # fmt: skip
+    return table((*head, 'processor', 'read once', 'MB', 'load'), cells)
+
+
+def harm(mutated: int, hand_made: int, kills: bool) -> str:
+    """Return what came of damaged files and of killed nodes."""
+    fuzz = [sys.executable, str(TESTS / 'map_fuzz.py'), str(mutated), str(hand_made)]
+    text = subprocess.run(fuzz, stdout=subprocess.PIPE, text=True, check=True).stdout
+    if kills:
+        tests = '-m', 'pytest', '-q', '-m', 'long', '-k', 'killed_at'
+        command = [sys.executable, *tests, str(TESTS / 'test_node_journal.py')]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+        lost = 'no published place lost' if done.returncode == 0 else done.stdout
+        text += f'20 kills of a recording node at random moments: {lost}\n'
+    return text
+
+
+def main() -> None:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser.add_argument('--places', type=int, default=100_000)
+    parser.add_argument('--runs', type=int, default=3, help='of each start (%(default)s)')
+    parser.add_argument('--mutated', type=int, default=10_000, help='damaged files (%(default)s)')
+    parser.add_argument('--hand-made', type=int, default=1_000, help='others (%(default)s)')
+    parser.add_argument('--no-kills', action='store_true', help='without killed nodes')
+    parser.add_argument('--output', type=Path, help='JSON file')
+    parser.add_argument('--start', nargs=3, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.start:
+        from stavpr_ros.threads import wait_passively
+
+        wait_passively()
+        path, precision, cache = arguments.start
+        print(json.dumps(start(Path(path), precision, cache)))
+        return
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_files(folder, arguments.places)
+        sizes = {path.name: path.stat().st_size / 1e6 for path in sorted(folder.iterdir())}
+        rows = [
+            measure(folder / case.file, case, cache, arguments.runs)
+            for case in CASES
+            for cache in CACHES
+        ]
+    print(f'{cpu_model()}, {torch.get_num_threads()} threads; {arguments.places:,} places')
+    print(', '.join(f'{name}: {size:.0f} MB' for name, size in sizes.items()))
+    print('\n'.join(lines(rows)))
+    text = harm(arguments.mutated, arguments.hand_made, not arguments.no_kills)
+    print(text)
+    if arguments.output:
+        found = {'processor': cpu_model(), 'places': arguments.places, 'megabytes': sizes}
+        content = json.dumps(found | {'starts': rows, 'harm': text.splitlines()}, indent=1)
+        arguments.output.write_text(content + '\n', encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()
