@@ -185,6 +185,11 @@ class ImageChange(MapChange):
         self._last = strips
         return change
 
+    def recenter_query(self, strips: np.ndarray) -> None:
+        """Take the query's last image (W, d) again: its mean has changed. None after a reset."""
+        if self._last is not None:
+            self._last = strips
+
     def is_standstill(self, change: float) -> bool:
         """Whether the query's images are equal up to noise: the camera stands, or it is dark."""
         return bool(change < self.standstill)
