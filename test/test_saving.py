@@ -6,10 +6,11 @@ import threading
 
 from pipelines import localizing, process, save, settings_of
 import pytest
-from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.mapping import load_map, open_map, save_map
 from stavpr_ros.output_file import FileVersion
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.pipeline.saving import save_recorded_map, write_map
+from stavpr_ros.recognition import held_map
 
 
 class Log:
@@ -42,6 +43,12 @@ def test_save_recorded_map_writes_unsaved_places_once(mapping, route, tmp_path):
     assert at_the_end(mapping, path) == []
     process(mapping, route[7:9], first=7)
     assert at_the_end(mapping, path)[-1] == ('info', f'9 places written to {path}')  # its own file
+
+
+def test_saved_map_of_a_long_recording_has_statistics(mapping, tmp_path, monkeypatch):
+    monkeypatch.setattr(held_map, 'LEAST_PLACES', 7)
+    at_the_end(mapping, tmp_path / 'route.stavpr')
+    assert open_map(tmp_path / 'route.stavpr').features.statistics is not None
 
 
 def test_save_recorded_map_beside_another_map_takes_a_numbered_name(mapping, route, tmp_path):
