@@ -86,7 +86,9 @@ def test_run_jobs_failed_job_does_not_stop_others(monkeypatch, capfd):
     ]
 
 
-def test_run_jobs_killed_job_is_run_again(tmp_path, monkeypatch, capfd):
+@pytest.mark.parametrize('is_new', [False, True])
+def test_run_jobs_killed_job_is_run_again(is_new, monkeypatch, capfd):
+    """It may have written its output before: another try replaces what was not there at first."""
     runs = []
 
     def run(command, **_):
@@ -94,8 +96,8 @@ def test_run_jobs_killed_job_is_run_again(tmp_path, monkeypatch, capfd):
         return subprocess.CompletedProcess(command, -9 if len(runs) == 1 else 0, 'fine\n')
 
     monkeypatch.setattr(subprocess, 'run', run)
-    assert run_jobs([Job('a', 'build_map', ('--help',))], 1, None) == 0
-    assert len(runs) == 2
+    assert run_jobs([Job('a', 'build_map', ('--help',), is_new)], 1, None) == 0
+    assert [command[3:] for command in runs] == [['--help'], ['--help', *['--force'] * is_new]]
     assert capfd.readouterr().out == '--- a: done\nfine\n'
 
 

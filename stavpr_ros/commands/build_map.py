@@ -310,10 +310,11 @@ def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:
         raise SettingsError(f'--output {folder} is a file: give a folder for several maps')
     folder.mkdir(parents=True, exist_ok=True)
     others = other_arguments(args, '--input')
-    jobs = [
-        Job(name, 'build_map', ('--input', one, '--output', f'{folder / name}.stavpr', *others))
-        for name, one in zip(job_names(arguments.input), arguments.input, strict=True)
-    ]
+    jobs = []
+    for name, one in zip(job_names(arguments.input), arguments.input, strict=True):
+        output = Path(f'{folder / name}.stavpr')
+        options = ('--input', one, '--output', str(output), *others)
+        jobs.append(Job(name, 'build_map', options, is_new=not output.exists()))
     return run_jobs(jobs, arguments.processes, arguments.ray)
 
 

@@ -436,7 +436,8 @@ def _run_each(
     for name, query in zip(job_names(arguments.query), arguments.query, strict=True):
         own = folder / name
         written = ('--output', str(own), '--json', f'{own}.json')
-        jobs.append(Job(name, 'evaluate', ('--query', query, *written, *others)))
+        is_new = not (own.exists() or Path(f'{own}.json').exists())
+        jobs.append(Job(name, 'evaluate', ('--query', query, *written, *others), is_new))
     folder.mkdir(parents=True, exist_ok=True)
     return run_jobs(jobs, arguments.processes, arguments.ray)
 

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed, ThreadPoolExecutor
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import importlib
 import io
 import logging
@@ -30,11 +30,17 @@ class Job:
     :param name: of its input, unique.
     :param command: module in ``stavpr_ros.commands``.
     :param arguments: of its command line.
+    :param is_new: none of its outputs was there before.
     """
 
     name: str
     command: str
     arguments: tuple[str, ...]
+    is_new: bool = False
+
+    def again(self) -> 'Job':
+        """Return the job for another try; what is there now is its own, if it was new."""
+        return replace(self, arguments=(*self.arguments, '--force')) if self.is_new else self
 
 
 def add_job_options(parser: argparse.ArgumentParser) -> None:
@@ -102,10 +108,10 @@ def _in_processes(jobs: Sequence[Job], processes: int | None) -> Iterator[tuple[
     environment = {'OMP_NUM_THREADS': threads, 'NUMBA_NUM_THREADS': threads} | os.environ
 
     def run(job: Job) -> tuple[int, str]:
-        command = [sys.executable, '-m', f'stavpr_ros.commands.{job.command}', *job.arguments]
-        for _ in range(1 + RETRIES):
+        command = [sys.executable, '-m', f'stavpr_ros.commands.{job.command}']
+        for attempt in range(1 + RETRIES):
             done = subprocess.run(
-                command,
+                [*command, *(job.again() if attempt else job).arguments],
                 env=environment,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
@@ -135,16 +141,19 @@ def _on_ray(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, int, str]]
         raise UnavailableError(f'--ray {address}: no cluster there: {error}') from error
     try:
         remote: Callable[..., object] = ray.remote(
-            num_cpus=1, max_retries=RETRIES, retry_exceptions=False
+            num_cpus=1, max_retries=0, retry_exceptions=False
         )(run_here).remote
-        waiting = {remote(job): job for job in jobs}
+        waiting = {remote(job): (job, 0) for job in jobs}
         while waiting:
             (future, *_), _ = ray.wait(list(waiting))
-            job = waiting.pop(future)
+            job, retries = waiting.pop(future)
             try:
                 yield job, *ray.get(future)
             except ray.exceptions.RayError as error:
-                yield job, FAILED, f'{error}\n'
+                if retries < RETRIES:
+                    waiting[remote(job.again())] = job, retries + 1
+                else:
+                    yield job, FAILED, f'{error}\n'
     finally:
         ray.shutdown()
 
