@@ -16,7 +16,7 @@ import numpy as np
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.export import BATCH
 from stavpr_ros.features.extractor import resize_square
-from stavpr_ros.features.outputs import as_maps
+from stavpr_ros.features.outputs import as_maps, as_vectors
 from stavpr_ros.features.registry import OnnxSettings
 from stavpr_ros.features.weights import read_model
 import torch
@@ -44,7 +44,8 @@ class Onnx:
             content = file.read()
         self.settings = replace(settings, sha256=digest)
         self._device = torch.device(device)
-        model = self._with_output(onnx, content)
+        self._layers = [layer for layer in (settings.layer, settings.vector) if layer]
+        model = self._with_outputs(onnx, content)
         properties = {row.key: row.value for row in model.metadata_props}
         self._one_by_one = properties.get(BATCH) == '1'
         providers = ['CPUExecutionProvider']
@@ -64,16 +65,18 @@ class Onnx:
         self._input = self._session.get_inputs()[0]
         self._dtype = np.float16 if self._input.type == 'tensor(float16)' else np.float32
 
-    def _with_output(self, onnx: ModuleType, content: bytes):  # type: ignore[no-untyped-def]
-        """Return the model with the layer as its only output and a variable batch size."""
-        name, layer = self.settings.model, self.settings.layer
+    def _with_outputs(self, onnx: ModuleType, content: bytes):  # type: ignore[no-untyped-def]
+        """Return the model with the layers as its only outputs and a variable batch size."""
+        name = self.settings.model
         try:
             model = onnx.load_model_from_string(content)
             onnx.checker.check_model(model)
         except Exception as error:  # protobuf and the checker have exception types of their own
             raise UnavailableError(f'{name} is no usable ONNX model: {error}') from error
         layers = [output for node in model.graph.node for output in node.output]
-        if layer not in layers:
+        for layer in self._layers:
+            if layer in layers:
+                continue
             shown = ', '.join(layers[:60]) + (', ...' if len(layers) > 60 else '')
             raise SettingsError(f'{name} has no layer {layer!r}: its layers are {shown}')
         weights = {tensor.name for tensor in model.graph.initializer}
@@ -83,7 +86,8 @@ class Onnx:
         inputs[0].type.tensor_type.shape.dim[0].dim_param = 'batch'
         del model.graph.output[:]
         del model.graph.value_info[:]  # it may fix the batch size
-        model.graph.output.append(onnx.ValueInfoProto(name=layer))
+        for layer in self._layers:
+            model.graph.output.append(onnx.ValueInfoProto(name=layer))
         return model
 
     def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
@@ -95,23 +99,41 @@ class Onnx:
         :raises SettingsError: the network rejects this size, or the layer is neither maps nor
             tokens nor vectors.
         """
+        return self._maps(self._run(images)[0])
+
+    def maps_and_vectors(self, images: Sequence[np.ndarray]) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        Compute feature maps, see :meth:`feature_maps`, and the vectors (n, D) of layer ``vector``.
+
+        :raises SettingsError: likewise; that layer is no vector.
+        """
+        maps, vectors = self._run(images)
+        name = f'layer {self.settings.vector!r} of {self.settings.model}'
+        return self._maps(maps), as_vectors(vectors, len(images), name)
+
+    def _maps(self, output: torch.Tensor) -> torch.Tensor:
+        name = f'layer {self.settings.layer!r} of {self.settings.model}'
+        return as_maps(output, len(output), self.settings.prefix_tokens, name)
+
+    def _run(self, images: Sequence[np.ndarray]) -> list[torch.Tensor]:
+        """Return the outputs of the layers for a batch."""
         if self._one_by_one and len(images) > 1:
-            return torch.cat([self.feature_maps([image]) for image in images])
+            single = [self._run([image]) for image in images]
+            return [torch.cat(outputs) for outputs in zip(*single, strict=True)]
         batch = np.stack([self._prepare(image) for image in images]).astype(self._dtype)
         try:
-            maps = self._session.run([self.settings.layer], {self._input.name: batch})[0]
+            outputs = self._session.run(self._layers, {self._input.name: batch})
         except Exception as error:  # onnxruntime has exception types of its own
             raise SettingsError(
                 f'{self.settings.model} rejects images of size {self.settings.size}: {error}'
             ) from error
-        if not np.issubdtype(maps.dtype, np.floating):
-            raise SettingsError(
-                f'layer {self.settings.layer!r} is {maps.dtype}, quantized numbers: name the '
-                'output of its DequantizeLinear'
-            )
-        output = torch.from_numpy(maps.astype(np.float32)).to(self._device)
-        name = f'layer {self.settings.layer!r} of {self.settings.model}'
-        return as_maps(output, len(images), self.settings.prefix_tokens, name)
+        for layer, output in zip(self._layers, outputs, strict=True):
+            if not np.issubdtype(output.dtype, np.floating):
+                raise SettingsError(
+                    f'layer {layer!r} is {output.dtype}, quantized numbers: name the output of '
+                    'its DequantizeLinear'
+                )
+        return [torch.from_numpy(o.astype(np.float32)).to(self._device) for o in outputs]
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         """Resize, order the channels, scale and shift: (3, size, size), float32."""
