@@ -43,8 +43,18 @@ ROSDEP_KEYS = {
     'tqdm': 'python3-tqdm',
     'yaml': 'python3-yaml',
 }
-NO_ROSDEP_KEY = {
-    *('evo', 'faiss', 'gtsam', 'llvmlite', 'onnx', 'onnxruntime', 'qdrant_client', 'qdrant_edge'),
+NO_ROSDEP_KEY = {  # h5py has one; it is of no use on a robot
+    *(
+        'evo',
+        'faiss',
+        'gtsam',
+        'h5py',
+        'llvmlite',
+        'onnx',
+        'onnxruntime',
+        'qdrant_client',
+        'qdrant_edge',
+    ),
     *('ray', 'rosbags', 'torch'),
 }
 ROS = re.compile(r'\w+_(msgs|srvs|interfaces)|rclpy|launch|launch_ros|ament_index_python|tf2_ros')
@@ -108,7 +118,7 @@ def declared(*tags: str) -> set[str]:
 
 def test_every_imported_distribution_is_required(setup_arguments):
     required = distribution_names(setup_arguments['install_requires'])
-    for extra in ('onnx', 'faiss', 'fleet', 'ray', 'slam'):
+    for extra in ('onnx', 'hdf5', 'faiss', 'fleet', 'ray', 'slam'):
         required |= distribution_names(setup_arguments['extras_require'][extra])
     needed = {name for name in imported(PACKAGE) if not ROS.fullmatch(name)}
     assert needed  # the search works
