@@ -43,19 +43,9 @@ ROSDEP_KEYS = {
     'tqdm': 'python3-tqdm',
     'yaml': 'python3-yaml',
 }
-NO_ROSDEP_KEY = {  # h5py has one; it is of no use on a robot
-    *(
-        'evo',
-        'faiss',
-        'gtsam',
-        'h5py',
-        'llvmlite',
-        'onnx',
-        'onnxruntime',
-        'qdrant_client',
-        'qdrant_edge',
-    ),
-    *('ray', 'rosbags', 'torch'),
+NO_ROSDEP_KEY = {
+    *('evo', 'faiss', 'gtsam', 'llvmlite', 'onnx', 'onnxruntime', 'qdrant_client', 'qdrant_edge'),
+    *('h5py', 'ray', 'rosbags', 'torch'),
 }
 ROS = re.compile(r'\w+_(msgs|srvs|interfaces)|rclpy|launch|launch_ros|ament_index_python|tf2_ros')
 PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules of another name
