@@ -13,14 +13,11 @@ from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.match import Match, Status
-from stavpr_ros.recognition.recognizer import (
-    position_of,
-    RecognizerSettings,
-    SequenceRecognizer,
-)
+from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
 from stavpr_ros.recognition.robust import z_normalized
 from stavpr_ros.recognition.route_features import RouteFeatures
 from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
+from stavpr_ros.recognition.settings import RecognizerSettings
 import torch
 
 EVICTED = 8  # the oldest one in so many is evicted at a time
