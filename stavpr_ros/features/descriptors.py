@@ -170,7 +170,7 @@ def _from_mat(file: Path, name: str) -> np.ndarray:
 def _from_hdf5(file: Path, name: str) -> np.ndarray:
     """Read a MATLAB file of version 7.3; its arrays have their axes in reverse order."""
     try:
-        import h5py
+        import h5py  # type: ignore[import-untyped]
     except ImportError as error:
         raise SourceError(
             f'descriptors {file} is a MATLAB file of version 7.3 (HDF5): save it with -v7, or pip '

@@ -29,7 +29,7 @@ from stavpr_ros.recognition.match import (
 )
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.relative_motion import Positions, RelativeMotion
-from stavpr_ros.recognition.robust import blocks, z_normalized
+from stavpr_ros.recognition.robust import blocks, MeanCentering, z_normalized
 from stavpr_ros.recognition.sequence_search import (
     FilterSearch,
     Search,
@@ -317,7 +317,7 @@ class PlaceRecognizer(SequenceRecognizer):
     def _keep_time_budget(
         self, held: LocalFeatures | Int8Features, features: LocalFeatures
     ) -> None:
-        image, options = features[:1], self._settings.applied_options
+        image, options = features[:1], self._options
         budget, exact = self._settings.time_budget_ms, self._milliseconds(image)
         self.stages = f'exact matching takes {exact:.3g} ms an image, time_budget_ms = {budget:g}'
         if exact <= budget:
