@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """ONNX files as other programs write them: batches, inputs, layers, several files."""
 
+from evaluation_commands import runner, write_images
 import numpy as np
 import pytest
+from stavpr_ros.commands import build_map
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class
@@ -113,3 +115,17 @@ def test_weights_in_another_file_are_rejected_with_the_remedy(saved, tmp_path):
     onnx.save(model, path, save_as_external_data=True, location='b.bin', size_threshold=0)
     with pytest.raises(UnavailableError, match='weights are in other files: save it as one'):
         extractor(path)
+
+
+def test_build_map_with_a_network_anywhere_suggests_a_threshold(
+    saved, tmp_path, monkeypatch, capsys
+):
+    """The file is in no folder of models; its place is an option of the command."""
+    folder = write_images(tmp_path / 'drive', np.tile(IMAGES, (20, 1, 1, 1)))
+    run = runner(build_map, monkeypatch, capsys)
+    code, output, errors = run(
+        *('--input', folder, '--output', tmp_path / 'map.stavpr', '--features', 'onnx'),
+        *('--onnx-model', saved(), '--onnx-layer', 'y', '--onnx-size', 64),
+    )
+    assert code == 0, errors
+    assert 'suggested threshold for mode paper' in output
