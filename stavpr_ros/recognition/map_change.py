@@ -70,13 +70,18 @@ class MapChange:
         self._from_before[list(firsts)] = 1
         self._update_curve()
 
-    def learn_newest(self, strips: np.ndarray) -> None:
-        """Learn from the newest place of a route, (W, n, d) of all its places."""
-        n = strips.shape[1]
-        newest = strips[:, n - 1]
+    def learn_newest(self, latest: np.ndarray, n: int) -> None:
+        """
+        Learn from the newest place of a route.
+
+        :param latest: strips of the newest places, oldest first, (W, m, d); ``APART`` + 1 of them
+            if there are so many.
+        :param n: places of the route.
+        """
+        last = latest.shape[1] - 1
         changes = [
-            change_between(newest, strips[:, n - 1 - apart])
-            for apart in range(1, min(APART, n - 1) + 1)
+            change_between(latest[:, last], latest[:, last - apart])
+            for apart in range(1, min(APART, last) + 1)
         ]
         self._from_before[n - 1] = changes[0] if changes else 1
         if changes and not changes[0] < self.standstill:

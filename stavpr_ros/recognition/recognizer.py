@@ -72,7 +72,7 @@ class SequenceRecognizer:
         sequence = settings.sequence
         self._settings, self._feature_settings = settings, feature_settings
         self._options = settings.applied_options
-        self._layout = layout
+        self._layout, self._to_oldest = layout, to_oldest
         columns = places if layout is None else layout.width
         self._buffer = SequenceBuffer(sequence.length, columns, sequence.k)
         self._filter = None
@@ -85,6 +85,24 @@ class SequenceRecognizer:
         self._window = WindowMatch()  # of the newest image
         self._nearest: SequenceMatch | None = None
         self._changes: deque[float] = deque(maxlen=sequence.length)  # of the window
+
+    def _match_on_device(self) -> None:
+        """Move the window and the filter to the CUDA device."""
+        from stavpr_ros.alignment.cuda.compilation import runtime
+
+        assert self._filter is not None
+        sequence, places, change = (
+            self._settings.sequence,
+            self._buffer.places,
+            self._filter.change,
+        )
+        device = runtime().torch_device
+        self._buffer = SequenceBuffer(sequence.length, places, sequence.k, device=device)
+        self._filter = FilterSearch(
+            self._buffer, layout=self._layout, to_oldest=self._to_oldest, on_device=True
+        )
+        self._filter.change = change
+        self._search = self._filter
 
     @property
     def settings(self) -> RecognizerSettings:
@@ -297,7 +315,7 @@ class PlaceRecognizer(SequenceRecognizer):
             firsts = (0,) if layout is None else layout.firsts
             self._filter.change.learn(held.strips, firsts)
         if backend == 'cuda' and self._filter is not None:
-            self._match_on_device(self._filter)
+            self._match_on_device()
         if backend == 'cuda' and not self._options.any:
             from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
@@ -353,16 +371,6 @@ class PlaceRecognizer(SequenceRecognizer):
         assert self._filter is not None
         columns = self._filter.filter.probable_blocks()
         return columns if self._layout is None else self._layout.columns.searchsorted(columns)
-
-    def _match_on_device(self, search: FilterSearch) -> None:
-        from stavpr_ros.alignment.cuda.compilation import runtime
-
-        sequence, places = self._settings.sequence, self._buffer.places
-        device = runtime().torch_device
-        self._buffer = SequenceBuffer(sequence.length, places, sequence.k, device=device)
-        self._filter = FilterSearch(self._buffer, layout=self._layout, on_device=True)
-        self._filter.change = search.change
-        self._search = self._filter
 
     @property
     def places(self) -> int:

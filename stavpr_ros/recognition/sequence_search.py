@@ -17,7 +17,7 @@ from stavpr_ros.alignment.lm_dtw import padded_width, SequenceMatch
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.checks import no_nan
 from stavpr_ros.recognition.map_change import APART, MapChange
-from stavpr_ros.recognition.place_filter import CLOSE, NEGLIGIBLE, PlaceFilter
+from stavpr_ros.recognition.place_filter import CLOSE, distinct, NEGLIGIBLE, PlaceFilter
 from stavpr_ros.recognition.robust import change_between, FilterSettings
 from stavpr_ros.recognition.sessions import Sequences, SessionLayout
 import torch
@@ -185,6 +185,11 @@ class ImageChange(MapChange):
         self._last = strips
         return change
 
+    def recenter_query(self, strips: np.ndarray) -> None:
+        """Take the query's last image (W, d) again: its mean has changed. None after a reset."""
+        if self._last is not None:
+            self._last = strips
+
     def is_standstill(self, change: float) -> bool:
         """Whether the query's images are equal up to noise: the camera stands, or it is dark."""
         return bool(change < self.standstill)
@@ -325,7 +330,7 @@ class FilterSearch:
     ) -> tuple[int, float]:
         """Return the most probable place beyond a radius, and its probability, 0 if none."""
         around = np.arange(max(0, middle - radius), min(n, middle + radius + 1))
-        now, faint = self.filter.most_probable(np.union1d(around, places))
+        now, faint = self.filter.most_probable(distinct(np.append(around, places)))
         faint *= NEGLIGIBLE
         apart = np.abs(places - middle) > radius
         if apart.any():
