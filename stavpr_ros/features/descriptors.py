@@ -34,7 +34,7 @@ class Descriptors:
     def __init__(self, settings: DescriptorSettings, device: str = 'cpu') -> None:
         raise UnavailableError(
             "features 'descriptors' come from arrays that another program computed, not from "
-            'images: give the descriptors of the query as well (evaluate --query FILE), or make '
+            'images: give those of map and query both (evaluate --map FILE --query FILE), or make '
             'the map with the network itself'
         )
 
