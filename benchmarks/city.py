@@ -233,12 +233,16 @@ def node_lines(folder: Path) -> list[str]:
 
 
 def write_page(found: list[dict[str, Any]], page: Path) -> None:
-    """Write the tables between the two marks of a page."""
-    text = page.read_text(encoding='utf-8')
-    before, rest = text.split(BEGIN)
-    _, after = rest.split(END)
-    shown = '\n'.join(['', *lines(sorted(found, key=case_order)), '', *node_lines(RESULTS), ''])
-    page.write_text(f'{before}{BEGIN}\n{shown}\n{END}{after}', encoding='utf-8')
+    """Write the tables to a page."""
+    shown = [*lines(sorted(found, key=case_order)), '', *node_lines(RESULTS)]
+    written_between(page, BEGIN, END, shown)
+
+
+def written_between(page: Path, begin: str, end: str, shown: list[str]) -> None:
+    """Replace what stands between two marks of a page."""
+    before, rest = page.read_text(encoding='utf-8').split(begin)
+    text = '\n'.join(['', '', *shown]).rstrip()
+    page.write_text(f'{before}{begin}{text}\n\n{end}{rest.split(end)[1]}', encoding='utf-8')
 
 
 def case_order(one: dict[str, Any]) -> tuple[int, int]:
