@@ -120,11 +120,14 @@ def lines(found: list[dict[str, Any]]) -> list[str]:
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser.add_argument('--kinds', nargs='+', metavar='KIND', help='of features (all)')
     parser.add_argument('--quick', action='store_true', help='without Nordland')
     parser.add_argument('--output', type=Path, default=RESULTS / 'projection.json')
     arguments = parser.parse_args()
     folder, found = data_folder(), []
     for kind, extractor in kinds(folder).items():
+        if arguments.kinds and kind not in arguments.kinds:
+            continue
         cases = [*short_cases(folder)]
         if not arguments.quick:
             cases += [case for case in long_cases(folder, 'o') if case.name == 'nordland']
