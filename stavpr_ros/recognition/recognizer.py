@@ -454,5 +454,5 @@ def position_of(pose: np.ndarray | None) -> np.ndarray:
 
 def require_finite(features: LocalFeatures, where: str) -> None:
     """Reject NaN and infinite numbers, which no sum of unit-norm features hides."""
-    if not bool(torch.isfinite(features.strips.sum())):
+    if not math.isfinite(features.strips.sum()):
         raise InputError(f'features of {where} are not finite: they are damaged')
