@@ -20,11 +20,8 @@ from stavpr_ros.mapping.place_map import PlaceMap, Session
 from stavpr_ros.mapping.stored_features import LONGEST, StoredFeatures, StoredThumbnails
 import torch
 
-LARGE = (
-    'strips',
-    'thumbnails',
-    'statistics/codes',
-)  # parts that are read, and compared with their hashes, later
+# parts that are read, and compared with their hashes, later
+LARGE = ('strips', 'thumbnails', 'vectors/vectors', 'statistics/codes')
 THUMBNAILS_AT_ONCE = 2**24  # bytes
 # Types and shape of each part; W, n, d are known from the others, a letter alone is any number.
 PARTS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
@@ -44,6 +41,7 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
     'statistics/gains': (('F64',), ('W', 'r')),
     'statistics/changes': (('F32',), (CHANGES, 'n')),
     'statistics/codes': (('I8',), ('W', 'n', 'd')),
+    'vectors/vectors': (('F32', 'F16'), ('n', 'D of a vector')),
 }
 _TOGETHER = (('ids', 'id_ends'), ('thumbnails', 'thumbnail_ends'))
 
@@ -57,11 +55,9 @@ def map_content(file: MapFile) -> PlaceMap:
     """
     manifest = file.manifest
     settings = _settings(manifest['settings'])
-    described = {
-        name
-        for name in file.parts.keys() & PARTS.keys()
-        if '/' not in name or _is_known(manifest['sections'], name.partition('/')[0])
-    }
+    described = file.parts.keys() & PARTS.keys()
+    if not _is_known(manifest['sections'], STATISTICS):
+        described = {name for name in described if not name.startswith(f'{STATISTICS}/')}
     sizes = _require_shapes(file.parts, described, settings, manifest['sections'])
     arrays = {name: file.read(name) for name in sorted(described.difference(LARGE))}
     if (manifest['projection'] is None) is ('projection' in arrays):
@@ -159,8 +155,8 @@ def _require_shapes(
             known = axis if isinstance(axis, int) else sizes.setdefault(axis, size)
             if axis != 'bytes' and size != known:
                 raise ValueError(f'part {name} has shape {shape}: expected {known} for {axis}')
-    if sizes['d'] < 1:
-        raise ValueError('the strips have no dimensions')
+    if min(sizes['d'], sizes.get('D of a vector', 1)) < 1:
+        raise ValueError('the strips, or the vectors, have no dimensions')
     return sizes
 
 
