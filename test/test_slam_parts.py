@@ -14,10 +14,11 @@ from rclpy.context import Context
 from sensor_msgs.msg import CameraInfo
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure
 from stavpr_ros.commands import demo
+from stavpr_ros.demonstration.false_places import NEAR, RUN
 from stavpr_ros.errors import StavprError
 from stavpr_ros.pose_graph import PoseGraph
 from stavpr_ros.ros.camera import CameraInput
-from stavpr_ros.ros.false_closures import FalseClosures, NEAR, RUN
+from stavpr_ros.ros.false_closures import FalseClosures
 from stavpr_ros.ros.graph_client import fetch_graph
 from stavpr_ros.ros.output import time_message
 from test_pose_graph import circle, closure, error, LAP, odometry_of
