@@ -23,7 +23,6 @@ import numpy as np
 from results import environment, RESULTS, ROOT
 from scipy.spatial.transform import Rotation
 from slam_page import markdown
-from stavpr_ros.demonstration.false_places import FalsePlaces
 from stavpr_ros.demonstration.slam import trajectory_errors
 from stavpr_ros.demonstration.street.laps import (
     CAMERA_IN_BASE,
@@ -37,6 +36,7 @@ from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.pipeline import Pipeline, PipelineSettings
 from stavpr_ros.pose_graph import Closure, optimize, PoseGraph
 from stavpr_ros.pose_graph.alignment import APPEARANCE, IDENTITY
+from stavpr_ros.pose_graph.false_places import FalsePlaces
 from stavpr_ros.pose_graph.transforms import inverse, matrices, planar_poses
 from stavpr_ros.recognition.verification import mutual_matches
 from stavpr_ros.relative_pose import landmarks
