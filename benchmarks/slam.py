@@ -8,7 +8,7 @@ and the graph is solved. Writes docs/slam_measured.md, and its JSON to benchmark
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import as_completed, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 import json
@@ -111,11 +111,22 @@ def render(seed: int, folder: Path) -> np.ndarray:
     return np.load(path, mmap_mode='r')
 
 
-def find(drive: LapDrive, images: np.ndarray, estimator: EdgeEstimator) -> list[Found]:
+def lap_masks(drive: LapDrive) -> list[np.ndarray]:
+    """Return which images are of each lap."""
+    return [drive.images[:, 0] == lap for lap in range(drive.images[-1, 0] + 1)]
+
+
+def find(
+    drive: LapDrive,
+    images: Sequence[np.ndarray] | np.ndarray,
+    estimator: EdgeEstimator,
+    camera: Camera | None = CAMERA,
+    exclude: int = 50,
+) -> list[Found]:
     """Recognize a drive and return its closures."""
-    laps = np.array([0, *np.cumsum([len(lap) for lap in drive.laps])])
-    pipeline = Pipeline(PipelineSettings(backend='cpu'), 'loop_closure')
-    pipeline.camera = CAMERA
+    laps = np.array([0, *np.cumsum([drive.images[own, 1].max() + 1 for own in lap_masks(drive)])])
+    pipeline = Pipeline(PipelineSettings(backend='cpu', exclude_places=exclude), 'loop_closure')
+    pipeline.camera = camera
     odometry, found = planar_poses(drive.odometry), []
     image_of = {int(stamp): i for i, stamp in enumerate(drive.stamps)}
     for i, (lap, number) in enumerate(drive.images.tolist()):
@@ -126,9 +137,9 @@ def find(drive: LapDrive, images: np.ndarray, estimator: EdgeEstimator) -> list[
             if pair is None or each is None:
                 continue
             query_stamp = each.window_stamps[each.position]
-            place_stamp = pipeline.places.place(each.place_index).stamp
+            place_stamp = pair.source.place(each.place_index).stamp
             began = time.thread_time()
-            edge = estimator.estimate(pair, CAMERA, CAMERA)
+            edge = estimator.estimate(pair, camera, camera)
             took = time.thread_time() - began
             changes = tuple(zip(each.window_stamps, each.window_changes, strict=True))
             if each.is_late:
