@@ -19,6 +19,7 @@ import numpy as np
 from results import environment, RESULTS, ROOT, table
 from slam import ate, DRIFTS, find
 from stavpr_ros.demonstration.street.laps import drifted, LapDrive, RingWorld
+from stavpr_ros.demonstration.street.traverses import LENGTH
 from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.evaluation.plots import page
 from stavpr_ros.pose_graph import optimize
@@ -27,9 +28,8 @@ from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.sources import open_source
 from tqdm import tqdm
 
-LENGTH = 600.0  # meters of the laps of Gardens Point; the hallway is about 40 m
-HALLWAY_LENGTH = 40.0
-HALLWAY_LAP, HALLWAY_EXCLUDED = 42, 20  # images
+HALLWAY_LENGTH = 40.0  # meters of a lap; those of Gardens Point get that of the street
+HALLWAY_EXCLUDED = 20  # latest images, as the ground truth has them
 FIRST = 10**9  # ns, the first stamp
 
 
@@ -98,7 +98,10 @@ def main() -> None:
     parser.add_argument('--draws', type=int, default=5, help='of the odometry (%(default)s)')
     given = parser.parse_args()
     folder = data_folder()
-    sets = {'hallway': (hallway(folder), 20), 'Gardens Point': (gardens_point(folder), 50)}
+    sets = {
+        'hallway': (hallway(folder), HALLWAY_EXCLUDED),
+        'Gardens Point': (gardens_point(folder), 50),
+    }
     rows: list[dict[str, Any]] = []
     drawn: dict[str, tuple[LapDrive, np.ndarray]] = {}
     cases = [

@@ -25,6 +25,7 @@ def markdown(about: dict[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     seeds = sorted({row['seed'] for row in rows})
     drives = f'Seeds {", ".join(map(str, seeds))}; {len(rows)} draws of the odometry in all.'
     return [
+        *('---', 'orphan: true', '---', ''),  # linked from slam.md, not in the table of contents
         *heading('Loop closures and the pose graph, measured', about),
         *TEXT.splitlines(),
         drives,
