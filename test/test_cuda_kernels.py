@@ -30,7 +30,10 @@ import torch
 
 SIMULATOR = os.environ.get('NUMBA_ENABLE_CUDASIM') == '1'
 INF = math.inf
-FILES = ('test_cuda_kernels.py', 'test_cuda_matcher.py', 'test_cuda_filter.py')
+FILES = (
+    *('test_cuda_kernels.py', 'test_cuda_matcher.py', 'test_cuda_filter.py'),
+    'test_cuda_loop_closure.py',
+)
 
 
 @pytest.fixture(scope='module')

@@ -4,17 +4,9 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.recognition.place_filter import FilterSettings
-from stavpr_ros.recognition.sequence_search import (
-    AHEAD,
-    APART,
-    change_between,
-    FLOOR,
-    ImageChange,
-    OFFSET,
-    SMOOTHED,
-    STRETCH,
-)
+from stavpr_ros.recognition.map_change import AHEAD, APART, STRETCH
+from stavpr_ros.recognition.robust import change_between, FilterSettings
+from stavpr_ros.recognition.sequence_search import FLOOR, ImageChange, OFFSET, SMOOTHED
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 SETTINGS = FilterSettings()
@@ -63,7 +55,7 @@ def test_learn_newest_of_each_place_equals_learn():
     for n in range(1, 31):
         if n == 6:
             route.grow(32)
-        route.learn_newest(strips[:, :n])
+        route.learn_newest(strips[:, :n], n)
     np.testing.assert_allclose(route.curve, learned(strips).curve, rtol=1e-5)
 
 
@@ -71,10 +63,10 @@ def test_learn_newest_of_standing_camera_leaves_curve():
     strips = drive_strips(30)
     route = ImageChange(60, SETTINGS)
     for n in range(1, 31):
-        route.learn_newest(strips[:, :n])
+        route.learn_newest(strips[:, :n], n)
     before = route.curve
     stood = np.concatenate([strips, strips[:, -1:]], axis=1)
-    route.learn_newest(stood)
+    route.learn_newest(stood, stood.shape[1])
     np.testing.assert_array_equal(route.curve, before)
 
 
@@ -165,6 +157,6 @@ def test_unlit_of_route_knows_its_newest_places():
     strips[:, 20:26] = 0
     route = ImageChange(30, SETTINGS)
     for n in range(1, 31):
-        route.learn_newest(strips[:, :n])
+        route.learn_newest(strips[:, :n], n)
     assert route.unlit(probable_at(22, 30))
     assert not route.unlit(probable_at(28, 30))

@@ -10,9 +10,16 @@ import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
 from stavpr_ros.alignment.spatial import adaptive_weights
-from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
+from stavpr_ros.devices import why_no_cuda
+from stavpr_ros.errors import (
+    FeatureMismatchError,
+    InputError,
+    SettingsError,
+    UnavailableError,
+)
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, route_features, Status
+from stavpr_ros.recognition.cpu_matcher import CpuMatcher, CpuRouteMatcher
 from stavpr_ros.recognition.loop_closer import (
     AROUND,
     choose_loop_backend,
@@ -274,7 +281,7 @@ def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
             change.evict(closer.first - first)
             first = closer.first
         strips = laps.strips[:, first : i + 1].contiguous().numpy()
-        change.learn_newest(strips)
+        change.learn_newest(strips, i + 1 - first)
         places = max(0, i + 1 - first - exclude)
         z = plain.normalized(i, first, first + places)
         seen = change.next_query(strips[:, -1])
@@ -512,10 +519,79 @@ def test_loop_closer_with_invalid_input_is_rejected(laps, small_map):
 
 
 @pytest.mark.parametrize(
-    ('backend', 'precision'),
-    [('cuda', 'float32'), ('auto', 'float16'), ('cpu', 'float16'), ('tpu', 'float32')],
+    ('backend', 'precision', 'error'),
+    [
+        ('tpu', 'float32', SettingsError),
+        ('cpu', 'float64', SettingsError),
+        ('cuda', 'float32', UnavailableError),
+    ],
 )
-def test_loop_closer_on_other_backend_or_precision_is_rejected(laps, backend, precision):
-    with pytest.raises(SettingsError, match=precision if precision == 'float16' else backend):
+def test_loop_closer_on_unknown_backend_or_precision_is_rejected(laps, backend, precision, error):
+    if backend == 'cuda' and not why_no_cuda():
+        pytest.skip('there is a CUDA device')
+    with pytest.raises(error, match=precision if precision == 'float64' else backend):
         LoopCloser(settings_of(ROBUST), 12, laps.settings, backend=backend, precision=precision)
-    assert choose_loop_backend('auto', 'float32') == choose_loop_backend('cpu', 'float32') == 'cpu'
+    assert choose_loop_backend('auto') == choose_loop_backend('cpu') == 'cpu'
+
+
+@pytest.mark.parametrize('precision', ['float16', 'int8'])
+@pytest.mark.parametrize('limit', [None, 90])
+def test_settled_route_in_less_memory_matches_as_in_float32(laps, monkeypatch, precision, limit):
+    """Rounded once, by the mean and the whitening of the day it settled; an eighth is evicted."""
+    monkeypatch.setattr(route_features, 'SETTLED', 150)
+    full = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit)
+    less = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit, precision=precision)
+    matched, settled = 0, min(150, limit or 150)
+    for i in range(len(laps)):
+        one, other = less.update(laps[i : i + 1]), full.update(laps[i : i + 1])
+        assert (less.first, len(less)) == (full.first, len(full))
+        if i + 1 < settled:
+            same(one, other)
+            continue
+        route = less._route
+        held = route.strips.values if precision == 'int8' else route.strips
+        assert held.dtype == (np.int8 if precision == 'int8' else torch.float16)
+        assert one.status == other.status
+        if other.accepted:
+            matched += 1
+            assert one.place_index == pytest.approx(other.place_index, abs=1)
+            assert one.probability == pytest.approx(other.probability, abs=0.05)
+    assert matched > 100
+    kept = laps[less.first :]
+    error = 1e-3 if precision == 'float16' else 0.05
+    torch.testing.assert_close(less.features().strips, kept.strips, atol=error, rtol=0)
+    torch.testing.assert_close(less.features().weights, kept.weights)
+
+
+@pytest.mark.parametrize('precision', ['float16', 'int8'])
+def test_settled_route_holds_its_places_through_growth_and_eviction(laps, monkeypatch, precision):
+    """Distances are those to the places' own features, rounded."""
+    monkeypatch.setattr(route_features, 'SETTLED', 20)
+    monkeypatch.setattr(route_features, 'ROOM', 16)
+    route = RouteFeatures(laps.settings, False, False, 75, precision)
+    matcher, evicted = CpuRouteMatcher(7, SpatialSettings()), 0
+    for i in range(200):
+        if route.count == 75:
+            route.evict(9)
+            evicted += 9
+        route.append(laps[i : i + 1])
+    held = laps[evicted:200]
+    newest = route.newest
+    found = matcher.to_oldest(route.strips, newest, route.count - 3)
+    expected = CpuMatcher(held, SpatialSettings(), precision).distances(
+        newest[:, 0], torch.ones(7)
+    )
+    torch.testing.assert_close(found, expected[:-3], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize('precision', ['float16', 'int8'])
+def test_settled_route_of_vectors_holds_its_places(laps, monkeypatch, precision):
+    monkeypatch.setattr(route_features, 'SETTLED', 20)
+    settings = replace(laps.settings, strips=1)
+    vectors = LocalFeatures(laps.strips[:1].contiguous(), laps.weights[:1], settings)
+    route = RouteFeatures(settings, False, False, None, precision)
+    for i in range(50):
+        route.append(vectors[i : i + 1])
+    found = CpuRouteMatcher(1, SpatialSettings()).to_oldest(route.strips, route.newest, 40)
+    cosine = vectors.strips[0, :40] @ vectors.strips[0, 49]
+    torch.testing.assert_close(found, 1 - cosine, atol=0.02, rtol=0)

@@ -31,13 +31,13 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import Match, RecognizerSettings, Status
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
-from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION, ROBUST
-from stavpr_ros.recognition.sequence_search import (
+from stavpr_ros.recognition.robust import (
     change_between,
-    FilterSearch,
-    ImageChange,
-    SequenceBuffer,
+    FilterSettings,
+    MIN_DEVIATION,
+    ROBUST,
 )
+from stavpr_ros.recognition.sequence_search import FilterSearch, ImageChange, SequenceBuffer
 from stavpr_ros.recognition.sessions import SessionLayout
 from stavpr_ros.threads import call_on_thread
 import torch

@@ -3,6 +3,7 @@
 """Recognition, image by image: query window, matcher, match."""
 
 from stavpr_ros.recognition.match import Candidate, Match, Status
-from stavpr_ros.recognition.recognizer import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.recognizer import PlaceRecognizer
+from stavpr_ros.recognition.settings import RecognizerSettings
 
 __all__ = ['Candidate', 'Match', 'PlaceRecognizer', 'RecognizerSettings', 'Status']

@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 from stavpr_ros.alignment.cpu import dot, int8
+from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.alignment.spatial import adaptive_weights, image_distances, WINDOW
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.int8_features import Int8Features, rounded
+from stavpr_ros.recognition.route_strips import RouteStrips
 import torch
 
 CACHE_LINE = 64  # bytes; vectors across two of them are read at half the speed
@@ -131,3 +133,42 @@ class CpuMatcher:
             return image_distances(d[:W], self._spatial)
         similarity = 1 - torch.from_numpy(d).diagonal()[:, :W]  # (n, W)
         return (1 - (similarity * self._weights.T) @ weights).numpy()
+
+
+class CpuRouteMatcher:
+    """
+    Compares an image with the oldest places of a route that grows.
+
+    :param W: strips of an image.
+    :param spatial: strategies ``adaptive`` and ``vanilla``.
+    :raises SettingsError: xi > W.
+    """
+
+    device = None  # a CUDA device where the route lies
+
+    def __init__(self, W: int, spatial: SpatialSettings) -> None:
+        self._band = spatial.band(W)
+        self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
+
+    def to_oldest(self, strips: RouteStrips, newest: torch.Tensor, places: int) -> torch.Tensor:
+        """
+        Return the distances of an image to the oldest places, (places,).
+
+        :param strips: of the route; newest: of the image, (W, 1, d), float32.
+        """
+        out = np.empty((1, places), np.float32)
+        is_vector = len(newest) == 1  # its alignment is its cosine distance
+        if isinstance(strips, Int8Strips):
+            rounded_map, rounded_query = strips.kernel_arguments(), int8.tiled(newest)
+            if is_vector:
+                int8.cosine_distances(rounded_map, rounded_query, out)
+            else:
+                dot.image_distances(rounded_map, rounded_query, self._a, self._band, out)
+            return torch.from_numpy(out[0])
+        assert isinstance(strips, torch.Tensor)
+        held = (strips if strips.dtype == torch.float32 else strips.view(torch.int16)).numpy()
+        if is_vector:
+            dot.cosine_distances(held[0], newest[0].numpy(), out)
+        else:
+            dot.image_distances(held, dot.tiled(newest), self._a, self._band, out)
+        return torch.from_numpy(out[0])

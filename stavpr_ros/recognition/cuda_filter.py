@@ -4,21 +4,30 @@
 
 import numpy as np
 from stavpr_ros.alignment.cuda.compilation import runtime
-from stavpr_ros.recognition.place_filter import Belief, belief_of, NEGLIGIBLE, TOP
+from stavpr_ros.recognition.place_filter import ALL_BORN, Belief, belief_of, NEGLIGIBLE, TOP
 from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION
+from stavpr_ros.recognition.route_strips import move_up
 import torch
+from torch.nn import functional
 
 MOST = 512  # most probable places that are copied back: more than are ever excluded
 
 
-def z_normalized_on_device(row: torch.Tensor) -> torch.Tensor:
+def z_normalized_on_device(row: torch.Tensor, around: int = 0) -> torch.Tensor:
     """Return a row as :func:`stavpr_ros.recognition.robust.z_normalized`, without waiting."""
+    if not len(row):
+        return row
     known = torch.isfinite(row)
     count = known.sum().clamp(min=1)
     values = torch.where(known, row, 0)
     mean = values.sum() / count
     off = torch.where(known, row - mean, 0)
-    return (row - mean) / (off.square().sum() / count).sqrt().clamp(min=MIN_DEVIATION)
+    z = (row - mean) / (off.square().sum() / count).sqrt().clamp(min=MIN_DEVIATION)
+    if not around:
+        return z
+    clipped = torch.where(torch.isfinite(z), z.clamp(min=-1), 0)[None]
+    padded = functional.pad(clipped, (around, around), mode='replicate')
+    return z - functional.avg_pool1d(padded, 2 * around + 1, stride=1)[0]
 
 
 class CudaPlaceFilter:
@@ -29,7 +38,7 @@ class CudaPlaceFilter:
     order. Nothing waits for the device but the first of :meth:`belief`, :meth:`most_probable` and
     :meth:`way` after an image.
 
-    :param places: of the map.
+    :param places: that there is room for.
     :param lag: most images that states are followed back.
     :param gaps: places that there are none of, between sessions.
     """
@@ -46,27 +55,32 @@ class CudaPlaceFilter:
         self.settings = s = settings or FilterSettings()
         self._kernels, self._runtime = place_filter, runtime()
         self._device = device = self._runtime.torch_device
-        self._n, K, V = places, len(s.levels), len(s.speeds)
-        self._shape, self._speeds = (K, V), np.array(s.speeds, np.float64)
+        self._shape, self._speeds = (len(s.levels), len(s.speeds)), np.array(s.speeds, np.float64)
         self._gaps = torch.from_numpy(np.empty(0, np.int64) if gaps is None else gaps).to(device)
-        self._real = max(places - len(self._gaps), 1)
-        reach = int(np.ceil(self._speeds.max())) + 2
+        self._reach, self._lag = int(np.ceil(self._speeds.max())) + 2, lag
+        self._levels = torch.tensor(s.levels, dtype=torch.float32, device=device)
+        self._level_changes = torch.from_numpy(s.level_changes()).to(device)
+        self._allocate(places)
+        self.reset()
+
+    def _allocate(self, room: int) -> None:
+        (K, V), lag, device = self._shape, self._lag, self._device
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(shape, dtype=dtype, device=device)
 
-        self._states, self._mixed = zeros(K * V, places), zeros(K * V, places)
-        self._codes = zeros(K * V, places, dtype=torch.uint8)
-        self._origins = zeros(lag, K * ((V + 1) // 2), places, dtype=torch.uint8)
+        self._room = room = max(1, room)
+        self._states, self._mixed = zeros(K * V, room), zeros(K * V, room)
+        self._codes = zeros(K * V, room, dtype=torch.uint8)
+        self._origins = zeros(lag, K * ((V + 1) // 2), room, dtype=torch.uint8)
+        self._origins.fill_(ALL_BORN)
         self._steps = zeros(lag, V, dtype=torch.int32)
-        self._sums = zeros(2 * K, places + reach)
-        self._levels = torch.tensor(s.levels, dtype=torch.float32, device=device)
-        self._level_changes = torch.from_numpy(s.level_changes()).to(device)
+        self._sums = zeros(2 * K, room + self._reach)
         self._factors, self._births = zeros(K, K), zeros(K)
-        self._speed_factors, self._z = zeros(5, V), zeros(places)
-        self._tops, top = min(TOP, places), min(MOST, places)
+        self._speed_factors, self._z = zeros(5, V), zeros(room)
+        tops, top = min(TOP, room), min(MOST, room)
         # one buffer of what is copied back: scale; sums and places; states and their ways
-        parts = (8, 8 * top, 4 * top, 4 * self._tops * K * V, 4 * (lag + 1) * self._tops * K * V)
+        parts = (8, 8 * top, 4 * top, 4 * tops * K * V, 4 * (lag + 1) * tops * K * V)
         ends = np.cumsum([-(-size // 8) * 8 for size in parts]).tolist()
         self._parts = [
             slice(end - -(-size // 8) * 8, end - -(-size // 8) * 8 + size)
@@ -89,7 +103,6 @@ class CudaPlaceFilter:
         self._slots = [self._runtime.array(slot) for slot in self._origins]
         self._slot_steps = [self._runtime.array(slot) for slot in self._steps]
         self._answer = [self._runtime.array(part) for part in self._out]
-        self.reset()
 
     def reset(self) -> None:
         """Forget where the camera was."""
@@ -99,7 +112,33 @@ class CudaPlaceFilter:
         self._off = torch.full((K,), 1 / K, dtype=torch.float64, device=self._device)
         self._seen = torch.zeros(K, dtype=torch.float64, device=self._device)
         self._scale = torch.ones((), dtype=torch.float64, device=self._device)
-        self.count, self._read_at = 0, -1
+        self.count, self._known, self._read_at = 0, 0, -1
+
+    def grow(self, places: int) -> None:
+        """Make room for more places."""
+        states, origins, sums, steps = self._states, self._origins, self._sums, self._steps
+        before = self._room
+        self._allocate(places)
+        self._states[:, :before], self._origins[..., :before] = states, origins
+        self._sums[:, : sums.shape[1]] = sums
+        self._steps.copy_(steps)
+        self._read_at = -1
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+        for values in (self._states, self._sums, *self._origins):
+            move_up(values, count, values.shape[1])
+            values[:, -count:] = ALL_BORN if values.dtype == torch.uint8 else 0
+        self._find_seen()
+
+    def _find_seen(self) -> None:
+        self._seen = self._sums[: self._shape[0]].sum(dim=1, dtype=torch.float64)
+        self._read_at = -1
+
+    def _clear_from(self, n: int) -> None:
+        """Set states and sums from place n on to 0."""
+        self._states[:, n:] = self._sums[:, n:] = 0
+        self._find_seen()
 
     @property
     def off_map(self) -> float:
@@ -107,12 +146,12 @@ class CudaPlaceFilter:
         return float(self._off.sum())
 
     def places_of_states(self) -> np.ndarray:
-        """Return the probability of each place, (n,), float32; copied from the device."""
+        """Return the probability of each place, (room,), float32; copied from the device."""
         found: np.ndarray = (self._by_place() * self._scale).float().cpu().numpy()
         return found
 
     def _by_place(self) -> torch.Tensor:
-        return self._sums[: self._shape[0], : self._n].sum(dim=0)
+        return self._sums[: self._shape[0], : self._room].sum(dim=0)
 
     def _launch(self, kernel: object, count: int, *arguments: object) -> None:
         block = self._kernels.BLOCK
@@ -122,40 +161,47 @@ class CudaPlaceFilter:
         """
         Advance by an image.
 
-        :param z: z-normalized distances to all places, (n,), float32, on the device; +inf bans a
-            place.
+        :param z: z-normalized distances to the first n places, (n,), float32, on the device; +inf
+            bans a place.
         :param weight: alpha; 0 = the image is no evidence.
         :param speed_weights: relative probability of each speed, (V,).
         """
-        s, (K, V), v = self.settings, self._shape, self._views
+        s, (K, V), v, n = self.settings, self._shape, self._views, len(z)
         slot = self.count % len(self._origins)
         moved = np.rint(self._speeds * (self.count + 1)) - np.rint(self._speeds * self.count)
         self._steps[slot].copy_(torch.from_numpy(moved.astype(np.int32)))
-        if not self.count:
-            self._states.fill_(s.start / (K * V * self._real))
+        real = max(n - len(self._gaps), 1)
+        if not self.count and n:
+            self._states[:, :n] = s.start / (K * V * real)
             self._states[:, self._gaps] = 0
             self._off.fill_((1 - s.start) / K)
             self._seen.fill_(s.start / K)
-        self._z.copy_(z)
-        self._z[self._gaps] = -torch.inf
-        self._speed_factors.copy_(torch.from_numpy(s.speed_changes(speed_weights)))
-        self._factors.copy_(self._level_changes * self._scale.float())
+        elif n < self._known:
+            self._clear_from(n)
         off = self._off @ self._level_changes.double()
-        self._births.copy_(off * s.enter / (V * self._real))
-        before = self._seen @ self._factors.double()
-        self._launch(
-            self._kernels.mix(K, V), self._n, v['_states'], v['_factors'], v['_speed_factors'],
-            v['_mixed'], v['_codes'],
-        )  # fmt: skip
-        self._launch(
-            self._kernels.move(K, V), self._sums.shape[1], v['_mixed'], v['_codes'], v['_z'],
-            self._slot_steps[slot], v['_levels'], np.float32(weight), np.float32(s.spread),
-            np.float32(1 - s.leave), v['_births'], v['_states'], self._slots[slot], v['_sums'],
-        )  # fmt: skip
-        self._seen, lost = self._sums.sum(dim=1, dtype=torch.float64).view(2, K)
+        before = lost = self._seen
+        if n:
+            self._z[:n] = z
+            self._z[self._gaps] = -torch.inf
+            self._speed_factors.copy_(torch.from_numpy(s.speed_changes(speed_weights)))
+            self._factors.copy_(self._level_changes * self._scale.float())
+            self._births.copy_(off * s.enter / (V * real))
+            before = self._seen @ self._factors.double()
+            self._launch(
+                self._kernels.mix(K, V), n, n, v['_states'], v['_factors'], v['_speed_factors'],
+                v['_mixed'], v['_codes'],
+            )  # fmt: skip
+            self._launch(
+                self._kernels.move(K, V), n + self._reach, n, v['_mixed'], v['_codes'], v['_z'],
+                self._slot_steps[slot], v['_levels'], np.float32(weight), np.float32(s.spread),
+                np.float32(1 - s.leave), v['_births'], v['_states'], self._slots[slot], v['_sums'],
+            )  # fmt: skip
+            sums = self._sums[:, : n + self._reach].sum(dim=1, dtype=torch.float64)
+            self._seen, lost = sums.view(2, K)
         off = off * (1 - s.enter) + (before - lost) * s.leave + lost
         total = off.sum() + self._seen.sum()
         self._off, self._scale = off / total, 1 / total
+        self._known = n
         self.count += 1
 
     def _read(self) -> None:

@@ -13,10 +13,12 @@ from stavpr_ros.alignment.spatial import WINDOW
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.int8_features import Int8Features, rounded
+from stavpr_ros.recognition.route_strips import DeviceInt8Route, RouteStrips
 import torch
 
 BLOCK_WORDS = 2**26  # most words of products that lie in memory at a time: 256 MiB
 QUERIES = 32  # most images of a batch whose products are made at once
+AT_ONCE = 1024  # places of a route: the memory of products is the same for so many
 PLACES_IN_PIECES = (
     2**14
 )  # most places widened at a time, where the half-width product is not available
@@ -49,21 +51,25 @@ class CudaMatcher:
         device = self._runtime.torch_device
         if precision == 'int8' and isinstance(features, LocalFeatures):
             features = rounded(features, lambda some: some)
-        self._reciprocals: torch.Tensor | None = None
         if isinstance(features, Int8Features):
             lengths = features.strips.reciprocals[:, : len(features)]
-            self._strips = features.strips.rounded().to(device)
-            self._reciprocals = torch.from_numpy(lengths).to(device)
+            self._hold(features.strips.rounded().to(device), torch.from_numpy(lengths).to(device))
         else:
-            self._strips = features.strips.to(device, getattr(torch, precision)).contiguous()
+            self._hold(features.strips.to(device, getattr(torch, precision)).contiguous(), None)
         self._weights = features.weights.to(device)
-        self._half = precision != 'float32'
-        # products of whole numbers and their sums are exact in float32
-        self._in_pieces = precision == 'int8' or (self._half and not self._runtime.half_products)
         self._workspace: tuple[torch.Tensor, Any] | None = None
         self._choose_kernel(spatial)
         if self.places:
             self._warm_up()
+
+    def _hold(self, strips: torch.Tensor, reciprocals: torch.Tensor | None) -> None:
+        """Compare with these strips; reciprocal lengths are of int8."""
+        self._strips, self._reciprocals = strips, reciprocals
+        self._half = strips.dtype != torch.float32
+        # products of whole numbers and their sums are exact in float32
+        self._in_pieces = reciprocals is not None or (
+            self._half and not self._runtime.half_products
+        )
 
     def _choose_kernel(self, spatial: SpatialSettings) -> None:
         from stavpr_ros.alignment.cuda import dtw
@@ -108,12 +114,14 @@ class CudaMatcher:
         :returns: shape (Q, n), float32, on the device.
         """
         device = self._runtime.torch_device
-        strips, weights = strips.to(device).transpose(0, 1), weights.to(device).T
+        strips = strips.transpose(0, 1)
+        if self._reciprocals is None:  # others are rounded on the CPU
+            strips = strips.to(device)
         out = torch.empty((len(strips), self._strips.shape[1]), device=self._strips.device)
         if out.numel() == 0:
             return out
         if self._kernel is None:
-            for row, query, query_weights in zip(out, strips, weights, strict=True):
+            for row, query, query_weights in zip(out, strips, weights.to(device).T, strict=True):
                 row.copy_(self._holistic(query, query_weights))
             return out
         view = self._runtime.array(out)
@@ -142,7 +150,7 @@ class CudaMatcher:
         if self._reciprocals is None:
             return queries.reshape(rows, d).to(self._strips.dtype), None
         whole, lengths = (
-            torch.from_numpy(part).to(queries.device)
+            torch.from_numpy(part).to(self._strips.device)
             for part in rounded_queries(queries.transpose(0, 1))
         )
         return whole.reshape(rows, d), lengths.reshape(rows)
@@ -154,7 +162,7 @@ class CudaMatcher:
         W, n, d = self._strips.shape
         rows = len(vectors)
         if (
-            last - first == n and not self._in_pieces
+            last - first == n and not self._in_pieces and self._strips.is_contiguous()
         ):  # one product: the map is one matrix, read once
             block, view = self._space((rows, W, n), (0, 1, 2))
             self._multiply(
@@ -205,3 +213,41 @@ class CudaMatcher:
         if self._reciprocals is not None and lengths is not None:
             similarity.mul_(self._reciprocals[:, :, None]).mul_(lengths[:, None, None])
         return 1 - (similarity[:, :, 0] * weights[:, None] * self._weights).sum(dim=0)
+
+
+class CudaRouteMatcher(CudaMatcher):
+    """
+    Compares an image with the oldest places of a route that grows on the device.
+
+    :param W: strips of an image.
+    :param spatial: strategies ``adaptive`` and ``vanilla``.
+    :raises UnavailableError: no CUDA device here, or the package numba-cuda is missing.
+    :raises SettingsError: xi > W.
+    """
+
+    def __init__(self, W: int, spatial: SpatialSettings) -> None:
+        self._runtime = runtime()
+        self._hold(torch.empty((W, 0, 0)), None)
+        self._workspace = None
+        self._choose_kernel(spatial)
+
+    @property
+    def device(self) -> torch.device:
+        """Return where the route lies."""
+        return self._runtime.torch_device
+
+    def to_oldest(self, strips: RouteStrips, newest: torch.Tensor, places: int) -> torch.Tensor:
+        """
+        Return the distances of an image to the oldest places, (places,), on the device.
+
+        Memory for more places is compared with as well, so that its size seldom changes.
+
+        :param strips: of the route; newest: of the image, (W, 1, d), float32.
+        """
+        ahead = slice(min(strips.shape[1], -(-places // AT_ONCE) * AT_ONCE))
+        if isinstance(strips, DeviceInt8Route):
+            self._hold(strips.whole[:, ahead], strips.reciprocals[:, ahead])
+        else:
+            assert isinstance(strips, torch.Tensor)
+            self._hold(strips[:, ahead], None)
+        return self.distance_matrix(newest, newest[:, :, 0])[0, :places]

@@ -5,49 +5,44 @@
 from collections import deque
 from dataclasses import replace
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
-from stavpr_ros.alignment.cpu import dot
-from stavpr_ros.alignment.spatial import adaptive_weights
-from stavpr_ros.devices import BACKENDS
+from stavpr_ros.alignment.settings import SpatialSettings
+from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.recognition.cpu_matcher import CpuRouteMatcher
 from stavpr_ros.recognition.match import Match, Status
-from stavpr_ros.recognition.recognizer import (
-    position_of,
-    RecognizerSettings,
-    SequenceRecognizer,
-)
+from stavpr_ros.recognition.matcher import PRECISIONS
+from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
 from stavpr_ros.recognition.robust import z_normalized
 from stavpr_ros.recognition.route_features import RouteFeatures
 from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
+from stavpr_ros.recognition.settings import RecognizerSettings
 import torch
+
+if TYPE_CHECKING:
+    from stavpr_ros.recognition.cuda_matcher import CudaRouteMatcher
 
 EVICTED = 8  # the oldest one in so many is evicted at a time
 AROUND = 30  # places whose mean distance is subtracted: a route has been through several lights
 LEAST_PLACES = 5  # fewer distances have no meaningful mean and deviation
 
 
-def choose_loop_backend(backend: str, precision: str) -> str:
+def choose_loop_backend(backend: str) -> str:
     """
-    Turn ``auto`` into the backend of loop closure, which is always ``cpu``, in float32.
+    Return the backend of loop closure: ``cpu`` for ``auto``, which has not been timed on a GPU.
 
-    :raises SettingsError: ``cuda`` or ``float16`` by name, or no such backend.
+    :raises UnavailableError: ``cuda``, and there is none.
+    :raises SettingsError: no such backend.
     """
-    if backend not in BACKENDS:
-        raise SettingsError(f'backend {backend!r} is unknown: take one of {", ".join(BACKENDS)}')
-    if backend == 'cuda':
-        raise SettingsError("backend 'cuda': loop closure runs on the CPU; take 'cpu' or 'auto'")
-    if precision != 'float32':
-        raise SettingsError(
-            f'precision {precision!r}: loop closure holds its route in float32; take float32'
-        )
-    return 'cpu'
+    return 'cpu' if backend == 'auto' else choose_backend(backend)
 
 
 class LoopCloser(SequenceRecognizer):
     """
-    Recognizes places that the same traverse has passed before, one image at a time, on the CPU.
+    Recognizes places that the same traverse has passed before, one image at a time.
 
     Every image becomes a place; an image is compared with those that came at least ``exclude``
     images and ``exclude_seconds`` before it. Growing needs no rebuild: memory doubles when it is
@@ -65,8 +60,12 @@ class LoopCloser(SequenceRecognizer):
     :param limit: most places held; None for all. It must leave room for more than the excluded
         images.
     :param exclude_seconds: places younger than so many seconds are not part of the map either.
-    :param backend, precision: see :func:`choose_loop_backend`.
+    :param backend: see :func:`choose_loop_backend`. On ``cuda`` the route's features lie on the
+        device; without the place filter, sequences are matched on the CPU.
+    :param precision: of the route's features once it is settled, ``float32``, ``float16`` or
+        ``int8``; see :mod:`stavpr_ros.recognition.route_features`.
     :raises SettingsError: invalid settings.
+    :raises UnavailableError: no such backend here.
     """
 
     def __init__(
@@ -80,16 +79,21 @@ class LoopCloser(SequenceRecognizer):
         precision: str = 'float32',
     ) -> None:
         _require_fitting(settings, exclude, limit, exclude_seconds)
-        choose_loop_backend(backend, precision)
+        if precision not in PRECISIONS:
+            raise SettingsError(
+                f'precision {precision!r} is unknown: take one of {", ".join(PRECISIONS)}'
+            )
         super().__init__(settings, feature_settings, 0, to_oldest=True)
         W = feature_settings.strips
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
-        self._band = settings.spatial.band(W)
-        self._a = adaptive_weights(W, settings.spatial, np.dtype(np.float32))
+        self._matcher = _matcher(W, settings.spatial, choose_loop_backend(backend))
         options = settings.applied_options
+        device = self._matcher.device
         self._route = RouteFeatures(
-            feature_settings, options.mean_centering, options.whitening, limit
+            feature_settings, options.mean_centering, options.whitening, limit, precision, device
         )
+        if device is not None and self._filter is not None:
+            self._match_on_device()
         # of the images of the window: each one had a match as the middle one
         self._closed: deque[bool] = deque(maxlen=settings.sequence.length)
         self._track: list[np.ndarray] = []  # position of each place held
@@ -147,7 +151,7 @@ class LoopCloser(SequenceRecognizer):
         self._append(features, stamp)
         self._track.append(position)
         newest = self._route.newest[:, 0]
-        match = self._match(torch.from_numpy(self._distances()), newest, stamp, position)
+        match = self._match(self._distances(), newest, stamp, position)
         if match.status is Status.NO_MATCH and match.sequence is None:
             return replace(match, reason='no earlier place is old enough to be matched with')
         return replace(match, late=self._late(match))
@@ -198,7 +202,9 @@ class LoopCloser(SequenceRecognizer):
             for part in self._parts():
                 part.grow(route.room)
         if self._filter is not None:
-            self._filter.change.learn_newest(route.strips[:, : route.count].numpy())
+            latest = route.latest.numpy()
+            self._filter.change.learn_newest(latest, route.count)
+            self._filter.change.recenter_query(latest[:, -2:][:, 0])
         self._young.append(stamp)
         self._places = max(0, route.count - max(self._exclude, self._count_young(stamp)))
 
@@ -218,17 +224,26 @@ class LoopCloser(SequenceRecognizer):
     def _z_normalized(self, row: np.ndarray) -> np.ndarray:
         return z_normalized(row, AROUND)
 
-    def _distances(self) -> np.ndarray:
+    def _z_normalized_on(self, row: torch.Tensor) -> torch.Tensor:
+        from stavpr_ros.recognition.cuda_filter import z_normalized_on_device
+
+        return z_normalized_on_device(row, AROUND)
+
+    def _distances(self) -> torch.Tensor:
         """Return the distances of the newest image to its places; none if they are too few."""
         if self._places < LEAST_PLACES:
-            return np.empty(0, np.float32)
-        out = np.empty((1, self._places), np.float32)
-        strips, newest = self._route.strips.numpy(), self._route.newest
-        if len(strips) == 1:
-            dot.cosine_distances(strips[0], newest[0].numpy(), out)
-            return out[0]
-        dot.image_distances(strips, dot.tiled(newest), self._a, self._band, out)
-        return out[0]
+            return torch.empty(0, device=self._matcher.device)
+        return self._matcher.to_oldest(self._route.strips, self._route.newest, self._places)
+
+
+def _matcher(
+    W: int, spatial: SpatialSettings, backend: str
+) -> 'CpuRouteMatcher | CudaRouteMatcher':
+    if backend == 'cpu':
+        return CpuRouteMatcher(W, spatial)
+    from stavpr_ros.recognition.cuda_matcher import CudaRouteMatcher
+
+    return CudaRouteMatcher(W, spatial)
 
 
 def least_limit(exclude: int, length: int) -> int:

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from stavpr_ros.mapping import PlaceMap, select_places
-from stavpr_ros.recognition.robust import blocks, FilterSettings, MeanCentering
-from stavpr_ros.recognition.sequence_search import change_between
+from stavpr_ros.recognition.robust import blocks, change_between, FilterSettings, MeanCentering
 from tqdm import tqdm
 
 MOVED = 0.1  # of the median step: a camera that moved farther did not stand

@@ -80,7 +80,7 @@ class Belief:
 
         :returns: places, ascending, (m,), and their probabilities.
         """
-        near = np.unique(self.places[:, None] + np.arange(-CLOSE, CLOSE + 1))
+        near = distinct(self.places[:, None] + np.arange(-CLOSE, CLOSE + 1))
         near = near[(near >= 0) & (near < n)]
         sums = np.concatenate([[0], np.cumsum(self.weights)])
         low = np.searchsorted(self.places, near - CLOSE)
@@ -263,7 +263,7 @@ class PlaceFilter:
         :param excluded: places that do not count.
         """
         maxima, by_block = self._maxima.copy(), self._by_place.reshape(-1, BLOCK)
-        touched = np.unique(excluded // BLOCK)
+        touched = distinct(excluded // BLOCK)
         left = by_block[touched]
         left[np.searchsorted(touched, excluded // BLOCK), excluded % BLOCK] = 0
         maxima[touched] = left.max(axis=1)
@@ -294,9 +294,23 @@ def belief_of(ways: np.ndarray, probabilities: np.ndarray) -> Belief:
     :param probabilities: of each state, (m,), float64.
     """
     order = np.lexsort((-probabilities, ways[:, 0]))  # the most probable first, of each place
-    places, firsts, each = np.unique(ways[order, 0], return_index=True, return_inverse=True)
-    weights = np.bincount(each, probabilities[order], len(places))
-    return Belief(places, weights, ways[order[firsts], 1:])
+    places = ways[order, 0]
+    is_first = _differ(places)
+    weights = np.bincount(np.cumsum(is_first) - 1, probabilities[order])
+    return Belief(places[is_first], weights, ways[order[is_first], 1:])
+
+
+def distinct(values: np.ndarray) -> np.ndarray:
+    """Return the different values, ascending, as ``np.unique``; of few, in a tenth of the time."""
+    values = np.sort(values, axis=None)
+    return values[_differ(values)]
+
+
+def _differ(values: np.ndarray) -> np.ndarray:
+    """Return which of some sorted values differ from the one before."""
+    differ = np.ones(len(values), bool)
+    np.not_equal(values[1:], values[:-1], out=differ[1:])
+    return differ
 
 
 def _move_up(values: np.ndarray, count: int, none: int) -> None:

@@ -3,20 +3,20 @@
 """Frame by frame: distances of the newest image, nearest sequence of the window, status."""
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 import math
 import time
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
-from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.recognition.int8_features import Int8Features, rounded
+from stavpr_ros.recognition.held_map import centering_of, held_features
+from stavpr_ros.recognition.int8_features import Int8Features
 from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
 from stavpr_ros.recognition.match import (
     Candidate,
@@ -28,14 +28,7 @@ from stavpr_ros.recognition.match import (
 )
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.relative_motion import Positions, RelativeMotion
-from stavpr_ros.recognition.robust import (
-    blocks,
-    converted,
-    MeanCentering,
-    options_of,
-    RobustOptions,
-    z_normalized,
-)
+from stavpr_ros.recognition.robust import blocks, z_normalized
 from stavpr_ros.recognition.sequence_search import (
     FilterSearch,
     Search,
@@ -43,74 +36,10 @@ from stavpr_ros.recognition.sequence_search import (
     WindowMatch,
 )
 from stavpr_ros.recognition.sessions import layout_of, SessionLayout
+from stavpr_ros.recognition.settings import RecognizerSettings
 import torch
 
 TIMED = 3  # images, to compare the time of one with the time budget
-
-
-@dataclass(frozen=True)
-class RecognizerSettings:
-    """
-    Settings of the recognizer.
-
-    :param threshold: a window is matched when its distance is below it; > 0.
-    :param spatial: how two images are compared.
-    :param sequence: how a window is matched.
-    :param nms_radius: the second best's midpoint is more than so many places from the nearest
-        one's.
-    :param mode: ``paper``, or ``robust``, with all options of
-        :class:`stavpr_ros.recognition.robust.RobustOptions`.
-    :param robust_options: another choice of options than the mode's.
-    :param odometry_error: of a distance by odometry, as a share of it; where query and places have
-        poses, the path of a match is compared with them; 0 = never. See
-        :mod:`stavpr_ros.recognition.relative_motion`.
-    :param time_budget_ms: of :class:`PlaceRecognizer`, for an image; maps whose exact matching
-        takes longer get a first stage (:mod:`stavpr_ros.recognition.first_stage`). 0 = always
-        exact.
-    """
-
-    threshold: float
-    spatial: SpatialSettings = field(default_factory=SpatialSettings)
-    sequence: SequenceSettings = field(default_factory=SequenceSettings)
-    nms_radius: int = 20
-    mode: str = 'paper'
-    robust_options: RobustOptions | None = None
-    odometry_error: float = 0.1
-    time_budget_ms: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not self.threshold > 0 or math.isnan(self.threshold):
-            raise SettingsError(
-                f'threshold = {self.threshold} must be above 0: nothing is nearer than 0'
-            )
-        if self.nms_radius < 0:
-            raise SettingsError(f'nms_radius = {self.nms_radius} must be at least 0 places')
-        if not 0 <= self.odometry_error <= 1:
-            raise SettingsError(
-                f'odometry_error = {self.odometry_error} must be a share of the distance, 0 to 1'
-            )
-        if (
-            options_of(self.mode).place_filter
-            and self.robust_options is None
-            and self.threshold > 1
-        ):
-            raise SettingsError(
-                f'threshold = {self.threshold}: distances of mode robust end at 1, '
-                'where no probability is left'
-            )
-        if not 0 <= self.time_budget_ms < math.inf:
-            raise SettingsError(f'time_budget_ms = {self.time_budget_ms} must be at least 0')
-        with_dtw = self.spatial.strategy in ('adaptive', 'vanilla') and not self.spatial.vertical
-        if self.time_budget_ms and not (self.applied_options.place_filter and with_dtw):
-            raise SettingsError(
-                f'time_budget_ms = {self.time_budget_ms}: the first stage is of mode robust with '
-                'strategy adaptive or vanilla, without vertical alignment; take 0'
-            )
-
-    @property
-    def applied_options(self) -> RobustOptions:
-        """Return the options that are applied."""
-        return options_of(self.mode) if self.robust_options is None else self.robust_options
 
 
 class SequenceRecognizer:
@@ -136,13 +65,14 @@ class SequenceRecognizer:
         layout: SessionLayout | None = None,
         to_oldest: bool = False,
     ) -> None:
-        options, sequence = settings.applied_options, settings.sequence
+        sequence = settings.sequence
         self._settings, self._feature_settings = settings, feature_settings
-        self._layout = layout
+        self._options = settings.applied_options
+        self._layout, self._to_oldest = layout, to_oldest
         columns = places if layout is None else layout.width
         self._buffer = SequenceBuffer(sequence.length, columns, sequence.k)
         self._filter = None
-        if options.place_filter:
+        if self._options.place_filter:
             self._filter = FilterSearch(self._buffer, layout=layout, to_oldest=to_oldest)
         self._search: Search = self._filter or LmDtwSearch(self._buffer)
         # x and y of each place, or of the places held; empty = unknown
@@ -151,6 +81,24 @@ class SequenceRecognizer:
         self._window = WindowMatch()  # of the newest image
         self._nearest: SequenceMatch | None = None
         self._changes: deque[float] = deque(maxlen=sequence.length)  # of the window
+
+    def _match_on_device(self) -> None:
+        """Move the window and the filter to the CUDA device."""
+        from stavpr_ros.alignment.cuda.compilation import runtime
+
+        assert self._filter is not None
+        sequence, places, change = (
+            self._settings.sequence,
+            self._buffer.places,
+            self._filter.change,
+        )
+        device = runtime().torch_device
+        self._buffer = SequenceBuffer(sequence.length, places, sequence.k, device=device)
+        self._filter = FilterSearch(
+            self._buffer, layout=self._layout, to_oldest=self._to_oldest, on_device=True
+        )
+        self._filter.change = change
+        self._search = self._filter
 
     @property
     def settings(self) -> RecognizerSettings:
@@ -246,7 +194,7 @@ class SequenceRecognizer:
         :param position: of the image by odometry, (2,).
         """
         on_device = self._filter is not None and self._filter.on_device
-        if self._settings.applied_options.query_znorm:
+        if self._options.query_znorm:
             row = self._z_normalized_on(row) if on_device else self._z_normalized_here(row)
         if self._layout is not None:
             row = self._layout.spread(row)
@@ -348,24 +296,23 @@ class PlaceRecognizer(SequenceRecognizer):
         super().__init__(settings, place_map.settings, len(place_map), layout)
         if place_map.poses is not None and place_map.has_poses:
             self._compare(place_map.poses[:, :2])
-        features, options = place_map.features, settings.applied_options
+        features = place_map.features
         if not isinstance(features, StoredFeatures):  # these are checked whenever they are read
             for _, some in blocks(features):
                 require_finite(some, 'the map')
         self._dimension = features.dimension
-        self._centering = None
-        if options.mean_centering or options.whitening:
-            self._centering = MeanCentering(features, options.mean_centering, options.whitening)
+        self._centering = centering_of(features, self._options)
         # cells are made of float32 strips
-        held = self._held(features, 'float32' if settings.spatial.vertical else precision)
+        held_in = 'float32' if settings.spatial.vertical else precision
+        held = held_features(features, self._centering, held_in)
         backend = choose_backend(backend)
         self._matcher = make_matcher(held, settings.spatial, backend, precision)
         if self._filter is not None:
             firsts = (0,) if layout is None else layout.firsts
             self._filter.change.learn(held.strips, firsts)
         if backend == 'cuda' and self._filter is not None:
-            self._match_on_device(self._filter)
-        if backend == 'cuda' and not options.any:
+            self._match_on_device()
+        if backend == 'cuda' and not self._options.any:
             from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
             search = CudaLmDtwSearch(self._buffer.places, settings.sequence)
@@ -407,30 +354,6 @@ class PlaceRecognizer(SequenceRecognizer):
         assert self._filter is not None
         columns = self._filter.filter.probable_blocks()
         return columns if self._layout is None else self._layout.columns.searchsorted(columns)
-
-    def _match_on_device(self, search: FilterSearch) -> None:
-        from stavpr_ros.alignment.cuda.compilation import runtime
-
-        sequence, places = self._settings.sequence, self._buffer.places
-        device = runtime().torch_device
-        self._buffer = SequenceBuffer(sequence.length, places, sequence.k, device=device)
-        self._filter = FilterSearch(self._buffer, layout=self._layout, on_device=True)
-        self._filter.change = search.change
-        self._search = self._filter
-
-    def _held(self, features: LocalFeatures, precision: str) -> LocalFeatures | Int8Features:
-        """Return the features for the matcher, in memory once; those of a map are not copied."""
-        if precision == 'int8':
-            return rounded(features, self._centered)
-        dtype = torch.float16 if precision == 'float16' else torch.float32
-        if self._centering is not None:
-            return self._centering.places(features, dtype)
-        if dtype == torch.float32:
-            return features[:]
-        return converted(features, lambda strips: strips, dtype)
-
-    def _centered(self, features: LocalFeatures) -> LocalFeatures:
-        return features if self._centering is None else self._centering.places(features)
 
     @property
     def places(self) -> int:

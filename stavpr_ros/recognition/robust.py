@@ -325,3 +325,10 @@ def z_normalized(row: np.ndarray, around: int = 0) -> np.ndarray:
         return z
     clipped = np.where(np.isfinite(z), np.maximum(z, -1), np.float32(0))
     return z - uniform_filter1d(clipped, 2 * around + 1, mode='nearest')
+
+
+def change_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the change of two images, unit-norm strips (W, d) each; equal where both are zero."""
+    similarity = np.einsum('jd,jd->j', a, b)
+    similarity[~(a.any(axis=1) | b.any(axis=1))] = 1
+    return float(1 - similarity.mean())

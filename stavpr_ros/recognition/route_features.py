@@ -1,16 +1,26 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Features of a route that grows by one place at a time, centered and whitened, in memory once."""
+"""
+Features of a route that grows by one place at a time, centered and whitened, in memory once.
+
+In float16 and int8 they are float32 until the route is settled, so that they are rounded once:
+from then on, neither mean nor whitening is learned again.
+"""
+
+from copy import copy
 
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.recognition.map_change import APART
 from stavpr_ros.recognition.robust import evenly, unit_norm, Whitening
+from stavpr_ros.recognition.route_strips import grown, move_up, rounded_strips, RouteStrips
 import torch
 
 ROOM = 256  # places that there is room for at first; doubled when they are full
 GROWTH = 1.125  # the mean is updated when the route is so much longer
 SAMPLE = 128  # places that whitening is learned from
-SETTLED = 2000  # places from which on it is not learned again
+SETTLED = 2000  # places from which on it is not learned again; a full route is settled as well
+LATEST = APART + 1  # places that the newest one is compared with, itself included
 AT_ONCE = 64  # places whitened at a time
 PIECE = 512  # places centered at a time: the intermediate results stay in the cache
 
@@ -26,20 +36,36 @@ class RouteFeatures:
     :param mean_centering: subtract the mean.
     :param whitening: whiten; learned again from time to time while the route is short.
     :param limit: most places there will be; None = no limit.
+    :param precision: of the features once the route is settled, see the module.
+    :param device: a CUDA device where the features lie; None = on the CPU. Only the image's own
+        are copied to it, and a sample is copied back when whitening is learned.
     """
 
     def __init__(
-        self, settings: FeatureSettings, mean_centering: bool, whitening: bool, limit: int | None
+        self,
+        settings: FeatureSettings,
+        mean_centering: bool,
+        whitening: bool,
+        limit: int | None,
+        precision: str = 'float32',
+        device: torch.device | None = None,
     ) -> None:
         self.count = 0
-        self.strips = torch.empty((settings.strips, 0, 0))  # centered, (W, room, d)
+        self._precision, self._on_device = precision, device is not None
+        self._device = device or torch.device('cpu')
+        # centered, (W, room, d)
+        self.strips: RouteStrips = torch.empty((settings.strips, 0, 0), device=self._device)
+        self._is_settled = False
+        self._latest = torch.empty((settings.strips, 0, 0))  # see latest
         self._settings, self._centering, self._limit = settings, mean_centering, limit
         self._whitens = whitening
-        self._whitening: Whitening | None = None  # of the features less the mean
+        # of the features less the mean; on the CPU, and on the device
+        self._whitening: Whitening | None = None
+        self._there: Whitening | None = None
         self._cells: tuple[int, int] | None = None
         self._weights = torch.empty((settings.strips, 0))
         # (W, room): the norm of each feature before it was made unit norm; 0 for zero features
-        self._norms = torch.empty((settings.strips, 0))
+        self._norms = torch.empty((settings.strips, 0), device=self._device)
         self._sum = self._mean = torch.empty(
             (settings.strips, 0)
         )  # of the original features, (W, d)
@@ -52,8 +78,13 @@ class RouteFeatures:
 
     @property
     def newest(self) -> torch.Tensor:
-        """Centered features of the newest place, (W, 1, d)."""
-        return self.strips[:, self.count - 1 : self.count]
+        """Centered features of the newest place, (W, 1, d), float32, on the CPU."""
+        return self._latest[:, -1:]
+
+    @property
+    def latest(self) -> torch.Tensor:
+        """Those of the newest ``LATEST`` places, oldest first, (W, m, d)."""
+        return self._latest
 
     @property
     def mean(self) -> torch.Tensor:
@@ -68,11 +99,11 @@ class RouteFeatures:
         """
         n = self.count
         if n and (self._centering or self._whitens):
-            strips = self._centered(slice(n))
+            strips, norms = self._centered(slice(n)).cpu(), self._norms[:, :n].cpu()
             for j in range(len(strips)):
-                strips[j] += self._mean[j] * (self._norms[j, :n, None] > 0)
+                strips[j] += self._mean[j] * (norms[j, :, None] > 0)
         else:
-            strips = self.strips[:, :n].clone()
+            strips = self._float32(slice(n)).cpu().clone()
         return LocalFeatures(strips, self._weights[:, :n].clone(), self._settings, self._cells)
 
     def append(self, features: LocalFeatures) -> bool:
@@ -82,32 +113,55 @@ class RouteFeatures:
         if grows:
             self._grow(strips.shape[2])
             self._cells = features.cells
-        self.strips[:, self.count] = self._whitened(strips)[:, 0]
+        newest, norms = self._whitened(strips), strips[:, 0].any(dim=1).float()
+        if self._centering or self._whitens:
+            change = -self._whitened(self._mean[:, None])[:, 0]
+            moved = [_moved(newest[j], norms[j : j + 1], change[j]) for j in range(len(strips))]
+            newest = torch.stack([unit for unit, _ in moved])
+            norms = torch.cat([length for _, length in moved])
+        self._write(newest.contiguous(), norms)
         self._weights[:, self.count] = features.weights[:, 0]
-        self._norms[:, self.count] = strips[:, 0].any(dim=1)
         self.count += 1
+        if self._is_settled:
+            return grows
         if self._centering:
             self._sum += strips[:, 0]
-        if self._centering or self._whitens:
-            self._shift(self.count - 1, self.count - 1, -self._whitened(self._mean[:, None])[:, 0])
-            if self.count >= self._next_mean:
-                self._learn(0)
-                self._next_mean = int(self.count * GROWTH) + 1
+        is_full = self.count == min(SETTLED, self._limit or SETTLED)
+        settles = is_full and self._precision != 'float32'
+        if (self._centering or self._whitens) and (self.count >= self._next_mean or settles):
+            self._learn(0)
+            self._next_mean = int(self.count * GROWTH) + 1
+        if settles:
+            self.strips = rounded_strips(
+                self._floats, self.count, self._precision, self._on_device
+            )
+            self._is_settled = True
         return grows
+
+    def _write(self, newest: torch.Tensor, norms: torch.Tensor) -> None:
+        """Make features (W, 1, d), of norms (W,) before, those of the next place."""
+        if isinstance(self.strips, torch.Tensor):
+            self.strips[:, self.count] = newest[:, 0]
+        else:
+            self.strips.write(self.count, newest)
+        self._norms[:, self.count] = norms
+        self._latest = torch.cat([self._latest[:, 1 - LATEST :], newest], dim=1)
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the mean is then that of the others until the next eviction."""
         kept = self.count - count
         self._weights[:, :kept] = self._weights[:, count : self.count].clone()
-        if self._centering or self._whitens:
+        if (self._centering or self._whitens) and not self._is_settled:
             self._subtract_from_sum(count)
             self.count = kept
             self._learn(count)
             self._next_mean = self.count + count + 1
             return
-        for first in range(count, self.count, count):
-            last = min(first + count, self.count)
-            self.strips[:, first - count : last - count] = self.strips[:, first:last]
+        if isinstance(self.strips, torch.Tensor):
+            move_up(self.strips, count, self.count)
+        else:
+            self.strips.evict(count)
+        move_up(self._norms, count, self.count)
         self.count = kept
 
     def _whitened(self, strips: torch.Tensor) -> torch.Tensor:
@@ -115,34 +169,42 @@ class RouteFeatures:
 
     def _centered(self, places: slice | np.ndarray) -> torch.Tensor:
         """Return features less the mean, not whitened, of their own norm, (W, m, d)."""
-        strips = self.strips[:, places] * self._norms[:, places, None]
-        return self._whitening.inverse(strips) if self._whitening else strips
+        strips = self._float32(places) * self._norms[:, places, None]
+        return self._there.inverse(strips) if self._there else strips
+
+    @property
+    def _floats(self) -> torch.Tensor:
+        """The strips before they are rounded."""
+        assert isinstance(self.strips, torch.Tensor)
+        return self.strips
+
+    def _float32(self, places: slice | np.ndarray) -> torch.Tensor:
+        return self.strips[:, places].float()
 
     def _grow(self, d: int) -> None:
         """Double the room; memory that is not used yet is not touched."""
         n, W = self.count, self._settings.strips
         room = max(ROOM, 2 * self.room)
         room = room if self._limit is None else min(room, self._limit)
-        strips, norms, weights = (
-            torch.empty((W, room, d)),
-            torch.empty((W, room)),
-            torch.empty((W, room)),
-        )
-        if n:
-            strips[:, :n], norms[:, :n], weights[:, :n] = self.strips, self._norms, self._weights
-        else:
+        if not n:
+            shape = W, 0, d
             self._sum, self._mean = torch.zeros((W, d), dtype=torch.float64), torch.zeros((W, d))
-        self.strips, self._norms, self._weights = strips, norms, weights
+            self.strips, self._latest = self._floats.new_empty(shape), torch.empty(shape)
+        if isinstance(self.strips, torch.Tensor):
+            self.strips = grown(self.strips, room)
+        else:
+            self.strips.grow(room)
+        self._norms, self._weights = grown(self._norms, room), grown(self._weights, room)
 
     def _subtract_from_sum(self, count: int) -> None:
         """Subtract the original features of the oldest places from the sum."""
         if not self._centering:
             return
-        total, alive = torch.zeros_like(self._mean), self._norms[:, :count] > 0
+        total, alive = torch.zeros_like(self._mean), self._norms[:, :count].cpu() > 0
         for j in range(len(self.strips)):
             for low in range(0, count, PIECE):
                 piece = slice(low, min(low + PIECE, count))
-                total[j] += self._norms[j, piece] @ self.strips[j, piece]
+                total[j] += (self._norms[j, piece] @ self._floats[j, piece]).cpu()
         if self._whitening:
             total = self._whitening.inverse(total[:, None])[:, 0]
         self._sum -= total + alive.sum(dim=1, keepdim=True) * self._mean
@@ -154,13 +216,15 @@ class RouteFeatures:
         self._mean = mean
         if self._whitens and self.count <= SETTLED:
             some = evenly(self.count, SAMPLE)
-            whitening = Whitening(unit_norm(self._centered(some)))
+            whitening = Whitening(unit_norm(self._centered(some)).cpu())
+            there = copy(whitening).to(self._device)
             for low in range(0, self.count, AT_ONCE):
                 places = slice(low, min(low + AT_ONCE, self.count))
-                strips, norms = whitening(self._centered(places)), self._norms[:, places]
+                strips, norms = there(self._centered(places)), self._norms[:, places]
                 norms.copy_(strips.norm(dim=2).clamp_(min=1e-12) * (norms > 0))
-                self.strips[:, places] = unit_norm(strips)
-            self._whitening = whitening
+                self._floats[:, places] = unit_norm(strips)
+            self._whitening, self._there = whitening, there
+        self._latest = self._floats[:, max(0, self.count - LATEST) : self.count].cpu().clone()
 
     def _shift(self, first: int, to: int, change: torch.Tensor) -> None:
         """
@@ -170,15 +234,28 @@ class RouteFeatures:
         :param to: place where they are written to, at most ``first``.
         :param change: shape (W, d).
         """
+        change = change.to(self._device)
         for j in range(len(self.strips)):
-            strips, norms = self.strips[j], self._norms[j]
+            strips, norms = self._floats[j], self._norms[j]
             for low in range(to, self.count, PIECE):
                 high = min(low + PIECE, self.count)
-                source, target = slice(low + first - to, high + first - to), slice(low, high)
-                alive = norms[source, None] > 0
-                moved = strips[source] * norms[source, None]
-                moved += change[j]
-                moved *= alive
-                length = moved.norm(dim=1, keepdim=True).clamp_(min=1e-12)
-                torch.div(moved, length, out=strips[target])
-                norms[target] = (length * alive)[:, 0]
+                source = slice(low + first - to, high + first - to)
+                unit, lengths = _moved(strips[source], norms[source], change[j])
+                strips[low:high], norms[low:high] = unit, lengths
+
+
+def _moved(
+    strips: torch.Tensor, norms: torch.Tensor, change: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """
+    Add to features (m, d) of norms (m,), and make them unit norm; zero features stay zero.
+
+    :returns: the features, and their norms.
+    """
+    alive = norms[:, None] > 0
+    moved = strips * norms[:, None]
+    moved += change
+    moved *= alive
+    length = moved.norm(dim=1, keepdim=True).clamp_(min=1e-12)
+    moved /= length
+    return moved, (length * alive)[:, 0]

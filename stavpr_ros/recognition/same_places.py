@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 from stavpr_ros.mapping import PlaceMap, select_places
-from stavpr_ros.recognition.recognizer import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.recognizer import PlaceRecognizer
+from stavpr_ros.recognition.settings import RecognizerSettings
 from tqdm import tqdm
 
 SURE = 0.9  # probability above which two places are taken to be the same

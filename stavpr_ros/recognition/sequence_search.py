@@ -3,9 +3,8 @@
 """
 The window of the query, and the search of mode robust over it.
 
-The change of two images is 1 less the mean cosine similarity of their strips, each with the one in
-the same place: 0 for equal images, about 1 for unrelated ones. How it grows with the number of
-places in between is learned from the map, so that the query's changes show how fast it moves.
+How the change of two images grows with the number of places in between is learned from the map
+(:mod:`stavpr_ros.recognition.map_change`), so that the query's changes show how fast it moves.
 """
 
 from collections import deque
@@ -13,26 +12,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import numba as nb
 import numpy as np
-from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.alignment.lm_dtw import padded_width, SequenceMatch
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.checks import no_nan
-from stavpr_ros.compilation import parallel_kernel
-from stavpr_ros.recognition.place_filter import CLOSE, NEGLIGIBLE, PlaceFilter
-from stavpr_ros.recognition.robust import FilterSettings
+from stavpr_ros.recognition.map_change import APART, MapChange
+from stavpr_ros.recognition.place_filter import CLOSE, distinct, NEGLIGIBLE, PlaceFilter
+from stavpr_ros.recognition.robust import change_between, FilterSettings
 from stavpr_ros.recognition.sessions import Sequences, SessionLayout
 import torch
 
-LEARNED_AT_ONCE = 256  # places
-APART = 5  # places apart up to which the map's changes are learned
 SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
 OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
 FLOOR = 1e-3  # least relative probability of a speed
-AHEAD = 8  # places within which an unlit stretch may begin
-STRETCH = 4  # places in a row, at least, equal each to the one before: an unlit stretch
-UNLIT = 0.3  # probability of such places above which equal images do not mean standstill
 
 
 class SequenceBuffer:
@@ -170,34 +162,16 @@ Search = Callable[[int], WindowMatch]
 """Matches a full window; the argument is the radius in places of the non-maximum suppression."""
 
 
-@parallel_kernel
-def _changes(strips, apart, out):
-    """Write the change of each place of (W, n, d) from the one ``apart`` places before, (n,)."""
-    W, n, d = strips.shape
-    for y in nb.prange(apart, n):
-        total = np.float32(0)
-        for j in range(W):
-            a, b = strips[j, y], strips[j, y - apart]
-            dot, norm = np.float32(0), np.float32(0)
-            for i in range(d):
-                dot += a[i] * b[i]
-                norm += a[i] * a[i] + b[i] * b[i]
-            total += dot if norm > 0 else np.float32(1)
-        out[y] = 1 - total / W
-
-
-class ImageChange:
+class ImageChange(MapChange):
     """
-    Changes of a map, and of the query that is compared with it.
+    Changes of the query, read by those of the map.
 
     :param places: places that there is room for.
     """
 
     def __init__(self, places: int, settings: FilterSettings) -> None:
-        self._settings = settings
+        super().__init__(places, settings)
         self._speeds = np.array(settings.speeds)
-        self._sums, self._counts = np.zeros(APART + 1), np.zeros(APART + 1)
-        self._from_before = np.ones(places, np.float32)  # change of each place from the one before
         self.reset()
 
     def reset(self) -> None:
@@ -205,101 +179,20 @@ class ImageChange:
         self._last: np.ndarray | None = None
         self._latest: deque[float] = deque(maxlen=SMOOTHED)
 
-    def learn(
-        self,
-        strips: torch.Tensor | np.ndarray | Int8Strips,
-        firsts: np.ndarray | tuple[int, ...] = (0,),
-    ) -> None:
-        """
-        Learn from all places of a map.
-
-        :param strips: unit-norm, (W, n, d), of any precision.
-        :param firsts: first place of each session.
-        """
-        n = strips.shape[1]
-        if not n:
-            return
-        changes = np.empty((APART + 1, n), np.float32)
-        for low in range(0, n, LEARNED_AT_ONCE):
-            first, high = max(0, low - APART), min(low + LEARNED_AT_ONCE, n)
-            block = torch.as_tensor(strips[:, first:high]).float().contiguous().cpu().numpy()
-            out = np.empty(high - first, np.float32)
-            for apart in range(1, min(APART, n - 1) + 1):
-                _changes(block, apart, out)
-                changes[apart, low:high] = out[low - first :]
-        for apart in range(1, min(APART, n - 1) + 1):
-            crossing = np.zeros(n, bool)
-            for first in firsts:
-                crossing[first : first + apart] = True
-            changes[apart, crossing] = 0
-            self._sums[apart] = changes[apart, apart:].sum(dtype=np.float64)
-            self._counts[apart] = n - np.count_nonzero(crossing)
-        self._from_before[1:] = changes[1, 1:]
-        self._from_before[list(firsts)] = 1
-
-    def learn_newest(self, strips: np.ndarray) -> None:
-        """Learn from the newest place of a route, (W, n, d) of all its places."""
-        n = strips.shape[1]
-        newest = strips[:, n - 1]
-        changes = [
-            change_between(newest, strips[:, n - 1 - apart])
-            for apart in range(1, min(APART, n - 1) + 1)
-        ]
-        self._from_before[n - 1] = changes[0] if changes else 1
-        if changes and not self.is_standstill(changes[0]):
-            self._sums[1 : len(changes) + 1] += changes
-            self._counts[1 : len(changes) + 1] += 1
-
-    def adopt(self, learned: 'ImageChange', from_before: np.ndarray) -> None:
-        """
-        Take what was learned from a sample, for some places of its map.
-
-        :param from_before: change of each place from the one before, (n,), float32.
-        """
-        self._sums, self._counts = learned._sums, learned._counts
-        self._from_before = from_before
-
-    def grow(self, places: int) -> None:
-        """Make room for more places."""
-        more = np.ones(places - len(self._from_before), np.float32)
-        self._from_before = np.append(self._from_before, more)
-
-    def evict(self, count: int) -> None:
-        """Drop the oldest places; the others move up."""
-        self._from_before = np.append(self._from_before[count:], np.ones(count, np.float32))
-
-    @property
-    def curve(self) -> np.ndarray:
-        """Mean change of places 0, 1, ... ``APART`` apart; 1 where none is known."""
-        known = self._counts > 0
-        curve = np.where(known, self._sums / np.maximum(self._counts, 1), 1)
-        curve[0] = 0
-        return curve
-
     def next_query(self, strips: np.ndarray) -> float:
         """Return the change of the query's next image (W, d) from the one before, 1 at first."""
         change = 1.0 if self._last is None else change_between(strips, self._last)
         self._last = strips
         return change
 
+    def recenter_query(self, strips: np.ndarray) -> None:
+        """Take the query's last image (W, d) again: its mean has changed. None after a reset."""
+        if self._last is not None:
+            self._last = strips
+
     def is_standstill(self, change: float) -> bool:
         """Whether the query's images are equal up to noise: the camera stands, or it is dark."""
-        return bool(change < self._settings.standstill * self.curve[1])
-
-    def unlit(self, by_place: np.ndarray) -> bool:
-        """
-        Whether equal images are expected where the camera is: places of the map are equal there.
-
-        :param by_place: probability of each place, (n,).
-        """
-        n = len(by_place)
-        equal = self._from_before[:n] < 2 * self._settings.standstill * self.curve[1]
-        for _ in range(STRETCH - 1):  # equal places before, too
-            equal[1:] &= equal[:-1].copy()
-        ahead = np.zeros(n, bool)
-        for places in range(min(AHEAD, n)):
-            ahead[: n - places] |= equal[places:]
-        return bool(by_place[ahead].sum() > UNLIT * by_place.sum())
+        return bool(change < self.standstill)
 
     def weight(self, change: float) -> float:
         """Return the exponent alpha of the image's likelihood."""
@@ -314,13 +207,6 @@ class ImageChange:
         expected = np.log(np.interp(self._speeds, np.arange(APART + 1), self.curve) + OFFSET)
         off = (seen - expected) / self._settings.change_deviation
         return np.asarray(np.exp(-0.5 * off**2) + FLOOR)
-
-
-def change_between(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the change of two images, unit-norm strips (W, d) each; equal where both are zero."""
-    similarity = np.einsum('jd,jd->j', a, b)
-    similarity[~(a.any(axis=1) | b.any(axis=1))] = 1
-    return float(1 - similarity.mean())
 
 
 class FilterSearch:
@@ -444,7 +330,7 @@ class FilterSearch:
     ) -> tuple[int, float]:
         """Return the most probable place beyond a radius, and its probability, 0 if none."""
         around = np.arange(max(0, middle - radius), min(n, middle + radius + 1))
-        now, faint = self.filter.most_probable(np.union1d(around, places))
+        now, faint = self.filter.most_probable(distinct(np.append(around, places)))
         faint *= NEGLIGIBLE
         apart = np.abs(places - middle) > radius
         if apart.any():

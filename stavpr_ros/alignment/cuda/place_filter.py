@@ -27,18 +27,19 @@ def mix(K: int, V: int) -> Any:
     """
     Compile the change of level and speed, for K levels and V speeds.
 
-    - ``states``: (K V, n), float32.
+    - ``n``: places; of the tables below, columns from it on are neither read nor written.
+    - ``states``: (K V, room), float32.
     - ``levels``: factors by the level before and after, (K, K).
     - ``speeds``: factors of the speed to stay, of the one below, of the one above, after any, and
       of any before, (5, V).
-    - ``mixed``: (K V, n), written.
-    - ``codes``: (K V, n), uint8, written: 0 the speed was the same, 1 the one below, 2 the one
+    - ``mixed``: (K V, room), written.
+    - ``codes``: (K V, room), uint8, written: 0 the speed was the same, 1 the one below, 2 the one
       above.
     """
 
-    def mix_states(states, levels, speeds, mixed, codes):
+    def mix_states(n, states, levels, speeds, mixed, codes):
         y = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
-        if y >= states.shape[1]:
+        if y >= n:
             return
         b = cuda.local.array(V, float32)
         for k in range(K):
@@ -70,25 +71,24 @@ def move(K: int, V: int) -> Any:
     """
     Compile the motion and the evidence; the grid covers the places and ``reach`` more.
 
-    - ``mixed``, ``codes``: of :func:`mix`.
-    - ``z``: (n,), float32; -inf in a gap.
+    - ``n``, ``mixed``, ``codes``: of :func:`mix`.
+    - ``z``: (room,), float32; -inf in a gap.
     - ``steps``: places that each speed moves on, (V,), int32.
     - ``levels``: mean z of right places, (K,).
     - ``weight``, ``spread``, ``stay``: alpha, probability of one place more or less, of staying on
       the map.
     - ``births``: (K,).
-    - ``states``: (K V, n), written.
-    - ``origins``: of this image, (K (V + 1) // 2, n), uint8, written.
-    - ``sums``: (2 K, n + reach), written: of a place's states of each level, and of what arrives
-      in gaps and beyond the map's end.
+    - ``states``: (K V, room), written.
+    - ``origins``: of this image, (K (V + 1) // 2, room), uint8, written.
+    - ``sums``: (2 K, room + reach), written: of a place's states of each level, and of what
+      arrives in gaps and beyond the map's end.
     """
     halves = (V + 1) // 2
 
     def move_states(
-        mixed, codes, z, steps, levels, weight, spread, stay, births, states, origins, sums
+        n, mixed, codes, z, steps, levels, weight, spread, stay, births, states, origins, sums
     ):
         y = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
-        n = mixed.shape[1]
         if y >= sums.shape[1]:
             return
         outside = y >= n or z[min(y, n - 1)] < GAP
@@ -140,8 +140,8 @@ def trace(K: int, V: int) -> Any:
     Compile the way back of the states of some places, one thread a state.
 
     - ``tops``: places, (m,), int64.
-    - ``states``: (K V, n).
-    - ``origins``: ring of the latest images', (L, K (V + 1) // 2, n), uint8.
+    - ``states``: (K V, room).
+    - ``origins``: ring of the latest images', (L, K (V + 1) // 2, room), uint8.
     - ``steps``: ring of their steps, (L, V), int32.
     - ``newest``: slot of the newest.
     - ``probabilities``: (m K V,), written: the states.

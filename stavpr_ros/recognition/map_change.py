@@ -1,0 +1,146 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+How much the images of a map change from place to place.
+
+The change of two images is 1 less the mean cosine similarity of their strips, each with the one in
+the same place: 0 for equal images, about 1 for unrelated ones.
+"""
+
+import numba as nb
+import numpy as np
+from stavpr_ros.alignment.cpu.int8 import Int8Strips
+from stavpr_ros.compilation import parallel_kernel
+from stavpr_ros.recognition.robust import change_between, FilterSettings
+import torch
+
+LEARNED_AT_ONCE = 256  # places
+APART = 5  # places apart up to which the map's changes are learned
+AHEAD = 8  # places within which an unlit stretch may begin
+STRETCH = 4  # places in a row, at least, equal each to the one before: an unlit stretch
+UNLIT = 0.3  # probability of such places above which equal images do not mean standstill
+
+
+class MapChange:
+    """
+    Changes of a map from place to place.
+
+    ``curve`` holds the mean change of places 0, 1, ... ``APART`` apart, 1 where none is known;
+    ``standstill`` the change below which a camera stands.
+
+    :param places: places that there is room for.
+    """
+
+    def __init__(self, places: int, settings: FilterSettings) -> None:
+        self._settings = settings
+        self._sums, self._counts = np.zeros(APART + 1), np.zeros(APART + 1)
+        self._from_before = np.ones(places, np.float32)  # change of each place from the one before
+        self._update_curve()
+
+    def learn(
+        self,
+        strips: torch.Tensor | np.ndarray | Int8Strips,
+        firsts: np.ndarray | tuple[int, ...] = (0,),
+    ) -> None:
+        """
+        Learn from all places of a map.
+
+        :param strips: unit-norm, (W, n, d), of any precision.
+        :param firsts: first place of each session.
+        """
+        n = strips.shape[1]
+        if not n:
+            return
+        changes = np.empty((APART + 1, n), np.float32)
+        for low in range(0, n, LEARNED_AT_ONCE):
+            first, high = max(0, low - APART), min(low + LEARNED_AT_ONCE, n)
+            block = torch.as_tensor(strips[:, first:high]).float().contiguous().cpu().numpy()
+            out = np.empty(high - first, np.float32)
+            for apart in range(1, min(APART, n - 1) + 1):
+                _changes(block, apart, out)
+                changes[apart, low:high] = out[low - first :]
+        for apart in range(1, min(APART, n - 1) + 1):
+            crossing = np.zeros(n, bool)
+            for first in firsts:
+                crossing[first : first + apart] = True
+            changes[apart, crossing] = 0
+            self._sums[apart] = changes[apart, apart:].sum(dtype=np.float64)
+            self._counts[apart] = n - np.count_nonzero(crossing)
+        self._from_before[1:] = changes[1, 1:]
+        self._from_before[list(firsts)] = 1
+        self._update_curve()
+
+    def learn_newest(self, latest: np.ndarray, n: int) -> None:
+        """
+        Learn from the newest place of a route.
+
+        :param latest: strips of the newest places, oldest first, (W, m, d); ``APART`` + 1 of them
+            if there are so many.
+        :param n: places of the route.
+        """
+        last = latest.shape[1] - 1
+        changes = [
+            change_between(latest[:, last], latest[:, last - apart])
+            for apart in range(1, min(APART, last) + 1)
+        ]
+        self._from_before[n - 1] = changes[0] if changes else 1
+        if changes and not changes[0] < self.standstill:
+            self._sums[1 : len(changes) + 1] += changes
+            self._counts[1 : len(changes) + 1] += 1
+            self._update_curve()
+
+    def adopt(self, learned: 'MapChange', from_before: np.ndarray) -> None:
+        """
+        Take what was learned from a sample, for some places of its map.
+
+        :param from_before: change of each place from the one before, (n,), float32.
+        """
+        self._sums, self._counts = learned._sums, learned._counts
+        self._from_before = from_before
+        self._update_curve()
+
+    def grow(self, places: int) -> None:
+        """Make room for more places."""
+        more = np.ones(places - len(self._from_before), np.float32)
+        self._from_before = np.append(self._from_before, more)
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+        self._from_before = np.append(self._from_before[count:], np.ones(count, np.float32))
+
+    def _update_curve(self) -> None:
+        known = self._counts > 0
+        self.curve = np.where(known, self._sums / np.maximum(self._counts, 1), 1)
+        self.curve[0] = 0
+        self.standstill = self._settings.standstill * self.curve[1]
+
+    def unlit(self, by_place: np.ndarray) -> bool:
+        """
+        Whether equal images are expected where the camera is: places of the map are equal there.
+
+        :param by_place: probability of each place, (n,).
+        """
+        n = len(by_place)
+        equal = self._from_before[:n] < 2 * self.standstill
+        for _ in range(STRETCH - 1):  # equal places before, too
+            equal[1:] &= equal[:-1].copy()
+        ahead = np.zeros(n, bool)
+        for places in range(min(AHEAD, n)):
+            ahead[: n - places] |= equal[places:]
+        return bool(by_place[ahead].sum() > UNLIT * by_place.sum())
+
+
+@parallel_kernel
+def _changes(strips, apart, out):
+    """Write the change of each place of (W, n, d) from the one ``apart`` places before, (n,)."""
+    W, n, d = strips.shape
+    for y in nb.prange(apart, n):
+        total = np.float32(0)
+        for j in range(W):
+            a, b = strips[j, y], strips[j, y - apart]
+            dot, norm = np.float32(0), np.float32(0)
+            for i in range(d):
+                dot += a[i] * b[i]
+                norm += a[i] * a[i] + b[i] * b[i]
+            total += dot if norm > 0 else np.float32(1)
+        out[y] = 1 - total / W

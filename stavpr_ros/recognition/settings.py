@@ -1,0 +1,75 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of the recognizers."""
+
+from dataclasses import dataclass, field
+import math
+
+from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.recognition.robust import options_of, RobustOptions
+
+
+@dataclass(frozen=True)
+class RecognizerSettings:
+    """
+    Settings of the recognizer.
+
+    :param threshold: a window is matched when its distance is below it; > 0.
+    :param spatial: how two images are compared.
+    :param sequence: how a window is matched.
+    :param nms_radius: the second best's midpoint is more than so many places from the nearest
+        one's.
+    :param mode: ``paper``, or ``robust``, with all options of
+        :class:`stavpr_ros.recognition.robust.RobustOptions`.
+    :param robust_options: another choice of options than the mode's.
+    :param odometry_error: of a distance by odometry, as a share of it; where query and places have
+        poses, the path of a match is compared with them; 0 = never. See
+        :mod:`stavpr_ros.recognition.relative_motion`.
+    :param time_budget_ms: of :class:`PlaceRecognizer`, for an image; maps whose exact matching
+        takes longer get a first stage (:mod:`stavpr_ros.recognition.first_stage`). 0 = always
+        exact.
+    """
+
+    threshold: float
+    spatial: SpatialSettings = field(default_factory=SpatialSettings)
+    sequence: SequenceSettings = field(default_factory=SequenceSettings)
+    nms_radius: int = 20
+    mode: str = 'paper'
+    robust_options: RobustOptions | None = None
+    odometry_error: float = 0.1
+    time_budget_ms: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.threshold > 0 or math.isnan(self.threshold):
+            raise SettingsError(
+                f'threshold = {self.threshold} must be above 0: nothing is nearer than 0'
+            )
+        if self.nms_radius < 0:
+            raise SettingsError(f'nms_radius = {self.nms_radius} must be at least 0 places')
+        if not 0 <= self.odometry_error <= 1:
+            raise SettingsError(
+                f'odometry_error = {self.odometry_error} must be a share of the distance, 0 to 1'
+            )
+        if (
+            options_of(self.mode).place_filter
+            and self.robust_options is None
+            and self.threshold > 1
+        ):
+            raise SettingsError(
+                f'threshold = {self.threshold}: distances of mode robust end at 1, '
+                'where no probability is left'
+            )
+        if not 0 <= self.time_budget_ms < math.inf:
+            raise SettingsError(f'time_budget_ms = {self.time_budget_ms} must be at least 0')
+        with_dtw = self.spatial.strategy in ('adaptive', 'vanilla') and not self.spatial.vertical
+        if self.time_budget_ms and not (self.applied_options.place_filter and with_dtw):
+            raise SettingsError(
+                f'time_budget_ms = {self.time_budget_ms}: the first stage is of mode robust with '
+                'strategy adaptive or vanilla, without vertical alignment; take 0'
+            )
+
+    @property
+    def applied_options(self) -> RobustOptions:
+        """Return the options that are applied."""
+        return options_of(self.mode) if self.robust_options is None else self.robust_options

@@ -1,0 +1,160 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Loop closure on CUDA and on the CPU; also in the simulator (test_cuda_kernels.py)."""
+
+import numpy as np
+import pytest
+from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.errors import UnavailableError
+from stavpr_ros.features import LocalFeatures
+from stavpr_ros.features.extractor import FeatureSettings
+from stavpr_ros.recognition import RecognizerSettings, route_features, Status
+from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.recognition.place_filter import PlaceFilter
+from stavpr_ros.recognition.robust import FilterSettings, z_normalized
+import torch
+
+W, D, LAP, LENGTH, EXCLUDE = 3, 16, 20, 6, 8
+SMALL = FilterSettings(speeds=(0.0, 0.5, 1.0, 2.0, 4.5), levels=(-1.4, -3.4), enter=0.1)
+
+
+@pytest.fixture(scope='module')
+def cuda_filter():
+    """Return the module, with small blocks and rooms; skip where there is no device."""
+    from stavpr_ros.alignment.cuda.compilation import runtime
+    from stavpr_ros.recognition import cuda_filter
+
+    try:
+        runtime()
+    except UnavailableError as error:
+        pytest.skip(f'{error}; the same test runs in the simulator')
+    from stavpr_ros.alignment.cuda import dtw
+    from stavpr_ros.alignment.cuda import place_filter as kernels
+    from stavpr_ros.recognition import cuda_matcher, loop_closer, place_filter
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels, 'BLOCK', 8)
+        patch.setattr(dtw, 'BLOCK', 8)
+        patch.setattr(cuda_matcher, 'AT_ONCE', 4)
+        patch.setattr(loop_closer, 'choose_backend', lambda backend: backend)
+        patch.setattr(route_features, 'ROOM', 8)
+        for module in (cuda_filter, place_filter):  # the simulator is slow
+            patch.setattr(module, 'TOP', 6)
+        yield cuda_filter
+
+
+def test_filter_of_growing_places_equals_that_of_the_cpu(cuda_filter):
+    """None at first, more, fewer, evicted ones, none again."""
+    lag, room = 4, 0
+    cpu, cuda = PlaceFilter(room, lag, SMALL), cuda_filter.CudaPlaceFilter(room, lag, SMALL)
+    rng = np.random.default_rng(0)
+    answered = 0
+    for image, n in enumerate([0, 0, 1, 5, 6, 7, 8, 9, 9, 12, 10, 11, 9, 10, 11, 0, 0, 12, 13]):
+        if n > room:
+            room = n + 3
+            cpu.grow(room)
+            cuda.grow(room)
+        if image == 12:  # three places are evicted
+            cpu.evict(3)
+            cuda.evict(3)
+        z = rng.normal(size=n).astype(np.float32)
+        if n > 4:
+            z[n - 3] -= 4
+        weights = rng.uniform(0.5, 1, len(SMALL.speeds))
+        cpu.update(z, 0.5, weights)
+        cuda.update(torch.from_numpy(z).to(cuda._device), 0.5, weights)
+        np.testing.assert_allclose(
+            cuda.places_of_states()[:n], cpu.places_of_states()[:n], rtol=1e-3, atol=1e-7
+        )
+        assert not cuda.places_of_states()[n:].any()
+        assert cuda.off_map == pytest.approx(cpu.off_map, rel=1e-3, abs=1e-6)
+        ago = min(image, lag)
+        one, other = cuda.belief(n, ago), cpu.belief(n, ago)
+        np.testing.assert_array_equal(one.places, other.places)
+        np.testing.assert_allclose(one.weights, other.weights, rtol=1e-3, atol=1e-7)
+        if len(other.places):
+            answered += 1
+            top = np.argmax(other.weights)
+            np.testing.assert_array_equal(one.ways[top], other.ways[top])
+            way = cpu.way(other.ways[top], ago)
+            np.testing.assert_array_equal(cuda.way(one.ways[top], ago), way)
+    assert answered > 6
+
+
+def test_background_on_device_equals_that_of_the_cpu(cuda_filter):
+    row = np.random.default_rng(0).uniform(0.2, 1, 150).astype(np.float32)
+    row[[7, 149]] = np.inf
+    for values in (row, row[:5], np.full(3, np.inf, np.float32), row[:0]):
+        found = cuda_filter.z_normalized_on_device(torch.from_numpy(values), 30)
+        np.testing.assert_allclose(found, z_normalized(values, 30), rtol=1e-4, atol=1e-5)
+
+
+def laps(count):
+    """Return features of a route that passes ``LAP`` places again and again."""
+    rng = np.random.default_rng(0)
+    known = rng.standard_normal((W, LAP, D))
+    strips = known[:, np.arange(count) % LAP] + 0.4 * rng.standard_normal((W, count, D))
+    strips += rng.standard_normal((W, 1, D))
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+    return LocalFeatures(
+        torch.from_numpy(strips).float(),
+        torch.full((W, count), W**-0.5),
+        FeatureSettings('gradient', None, W),
+    )
+
+
+@pytest.mark.parametrize(
+    ('precision', 'limit', 'settled'),
+    [('float32', 34, 2000), ('float16', 30, 20), ('int8', None, 20)],
+)
+def test_loop_closer_on_device_equals_that_of_the_cpu(
+    cuda_filter, monkeypatch, precision, limit, settled
+):
+    """Growing, whitened anew, settled, evicted; late matches, too."""
+    monkeypatch.setattr(route_features, 'SETTLED', settled)
+    features = laps(44)
+    settings = RecognizerSettings(
+        0.5, sequence=SequenceSettings(LENGTH), nms_radius=3, mode='robust'
+    )
+    cpu, cuda = (
+        LoopCloser(
+            settings, EXCLUDE, features.settings, limit=limit, backend=backend, precision=precision
+        )
+        for backend in ('cpu', 'cuda')
+    )
+    matched = late = 0
+    most = 0.02 if precision == 'float16' else 2e-3  # the image is rounded on the device, too
+    for i in range(len(features)):
+        one, other = (closer.update(features[i : i + 1], 1 + i) for closer in (cuda, cpu))
+        assert (one.status, one.window_stamps) == (other.status, other.window_stamps)
+        assert (cuda.first, len(cuda)) == (cpu.first, len(cpu))
+        if other.sequence is None:
+            assert one.sequence is None
+            continue
+        matched += other.accepted
+        assert np.percentile(np.abs(cuda.newest_row() - cpu.newest_row()), 90) < most
+        assert one.probability == pytest.approx(other.probability, abs=most)
+        assert one.sequence.middle == other.sequence.middle
+        if other.status is Status.MATCH:
+            np.testing.assert_array_equal(one.path, other.path)
+        assert (one.late is None) == (other.late is None)
+        if other.late is not None:
+            late += 1
+            assert one.late.place_index == other.late.place_index
+    assert late or precision != 'float32'
+    assert matched > 10
+    np.testing.assert_allclose(cuda.features().strips, cpu.features().strips, atol=1e-5)
+    cuda.reset()
+    assert cuda.update(features[:1]).status is Status.WARMING_UP
+
+
+def test_loop_closer_with_lm_dtw_and_route_on_device_equals_that_of_the_cpu(cuda_filter):
+    features = laps(34)
+    settings = RecognizerSettings(1.0, sequence=SequenceSettings(LENGTH), nms_radius=3)
+    closers = [
+        LoopCloser(settings, EXCLUDE, features.settings, backend=b) for b in ('cpu', 'cuda')
+    ]
+    for i in range(len(features)):
+        cpu, cuda = (closer.update(features[i : i + 1]) for closer in closers)
+        assert cpu.status == cuda.status
+        assert cpu.place_index == cuda.place_index
