@@ -136,11 +136,10 @@ def _edge_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
             f'{np.percentile(np.abs(edges[name, "PNP"][:, column]), 90) / unit:.2f}'
             for name in drifts
         ))  # fmt: skip
-    for source in ('PNP', 'ALIGNED'):
-        add(f'{source.replace("ALIGNED", "aligned").replace("PNP", "PnP")}: inside the bound of '
-            '95 % (NEES)', '90 to 99 %', (
-            f'{100 * np.mean(edges[name, source][:, 3] < BOUND):.1f} % of '
-            f'{len(edges[name, source])}' if len(edges[name, source]) else ''
+    for source, title in (('PNP', 'PnP'), ('ALIGNED', 'aligned')):
+        inside = {name: edges[name, source][:, 3] < BOUND for name in drifts}
+        add(f'{title}: inside the bound of 95 % (NEES)', '90 to 99 %', (
+            f'{100 * inside[name].mean():.1f} % of {len(inside[name])}' if len(inside[name]) else ''
             for name in drifts
         ))  # fmt: skip
     for kind, title in (('edge', 'edge'), ('place_index', '`place_index`')):
