@@ -30,7 +30,7 @@ help: ## list the targets (the default)
 	@echo 'Names and values:'
 	@echo '  PYTHON=python3.12          the Python to use, 3.11 to 3.13 (default: python3)'
 	@echo '  TORCH_INDEX=URL            package index for torch, for example one of CPU wheels'
-	@echo '  EXTRAS="onnx cuda"         optional packages: onnx, faiss, fleet, ray, cuda, slam, evaluation, bench, dev, docs'
+	@echo '  EXTRAS="onnx cuda"         optional packages: onnx, hdf5, faiss, fleet, ray, cuda, slam, evaluation, bench, dev, docs'
 	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your folders of images, bags or saved maps'
 	@echo '  LOOP=PATH                  demo: your sequence with loops, or synthetic for the street'
 	@echo '  SLAM=world                 demo: three laps, odometry corrected by a pose graph'
@@ -94,4 +94,4 @@ distclean: clean ## also remove .venv and the caches of tools
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 development:
-	@$(SETUP) build $(OPTIONS) onnx faiss fleet slam evaluation dev docs
+	@$(SETUP) build $(OPTIONS) onnx hdf5 faiss fleet slam evaluation dev docs

@@ -91,6 +91,7 @@ setup(
         'evaluation': EVALUATION,
         'faiss': ['faiss-cpu>=1.8'],
         'fleet': ['faiss-cpu>=1.8', 'qdrant-client>=1.15', 'qdrant-edge-py>=0.5'],
+        'hdf5': ['h5py>=3.10'],
         'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
         'ray': ['ray>=2.40'],
         'slam': ['evo>=1.31', 'gtsam>=4.2'],

@@ -6,20 +6,24 @@ Mode robust in a city: a real map among simulated places, compared exactly and b
 The simulated places are a route of images whose features have the mean, the covariance (of all
 strips together, its ``RANK`` largest directions) and the correlation from image to image of the
 real map: a first-order autoregressive Gaussian, each strip made unit norm. The real places lie
-together within it. ``PYTHONPATH=. python benchmarks/city.py --places 1000000``.
+together within it. ``PYTHONPATH=. python benchmarks/city.py --places 1000000`` adds to
+``benchmarks/results/city.json``, and writes the tables of docs/performance.md from it and from
+what ``soak.py --output benchmarks/results/node-NAME.json`` has measured.
 """
 
 import argparse
 from collections.abc import Iterator
 import json
+import os
 from pathlib import Path
 import time
 from typing import Any
 
 from data import data_folder
 import numpy as np
-from results import cpu_model, table
+from results import commit, cpu_model, RESULTS, ROOT, table
 from scipy.signal import lfilter
+from stavpr_ros.evaluation.warp import warp_indices
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import PlaceMap, save_map
 from stavpr_ros.mapping.builder import extract_features
@@ -31,12 +35,18 @@ import torch
 RANK, PIECE = 256, 4096
 AT = 0.37  # where in the city the real places begin
 ALWAYS = 1e-6  # ms: no exact matching is as fast
-CASES = {
-    'gardens_point': ('gardens_point/day_left', 'gardens_point/day_right', 2),
-    'walk_night': ('walk_by_night/left_day', 'walk_by_night/right_night', 2),
-    'corridor': ('corridor/ref', 'corridor/query', 3),
-    'nordland': ('nordland_64x32/summer', 'nordland_64x32/winter', 3),
+CASES = {  # map, query, tolerance, speed of the query
+    'gardens_point': ('gardens_point/day_left', 'gardens_point/day_right', 2, '1x'),
+    'walk_night': ('walk_by_night/left_day', 'walk_by_night/right_night', 2, '1x'),
+    'corridor': ('corridor/ref', 'corridor/query', 3, '1x'),
+    'nordland': ('nordland_64x32/summer', 'nordland_64x32/winter', 3, '1x'),
+    # on these, exact matching makes errors
+    'night_map': ('walk_by_night/right_night', 'walk_by_night/left_day', 2, 'vary'),
+    'night_map_half': ('walk_by_night/right_night', 'walk_by_night/right_day', 2, '0.5x'),
+    'nordland_vary': ('nordland_64x32/winter', 'nordland_64x32/summer', 3, 'vary'),
 }
+PAGE = ROOT / 'docs' / 'performance.md'
+BEGIN, END = '<!-- written by benchmarks/city.py -->', '<!-- end -->'
 
 
 class HalfFeatures(LocalFeatures):
@@ -107,9 +117,13 @@ def city(real: LocalFeatures, n: int, seed: int) -> tuple[HalfFeatures, int]:
 
 
 def drive(
-    features: LocalFeatures, query: LocalFeatures, first: int, tolerance: int, budget: float
+    features: LocalFeatures, query: LocalFeatures, true: np.ndarray, tolerance: int, budget: float
 ) -> dict[str, Any]:
-    """Return precision, recall, matches and times of a query whose image i shows place i."""
+    """
+    Return precision, recall, matches and times of a query.
+
+    :param true: place of each image.
+    """
     n = len(features)
     settings = RecognizerSettings(THRESHOLD, mode='robust', time_budget_ms=budget)
     place_map = PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
@@ -124,7 +138,7 @@ def drive(
     length = settings.sequence.length
     middles = [match.sequence.middle for match in matches[length - 1 :] if match.sequence]
     accepted = np.array([match.accepted for match in matches[length - 1 :]])
-    true = np.arange(len(middles)) + (length - 1) // 2 + first
+    true = true[(length - 1) // 2 :][: len(middles)]
     right = np.abs(np.array(middles) - true) <= tolerance
     return {
         'precision': float(right[accepted].mean()) if accepted.any() else 1.0,
@@ -140,15 +154,18 @@ def drive(
 
 def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dict[str, Any]:
     """Return the numbers of one case."""
-    folder, (reference, query_folder, tolerance) = data_folder(), CASES[name]
+    folder, (reference, query_folder, tolerance, speed) = data_folder(), CASES[name]
     extractor = FeatureExtractor()
     real = extract_features(open_source(folder / reference), extractor, progress=False)
     query = extract_features(open_source(folder / query_folder), extractor, progress=False)
+    shown = np.arange(len(query)) if speed == '1x' else warp_indices(len(query), speed)
+    shown = shown[:images]
+    query = query[shown]
     features, first = city(real, n, seed)
     if save is not None:
         save_map(PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n), save, force=True)
     exact, stage = (
-        drive(features, query[:images], first, tolerance, budget) for budget in (0, ALWAYS)
+        drive(features, query, first + shown, tolerance, budget) for budget in (0, ALWAYS)
     )
     answers = exact.pop('answers'), stage.pop('answers')
     changed = (answers[0] < 0) != (answers[1] < 0)
@@ -156,7 +173,11 @@ def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dic
     return {
         'case': name,
         'places': n,
-        'images': len(query[:images]),
+        'images': len(query),
+        'cpu': cpu_model(),
+        'threads': torch.get_num_threads(),
+        'commit': commit(),
+        'load': os.getloadavg()[0],
         'exact': exact,
         'first_stage': stage,
         'statuses_changed': int(changed.sum()),
@@ -177,9 +198,56 @@ def lines(found: list[dict[str, Any]]) -> list[str]:
             f'{one["statuses_changed"]}, {one["places_moved"]}',
             f'{exact["processor_ms"]:.0f}',
             f'{stage["processor_ms"]:.0f}',
+            f'{one["threads"]}',
+            f'{one["load"]:.1f}',
         ])  # fmt: skip
     head = ('case', 'places', 'exact P / R', 'first stage P / R', 'statuses, places changed')
-    return table((*head, 'exact ms', 'first stage ms'), rows)
+    return table((*head, 'exact ms', 'first stage ms', 'threads', 'load'), rows)
+
+
+def merged(path: Path, found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Add results to those of a file, each case and size once, the newest last; return all."""
+    before = json.loads(path.read_text(encoding='utf-8')) if path.exists() else []
+    of_cases = {(one['case'], one['places']): one for one in (*before, *found)}
+    if found:
+        path.write_text(json.dumps([*of_cases.values()], indent=1) + '\n', encoding='utf-8')
+    return list(of_cases.values())
+
+
+def node_lines(folder: Path) -> list[str]:
+    """Return the table of what ``soak.py`` has measured on maps of cities."""
+    rows = []
+    for path in sorted(folder.glob('node-*.json')):
+        one = json.loads(path.read_text(encoding='utf-8'))
+        rows.append([
+            path.stem.removeprefix('node-'),
+            ' '.join(one['parameters']),
+            f'{one["rate_hz"]:.0f}',
+            f'{one["processed"]} of {one["images_published"]}',
+            f'{one["latency_ms_p50"]:.0f} / {one["latency_ms_p99"]:.0f}',
+            f'{one["memory_mb_end"]:.0f}',
+            f'{one.get("load_before", float("nan")):.1f}',
+        ])  # fmt: skip
+    head = ('run', 'parameters', 'images/s', 'processed', 'p50 / p99, ms', 'resident, MB', 'load')
+    return table(head, rows) if rows else []
+
+
+def write_page(found: list[dict[str, Any]], page: Path) -> None:
+    """Write the tables to a page."""
+    shown = [*lines(sorted(found, key=case_order)), '', *node_lines(RESULTS)]
+    written_between(page, BEGIN, END, shown)
+
+
+def written_between(page: Path, begin: str, end: str, shown: list[str]) -> None:
+    """Replace what stands between two marks of a page."""
+    before, rest = page.read_text(encoding='utf-8').split(begin)
+    text = '\n'.join(['', '', *shown]).rstrip()
+    page.write_text(f'{before}{begin}{text}\n\n{end}{rest.split(end)[1]}', encoding='utf-8')
+
+
+def case_order(one: dict[str, Any]) -> tuple[int, int]:
+    """Return where a result stands in the table."""
+    return one['places'], list(CASES).index(one['case'])
 
 
 def main() -> None:
@@ -190,17 +258,17 @@ def main() -> None:
     parser.add_argument('--images', type=int, default=200, help='of a query (%(default)s)')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--save-map', type=Path, help='of the last case, for soak.py --map')
-    parser.add_argument('--output', type=Path, help='JSON file')
+    parser.add_argument('--output', type=Path, default=RESULTS / 'city.json', help='JSON file')
     arguments = parser.parse_args()
-    found = []
+    found = merged(arguments.output, [])
     for n in arguments.places:
         for case in arguments.cases:
-            found.append(measure(case, n, arguments.images, arguments.seed, arguments.save_map))
-            print('\n'.join(lines(found[-1:])[2:3]), flush=True)
-    print(f'{cpu_model()}, {torch.get_num_threads()} threads, processor time of an image')
+            one = measure(case, n, arguments.images, arguments.seed, arguments.save_map)
+            found = merged(arguments.output, [one])
+            print('\n'.join(lines([one])[2:3]), flush=True)
     print('\n'.join(lines(found)))
-    if arguments.output:
-        arguments.output.write_text(json.dumps(found, indent=1) + '\n', encoding='utf-8')
+    if arguments.output == RESULTS / 'city.json':
+        write_page(found, PAGE)
 
 
 if __name__ == '__main__':

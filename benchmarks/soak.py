@@ -160,7 +160,7 @@ def main() -> None:
     from stavpr_ros.ros.live import executable, private_domain
     from stavpr_ros.ros.process import prepare_transport
 
-    environment = private_domain()
+    environment, load = private_domain(), os.getloadavg()[0]
     os.environ.update(environment)
     prepare_transport()
     with tempfile.TemporaryDirectory() as folder:
@@ -177,7 +177,13 @@ def main() -> None:
             node.send_signal(signal.SIGINT)
             node.wait()
     figures |= {'map': arguments.map or f'{PLACES} places', 'parameters': arguments.parameter}
-    figures |= {'cpu': cpu_model(), 'cores': os.cpu_count(), 'commit': commit(), **versions()}
+    figures |= {
+        'load_before': load,
+        'cpu': cpu_model(),
+        'cores': os.cpu_count(),
+        'commit': commit(),
+        **versions(),
+    }
     text = json.dumps(figures, indent=2)
     print(text)
     if arguments.output:

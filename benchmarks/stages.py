@@ -42,6 +42,7 @@ STRIPS = 7
 FRAMES = 20  # of the distance matrix
 MATRIX_PLACES = 20_000  # most places of the distance matrix
 LIBROSA_STARTS, ENDS_CHECKED = 500, 3
+CHECKED = 2000  # places among which a peer must find the nearest one
 Call = Callable[[], Any]
 
 
@@ -274,6 +275,8 @@ def products(
         peers.append(Peer(f'torch {dtype}', timed(call, wait), note, partial=True))
     if run.device == 'cpu' and precision == 'float32' and len(queries) == 1:
         peers += faiss_peer(run, places, queries)
+    if run.device == 'cpu' and precision == 'int8' and len(queries) == 1:
+        peers += usearch_peer(run, places, queries)
     return peers
 
 
@@ -290,6 +293,28 @@ def faiss_peer(run: Run, places: LocalFeatures, queries: LocalFeatures) -> list[
     query = queries.strips.transpose(0, 1).flatten(1).contiguous().numpy()
     note = 'IndexFlatIP, one product of whole images instead of 49 of strips'
     return [Peer('faiss flat', timed(partial(index.search, query, 1)), note, partial=True)]
+
+
+def usearch_peer(run: Run, places: LocalFeatures, queries: LocalFeatures) -> list[Peer]:
+    """Return usearch as a peer of the product in int8: whole images as vectors, the nearest."""
+    try:
+        from usearch.index import MetricKind, search  # type: ignore[import-not-found]
+    except ImportError:
+        run.skip('usearch', 0, 0, 'not installed (requirements/bench.txt)')
+        return []
+    vectors, query = (
+        np.rint(images / np.abs(images).max(axis=1, keepdims=True) * 127).astype(np.int8)
+        for images in (
+            each.strips.transpose(0, 1).flatten(1).cpu().numpy() for each in (places, queries)
+        )
+    )
+    some = vectors[:CHECKED].astype(np.float32)
+    cosines = some @ query[0].astype(np.float32) / np.linalg.norm(some, axis=1)
+    nearest = search(vectors[:CHECKED], query, 1, MetricKind.Cos, exact=True).keys[0]
+    np.testing.assert_allclose(cosines[nearest], cosines.max(), 1e-3)
+    call = partial(search, vectors, query, 1, MetricKind.Cos, exact=True, threads=0)
+    note = 'exact search in int8, one product of whole images instead of 49 of strips'
+    return [Peer('usearch int8', timed(call), note, partial=True)]
 
 
 def bare_product(

@@ -415,7 +415,44 @@ def test_command_on_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_usearch_peer_finds_the_nearest_image_or_is_left_out(monkeypatch):
+    places, query = (data.make_features(n, 16, 7, 'cpu', 0) for n in (50, 1))
+    run = Run('cpu')
+    peers = stages.usearch_peer(run, places, query)
+    assert len(peers) == 1 or run.skipped[0].name == 'usearch'
+    monkeypatch.setitem(sys.modules, 'usearch.index', None)
+    assert stages.usearch_peer(run, places, query) == []
+    assert 'requirements/bench.txt' in run.skipped[-1].reason
+
+
 # ------------------------------------------------ the city
+
+
+def test_city_results_are_merged_and_written_between_the_marks(tmp_path):
+    def result(case, places, precision):
+        drive = {'precision': precision, 'recall': 0.5, 'processor_ms': 12.0}
+        found = {'exact': drive, 'first_stage': drive, 'statuses_changed': 1, 'places_moved': 0}
+        return found | {'case': case, 'places': places, 'threads': 2, 'load': 0.1}
+
+    path, page = tmp_path / 'city.json', tmp_path / 'page.md'
+    assert city.merged(path, []) == []
+    city.merged(path, [result('corridor', 1000, 0.1), result('gardens_point', 1000, 0.2)])
+    found = city.merged(path, [result('corridor', 1000, 0.75)])
+    assert len(found) == 2
+    page.write_text(f'before {city.BEGIN} old {city.END} after')
+    city.write_page(found, page)
+    city.write_page(found, page)
+    text = page.read_text()
+    assert text.startswith('before')
+    assert text.endswith('after')
+    assert 'old' not in text
+    assert text.index('gardens_point') < text.index('corridor')
+    assert text.count('| corridor | 1,000 | 0.750 / 0.500 |') == 1
+
+
+def test_city_page_has_its_marks():
+    text = city.PAGE.read_text(encoding='utf-8')
+    assert text.count(city.BEGIN) == text.count(city.END) == 1
 
 
 def similar_places():

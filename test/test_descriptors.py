@@ -3,6 +3,7 @@
 """Descriptors that other programs computed: files, maps and evaluations of them."""
 
 import json
+import sys
 
 from evaluation_commands import runner, write_images
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from scipy.io import savemat
 from stavpr_ros.commands import build_map, evaluate
 from stavpr_ros.errors import FeatureMismatchError, SourceError, UnavailableError
+from stavpr_ros.features import descriptors
 from stavpr_ros.features.descriptors import (
     is_descriptors,
     read_descriptors,
@@ -105,9 +107,11 @@ def test_read_descriptors_executes_nothing(tmp_path):
     trap = tmp_path / 'trap'
     np.save(tmp_path / 'a.npy', np.array([Harmful(trap)], object), allow_pickle=True)
     np.savez(tmp_path / 'a.npz', a=np.array([Harmful(trap)], object))
-    for name in ('a.npy', 'a.npz'):
-        with pytest.raises(SourceError, match='cannot be read'):
+    for name, words in (('a.npy', 'cannot be read'), ('a.npz', 'numbers are none')):
+        with pytest.raises(SourceError, match=words):
             read_descriptors(str(tmp_path / name))
+    with pytest.raises(SourceError, match='numbers are none'):
+        read_descriptors(f'{tmp_path / "a.npz"}:a')
     assert not trap.exists()
 
 
@@ -133,13 +137,98 @@ def test_read_descriptors_names_what_is_wrong(tmp_path, vectors):
     reject(f'{tmp_path}/two.npz:c', r'c\? .* a, b')
     (tmp_path / 'ragged.csv').write_text('1,2,3\n1,2\n')
     reject(tmp_path / 'ragged.csv', 'number of columns changed')
+    for text, words in (
+        ('', 'is empty'),
+        ('a,b,c\n', 'names, but no numbers'),
+        ('1,2\n,3\n', "could not convert string ''"),
+        (',3\n1,2\n', "could not convert string ''"),
+        ('1,2,3\n4,5,6,7\n', 'number of columns changed'),
+    ):
+        (tmp_path / 'a.csv').write_text(text)
+        reject(tmp_path / 'a.csv', words)
+    (tmp_path / 'a.npz').write_text('text')
+    reject(tmp_path / 'a.npz', 'not a zip file')
+    (tmp_path / 'b.npy').write_text('text')
+    reject(tmp_path / 'b.npy', 'of another format')
     savemat(tmp_path / 'cell.mat', {'c': np.array([vectors], object)})
     reject(tmp_path / 'cell.mat', 'arrays of numbers are none')
-    head = b'MATLAB 7.3 MAT-file'.ljust(124) + b'\x00\x02IM' + b'\0' * 384
-    (tmp_path / 'new.mat').write_bytes(head)
-    reject(tmp_path / 'new.mat', 'version 7.3 .* save it with -v7')
     (tmp_path / 'cut.mat').write_bytes(b'MATLAB')
     reject(tmp_path / 'cut.mat', 'cannot be read')
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        '1,2,3\n4,5,6\n',
+        '# by another program\nx,y,z\n1,2,3\n\n4,5,6\n',
+        '0,1,2\n1,2,3\n4,5,6\n',  # columns as pandas numbers them
+        ',0,1,2\n0,1,2,3\n1,4,5,6\n',  # rows as well
+        'file,x,y,z\na.jpg,1,2,3\nb.jpg,4,5,6\n',
+        'a.jpg 1 2 3\nb.jpg 4 5 6\n',
+        '"x" "y" "z"\n"1" 1 2 3\n"2" 4 5 6\n',  # of R
+        '"1";"2";"3"\r\n"4";"5";"6"\r\n',
+        'x;y;z;\n1;2;3;\n4;5;6;\n',
+        'x;y;z\n1,0;2,0;3,0\n4,0;5,0;6,0\n',  # of German programs
+        '1\t2\t3\t\n4\t5\t6\t\n',
+    ],
+)
+def test_read_tables_of_many_programs(tmp_path, text):
+    (tmp_path / 'a.csv').write_text(text)
+    strips = read_descriptors(str(tmp_path / 'a.csv')).strips[0]
+    np.testing.assert_allclose(strips, unit(np.array([[1, 2, 3], [4, 5, 6]])), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    'array', ['<f2', '>f4', 'f8', 'i1', 'u8', 'fortran', 'huge', 'tiny', 'huge32', 'tiny32']
+)
+def test_read_descriptors_of_any_type_and_size(tmp_path, vectors, array, monkeypatch):
+    """Squares of float32 overflow from 1e19 on: rows are scaled before."""
+    monkeypatch.setattr(descriptors, 'AT_ONCE', 16)
+    monkeypatch.setattr(descriptors, 'MAPPED', 0)
+    whole = np.round(vectors * 8)  # -128 fits into i1
+    whole -= whole.min() + (128 if array == 'i1' else 0)
+    scale = {'huge': 1e200, 'tiny': 1e-200, 'huge32': 1e30, 'tiny32': 1e-30}.get(array, 1)
+    dtype = {'fortran': 'f4', 'huge32': 'f4', 'tiny32': 'f4'}.get(array, array)
+    dtype = 'f8' if dtype in ('huge', 'tiny') else dtype
+    stored = (whole.astype('f8') * scale).astype(dtype, order='F' if array == 'fortran' else 'C')
+    np.save(tmp_path / 'a.npy', stored)
+    features = read_descriptors(str(tmp_path / 'a.npy'))
+    np.testing.assert_allclose(features.strips[0], unit(whole.astype('f8')), atol=1e-6)
+
+
+def test_read_descriptors_takes_the_only_array_that_can_be_meant(tmp_path, vectors):
+    np.savez(tmp_path / 'a.npz', names=np.array(['a'] * 40), times=np.arange(40.0), x=vectors)
+    savemat(tmp_path / 'a.mat', {'times': np.arange(40.0), 'count': 40, 'x': vectors})
+    np.savez(tmp_path / 'b.npz', **{'a.b/c-d': vectors, 'e': vectors})
+    for path in ('a.npz', 'a.mat', 'b.npz:a.b/c-d'):
+        features = read_descriptors(str(tmp_path / path))
+        np.testing.assert_allclose(features.strips[0], unit(vectors), atol=1e-6)
+
+
+def test_read_descriptors_of_matlab_7_3(tmp_path, vectors, monkeypatch):
+    """HDF5 behind 512 bytes; columns of MATLAB are rows of the file."""
+    h5py = pytest.importorskip('h5py', reason='the extra hdf5 is not installed')
+    path = tmp_path / 'a.mat'
+    strips = np.random.default_rng(1).standard_normal((6, 3, 5))
+    with h5py.File(path, 'w', userblock_size=512) as file:
+        for name, array, kind in (
+            ('x', vectors, b'single'),
+            ('strips', strips, b'double'),
+            ('label', np.zeros((9, 9), np.uint16), b'char'),
+        ):
+            file.create_dataset(name, data=array.T).attrs['MATLAB_class'] = np.bytes_(kind)
+        file.create_group('s').attrs['MATLAB_class'] = np.bytes_(b'struct')
+    with path.open('r+b') as file:
+        file.write(b'MATLAB 7.3 MAT-file'.ljust(124) + b'\x00\x02IM')
+    features = read_descriptors(f'{path}:x')
+    np.testing.assert_allclose(features.strips[0], unit(vectors), atol=1e-6)
+    features = read_descriptors(f'{path}:strips')
+    np.testing.assert_allclose(features.strips[2, 4], unit(strips[4, 2]), atol=1e-6)
+    with pytest.raises(SourceError, match=r'which array\? .* are strips, x: give'):
+        read_descriptors(str(path))
+    monkeypatch.setitem(sys.modules, 'h5py', None)
+    with pytest.raises(SourceError, match=r'version 7.3 .* -v7, or pip install h5py'):
+        read_descriptors(str(path))
 
 
 def test_descriptors_of_another_source_or_dimension_are_rejected(tmp_path, vectors):

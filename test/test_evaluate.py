@@ -465,7 +465,6 @@ LOOP = ['--query', 'x', '--loop-closure', '--truth', 'y']
             "'3-4': expected two whole",
         ),
         (['--map', 'x', '--query', 'y', '--warp', '2x', '--speed', '3'], 2, 'give one of them'),
-        ([*LOOP, '--backend', 'auto'], 2, '--backend'),
         ([*LOOP[:-1], 'poses', '--map-poses', 'y'], 2, '--map-poses'),
         (['--map', 'x', '--query', 'y', '--exclude-places', '9'], 2, 'goes with --loop-closure'),
         (['--map', 'x', '--query', 'y', '--late-closures'], 2, 'goes with --loop-closure'),

@@ -83,7 +83,9 @@ def test_experiments_print_our_numbers_beside_the_published(tmp_path, run):
     assert read_json(out.read_text())[0]['results']['sta_vpr']['f1'] == 1
     code, text, _ = run('sweep', *options[:4], '--values', 20, 40)
     assert code == 0
-    assert text.splitlines()[-1].split() == ['nordland', 'gradient', '1.000', '-']  # 24 images
+    row, blank = text.splitlines()[-2:]
+    assert row.split() == ['nordland', 'gradient', '1.000', '-']
+    assert blank == '- nordland, l = 40: its 24 images are fewer than a window has'
 
 
 def test_paper_table_has_all_systems_of_the_paper(tmp_path, run):
@@ -105,8 +107,17 @@ def test_paper_table_has_all_systems_of_the_paper(tmp_path, run):
     assert ours[3:8] == ['-', '0.000', '1.000', '-', '-']  # all of SAES is wrong
     densenet = ['.982', '.587', '.682', '.919', '.221', '.952', '.977', '.971']
     assert ['published,', 'DenseNet161', *(f'0{number}' for number in densenet)] in lines
+    assert '- nordland, NetVLAD: give --descriptors netvlad=FOLDER' in text
+    assert '- nordland, SSM-VPR: give --features onnx' in text
     vgg = ['.982', '.587', '.682', '.987', '.221', '.952', '.994', '.994']
     assert ['published,', 'VGG16', *(f'0{number}' for number in vgg)] in lines
+    assert 'SAES:' not in text
+    code, text, _ = run('paper', '--data', tmp_path, '--gradient-cell', 32)
+    lines = text.splitlines()
+    empty = lines.index(next(line for line in lines if line.startswith('ua ')))
+    assert lines[empty].split() == ['ua', 'gradient', *8 * '-']
+    assert lines[empty + 1].split()[:3] == ['published,', 'DenseNet161', '0.687']
+    assert any(line.startswith('- ua: no data: ') for line in lines)
     np.save(arrays / 'map.npy', vectors[:20])
     code, _, errors = run('paper', *options, *saes, '--gradient-cell', 32)
     assert (code, 'of (20, 24) images: expected (24, 24)' in errors) == (1, True)

@@ -45,7 +45,7 @@ ROSDEP_KEYS = {
 }
 NO_ROSDEP_KEY = {
     *('evo', 'faiss', 'gtsam', 'llvmlite', 'onnx', 'onnxruntime', 'qdrant_client', 'qdrant_edge'),
-    *('ray', 'rosbags', 'torch'),
+    *('h5py', 'ray', 'rosbags', 'torch'),
 }
 ROS = re.compile(r'\w+_(msgs|srvs|interfaces)|rclpy|launch|launch_ros|ament_index_python|tf2_ros')
 PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules of another name
@@ -108,7 +108,7 @@ def declared(*tags: str) -> set[str]:
 
 def test_every_imported_distribution_is_required(setup_arguments):
     required = distribution_names(setup_arguments['install_requires'])
-    for extra in ('onnx', 'faiss', 'fleet', 'ray', 'slam'):
+    for extra in ('onnx', 'hdf5', 'faiss', 'fleet', 'ray', 'slam'):
         required |= distribution_names(setup_arguments['extras_require'][extra])
     needed = {name for name in imported(PACKAGE) if not ROS.fullmatch(name)}
     assert needed  # the search works

@@ -117,11 +117,6 @@ def test_threshold_in_mode_paper_is_applied_instead_of_min_probability(threshold
         ),
         ({'min_probability': 0.0}, 'min_probability = 0.0 must be above 0 and below 1'),
         ({'min_probability': 1.0}, 'min_probability = 1.0 must be above 0 and below 1'),
-        (
-            {'operation': 'loop_closure', 'backend': 'cuda'},
-            'backend cuda, precision float32: loop',
-        ),
-        ({'operation': 'loop_closure', 'precision': 'float16'}, 'precision float16: loop closure'),
         ({'operation': 'loop_closure', 'strategy': 'none'}, 'take strategy adaptive or vanilla'),
         ({'operation': 'loop_closure', 'vertical': True}, 'without vertical alignment'),
         ({'operation': 'loop_closure', 'max_places': 100}, 'take at least 103'),

@@ -30,7 +30,12 @@ def whole():
     return map_of(frames, FeatureExtractor(), thumbnails=False, progress=False)
 
 
-def test_directions_are_those_of_largest_variance(whole):
+@pytest.mark.parametrize('count', [30, 40])
+def test_directions_are_those_of_largest_variance(count):
+    """Of 7 strips each, fewer and more than their 224 dimensions."""
+    frames = [Frame(image, 0, str(i)) for i, image in enumerate(images(count))]
+    whole = map_of(frames, FeatureExtractor(), thumbnails=False, progress=False)
+    assert (7 * count < whole.dimension) == (count == 30)
     reduced = with_principal_components(whole, D)
     x = whole.features.strips.double().numpy()
     centered = (x - x.mean(axis=1, keepdims=True)).reshape(-1, x.shape[2])

@@ -9,7 +9,7 @@ import numpy as np
 from pipelines import localizing, process
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.features.extractor import cut_strips
 from stavpr_ros.features.outputs import as_maps, one_of
@@ -277,3 +277,75 @@ def test_loop_of_vectors_is_closed():
             found.append((i, match.place_index))
     assert len(found) > 20
     assert all(abs(place - (i - 60 - 5)) <= 2 for i, place in found)
+
+
+# ------------------------------------------------ a vector beside strips
+
+
+def test_extractor_of_vector_and_strips_equals_both_alone(network, route):
+    both = extractor(network, 'map', vector='global').extract(route[:3])
+    torch.testing.assert_close(both.strips, extractor(network, 'map').extract(route[:3]).strips)
+    alone = extractor(network, 'global').extract(route[:3])
+    torch.testing.assert_close(both.vectors, alone.strips[0])
+    assert alone.vectors is None
+    assert both[1:].vectors.shape == (2, 32)
+    joined = LocalFeatures.concatenate([both[:1], both[1:]])
+    assert torch.equal(joined.vectors, both.vectors)
+    bare = extractor(network, 'map').extract(route[:1])
+    assert LocalFeatures.concatenate([both, bare]).vectors is None
+
+
+class Pair(torch.nn.Module):
+    """Returns a map and its mean over all cells, both times a factor."""
+
+    def __init__(self):
+        super().__init__()
+        self.conv = torch.nn.Conv2d(3, 5, 8, 8)
+        self.factor = torch.nn.Parameter(torch.ones(()))
+
+    def forward(self, x):
+        maps = self.conv(x)
+        return maps, self.factor * maps.mean((2, 3))
+
+
+def pair(tmp_path, vector, **changes):
+    torch.manual_seed(0)
+    network = Pair()
+    for name, value in changes.items():
+        getattr(network, name).data.fill_(value)
+    path = tmp_path / 'pair.pt'
+    torch.jit.trace(network.eval(), torch.zeros(1, 3, 64, 64)).save(str(path))
+    settings = settings_class('torchscript')(model=str(path), size=64, allow=True, vector=vector)
+    return network, FeatureExtractor('torchscript', settings)
+
+
+def test_torchscript_extractor_of_two_outputs_has_strips_and_vector(tmp_path, route):
+    _, made = pair(tmp_path, '1')
+    features = made.extract(route[:2])
+    assert features.strips.shape == (7, 2, 5 * 8)
+    assert features.vectors.shape == (2, 5)
+    torch.testing.assert_close(features.vectors.norm(dim=1), torch.ones(2))
+    assert pair(tmp_path, '')[1].extract(route[:2]).vectors is None
+
+
+def test_unusable_vectors_are_rejected_before_any_image(network, tmp_path):
+    with pytest.raises(SettingsError, match="vector = 'map' is what the strips are made of"):
+        extractor(network, 'map', vector='map')
+    with pytest.raises(SettingsError, match=r"no layer 'local'.*its layers are conv, map"):
+        extractor(network, 'map', vector='local')
+    with pytest.raises(SettingsError, match=r"'conv'.*\(1, 16, 8, 8\).*expected one vector"):
+        extractor(network, 'map', vector='conv')
+    with pytest.raises(SettingsError, match="vector = '0'"):
+        pair(tmp_path, '0')
+    with pytest.raises(SettingsError, match="no output '2'"):
+        pair(tmp_path, '2')
+    with pytest.raises(SettingsError, match='not finite'):
+        pair(tmp_path, '1', factor=math.nan)
+
+
+def test_query_without_vector_on_map_with_vectors_is_rejected(network, route):
+    frames = [Frame(image, i + 1, '') for i, image in enumerate(route[:5])]
+    made = build_map(frames, extractor(network, 'map', vector='global'), progress=False)
+    recognizer = PlaceRecognizer(made, RecognizerSettings(0.5))
+    with pytest.raises(FeatureMismatchError, match=r'"vector": "".*"vector": "global"'):
+        recognizer.update(extractor(network, 'map').extract(route[:1]))

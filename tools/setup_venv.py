@@ -32,7 +32,9 @@ LAST_LINES = 25  # of the log of a failed command
 # them: base.txt, and a file for each extra. Those are installed, and their hashes compared.
 # torch and cuda are not locked: their builds depend on the index and on the driver.
 BASE = ('runtime', 'ros', 'build')
-LOCKED_EXTRAS = ('onnx', 'faiss', 'fleet', 'ray', 'slam', 'evaluation', 'bench', 'dev', 'docs')
+LOCKED_EXTRAS = (
+    'onnx', 'hdf5', 'faiss', 'fleet', 'ray', 'slam', 'evaluation', 'bench', 'dev', 'docs',
+)  # fmt: skip
 EXTRAS = (*LOCKED_EXTRAS, 'cuda')
 
 # The files that a package is built from, in build order: stavpr_ros depends on stavpr_msgs.

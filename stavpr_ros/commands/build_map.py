@@ -284,10 +284,11 @@ def _known_poses(place_map: 'PlaceMap') -> str:
     return f', {known} of them with a pose' if known else ''
 
 
-def _report(place_map: 'PlaceMap', output: str) -> None:
+def _report(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
     from stavpr_ros.errors import InputError
     from stavpr_ros.recognition.threshold import suggest_threshold
 
+    output, kind = arguments.output, place_map.settings.kind
     if len(place_map) > MOST_SUGGESTED:
         print(f'{output}: {len(place_map)} places')
         return  # the suggestion for mode paper would take the whole map into memory
@@ -296,7 +297,12 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
     shape = f'{strips.shape[0]} strips of {strips.shape[2]} dimensions'
     print(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
     try:
-        suggestion = suggest_threshold(place_map, progress=True)
+        suggestion = suggest_threshold(
+            place_map,
+            progress=True,
+            model=getattr(arguments, f'{kind}_model', None) or '',
+            allow_torchscript=arguments.torchscript_allow or False,
+        )
     except InputError as error:
         print(f'no threshold is suggested for mode paper: {error}')
         return
@@ -339,7 +345,7 @@ def main(args: list[str] | None = None) -> int:
         if journal is not None:
             journal.unlink()
         state = f'{arguments.output} is written, without a suggested threshold'
-        _report(place_map, arguments.output)
+        _report(place_map, arguments)
         return None
 
     return run_program('build_map', work, lambda: f'interrupted, {state}')

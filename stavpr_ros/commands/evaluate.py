@@ -229,11 +229,9 @@ def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Nam
     for name in names:
         if getattr(arguments, name):
             parser.error(f'--loop-closure: --{name.replace("_", "-")} needs a --map')
-    cuda = arguments.backend != 'cpu' or arguments.precision != 'float32'
-    if cuda or arguments.crop_map or arguments.map_poses:
+    if arguments.crop_map or arguments.map_poses:
         parser.error(
-            '--loop-closure is computed on the CPU, in float32, on the query alone: leave '
-            '--backend, --precision, --crop-map and --map-poses out'
+            '--loop-closure is computed on the query alone: leave --crop-map and --map-poses out'
         )
     if arguments.truth == 'identity':
         parser.error('--loop-closure needs --truth FILE or poses')
@@ -279,6 +277,8 @@ def _evaluate(
             progress=True,
             odometry=sequences.odometry,
             late=arguments.late_closures,
+            backend=arguments.backend,
+            precision=arguments.precision,
         )
     return evaluate_on_map(
         sequences.reference,

@@ -27,7 +27,7 @@ the table beside the published numbers (F1; the paper has no others).
 EPILOG = """
 experiments:
   paper        SeqSLAM, NetVLAD, SAES, no alignment, VGG fc6, SSM-VPR, STA-VPR, STA-VPR with GRP
-               and RA; - where --descriptors or --ssm-layers are missing
+               and RA, on all data sets; below the table, why an entry is -
   ablation     no alignment, only spatial, only temporal, both
   strategies   sliding window, vanilla DTW, adaptive DTW
   fast         random projection (GRP) and restricted alignment (RA), off and on
@@ -99,12 +99,12 @@ def _columns(arguments: argparse.Namespace) -> 'tuple[Configuration, ...]':
     return PRESETS[arguments.experiment]
 
 
-def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset]':
-    """Open the requested data sets, or all that are found."""
+def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset | SourceError]':
+    """Open the requested data sets, or all; of one that is not found, return why."""
     from stavpr_ros.evaluation.paper.datasets import open_dataset
     from stavpr_ros.evaluation.paper.published import F1
 
-    found: dict[str, Dataset] = {}
+    found: dict[str, Dataset | SourceError] = {}
     if arguments.datasets:
         for entry in arguments.datasets:
             name, _, folder = entry.partition('=')
@@ -118,8 +118,8 @@ def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset]':
         try:
             found[name] = open_dataset(name, arguments.data)
         except SourceError as error:
-            print(f'without {name}: {error}', file=sys.stderr)
-    if not found:
+            found[name] = error
+    if all(isinstance(each, SourceError) for each in found.values()):
         raise SourceError(f'none of the data sets {", ".join(F1)} is in {arguments.data}')
     return found
 
@@ -192,6 +192,22 @@ def _run_row(
     return found
 
 
+def _reason(name: str, dataset: 'Dataset', column: 'Configuration') -> str:
+    """Return why a data set has no number in a column."""
+    if len(dataset.query) < column.sequence.length:
+        return f'its {len(dataset.query)} images are fewer than a window has'
+    if column.baseline == 'ssm_vpr':
+        return 'give --features onnx or torchscript and --ssm-layers'
+    way = {
+        'saes': 'from any program: SAES is a metric trained on SPED, without public weights',
+        'netvlad': 'evaluate --export writes them, with --features netvlad',
+        'vgg_fc6': 'evaluate --export writes them, with --features vgg16_fc6',
+    }[column.name]
+    return (
+        f'give --descriptors {column.name}=FOLDER with FOLDER/{name}/map.npy and query.npy; {way}'
+    )
+
+
 def _published(
     dataset: str, columns: 'tuple[Configuration, ...]'
 ) -> dict[str, list[float | None]]:
@@ -236,8 +252,18 @@ def _run(arguments: argparse.Namespace) -> None:
     columns, datasets = _columns(arguments), _datasets(arguments)
     rows = [['data set', 'features', *(column.title for column in columns)]]
     results: list[dict[str, Any]] = []
+    blanks: dict[str, list[str]] = {}  # data sets and columns, by reason
     for name, dataset in datasets.items():
-        metrics = _run_row(dataset, arguments, columns, name)
+        metrics: dict[str, Metrics | None] = {}
+        if isinstance(dataset, SourceError):
+            metrics = dict.fromkeys(column.name for column in columns)
+            blanks[f'no data: {dataset}'] = [name]
+        else:
+            metrics = _run_row(dataset, arguments, columns, name)
+            for column in columns:
+                if metrics[column.name] is None:
+                    reason = _reason(name, dataset, column)
+                    blanks.setdefault(reason, []).append(f'{name}, {column.title}')
         numbers = {
             key: None if found is None else found.to_json() for key, found in metrics.items()
         }
@@ -250,6 +276,8 @@ def _run(arguments: argparse.Namespace) -> None:
             results.append({'dataset': name, 'published': backbone, 'f1': named})
     print(f'{arguments.experiment}, mode {arguments.mode}: f1')
     print(_table(rows))
+    for reason, where in blanks.items():
+        print(f'{EMPTY} {"; ".join(where)}: {reason}')
     if arguments.json:
         text = json.dumps(jsonable(results), indent=2) + '\n'
         write_output(arguments.json, text, JSON, arguments.force)

@@ -170,6 +170,8 @@ def main(args: list[str] | None = None) -> int:
             f'use: --features onnx --onnx-model {arguments.output} --onnx-layer {layer} '
             f'--onnx-size {arguments.size}'
         )
+        if len(exported.shapes) > 1:
+            print('or, strips and a vector: --onnx-layer map --onnx-vector global')
 
     return run_program('export_model', work)
 

@@ -7,9 +7,11 @@ An array has the shape (n, D), one vector an image, or (n, W, D), W local featur
 right. Nothing in a file is executed: no pickles, no MATLAB objects.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 import re
+import zipfile
 
 import numpy as np
 from stavpr_ros.errors import SourceError, UnavailableError
@@ -19,9 +21,11 @@ from stavpr_ros.output_file import atomic_output, Force, NPY
 from stavpr_ros.regular_file import require_regular
 import torch
 
-_PATH = re.compile(r'(?P<file>.*\.(npy|npz|csv|mat))(:(?P<name>\w+))?', re.IGNORECASE)
+_PATH = re.compile(r'(?P<file>.*\.(npy|npz|csv|mat))(:(?P<name>.+))?', re.IGNORECASE)
 _NUMERIC = ('double', 'single', *(f'{u}int{bits}' for u in ('', 'u') for bits in (8, 16, 32, 64)))
 MOST_STRIPS = 1024
+AT_ONCE = 1024  # images converted together
+MAPPED = 2**26  # bytes of a .npy file from which on it is not read as a whole
 
 
 class Descriptors:
@@ -30,7 +34,7 @@ class Descriptors:
     def __init__(self, settings: DescriptorSettings, device: str = 'cpu') -> None:
         raise UnavailableError(
             "features 'descriptors' come from arrays that another program computed, not from "
-            'images: give the descriptors of the query as well (evaluate --query FILE), or make '
+            'images: give those of map and query both (evaluate --map FILE --query FILE), or make '
             'the map with the network itself'
         )
 
@@ -65,22 +69,41 @@ def read_descriptors(path: str, source: str = '') -> LocalFeatures:
     except SourceError:
         raise
     except Exception as error:  # damaged files raise errors of any type
-        raise SourceError(f'descriptors {file} cannot be read: {error}') from error
+        reason = str(error)
+        if 'allow_pickle' in reason or 'Python objects' in reason:
+            reason = 'it holds Python objects, or is of another format; save an array of numbers'
+        raise SourceError(f'descriptors {file} cannot be read: {reason}') from error
     if array.dtype.kind not in 'fiu' or array.ndim not in (2, 3) or 0 in array.shape:
         raise SourceError(
             f'descriptors {path}: {array.dtype} {array.shape}: expected real numbers (n, D) or '
             '(n, W, D), one row an image'
         )
-    numbers = array.astype(np.float32)
-    if not np.isfinite(numbers).all():
-        row = int(np.flatnonzero(~np.isfinite(numbers).reshape(len(numbers), -1).all(axis=1))[0])
+    n, W = len(array), 1 if array.ndim == 2 else array.shape[1]
+    if W > MOST_STRIPS:
+        raise SourceError(f'descriptors {path}: W = {W} strips, at most {MOST_STRIPS}')
+    strips, weights = torch.empty((W, n, array.shape[-1])), torch.empty((W, n))
+    for low in range(0, n, AT_ONCE):  # it may be in its file
+        some = slice(low, low + AT_ONCE)
+        rows = _float32(array[some].reshape(-1, W, array.shape[-1]), path, low)
+        strips[:, some], weights[:, some] = normalize(torch.from_numpy(rows).transpose(0, 1))
+    settings = FeatureSettings('descriptors', DescriptorSettings(source=source), W)
+    return LocalFeatures(strips, weights, settings)
+
+
+def _float32(rows: np.ndarray, path: str, first: int) -> np.ndarray:
+    """
+    Return rows (n, W, D) as float32, each over a power of two, so that squares are in range.
+
+    :param first: number of the first row, for the error.
+    """
+    exact = np.float32 if rows.dtype == np.float16 else np.promote_types(rows.dtype, np.float32)
+    rows = rows.astype(exact)
+    finite = np.isfinite(rows).all(axis=(1, 2))
+    if not finite.all():
+        row = first + int(np.flatnonzero(~finite)[0])
         raise SourceError(f'descriptors {path}: row {row} holds NaN or infinite numbers')
-    strips = numbers[None] if numbers.ndim == 2 else numbers.transpose(1, 0, 2)
-    if len(strips) > MOST_STRIPS:
-        raise SourceError(f'descriptors {path}: W = {len(strips)} strips, at most {MOST_STRIPS}')
-    settings = FeatureSettings('descriptors', DescriptorSettings(source=source), len(strips))
-    features = torch.from_numpy(np.ascontiguousarray(strips))
-    return LocalFeatures(*normalize(features), settings)
+    _, exponents = np.frexp(abs(rows).max(axis=(1, 2), keepdims=True))
+    return np.ldexp(rows, -exponents).astype(np.float32)
 
 
 def write_descriptors(features: LocalFeatures, path: Path, force: Force = False) -> None:
@@ -114,50 +137,127 @@ def require_comparable(features: LocalFeatures, settings: FeatureSettings, dimen
 def _from_npy(file: Path, name: str) -> np.ndarray:
     if name:
         raise SourceError(f'descriptors {file} is one array without a name: leave :{name} out')
-    return np.load(file, allow_pickle=False)
+    return np.load(file, mmap_mode='r' if file.stat().st_size > MAPPED else None)
 
 
 def _from_npz(file: Path, name: str) -> np.ndarray:
-    with np.load(file, allow_pickle=False) as arrays:
-        return arrays[_chosen(file, name, arrays.files)]
+    with zipfile.ZipFile(file) as archive:
+        shapes = {}
+        for member in filter(lambda name: name.endswith('.npy'), archive.namelist()):
+            with archive.open(member) as content:
+                version = np.lib.format.read_magic(content)
+                read = np.lib.format.read_array_header_1_0
+                if version != (1, 0):
+                    read = np.lib.format.read_array_header_2_0
+                shape, _, dtype = read(content)
+            if dtype.kind in 'fiu':
+                shapes[member.removesuffix('.npy')] = shape
+    with np.load(file) as arrays:
+        return arrays[_chosen(file, name, shapes)]
 
 
 def _from_mat(file: Path, name: str) -> np.ndarray:
     from scipy.io import loadmat, whosmat
 
     try:
-        arrays = [row for row, _, kind in whosmat(file) if kind in _NUMERIC]
-    except NotImplementedError as error:
+        shapes = {row: shape for row, shape, kind in whosmat(file) if kind in _NUMERIC}
+    except NotImplementedError:
+        return _from_hdf5(file, name)
+    name = _chosen(file, name, shapes)
+    return loadmat(file, variable_names=[name])[name]
+
+
+def _from_hdf5(file: Path, name: str) -> np.ndarray:
+    """Read a MATLAB file of version 7.3; its arrays have their axes in reverse order."""
+    try:
+        import h5py  # type: ignore[import-untyped]
+    except ImportError as error:
         raise SourceError(
-            f'descriptors {file} is a MATLAB file of version 7.3 (HDF5): save it with -v7'
+            f'descriptors {file} is a MATLAB file of version 7.3 (HDF5): save it with -v7, or pip '
+            'install h5py'
         ) from error
-    return loadmat(file, variable_names=[_chosen(file, name, arrays)])[name or arrays[0]]
+    with h5py.File(file, 'r') as content:
+        shapes = {
+            key: item.shape[::-1]
+            for key, item in content.items()
+            if isinstance(item, h5py.Dataset)
+            and item.attrs.get('MATLAB_class', b'').decode() in _NUMERIC
+            and 'MATLAB_sparse' not in item.attrs
+        }
+        return content[_chosen(file, name, shapes)][:].T
 
 
-def _chosen(file: Path, name: str, arrays: list[str]) -> str:
-    """Return the name of the array to read."""
-    if not arrays or (name and name not in arrays) or (not name and len(arrays) > 1):
-        some = ', '.join(arrays[:20]) or 'none'
+def _chosen(file: Path, name: str, shapes: dict[str, tuple[int, ...]]) -> str:
+    """Return the name of the array to read: that given, or the only one that can be meant."""
+    able = [each for each, shape in shapes.items() if len(shape) in (2, 3) and min(shape) > 1]
+    if not name and len(able if len(shapes) > 1 else shapes) == 1:
+        return (able or list(shapes))[0]
+    if name not in shapes:
+        some = ', '.join(list(shapes)[:20]) or 'none'
         raise SourceError(
             f'descriptors {file}: {name or "which array"}? Its arrays of numbers are {some}: '
             f'give {file}:NAME'
         )
-    return name or arrays[0]
+    return name
 
 
 def _from_csv(file: Path, name: str) -> np.ndarray:
+    """
+    Read a table: separators, a line and a column of names are recognized by the first two lines.
+
+    Column numbers 0, 1, 2 ... as the first line, and a first column without a name, are those that
+    pandas writes.
+    """
     if name:
         raise SourceError(f'descriptors {file} is one table: leave :{name} out')
     with file.open(encoding='utf-8-sig') as text:
-        first = next((line for line in text if line.strip() and line[0] != '#'), '')
-    separator = next((mark for mark in ',;\t' if mark in first), None)
-    try:
-        np.array(first.split(separator), np.float64)
-        header = 0
-    except ValueError:
-        header = 1
+        lines = _lines(text)
+        first, second = next(lines, ''), next(lines, '')
+    if not first:
+        raise SourceError(f'descriptors {file} is empty')
+    separator = next((mark for mark in ';,\t' if mark in first), None)
+    point = ',' if separator == ';' else '.'  # as German programs write numbers
+    names, cells = (
+        [cell.strip(' "').replace(point, '.') for cell in line.strip('\r\n').split(separator)]
+        for line in (first, second or first)
+    )
+    ended = len(cells) > 1 and not cells[-1]  # a separator ends each line
+    width = len(cells) - ended
+    labels = _is_name(cells[0]) or (
+        _is_header(names[1:], width - 1) and (not names[0] or len(names) < width)
+    )
+    header = _is_header(names[labels:], width - labels)
+    if header and not second:
+        raise SourceError(f'descriptors {file} holds names, but no numbers')
+
+    def numbers(line: str) -> str:
+        line = line.strip().replace(point, '.')
+        line = line.removesuffix(separator or '') if ended else line
+        return line.split(separator, 1)[1] if labels else line
+
     with file.open(encoding='utf-8-sig') as text:
-        return np.loadtxt(text, np.float32, delimiter=separator, skiprows=header, ndmin=2)
+        rows = map(numbers, islice(_lines(text), int(header), None))
+        return np.loadtxt(rows, delimiter=separator, ndmin=2, quotechar='"')
+
+
+def _lines(text: Iterable[str]) -> Iterator[str]:
+    """Yield the lines that are neither empty nor comments."""
+    return (line for line in text if line.strip() and line[0] != '#')
+
+
+def _is_header(cells: list[str], width: int) -> bool:
+    """Return whether cells are names, or the numbers of more than two columns."""
+    counted = width > 2 and cells == [str(i) for i in range(width)]
+    return counted or any(map(_is_name, cells[:width]))
+
+
+def _is_name(cell: str) -> bool:
+    """Return whether a cell is neither empty nor a number."""
+    try:
+        float(cell or 0)
+    except ValueError:
+        return True
+    return False
 
 
 _READERS: dict[str, Callable[[Path, str], np.ndarray]] = {

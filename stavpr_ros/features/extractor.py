@@ -67,12 +67,15 @@ class LocalFeatures:
     :param settings: the settings of the extractor.
     :param cells: rows H and columns of a strip's cells: strips are (channels, H, columns),
         flattened; None if unknown, and after a random projection.
+    :param vectors: a vector of each whole image beside its strips, unit-norm or all zeros, shape
+        (n, D), float32, for the first stage of large maps; None without.
     """
 
     strips: torch.Tensor
     weights: torch.Tensor
     settings: FeatureSettings
     cells: tuple[int, int] | None = None
+    vectors: torch.Tensor | None = None
 
     def __len__(self) -> int:
         return self.strips.shape[1]
@@ -84,12 +87,14 @@ class LocalFeatures:
 
     def __getitem__(self, images: slice | np.ndarray) -> 'LocalFeatures':
         strips, weights = self.strips[:, images], self.weights[:, images]
-        return dataclasses.replace(self, strips=strips, weights=weights)
+        vectors = None if self.vectors is None else self.vectors[images]
+        return dataclasses.replace(self, strips=strips, weights=weights, vectors=vectors)
 
     def to(self, device: str | torch.device) -> 'LocalFeatures':
         """Return the features on a device."""
         strips, weights = self.strips.to(device), self.weights.to(device)
-        return dataclasses.replace(self, strips=strips, weights=weights)
+        vectors = None if self.vectors is None else self.vectors.to(device)
+        return dataclasses.replace(self, strips=strips, weights=weights, vectors=vectors)
 
     def require_same_settings(self, other: FeatureSettings, where: str) -> None:
         """
@@ -105,12 +110,14 @@ class LocalFeatures:
 
     @staticmethod
     def concatenate(parts: 'Sequence[LocalFeatures]') -> 'LocalFeatures':
-        """Join the features of several batches of images."""
+        """Join the features of several batches of images; vectors if all have them."""
+        vectors = [part.vectors for part in parts if part.vectors is not None]
         return LocalFeatures(
             torch.cat([part.strips for part in parts], dim=1).contiguous(),
             torch.cat([part.weights for part in parts], dim=1).contiguous(),
             parts[0].settings,
             parts[0].cells,
+            torch.cat(vectors) if len(vectors) == len(parts) else None,
         )
 
 
@@ -146,8 +153,8 @@ class FeatureExtractor:
         tried = None
         if isinstance(backbone, NetworkSettings) or isinstance(projection, int):
             image = np.random.default_rng(0).integers(0, 256, (TEST_SIDE, TEST_SIDE, 3), np.uint8)
-            tried = self._backbone.feature_maps([image])
-            if not bool(torch.isfinite(tried).all()):
+            tried, vectors = self._computed([image])
+            if not (_finite(tried) and _finite(vectors)):
                 raise SettingsError(
                     f'features {kind} of a test image are not finite: the network is damaged, or '
                     f'its input out of range; its settings are {self._backbone.settings}'
@@ -205,8 +212,9 @@ class FeatureExtractor:
         :returns: local features of shape (W, len(images), d).
         :raises ImageError: the features are not finite.
         """
-        strips, cells = self._cut(self._backbone.feature_maps(images))
-        if not bool(torch.isfinite(strips).all()):
+        maps, vectors = self._computed(images)
+        strips, cells = self._cut(maps)
+        if not (_finite(strips) and _finite(vectors)):
             raise ImageError(
                 'the features of an image are not finite: the network or its input is out of '
                 'range',
@@ -214,7 +222,15 @@ class FeatureExtractor:
             )
         if self.projection is not None:
             strips, cells = self.projection.apply(strips), None
-        return LocalFeatures(*normalize(strips), self.settings, cells)
+        if vectors is not None:
+            vectors = normalize(vectors.float()[None])[0][0]
+        return LocalFeatures(*normalize(strips), self.settings, cells, vectors)
+
+    def _computed(self, images: Sequence[np.ndarray]) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Return maps, and vectors if the settings want them."""
+        if getattr(self._backbone.settings, 'vector', ''):
+            return self._backbone.maps_and_vectors(images)
+        return self._backbone.feature_maps(images), None
 
     def _cut(self, maps: torch.Tensor) -> tuple[torch.Tensor, tuple[int, int] | None]:
         """Return strips (W, n, d), not normalized, and the cells of each."""
@@ -228,6 +244,10 @@ class FeatureExtractor:
             return maps.float()[None], (1, 1)
         cells = (maps.shape[2], maps.shape[3] // W) if pooling == 'flatten' else (1, 1)
         return cut_strips(maps, W, pooling), cells
+
+
+def _finite(values: torch.Tensor | None) -> bool:
+    return values is None or bool(torch.isfinite(values).all())
 
 
 def resize_square(image: np.ndarray, size: int, method: str) -> np.ndarray:

@@ -11,15 +11,18 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from stavpr_ros.errors import SettingsError, UnavailableError
-from stavpr_ros.features.export import BATCH
-from stavpr_ros.features.extractor import resize_square
-from stavpr_ros.features.outputs import as_maps
+from stavpr_ros.features.export import BATCH, TOLERANCE
+from stavpr_ros.features.extractor import resize_square, TEST_SIDE
+from stavpr_ros.features.outputs import as_maps, as_vectors
 from stavpr_ros.features.registry import OnnxSettings
 from stavpr_ros.features.weights import read_model
 import torch
+
+FLOAT, FLOAT16 = 1, 10  # as ONNX numbers them
 
 
 def _import_extra() -> tuple[ModuleType, ModuleType]:
@@ -44,15 +47,18 @@ class Onnx:
             content = file.read()
         self.settings = replace(settings, sha256=digest)
         self._device = torch.device(device)
-        model = self._with_output(onnx, content)
+        self._layers = [settings.layer, *([settings.vector] if settings.vector else [])]
+        model = self._with_outputs(onnx, content)
         properties = {row.key: row.value for row in model.metadata_props}
-        self._one_by_one = properties.get(BATCH) == '1'
+        # whether images go through the network alone; None = not known yet
+        self._one_by_one = True if properties.get(BATCH) == '1' else None
         providers = ['CPUExecutionProvider']
         on_gpu = self._device.type == 'cuda'
         if on_gpu and 'CUDAExecutionProvider' in onnxruntime.get_available_providers():
             providers.insert(0, 'CUDAExecutionProvider')
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
+        options.log_severity_level = 4  # errors are raised
         try:
             self._session = onnxruntime.InferenceSession(
                 model.SerializeToString(), options, providers=providers
@@ -64,27 +70,51 @@ class Onnx:
         self._input = self._session.get_inputs()[0]
         self._dtype = np.float16 if self._input.type == 'tensor(float16)' else np.float32
 
-    def _with_output(self, onnx: ModuleType, content: bytes):  # type: ignore[no-untyped-def]
-        """Return the model with the layer as its only output and a variable batch size."""
-        name, layer = self.settings.model, self.settings.layer
+    def _with_outputs(self, onnx: ModuleType, content: bytes):  # type: ignore[no-untyped-def]
+        """Return the model with the layers as its only outputs and a variable batch size."""
+        name = self.settings.model
         try:
             model = onnx.load_model_from_string(content)
+            if any(tensor.external_data for tensor in model.graph.initializer):
+                raise ValueError('weights are in other files: save it as one, onnx.save')
             onnx.checker.check_model(model)
         except Exception as error:  # protobuf and the checker have exception types of their own
             raise UnavailableError(f'{name} is no usable ONNX model: {error}') from error
         layers = [output for node in model.graph.node for output in node.output]
-        if layer not in layers:
+        for layer in self._layers:
+            if layer in layers:
+                continue
             shown = ', '.join(layers[:60]) + (', ...' if len(layers) > 60 else '')
             raise SettingsError(f'{name} has no layer {layer!r}: its layers are {shown}')
         weights = {tensor.name for tensor in model.graph.initializer}
         inputs = [value for value in model.graph.input if value.name not in weights]
         if len(inputs) != 1:
             raise SettingsError(f'{name} has {len(inputs)} inputs: expected one, the image')
+        self._require_images(inputs[0])
         inputs[0].type.tensor_type.shape.dim[0].dim_param = 'batch'
         del model.graph.output[:]
         del model.graph.value_info[:]  # it may fix the batch size
-        model.graph.output.append(onnx.ValueInfoProto(name=layer))
+        for layer in self._layers:
+            model.graph.output.append(onnx.ValueInfoProto(name=layer))
         return model
+
+    def _require_images(self, value: Any) -> None:
+        """Reject a network whose input is no batch of images of the set size."""
+        name, size, tensor = self.settings.model, self.settings.size, value.type.tensor_type
+        if tensor.elem_type not in (FLOAT, FLOAT16):
+            raise SettingsError(
+                f'{name}: input {value.name!r} is of ONNX type {tensor.elem_type}, expected '
+                f'{FLOAT} (float32) or {FLOAT16} (float16): export it without its conversion'
+            )
+        shape = [dim.dim_value for dim in tensor.shape.dim]  # 0 = any
+        wanted = (3, size, size)
+        if len(shape) == 4 and all(a in (0, b) for a, b in zip(shape[1:], wanted, strict=True)):
+            return
+        square = len(shape) == 4 and shape[1] in (0, 3) and shape[2] == shape[3]
+        raise SettingsError(
+            f'{name} takes inputs of shape {tuple(shape)}, 0 = any, not (n, 3, {size}, {size}): '
+            + (f'set size = {shape[2]}' if square else 'export it for square RGB images')
+        )
 
     def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
         """
@@ -95,23 +125,70 @@ class Onnx:
         :raises SettingsError: the network rejects this size, or the layer is neither maps nor
             tokens nor vectors.
         """
-        if self._one_by_one and len(images) > 1:
-            return torch.cat([self.feature_maps([image]) for image in images])
+        return self._maps(self._run(images)[0], len(images))
+
+    def maps_and_vectors(self, images: Sequence[np.ndarray]) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        Compute feature maps, see :meth:`feature_maps`, and the vectors (n, D) of layer ``vector``.
+
+        :raises SettingsError: likewise; that layer is no vector.
+        """
+        maps, vectors = self._run(images)
+        name = f'layer {self.settings.vector!r} of {self.settings.model}'
+        return self._maps(maps, len(images)), as_vectors(vectors, len(images), name)
+
+    def _maps(self, output: torch.Tensor, images: int) -> torch.Tensor:
+        name = f'layer {self.settings.layer!r} of {self.settings.model}'
+        return as_maps(output, images, self.settings.prefix_tokens, name)
+
+    def _run(self, images: Sequence[np.ndarray]) -> list[torch.Tensor]:
+        """Return the outputs of the layers for images, in a batch if that changes nothing."""
+        if len(images) == 1:
+            return self._run_batch(images)
+        if self._one_by_one is None:
+            self._one_by_one = not self._runs_batches()
+        if not self._one_by_one:
+            return self._run_batch(images)
+        single = [self._run_batch([image]) for image in images]
+        return [torch.cat(outputs) for outputs in zip(*single, strict=True)]
+
+    def _runs_batches(self) -> bool:
+        """Return whether two images in a batch have the outputs that each has alone."""
+        bright = np.random.default_rng(0).integers(0, 256, (TEST_SIDE, TEST_SIDE, 3), np.uint8)
+        two = [bright, bright // 8]
+        single = [self._run_batch([one]) for one in two]
+        try:
+            together = self._run_batch(two)
+        except SettingsError:  # a batch of one is written into the network
+            return False
+        for outputs, both in zip(zip(*single, strict=True), together, strict=True):
+            alone = torch.cat(outputs)
+            if alone.shape != both.shape:
+                return False
+            if float((alone - both).abs().max()) > TOLERANCE * float(alone.abs().max()):
+                return False
+        return True
+
+    def _run_batch(self, images: Sequence[np.ndarray]) -> list[torch.Tensor]:
         batch = np.stack([self._prepare(image) for image in images]).astype(self._dtype)
         try:
-            maps = self._session.run([self.settings.layer], {self._input.name: batch})[0]
+            outputs = self._session.run(self._layers, {self._input.name: batch})
         except Exception as error:  # onnxruntime has exception types of its own
             raise SettingsError(
                 f'{self.settings.model} rejects images of size {self.settings.size}: {error}'
             ) from error
-        if not np.issubdtype(maps.dtype, np.floating):
-            raise SettingsError(
-                f'layer {self.settings.layer!r} is {maps.dtype}, quantized numbers: name the '
-                'output of its DequantizeLinear'
-            )
-        output = torch.from_numpy(maps.astype(np.float32)).to(self._device)
-        name = f'layer {self.settings.layer!r} of {self.settings.model}'
-        return as_maps(output, len(images), self.settings.prefix_tokens, name)
+        for layer, output in zip(self._layers, outputs, strict=True):
+            if not np.issubdtype(output.dtype, np.floating):
+                raise SettingsError(
+                    f'layer {layer!r} is {output.dtype}, expected float numbers: of the '
+                    'quantized numbers, name the output of their DequantizeLinear'
+                )
+            if output.shape[:1] != (len(images),):
+                raise SettingsError(
+                    f'layer {layer!r} of {self.settings.model} returns {output.shape} for '
+                    f'{len(images)} images: expected as many rows; name another layer'
+                )
+        return [torch.from_numpy(o.astype(np.float32)).to(self._device) for o in outputs]
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         """Resize, order the channels, scale and shift: (3, size, size), float32."""

@@ -64,3 +64,18 @@ def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> torch.Te
             f'{largest}'
         )
     return output[:, prefix_tokens:].mT.reshape(n, C, side, side)
+
+
+def as_vectors(output: Any, images: int, name: str) -> torch.Tensor:
+    """
+    Return what a network computes for a batch as vectors (n, D).
+
+    :raises SettingsError: it is something else.
+    """
+    vectors = as_maps(output, images, 0, name)
+    if vectors.ndim != 2:
+        raise SettingsError(
+            f'{name} returns {tuple(output.shape)} for {images} images: expected one vector an '
+            'image, (n, D), as setting vector'
+        )
+    return vectors

@@ -114,7 +114,11 @@ class NetworkSettings:
 class OnnxSettings(NetworkSettings):
     """Settings of the ONNX features; mean and std are in units of scale * (0..255)."""
 
-    BEFORE: ClassVar[dict[str, Any]] = {**NetworkSettings.BEFORE, 'prefix_tokens': 1}
+    BEFORE: ClassVar[dict[str, Any]] = {
+        **NetworkSettings.BEFORE,
+        'prefix_tokens': 1,
+        'vector': '',
+    }
 
     model: str = setting(help='the ONNX file', identity=False)
     layer: str = setting(
@@ -129,6 +133,11 @@ class OnnxSettings(NetworkSettings):
     prefix_tokens: int = setting(
         1, help='of layers (n, T, C): leading tokens that are no patches (class token, registers)'
     )
+    vector: str = setting(
+        '',
+        help='output with one vector (n, D) an image, beside the strips of the layer, for the '
+        'first stage of large maps (time_budget_ms)',
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -142,6 +151,14 @@ class OnnxSettings(NetworkSettings):
             )
         if self.prefix_tokens < 0:
             raise SettingsError(f'prefix_tokens = {self.prefix_tokens} must be at least 0')
+        if self.vector and self.vector == self._strips_of:
+            raise SettingsError(
+                f'vector = {self.vector!r} is what the strips are made of: leave it out'
+            )
+
+    @property
+    def _strips_of(self) -> str:
+        return self.layer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,6 +178,10 @@ class TorchScriptSettings(OnnxSettings):
     allow: bool = setting(
         False, help='permit to run this file: TorchScript is a program', identity=False
     )
+
+    @property
+    def _strips_of(self) -> str:
+        return self.output
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,6 +246,12 @@ class Backbone(Protocol):
 
         :param images: each (h, w, 3), uint8.
         """
+        ...
+
+    def maps_and_vectors(
+        self, images: 'Sequence[np.ndarray]'
+    ) -> 'tuple[torch.Tensor, torch.Tensor]':
+        """Compute both; of kinds with a setting ``vector``, where it is given."""
         ...
 
 

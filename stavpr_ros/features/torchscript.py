@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from stavpr_ros.errors import SettingsError, UnavailableError
-from stavpr_ros.features.outputs import as_maps, one_of
+from stavpr_ros.features.outputs import as_maps, as_vectors, one_of
 from stavpr_ros.features.preprocessing import BatchMaker
 from stavpr_ros.features.registry import TorchScriptSettings
 from stavpr_ros.features.weights import expected_hash, last_line, read_model
@@ -67,18 +67,37 @@ class TorchScript:
         :raises SettingsError: the network rejects the batch, or the layer returns neither maps nor
             tokens nor vectors.
         """
+        return self._chosen(self._run(images), len(images))
+
+    def maps_and_vectors(self, images: Sequence[np.ndarray]) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        Compute feature maps, see :meth:`feature_maps`, and vectors (n, D) of output ``vector``.
+
+        :raises SettingsError: likewise; that output is no vector.
+        """
+        output, which = self._run(images), self.settings.vector
+        vectors = one_of(output, which, self._name)
+        name = f'output {which!r} of {self.settings.model}'
+        return self._chosen(output, len(images)), as_vectors(vectors, len(images), name)
+
+    @property
+    def _name(self) -> str:
+        return f'layer {self.settings.layer!r} of {self.settings.model}'
+
+    def _chosen(self, output: Any, images: int) -> torch.Tensor:
+        maps = one_of(output, self.settings.output, self._name)
+        return as_maps(maps, images, self.settings.prefix_tokens, self._name)
+
+    def _run(self, images: Sequence[np.ndarray]) -> Any:
         settings = self.settings
         try:
             with torch.inference_mode():
-                maps = self._maps(self._batch(images))
+                return self._maps(self._batch(images))
         except Exception as error:  # operators have exception types of their own
             raise SettingsError(
                 f'{settings.model} rejects {len(images)} images of size {settings.size}: '
                 f'{last_line(error)}'
             ) from error
-        name = f'layer {settings.layer!r} of {settings.model}'
-        maps = one_of(maps, settings.output, name)
-        return as_maps(maps, len(images), settings.prefix_tokens, name)
 
 
 def up_to_module(

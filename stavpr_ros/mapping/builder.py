@@ -17,6 +17,7 @@ from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.keyframes import KeyframeSelector, KeyframeSettings
 from stavpr_ros.mapping.place_map import (
     encode_thumbnail,
+    Place,
     PlaceMap,
     plain_text,
     THUMBNAIL_WIDTH,
@@ -165,17 +166,8 @@ def _ignore(error: str) -> None:
 
 
 def _journal_place(place: _Place, features: LocalFeatures, thumbnail: bytes) -> JournalPlace:
-    strips, weights = features.strips[:, 0].numpy(), features.weights[:, 0].numpy()
-    frame = place.frame
-    return JournalPlace(
-        place.number,
-        frame.stamp,
-        plain_text(frame.identifier),
-        place.pose,
-        strips,
-        weights,
-        thumbnail,
-    )
+    known = Place(place.frame.stamp, plain_text(place.frame.identifier), place.pose)
+    return JournalPlace.of(place.number, known, features, thumbnail)
 
 
 class _Work:

@@ -58,6 +58,7 @@ class GrowingMap:
         self.first = self._count = 0
         self._strips = np.empty((settings.strips, 0, 0), np.float32)
         self._weights = np.empty((settings.strips, 0), np.float32)
+        self._vectors: np.ndarray | None = None  # (room, D), once there is a place with one
         self._stamps = np.empty(0, np.int64)
         self._poses = np.empty((0, 7))
         self.camera: Camera | None = None  # of the images, None = unknown
@@ -82,10 +83,14 @@ class GrowingMap:
         features = place_map.features
         growing = cls(place_map.settings, place_map.projection, limit, features.cells)
         growing.dimension = features.dimension
+        growing._vectors = _room_of(features[:1])
         growing._make_room(max(n, min(ROOM, limit)))
         for low in range(0, n, ROOM):  # they may be in the map's file
             places = slice(low, min(low + ROOM, n))
-            growing._strips[:, places] = features[places].strips.cpu().numpy()
+            some = features[places]
+            growing._strips[:, places] = some.strips.cpu().numpy()
+            if growing._vectors is not None and some.vectors is not None:
+                growing._vectors[places] = some.vectors.cpu().numpy()
         growing._weights[:, :n] = features.weights.cpu().numpy()
         growing._stamps[:n] = place_map.stamps
         growing._poses[:n] = np.nan if place_map.poses is None else place_map.poses
@@ -113,13 +118,15 @@ class GrowingMap:
         Where another object holds the features, a copy.
         """
         n = self._count
+        vectors = None if self._vectors is None else torch.from_numpy(self._vectors[:n])
         if self._held_features is not None:
-            return self._held_features()
+            vectors = None if vectors is None else vectors.clone()
+            return dataclasses.replace(self._held_features(), vectors=vectors)
         strips, weights = (
             torch.from_numpy(self._strips[:, :n]),
             torch.from_numpy(self._weights[:, :n]),
         )
-        return LocalFeatures(strips, weights, self.settings, self._cells)
+        return LocalFeatures(strips, weights, self.settings, self._cells, vectors)
 
     @property
     def stamps(self) -> np.ndarray:
@@ -147,7 +154,8 @@ class GrowingMap:
         """Bytes held, the room for places to come included."""
         arrays = (self._strips, self._weights, self._stamps, self._poses)
         texts = sum(map(len, self.thumbnails)) + sum(map(len, self.ids))
-        return sum(array.nbytes for array in arrays) + texts
+        vectors = 0 if self._vectors is None else self._vectors.nbytes
+        return sum(array.nbytes for array in arrays) + vectors + texts
 
     def add(
         self,
@@ -168,14 +176,18 @@ class GrowingMap:
         :raises FeatureMismatchError: features with other settings.
         :raises InputError: the map is full; not one image; values that are not finite.
         """
-        strips, weights = self._checked(features)
+        strips, weights, vector = self._checked(features)
         row = np.full(7, np.nan) if pose is None else checked_pose(pose)
         n = self._count
         self.dimension = self.dimension or strips.shape[1]
+        if self._vectors is None and not n:
+            self._vectors = _room_of(features, len(self._stamps))
         if n == len(self._stamps):
             self._make_room(min(max(2 * n, ROOM), self.limit))
         if self._held_features is None:
             self._strips[:, n], self._weights[:, n] = strips, weights
+        if self._vectors is not None:
+            self._vectors[n] = vector
         self._stamps[n], self._poses[n] = stamp, row
         if not n and not self.first and self._cells is None:
             self._cells = features.cells
@@ -194,7 +206,8 @@ class GrowingMap:
         if not 0 <= count <= n:
             raise InputError(f'{count} places cannot be evicted: expected 0 to {n}')
         features = (*self._strips, *self._weights) if self._held_features is None else ()
-        for array in (*features, self._stamps, self._poses):
+        vectors = () if self._vectors is None else (self._vectors,)
+        for array in (*features, *vectors, self._stamps, self._poses):
             array[: n - count] = array[count:n]
         del self.ids[:count], self.thumbnails[:count]
         self.first, self._count = self.first + count, n - count
@@ -203,8 +216,7 @@ class GrowingMap:
         """Return the map as it is now, in memory of its own."""
         features = self.features
         if self._held_features is None:
-            strips, weights = features.strips.clone(), features.weights.clone()
-            features = dataclasses.replace(features, strips=strips, weights=weights)
+            features = features[np.arange(self._count)]
         sessions, session_index = self._with_session()
         same_as = self._same_as
         if same_as is not None:
@@ -235,8 +247,10 @@ class GrowingMap:
         added = np.full(self._count - len(index), len(self.sessions), np.int32)
         return (*self.sessions, recorded), np.concatenate([index, added])
 
-    def _checked(self, features: LocalFeatures) -> tuple[np.ndarray, np.ndarray]:
-        """Return the strips (W, d) and weights (W,) of an image that fits."""
+    def _checked(
+        self, features: LocalFeatures
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Return the strips (W, d), weights (W,) and vector (D,) of an image that fits."""
         features.require_same_settings(self.settings, 'the map')
         if len(features) != 1:
             raise InputError(f'features of {len(features)} images: expected those of one')
@@ -250,9 +264,16 @@ class GrowingMap:
         d = self.dimension
         if d and strips.shape[1] != d:
             raise InputError(f'strips of {strips.shape[1]} dimensions: the map has {d}')
-        if not np.isfinite(strips).all() or not np.isfinite(weights).all():
-            raise InputError('the features are not finite: check the network and its input')
-        return strips, weights
+        vector = None if features.vectors is None else features.vectors[0].cpu().numpy()
+        if self._vectors is not None and (
+            vector is None or vector.shape != self._vectors.shape[1:]
+        ):
+            found = 'no vector' if vector is None else f'a vector of {len(vector)} dimensions'
+            raise InputError(f'{found}: places of the map have one of {self._vectors.shape[1]}')
+        for values in (strips, weights) if vector is None else (strips, weights, vector):
+            if not np.isfinite(values).all():
+                raise InputError('the features are not finite: check the network and its input')
+        return strips, weights, vector
 
     def _make_room(self, room: int) -> None:
         """Reallocate every array with a capacity of ``room`` places; all or none."""
@@ -265,4 +286,14 @@ class GrowingMap:
             if n:
                 strips[:, :n], weights[:, :n] = self._strips[:, :n], self._weights[:, :n]
             self._strips, self._weights = strips, weights
+        if self._vectors is not None:
+            vectors = np.empty((room, self._vectors.shape[1]), np.float32)
+            vectors[:n] = self._vectors[:n]
+            self._vectors = vectors
         self._stamps, self._poses = stamps, poses
+
+
+def _room_of(features: LocalFeatures, room: int = 0) -> np.ndarray | None:
+    """Return room for the vectors of places as these, None if they have none."""
+    vectors = features.vectors
+    return None if vectors is None else np.empty((room, vectors.shape[1]), np.float32)

@@ -19,7 +19,7 @@ from pathlib import Path
 import stat
 import struct
 import tempfile
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple, Self
 import zlib
 
 import numpy as np
@@ -27,7 +27,7 @@ from stavpr_ros.errors import JournalError, OutputTakenError, StavprError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.growing_map import GrowingMap
 from stavpr_ros.mapping.map_file import load_map, open_map, save_map
-from stavpr_ros.mapping.place_map import PlaceMap
+from stavpr_ros.mapping.place_map import Place, PlaceMap
 from stavpr_ros.output_file import FileVersion
 import torch
 
@@ -66,6 +66,7 @@ class JournalPlace(NamedTuple):
 
     :param number: of its image, as the writer counts them.
     :param strips, weights: of its features, shapes (W, d) and (W,), float32.
+    :param vector: of its features, shape (D,), float32; D = 0 without one.
     """
 
     number: int
@@ -75,6 +76,26 @@ class JournalPlace(NamedTuple):
     strips: np.ndarray
     weights: np.ndarray
     thumbnail: bytes
+    vector: np.ndarray = np.empty(0, np.float32)
+
+    @classmethod
+    def of(cls, number: int, place: Place, features: LocalFeatures, thumbnail: bytes) -> Self:
+        """
+        Make the record of a place.
+
+        :param features: of its image, strips (W, 1, d).
+        """
+        features = features.to('cpu')
+        return cls(
+            number,
+            place.stamp,
+            place.identifier,
+            place.pose,
+            features.strips[:, 0].numpy(),
+            features.weights[:, 0].numpy(),
+            thumbnail,
+            *(() if features.vectors is None else (features.vectors[0].numpy(),)),
+        )
 
     def encode(self) -> bytes:
         """Return the content of its record."""
@@ -88,8 +109,11 @@ class JournalPlace(NamedTuple):
             self.pose is not None,
             *pose,
         )
-        strips, weights = (np.ascontiguousarray(a, '<f4') for a in (self.strips, self.weights))
-        return b''.join((head, weights.data, strips.data, identifier, self.thumbnail))
+        strips, weights, vector = (
+            np.ascontiguousarray(a, '<f4') for a in (self.strips, self.weights, self.vector)
+        )
+        features = weights.data, strips.data, vector.data
+        return b''.join((head, *features, identifier, self.thumbnail))
 
 
 def frame(content: bytes) -> bytes:
@@ -155,21 +179,24 @@ class JournalReader:
     def places(self) -> Iterator[JournalPlace]:
         """Yield the places, once, in the order in which they were recorded."""
         W, d = self.template.settings.strips, self.template.dimension
-        features = 4 * W * (d + 1)
+        vectors = self.template.features.vectors
+        D = 0 if vectors is None else vectors.shape[1]
+        count = W * (d + 1) + D
         while (content := self._record()) is not None:
             number, stamp, of_id, of_thumbnail, has_pose, *pose = _PLACE.unpack_from(content)
-            values = np.frombuffer(content, '<f4', W * (d + 1), _PLACE.size)
-            rest = content[_PLACE.size + features :]
+            rest = content[_PLACE.size + 4 * count :]
             if len(rest) != of_id + of_thumbnail:
                 raise JournalError(f'{self.path} has records of another version: update')
+            values = np.frombuffer(content, '<f4', count, _PLACE.size)
             yield JournalPlace(
                 number,
                 stamp,
                 rest[:of_id].decode(),
                 np.array(pose) if has_pose else None,
-                values[W:].reshape(W, d),
+                values[W : W * (d + 1)].reshape(W, d),
                 values[:W],
                 rest[of_id:],
+                values[W * (d + 1) :],
             )
 
     def _header(self) -> tuple[Base, PlaceMap]:
@@ -324,6 +351,7 @@ def _with_places(start: PlaceMap, reader: JournalReader, continued: bool) -> Gro
             torch.from_numpy(place.strips[:, None].copy()),
             torch.from_numpy(place.weights[:, None].copy()),
             start.settings,
+            vectors=torch.from_numpy(place.vector[None].copy()) if place.vector.size else None,
         )
         growing.add(features, place.stamp, place.identifier, place.pose, place.thumbnail)
     return growing

@@ -56,10 +56,12 @@ def journal_map(path: Path) -> PlaceMap:
     with JournalReader(path) as reader:
         template = reader.template
         W, d = template.settings.strips, template.dimension
+        D = 0 if template.features.vectors is None else template.features.vectors.shape[1]
         with tempfile.TemporaryFile(dir=path.parent) as file:
-            file.truncate(4 * W * n * d)
+            file.truncate(4 * n * (W * d + D))
             pages = mmap.mmap(file.fileno(), 0)
-        strips = np.frombuffer(pages, np.float32).reshape(W, n, d)
+        strips = np.frombuffer(pages, np.float32, W * n * d).reshape(W, n, d)
+        vectors = np.frombuffer(pages, np.float32, n * D, strips.nbytes).reshape(n, D)
         weights = np.empty((W, n), np.float32)
         stamps, poses = np.empty(n, np.int64), np.full((n, 7), np.nan)
         ids, ends, sizes = [], [], []
@@ -67,6 +69,7 @@ def journal_map(path: Path) -> PlaceMap:
             if i % PLACES_AT_ONCE == 0:
                 pages.madvise(mmap.MADV_DONTNEED)  # they stay in the file
             strips[:, i], weights[:, i], stamps[i] = place.strips, place.weights, place.stamp
+            vectors[i] = place.vector
             if place.pose is not None:
                 poses[i] = place.pose
             ids.append(place.identifier)
@@ -74,7 +77,7 @@ def journal_map(path: Path) -> PlaceMap:
             sizes.append(len(place.thumbnail))
     features = MappedFeatures(
         torch.from_numpy(strips), torch.from_numpy(weights), template.settings,
-        template.features.cells,
+        template.features.cells, torch.from_numpy(vectors) if D else None,
     )  # fmt: skip
     object.__setattr__(features, 'pages', pages)
     return PlaceMap(

@@ -19,7 +19,8 @@ from stavpr_ros.mapping.place_map import PlaceMap, Session
 from stavpr_ros.mapping.stored_features import LONGEST, StoredFeatures, StoredThumbnails
 import torch
 
-LARGE = ('strips', 'thumbnails')  # parts that are read, and compared with their hashes, later
+# parts that are read, and compared with their hashes, later
+LARGE = ('strips', 'thumbnails', 'vectors/vectors')
 THUMBNAILS_AT_ONCE = 2**24  # bytes
 # Types and shape of each part; W, n, d are known from the others, a letter alone is any number.
 PARTS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
@@ -34,6 +35,7 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
     'thumbnail_ends': (('I64',), ('n',)),
     'session': (('I32',), ('n',)),
     'same_places/same_as': (('I32',), ('n',)),
+    'vectors/vectors': (('F32', 'F16'), ('n', 'D of a vector')),
 }
 _TOGETHER = (('ids', 'id_ends'), ('thumbnails', 'thumbnail_ends'))
 
@@ -132,8 +134,8 @@ def _require_shapes(
             known = axis if isinstance(axis, int) else sizes.setdefault(axis, size)
             if axis != 'bytes' and size != known:
                 raise ValueError(f'part {name} has shape {shape}: expected {known} for {axis}')
-    if sizes['d'] < 1:
-        raise ValueError('the strips have no dimensions')
+    if min(sizes['d'], sizes.get('D of a vector', 1)) < 1:
+        raise ValueError('the strips, or the vectors, have no dimensions')
     return sizes
 
 

@@ -56,6 +56,8 @@ def _manifest(place_map: PlaceMap) -> dict[str, Any]:
         sections['intrinsics'] = {'version': 1, 'required': False, 'data': data}
     if place_map.same_as is not None:
         sections['same_places'] = {'version': 1, 'required': False, 'data': None}
+    if place_map.features.vectors is not None:
+        sections['vectors'] = {'version': 1, 'required': False, 'data': None}
     settings, projection = place_map.settings, place_map.projection
     backbone = {name: getattr(settings.backbone, name) for name in identity_fields(settings.kind)}
     return {
@@ -86,8 +88,8 @@ def _parts(place_map: PlaceMap, storage: str) -> dict[str, NewPart]:
     strips = _strips(features, np.dtype(DTYPES[dtype]))
     parts = {'strips': NewPart(dtype, shape, strips)}
 
-    def add(name: str, array: np.ndarray) -> None:
-        dtype = PARTS[name][0][0]
+    def add(name: str, array: np.ndarray, dtype: str = '') -> None:
+        dtype = dtype or PARTS[name][0][0]
         parts[name] = NewPart(dtype, array.shape, [array.astype(DTYPES[dtype], copy=False)])
 
     def add_texts(name: str, ends: str, texts: Sequence[bytes]) -> None:
@@ -110,6 +112,8 @@ def _parts(place_map: PlaceMap, storage: str) -> dict[str, NewPart]:
         add('session', place_map.session_index)
     if place_map.same_as is not None:
         add('same_places/same_as', place_map.same_as)
+    if (vectors := features.vectors) is not None:
+        add('vectors/vectors', vectors.cpu().numpy(), dtype)
     return parts
 
 

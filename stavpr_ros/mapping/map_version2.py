@@ -16,7 +16,7 @@ from stavpr_ros.mapping.map_schema import Int, ListOf, MANIFEST, Object, Text
 FORMAT, VERSION = 'stavpr-map', 2
 MOST_HEADER = 2**20  # bytes: parsing takes at most 25 times as much memory
 PIECE = 2**22  # bytes that are hashed together
-KNOWN_SECTIONS = {'intrinsics': 1, 'same_places': 1}  # name: highest known version
+KNOWN_SECTIONS = {'intrinsics': 1, 'same_places': 1, 'vectors': 1}  # name: highest known version
 _TEXT = Text(MOST_HEADER)
 _METADATA = Object({'format': _TEXT, 'version': _TEXT, 'manifest': _TEXT, 'sha256': _TEXT})
 _TENSOR = Object(

@@ -30,14 +30,7 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
         raise SettingsError(
             f'projection pca:{dimension}: the features have {d} dimensions, take 1 to {d - 1}'
         )
-    total = torch.zeros((W, d), dtype=torch.float64)
-    squares = torch.zeros((d, d), dtype=torch.float64)
-    for low in range(0, n, PIECE):
-        strips = features[low : low + PIECE].strips
-        total += strips.sum(dim=1)
-        squares += strips.flatten(0, 1).T @ strips.flatten(0, 1)
-    _, vectors = torch.linalg.eigh(squares - total.T @ total / max(n, 1))
-    basis = vectors[:, -dimension:].float()
+    basis = _directions(features, d, dimension)[:, -dimension:].float()
     matrix, name = basis.numpy(), f'principal components {d} -> {dimension} of {n} places'
     if before := place_map.projection:
         matrix, name = before.matrix @ matrix, f'{before.name}, {name}'
@@ -48,7 +41,26 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
     settings = replace(place_map.settings, projection=projection.identity)
     return replace(
         place_map,
-        features=LocalFeatures(strips, features.weights, settings),
+        features=LocalFeatures(strips, features.weights, settings, vectors=features.vectors),
         projection=projection,
         map_id='',
     )
+
+
+def _directions(features: LocalFeatures, d: int, wanted: int) -> torch.Tensor:
+    """Return the principal directions, (d, m), float64, those of the largest variance last."""
+    W, n = features.weights.shape
+    if wanted <= W * n < d:  # the products of fewer strips than dimensions
+        strips = features[:].strips.double()
+        centered = (strips - strips.mean(dim=1, keepdim=True)).flatten(0, 1)
+        _, vectors = torch.linalg.eigh(centered @ centered.T)
+        directions = vectors.T @ centered
+        return (directions / directions.norm(dim=1, keepdim=True).clamp_(min=1e-9)).T
+    total = torch.zeros((W, d), dtype=torch.float64)
+    squares = torch.zeros((d, d), dtype=torch.float64)
+    for low in range(0, n, PIECE):
+        strips = features[low : low + PIECE].strips
+        total += strips.sum(dim=1)
+        squares += strips.flatten(0, 1).T @ strips.flatten(0, 1)
+    _, vectors = torch.linalg.eigh(squares - total.T @ total / max(n, 1))
+    return vectors

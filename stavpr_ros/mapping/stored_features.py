@@ -8,7 +8,7 @@ from typing import Any, overload
 
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile
+from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
 import torch
 
 LONGEST = 1.01  # norm of a strip; float16 rounds it
@@ -60,8 +60,8 @@ class StoredFeatures(LocalFeatures):
     """
     Features of a map that stay in its file, without a copy in memory.
 
-    Every access to ``strips`` reads them all, ``features[places]`` some of them. The file stays
-    open, so that it may be replaced or deleted. Thread-safe.
+    Every access to ``strips`` or ``vectors`` reads them all, ``features[places]`` some of them.
+    The file stays open, so that it may be replaced or deleted. Thread-safe.
 
     :param weights: see :class:`LocalFeatures`; in memory.
     """
@@ -74,6 +74,7 @@ class StoredFeatures(LocalFeatures):
         cells: tuple[int, int] | None,
     ) -> None:
         self.file, self._part = file, file.parts['strips']
+        self._vectors = file.parts.get('vectors/vectors')
         for name, value in (('weights', weights), ('settings', settings), ('cells', cells)):
             object.__setattr__(self, name, value)
 
@@ -87,8 +88,9 @@ class StoredFeatures(LocalFeatures):
         return f'StoredFeatures({str(self.file.path)!r}, {self._part.shape}, {self.settings})'
 
     def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
-        strips = self._read(np.arange(len(self))[images])
-        return LocalFeatures(strips, self.weights[:, images], self.settings, self.cells)
+        places = np.arange(len(self))[images]
+        strips, vectors = self._read(places), self._read_vectors(places)
+        return LocalFeatures(strips, self.weights[:, images], self.settings, self.cells, vectors)
 
     @property
     def dimension(self) -> int:
@@ -105,6 +107,11 @@ class StoredFeatures(LocalFeatures):
         """Return the features, read from the file; shape (W, n, d), float32."""
         return self._read(np.arange(len(self)))
 
+    @property
+    def vectors(self) -> torch.Tensor | None:
+        """Return the vectors, read from the file; shape (n, D), float32."""
+        return self._read_vectors(np.arange(len(self)))
+
     def to(self, device: str | torch.device) -> LocalFeatures:
         """Read the features to a device."""
         return self[:].to(device)
@@ -115,40 +122,55 @@ class StoredFeatures(LocalFeatures):
         strip: np.ndarray = np.empty((n, d), DTYPES[self._part.dtype])
         with errors_of(self.file.path):
             self.file.fill(strip, self._part.start + j * strip.nbytes)
-            self._require_normalized(torch.from_numpy(strip), j, 0)
+            _require_normalized(torch.from_numpy(strip), f'strips, strip {j}', 0)
         return strip
 
     def _read(self, places: np.ndarray) -> torch.Tensor:
         """Return the features of some places, shape (W, len(places), d), float32."""
         W, n, d = self._part.shape
-        row = d * np.dtype(DTYPES[self._part.dtype]).itemsize
+        out = torch.empty((W, len(places), d))
+        for j in range(W):
+            self._fill(out[j], self._part, j * n, places, f'strips, strip {j}')
+        return out
+
+    def _read_vectors(self, places: np.ndarray) -> torch.Tensor | None:
+        """Return the vectors of some places, shape (len(places), D), float32."""
+        if self._vectors is None:
+            return None
+        out = torch.empty((len(places), self._vectors.shape[1]))
+        self._fill(out, self._vectors, 0, places, 'vectors/vectors')
+        return out
+
+    def _fill(
+        self, out: torch.Tensor, part: Part, first: int, places: np.ndarray, name: str
+    ) -> None:
+        """Read the rows of some places of a part; ``first`` is the row of place 0."""
+        dtype = np.dtype(DTYPES[part.dtype])
         # runs of neighbors, each read at once
         ends = np.append(np.flatnonzero(np.diff(places) != 1) + 1, len(places))
         runs = [(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True) if a < b]
         pieces = [
             (c, min(c + PLACES_AT_ONCE, b)) for a, b in runs for c in range(a, b, PLACES_AT_ONCE)
         ]
-        out = torch.empty((W, len(places), d))
         with errors_of(self.file.path):
-            for j in range(W):
-                for a, b in pieces:
-                    target = out[j, a:b]
-                    start = self._part.start + (j * n + int(places[a])) * row
-                    if self.storage == 'float32':
-                        self.file.fill(target.numpy(), start)
-                    else:
-                        half = torch.empty((b - a, d), dtype=torch.float16)
-                        self.file.fill(half.numpy(), start)
-                        target.copy_(half)
-                    self._require_normalized(target, j, int(places[a]))
-        return out
+            for a, b in pieces:
+                target, place = out[a:b], int(places[a])
+                start = part.start + (first + place) * part.shape[-1] * dtype.itemsize
+                if dtype == np.float32:
+                    self.file.fill(target.numpy(), start)
+                else:
+                    half = torch.empty(target.shape, dtype=torch.float16)
+                    self.file.fill(half.numpy(), start)
+                    target.copy_(half)
+                _require_normalized(target, name, place)
 
-    def _require_normalized(self, strips: torch.Tensor, j: int, place: int) -> None:
-        for low in range(0, len(strips), PLACES_AT_ONCE):
-            # by NumPy: torch would wake its threads for each of thousands of short blocks
-            block = strips[low : low + PLACES_AT_ONCE].float().numpy()
-            if not (np.einsum('ij,ij->i', block, block) <= LONGEST**2).all():  # NaN included
-                raise ValueError(
-                    f'part strips, strip {j}, from place {place + low} on: features are not '
-                    'finite, or longer than 1'
-                )
+
+def _require_normalized(rows: torch.Tensor, name: str, place: int) -> None:
+    for low in range(0, len(rows), PLACES_AT_ONCE):
+        # by NumPy: torch would wake its threads for each of thousands of short blocks
+        block = rows[low : low + PLACES_AT_ONCE].float().numpy()
+        if not (np.einsum('ij,ij->i', block, block) <= LONGEST**2).all():  # NaN included
+            raise ValueError(
+                f'part {name}, from place {place + low} on: features are not finite, or longer '
+                'than 1'
+            )

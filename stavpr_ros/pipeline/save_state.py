@@ -70,12 +70,8 @@ class SaveState:
             self.journal = open_journal(self.base, template)
             self._forgotten = self.recorded
         if self.journal is not None:
-            strips, weights = (a[:, 0].cpu().numpy() for a in (features.strips, features.weights))
-            place = JournalPlace(
-                self.recorded, newest.stamp, newest.identifier, newest.pose, strips, weights,
-                places.thumbnails[-1],
-            )  # fmt: skip
-            self.journal.append(place)
+            thumbnail = places.thumbnails[-1]
+            self.journal.append(JournalPlace.of(self.recorded, newest, features, thumbnail))
             self._forget(places.first)  # of a route, which counts as recorded does
         self.recorded += 1
 

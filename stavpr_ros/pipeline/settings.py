@@ -17,7 +17,7 @@ from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.pipeline.maps_folder import is_address, maps_folder
 from stavpr_ros.recognition import RecognizerSettings
-from stavpr_ros.recognition.loop_closer import least_limit
+from stavpr_ros.recognition.loop_closer import choose_loop_backend, least_limit
 from stavpr_ros.recognition.robust import MIN_PROBABILITY, options_of
 from stavpr_ros.recognition.verification import GeometricSettings
 
@@ -137,12 +137,6 @@ class PipelineSettings:
                 f'{spatial.vertical}: take strategy adaptive or vanilla, without vertical '
                 'alignment'
             )
-        if self.backend == 'cuda' or self.precision != 'float32':
-            raise SettingsError(
-                f'operation loop_closure with backend {self.backend}, precision '
-                f'{self.precision}: loop closure matches on the CPU in float32; take backend '
-                'auto or cpu, and precision float32'
-            )
         least = least_limit(self.exclude_places, self.sequence.length)
         if self.max_places < least:
             raise SettingsError(
@@ -156,7 +150,8 @@ class PipelineSettings:
 
         :raises UnavailableError: ``cuda`` is set and not available.
         """
-        return 'cpu' if operation == 'loop_closure' else choose_backend(self.backend)
+        choose = choose_loop_backend if operation == 'loop_closure' else choose_backend
+        return choose(self.backend)
 
     def backend_summary(self, operation: str) -> str:
         """Return one line for the log: the device of each stage, and why."""

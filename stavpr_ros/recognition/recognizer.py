@@ -6,6 +6,7 @@ from collections import deque
 from dataclasses import replace
 import math
 import time
+from typing import TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
@@ -28,7 +29,7 @@ from stavpr_ros.recognition.match import (
 )
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.relative_motion import Positions, RelativeMotion
-from stavpr_ros.recognition.robust import blocks, z_normalized
+from stavpr_ros.recognition.robust import blocks, MeanCentering, z_normalized
 from stavpr_ros.recognition.sequence_search import (
     FilterSearch,
     Search,
@@ -38,6 +39,9 @@ from stavpr_ros.recognition.sequence_search import (
 from stavpr_ros.recognition.sessions import layout_of, SessionLayout
 from stavpr_ros.recognition.settings import RecognizerSettings
 import torch
+
+if TYPE_CHECKING:
+    from stavpr_ros.recognition.first_stage import FirstStage
 
 TIMED = 3  # images, to compare the time of one with the time budget
 
@@ -317,6 +321,8 @@ class PlaceRecognizer(SequenceRecognizer):
 
             search = CudaLmDtwSearch(self._buffer.places, settings.sequence)
             self._search, self._buffer = search, search.buffer
+        # where a first stage compares vectors of whole images: it, and their centering
+        self._vectors: tuple[FirstStage, MeanCentering] | None = None
         self.stages = ''  # how the time budget is kept, for the log; '' = without one
         if settings.time_budget_ms and len(features):
             if backend == 'cuda':
@@ -324,9 +330,12 @@ class PlaceRecognizer(SequenceRecognizer):
                     f"time_budget_ms = {settings.time_budget_ms} with backend 'cuda': the first "
                     "stage is of backend 'cpu'; take that, or 0"
                 )
-            self._keep_time_budget(held, features[:1])
+            self._keep_time_budget(held, features)
 
-    def _keep_time_budget(self, held: LocalFeatures | Int8Features, image: LocalFeatures) -> None:
+    def _keep_time_budget(
+        self, held: LocalFeatures | Int8Features, features: LocalFeatures
+    ) -> None:
+        image, options = features[:1], self._options
         budget, exact = self._settings.time_budget_ms, self._milliseconds(image)
         self.stages = f'exact matching takes {exact:.3g} ms an image, time_budget_ms = {budget:g}'
         if exact <= budget:
@@ -335,8 +344,16 @@ class PlaceRecognizer(SequenceRecognizer):
         from stavpr_ros.recognition.first_stage import FirstStage
 
         assert isinstance(self._matcher, CpuMatcher)
-        self._matcher = FirstStage(self._matcher, held, self._probable_places)
-        self.stages += f': with a first stage {self._milliseconds(image):.3g} ms'
+        if (vectors := features.vectors) is not None:
+            whole = LocalFeatures(vectors[None], torch.ones(1, len(vectors)), features.settings)
+            centering = MeanCentering(whole, options.mean_centering, options.whitening)
+            held = centering.places(whole)
+            require_finite(held, 'the map')
+        self._matcher = stage = FirstStage(self._matcher, held, self._probable_places)
+        if vectors is not None:
+            self._vectors = stage, centering
+        of = ' of vectors' if self._vectors is not None else ''
+        self.stages += f': with a first stage{of} {self._milliseconds(image):.3g} ms'
 
     def _milliseconds(self, image: LocalFeatures) -> float:
         """Return the least time of a few updates by an image, after one that compiles."""
@@ -365,6 +382,8 @@ class PlaceRecognizer(SequenceRecognizer):
         self._clear_window()
         if self._centering is not None:
             self._centering.reset()
+        if self._vectors is not None:
+            self._vectors[1].reset()
 
     def distances(self, features: LocalFeatures) -> np.ndarray:
         """
@@ -389,6 +408,11 @@ class PlaceRecognizer(SequenceRecognizer):
                 f'strips of {features.dimension} dimensions, the map has {self._dimension}: it '
                 'was not made with this network; build it again'
             )
+        if features.vectors is None and self._vectors is not None:
+            raise FeatureMismatchError(
+                'features without a vector of the whole image, the map has them: extract the '
+                'query with the settings of the map'
+            )
 
     def update(
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
@@ -410,7 +434,12 @@ class PlaceRecognizer(SequenceRecognizer):
         strips = features.strips[:, 0]
         if self._centering is not None:
             strips = self._centering.next_query(strips)
-        row = self._matcher.distances(strips, features.weights[:, 0])
+        weights = features.weights[:, 0]
+        if self._vectors is None or features.vectors is None:
+            row = self._matcher.distances(strips, weights)
+        else:
+            stage, centering = self._vectors
+            row = stage.distances(strips, weights, centering.next_query(features.vectors))
         return self._match(row, strips, stamp, position)
 
 
@@ -425,5 +454,5 @@ def position_of(pose: np.ndarray | None) -> np.ndarray:
 
 def require_finite(features: LocalFeatures, where: str) -> None:
     """Reject NaN and infinite numbers, which no sum of unit-norm features hides."""
-    if not bool(torch.isfinite(features.strips.sum())):
+    if not math.isfinite(features.strips.sum()):
         raise InputError(f'features of {where} are not finite: they are damaged')

@@ -3,8 +3,9 @@
 """
 Features of a route that grows by one place at a time, centered and whitened, in memory once.
 
-In float16 and int8 they are float32 until the route is settled, so that they are rounded once:
-from then on, neither mean nor whitening is learned again.
+In float16 and int8 they are float32 until the route is settled and whitening is not learned again.
+From then on they are rounded, and the mean is updated only when as many images have come as there
+are places, so that a place is seldom rounded again.
 """
 
 from copy import copy
@@ -55,7 +56,7 @@ class RouteFeatures:
         self._device = device or torch.device('cpu')
         # centered, (W, room, d)
         self.strips: RouteStrips = torch.empty((settings.strips, 0, 0), device=self._device)
-        self._is_settled = False
+        self._is_settled, self._since_mean = False, 0  # images since the mean was taken
         self._latest = torch.empty((settings.strips, 0, 0))  # see latest
         self._settings, self._centering, self._limit = settings, mean_centering, limit
         self._whitens = whitening
@@ -122,10 +123,13 @@ class RouteFeatures:
         self._write(newest.contiguous(), norms)
         self._weights[:, self.count] = features.weights[:, 0]
         self.count += 1
-        if self._is_settled:
-            return grows
         if self._centering:
             self._sum += strips[:, 0]
+        if self._is_settled:
+            self._since_mean += 1
+            if self._centering and self._since_mean >= self.count:
+                self._update_mean()
+            return grows
         is_full = self.count == min(SETTLED, self._limit or SETTLED)
         settles = is_full and self._precision != 'float32'
         if (self._centering or self._whitens) and (self.count >= self._next_mean or settles):
@@ -135,7 +139,7 @@ class RouteFeatures:
             self.strips = rounded_strips(
                 self._floats, self.count, self._precision, self._on_device
             )
-            self._is_settled = True
+            self._is_settled, self._since_mean = True, 0
         return grows
 
     def _write(self, newest: torch.Tensor, norms: torch.Tensor) -> None:
@@ -157,6 +161,7 @@ class RouteFeatures:
             self._learn(count)
             self._next_mean = self.count + count + 1
             return
+        self._subtract_from_sum(count)
         if isinstance(self.strips, torch.Tensor):
             move_up(self.strips, count, self.count)
         else:
@@ -201,10 +206,10 @@ class RouteFeatures:
         if not self._centering:
             return
         total, alive = torch.zeros_like(self._mean), self._norms[:, :count].cpu() > 0
-        for j in range(len(self.strips)):
-            for low in range(0, count, PIECE):
-                piece = slice(low, min(low + PIECE, count))
-                total[j] += (self._norms[j, piece] @ self._floats[j, piece]).cpu()
+        for low in range(0, count, PIECE):
+            piece = slice(low, min(low + PIECE, count))
+            for j, strips in enumerate(self._float32(piece)):
+                total[j] += (self._norms[j, piece] @ strips).cpu()
         if self._whitening:
             total = self._whitening.inverse(total[:, None])[:, 0]
         self._sum -= total + alive.sum(dim=1, keepdim=True) * self._mean
@@ -225,6 +230,26 @@ class RouteFeatures:
                 self._floats[:, places] = unit_norm(strips)
             self._whitening, self._there = whitening, there
         self._latest = self._floats[:, max(0, self.count - LATEST) : self.count].cpu().clone()
+
+    def _update_mean(self) -> None:
+        """Take the present mean for rounded features, and round them again."""
+        mean = (self._sum / self.count).float()
+        change = self._whitened((self._mean - mean)[:, None])[:, 0].to(self._device)
+        for low in range(0, self.count, PIECE):
+            piece = slice(low, min(low + PIECE, self.count))
+            norms = self._norms[:, piece]
+            moved = [
+                _moved(*each) for each in zip(self._float32(piece), norms, change, strict=True)
+            ]
+            strips = torch.stack([unit for unit, _ in moved])
+            norms.copy_(torch.stack([lengths for _, lengths in moved]))
+            if isinstance(self.strips, torch.Tensor):
+                self.strips[:, piece] = strips
+            else:
+                self.strips.write(low, strips.cpu())
+        self._mean, self._since_mean = mean, 0
+        last = slice(max(0, self.count - LATEST), self.count)
+        self._latest = self._float32(last).cpu().clone()
 
     def _shift(self, first: int, to: int, change: torch.Tensor) -> None:
         """

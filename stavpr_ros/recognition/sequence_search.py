@@ -171,8 +171,12 @@ class ImageChange(MapChange):
 
     def __init__(self, places: int, settings: FilterSettings) -> None:
         super().__init__(places, settings)
-        self._speeds = np.array(settings.speeds)
         self.reset()
+
+    def _update_curve(self) -> None:
+        super()._update_curve()
+        changes = np.interp(self._settings.speeds, np.arange(APART + 1), self.curve)
+        self._expected = np.log(changes + OFFSET)  # by speed
 
     def reset(self) -> None:
         """Forget the query."""
@@ -203,9 +207,8 @@ class ImageChange(MapChange):
     def speed_weights(self, change: float) -> np.ndarray:
         """Return the relative probability of each speed after another change, (V,)."""
         self._latest.append(change)
-        seen = np.log(np.mean(self._latest) + OFFSET)
-        expected = np.log(np.interp(self._speeds, np.arange(APART + 1), self.curve) + OFFSET)
-        off = (seen - expected) / self._settings.change_deviation
+        seen = np.log(sum(self._latest) / len(self._latest) + OFFSET)
+        off = (seen - self._expected) / self._settings.change_deviation
         return np.asarray(np.exp(-0.5 * off**2) + FLOOR)
 
 

@@ -1,0 +1,144 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Mode robust with fewer dimensions: no projection, principal components, random ones, int8.
+
+``PYTHONPATH=. python benchmarks/projection.py`` writes ``benchmarks/results/projection.json`` and
+the table of docs/performance.md: best F1, and precision and recall at the default threshold.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+import json
+from pathlib import Path
+from typing import Any
+
+from accuracy import Case, extractors, long_cases, numbers, short_cases
+from city import written_between
+from data import data_folder
+import numpy as np
+from results import RESULTS, ROOT, table
+from stavpr_ros.evaluation.evaluate import evaluate_on_map
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping.builder import extract_features
+from stavpr_ros.mapping.reduction import with_principal_components
+from stavpr_ros.recognition import RecognizerSettings
+from stavpr_ros.recognition.robust import THRESHOLD
+import torch
+
+PAGE = ROOT / 'docs' / 'performance.md'
+BEGIN, END = '<!-- written by benchmarks/projection.py -->', '<!-- end of projection -->'
+COLUMNS = {  # name: projection, dimension, precision
+    'all': ('', 0, 'float32'),
+    'all, int8': ('', 0, 'int8'),
+    'PCA 128': ('pca', 128, 'float32'),
+    'PCA 64': ('pca', 64, 'float32'),
+    'PCA 64, int8': ('pca', 64, 'int8'),
+    'PCA 32': ('pca', 32, 'float32'),
+    'random 64': ('random', 64, 'float32'),
+}
+
+
+def kinds(folder: Path) -> dict[str, FeatureExtractor]:
+    """Return the extractors: strips of gradients, and strips and one vector of a network."""
+    network = extractors('o', folder)['robust']
+    return {
+        'gradient': extractors('g', folder)['robust'],
+        'SqueezeNet': network,
+        'SqueezeNet, one vector': FeatureExtractor('onnx', network.settings.backbone, 1),
+    }
+
+
+def projected(
+    place_map: PlaceMap, query: Any, projection: str, dimension: int
+) -> tuple[PlaceMap, Any]:
+    """Return the map and the query with fewer dimensions."""
+    if not projection:
+        return place_map, query
+    if projection == 'pca':
+        place_map = with_principal_components(place_map, dimension)
+        assert place_map.projection is not None
+        matrix = torch.from_numpy(place_map.projection.matrix)
+    else:
+        rng = np.random.default_rng(0)
+        shape = place_map.features.dimension, dimension
+        matrix = torch.from_numpy(rng.standard_normal(shape).astype(np.float32))
+        place_map = replace(place_map, features=_times(place_map.features, matrix))
+    query = _times(query, matrix)
+    return place_map, replace(query, settings=place_map.features.settings)
+
+
+def _times(features: Any, matrix: torch.Tensor) -> Any:
+    strips = features.strips @ matrix
+    strips /= strips.norm(dim=2, keepdim=True).clamp_(min=1e-12)
+    return replace(features, strips=strips, cells=None)
+
+
+def rows(case: Case, kind: str, extractor: FeatureExtractor) -> Iterator[dict[str, Any]]:
+    """Yield the numbers of a case in each column."""
+    places, query = (
+        extract_features(source, extractor, progress=False) for source in (case.places, case.query)
+    )
+    n = len(places)
+    whole = PlaceMap(places, None, np.zeros(n, np.int64), ('',) * n)
+    settings = RecognizerSettings(THRESHOLD, mode='robust')
+    for name, (projection, dimension, precision) in COLUMNS.items():
+        if dimension >= places.dimension:
+            continue
+        place_map, images = projected(whole, query, projection, dimension)
+        evaluation = evaluate_on_map(
+            place_map, images, case.truth(len(query), n), settings, precision=precision
+        )
+        found = numbers(evaluation, THRESHOLD)
+        yield {
+            'kind': kind,
+            'dimension': places.dimension,
+            'case': case.name,
+            'column': name,
+            'f1': found['sequence']['f1'],
+            'precision': found['at_default']['precision'],
+            'recall': found['at_default']['recall'],
+        }
+
+
+def lines(found: list[dict[str, Any]]) -> list[str]:
+    """Return the table of the results."""
+    cells = {(one['kind'], one['dimension'], one['case']): {} for one in found}  # type: ignore[var-annotated]
+    for one in found:
+        numbers = (f'{one[key]:.3f}' for key in ('f1', 'precision', 'recall'))
+        cells[one['kind'], one['dimension'], one['case']][one['column']] = ' '.join(numbers)
+    head = ('features', 'query', *COLUMNS)
+    body = [
+        [f'{kind}, {d}', case, *(row.get(name, '-') for name in COLUMNS)]
+        for (kind, d, case), row in cells.items()
+    ]
+    return table(head, body)
+
+
+def main() -> None:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser.add_argument('--kinds', nargs='+', metavar='KIND', help='of features (all)')
+    parser.add_argument('--quick', action='store_true', help='without Nordland')
+    parser.add_argument('--output', type=Path, default=RESULTS / 'projection.json')
+    arguments = parser.parse_args()
+    folder, found = data_folder(), []
+    for kind, extractor in kinds(folder).items():
+        if arguments.kinds and kind not in arguments.kinds:
+            continue
+        cases = [*short_cases(folder)]
+        if not arguments.quick:
+            cases += [case for case in long_cases(folder, 'o') if case.name == 'nordland']
+        for case in cases:
+            new = [*rows(case, kind, extractor)]
+            print(lines(new)[2], flush=True)
+            found += new
+    arguments.output.write_text(json.dumps(found, indent=1) + '\n', encoding='utf-8')
+    if arguments.output == RESULTS / 'projection.json':
+        written_between(PAGE, BEGIN, END, lines(found))
+
+
+if __name__ == '__main__':
+    main()
