@@ -137,10 +137,9 @@ def _edge_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
             for name in drifts
         ))  # fmt: skip
     for source, title in (('PNP', 'PnP'), ('ALIGNED', 'aligned')):
-        inside = {name: edges[name, source][:, 3] < BOUND for name in drifts}
+        inside = [edges[name, source][:, 3] < BOUND for name in drifts]
         add(f'{title}: inside the bound of 95 % (NEES)', '90 to 99 %', (
-            f'{100 * inside[name].mean():.1f} % of {len(inside[name])}' if len(inside[name]) else ''
-            for name in drifts
+            f'{100 * each.mean():.1f} % of {len(each)}' if len(each) else '' for each in inside
         ))  # fmt: skip
     for kind, title in (('edge', 'edge'), ('place_index', '`place_index`')):
         add(f'{title}: mean along the track, same lane, places', '.1', (
