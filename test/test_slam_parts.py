@@ -12,14 +12,16 @@ import pytest
 import rclpy
 from rclpy.context import Context
 from sensor_msgs.msg import CameraInfo
-from stavpr_msgs.msg import AlignedPlaces, LoopClosure
+from stavpr_msgs.msg import AlignedPlaces, LoopClosure, RelativePose
 from stavpr_ros.commands import demo
 from stavpr_ros.errors import StavprError
 from stavpr_ros.pose_graph import PoseGraph
+from stavpr_ros.pose_graph.false_places import NEAR, RUN
 from stavpr_ros.ros.camera import CameraInput
-from stavpr_ros.ros.false_closures import FalseClosures, NEAR, RUN
+from stavpr_ros.ros.false_closures import FalseClosures
 from stavpr_ros.ros.graph_client import fetch_graph
-from stavpr_ros.ros.output import time_message
+from stavpr_ros.ros.graph_messages import closure_of
+from stavpr_ros.ros.output import pose_message, time_message
 from test_pose_graph import circle, closure, error, LAP, odometry_of
 
 
@@ -114,6 +116,30 @@ def test_pose_graph_started_late_counts_closures_of_earlier_places():
     assert graph.counts['unknown stamp'] == LAP
     assert graph.accepted > 0.9 * LAP
     assert error(np.pad(found, ((0, 0), (0, 5))), truth[LAP:]) < 1
+
+
+def test_pose_graph_accepts_closures_before_and_after_recognition_restarts():
+    """The recognition node was restarted on lap 2: it numbers places anew, stamps go on."""
+    truth = circle(3)
+    odometry, graph, restart = odometry_of(truth), PoseGraph(), LAP + 40
+    for i in range(3 * LAP):
+        graph.add_odometry((i + 1) * SECOND, odometry[i])
+        first = 0 if i < restart else restart
+        if i - LAP < first:
+            continue  # the place of this image is not on the route
+        made = closure(truth, i, i - LAP, independent=True)
+        message = LoopClosure(query_index=i - first, place_index=i - LAP - first)
+        message.has_relative_pose = True
+        edge = message.relative_pose
+        edge.source, edge.is_independent = RelativePose.PNP, True
+        edge.query_stamp = time_message(made.query_stamp)
+        edge.place_stamp = time_message(made.place_stamp)
+        edge.pose.pose, edge.pose.covariance = pose_message(made.pose), made.covariance.ravel()
+        graph.add_closure(closure_of(message, False))
+    found = graph.update()[:, :2, 3]
+    assert graph.accepted > 0.9 * (40 + 60)
+    assert {edge.query for edge in graph.edges if edge.accepted} & set(range(LAP, restart))
+    assert error(np.pad(found, ((0, 0), (0, 5))), truth) < error(odometry, truth) / 2
 
 
 def test_pose_graph_with_stamps_that_jump_back_begins_a_session():

@@ -15,6 +15,10 @@ from stavpr_ros.demonstration.street import (
     Traverse,
     World,
 )
+from stavpr_ros.demonstration.street.laps import drive_laps, RingWorld
+from stavpr_ros.demonstration.street.objects import _from_camera
+from stavpr_ros.demonstration.street.rendering import _on_ground, center_line_ahead
+from stavpr_ros.demonstration.street.street import CELL
 
 SIZE = (96, 72)
 STILL = replace(GOOD_LIGHT, noise=0.0, shake=0.0)
@@ -111,3 +115,29 @@ def test_nearest_places_by_hand(world):
     second = traverse([0.9, 1.1, 50.0, 6.9, 3.0], [False, False, True, False, False])
     assert nearest_places(first, second).tolist() == [0, 1, -1, 3, 1]  # the lower one on a tie
     assert np.isnan(second.position[2])
+
+
+@pytest.mark.parametrize('image', [40, 260, 620])
+def test_center_line_ahead_of_closed_street_agrees_with_poses(image):
+    drive = drive_laps(5)
+    lap, number = drive.images[image].tolist()
+    traverse = drive.laps[lap]
+    street, along = traverse._streets[0], float(traverse.along[number])
+    ahead = center_line_ahead(street, along)[:80]
+    x, y, yaw = drive.truth[image]
+    across, _, turned = traverse.camera(number)
+    yaw += turned  # the camera is turned in the street
+    forward, right = np.array([np.cos(yaw), np.sin(yaw)]), np.array([np.sin(yaw), -np.cos(yaw)])
+    found = [x, y] + ahead[:, :1] * forward + (ahead[:, 1:2] - across) * right
+    line = RingWorld(5).center_line
+    cells = (int(along / CELL) + 1 + np.arange(80)) % (len(line) - 1)
+    assert np.abs(found - line[cells, :2]).max() < 1e-3  # the ends meet to 0.2 mm
+
+
+def test_points_of_rigid_street_seen_on_ground_are_where_they_are():
+    street, along, across = RingWorld(5).streets[0], 123.3, 1.2
+    line = center_line_ahead(street, along)
+    for ahead, beside in ((4.0, -3.0), (21.7, 5.0), (40.2, -9.0)):
+        z, right = _from_camera(line, along, ahead, beside)
+        found = _on_ground(line, along, across, (right - across) / z, z)
+        assert found == pytest.approx((ahead, beside), abs=0.02)

@@ -117,6 +117,29 @@ class Cycles:
         position = np.linalg.norm(cycle[:, :3, 3], axis=1)
         return position, angles(cycle), variance, angle_variance
 
+    def loop_scale(self, noise: OdometryNoise, scales: np.ndarray) -> float:
+        """
+        Return the factor on the errors of the odometry that most probably left these loops open.
+
+        Few closures, and short loops, have no cycles that :meth:`noise_scale` could use.
+        """
+        same = self.query_session == self.place_session
+        if not same.any():
+            return float(scales[-1])
+        off = inverse(self.Z) @ inverse(self.P) @ self.Q
+        position, angle = np.linalg.norm(off[same, :3, 3], axis=1), angles(off[same])
+        driven = np.abs(self.query_at - self.place_at)[same]
+        likelihood = np.zeros(len(scales))
+        for k, scale in enumerate(scales):
+            own = OdometryNoise(noise.translation * scale, noise.rotation * scale)
+            for error, of, dof in (
+                (position, self.position_variance[same] + own.position_variance(driven), 2),
+                (angle, self.angle_variance[same] + own.angle_variance(driven), 1),
+            ):
+                heavy = (4 + dof) / 2 * np.log1p(error**2 / (4 * of))
+                likelihood[k] -= (heavy + dof / 2 * np.log(of)).sum()
+        return float(scales[np.argmax(likelihood)])
+
     def noise_scale(self, noise: OdometryNoise, scales: np.ndarray) -> float:
         """
         Return the factor on the errors of the odometry that the cycles have most probably.

@@ -4,6 +4,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+import math
 
 import numpy as np
 from stavpr_ros.errors import InputError
@@ -81,6 +82,7 @@ class PoseGraph:
         self._edges: dict[int, ResolvedClosure] = {}
         self._scaled_at = 0
         self.scale = 1.0
+        self._loop_scale = math.inf  # until there are clusters enough
         self.solved = np.zeros((0, 4, 4))
         self.splits = 0
         self.counts: Counter[str] = Counter()
@@ -88,8 +90,8 @@ class PoseGraph:
     @property
     def noise(self) -> OdometryNoise:
         """Return the errors of the odometry as estimated."""
-        own = self.settings.noise
-        return OdometryNoise(own.translation * self.scale, own.rotation * self.scale)
+        own, scale = self.settings.noise, min(self.scale, self._loop_scale)
+        return OdometryNoise(own.translation * scale, own.rotation * scale)
 
     @property
     def _cautious_noise(self) -> OdometryNoise:
@@ -221,8 +223,10 @@ class PoseGraph:
         support = self.settings.consistency.support
         candidates = sum(cluster.weight >= support for cluster in self._clusters)
         if self.settings.adapt and candidates >= max(LEAST_CLUSTERS, 1.3 * self._scaled_at):
-            self._scaled_at = candidates
+            self._scaled_at, self._loop_scale = candidates, math.inf
             self._adapt()
+        elif self.settings.adapt and not self._scaled_at:
+            self._adapt_to_loops()
 
     def _adapt(self) -> None:
         """Estimate the errors of the odometry anew, not from what the last estimate accepts."""
@@ -238,6 +242,15 @@ class PoseGraph:
         else:
             self._solver.restart()
         self._decide_all()
+
+    def _adapt_to_loops(self) -> None:
+        """Trust the odometry in the solution as far as the first closed loops allow."""
+        members = [each for cluster in self._accepted_clusters() for each in cluster.members]
+        if members:
+            before = self._loop_scale
+            self._loop_scale = Cycles(self.chain, members).loop_scale(self.settings.noise, SCALES)
+            if not 0.7 < self._loop_scale / before < 1.4:
+                self._solver.restart()
 
     def _decide_all(self) -> None:
         everything = set(range(len(self._clusters)))

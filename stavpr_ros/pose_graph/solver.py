@@ -1,6 +1,11 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The graph as factors of GTSAM: iSAM2 with QR, or all at once."""
+"""
+The graph as factors of GTSAM: iSAM2 with QR, or all at once.
+
+Only some nodes are variables: a run of the odometry between two of them is one factor, and the
+nodes inside a run follow from its ends.
+"""
 
 from typing import Any
 
@@ -8,6 +13,7 @@ import numpy as np
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.pose_graph.closures import ResolvedClosure
 from stavpr_ros.pose_graph.odometry import KeyframeChain, OdometryNoise
+from stavpr_ros.pose_graph.runs import Runs
 from stavpr_ros.pose_graph.transforms import inverse
 
 CAUCHY = 2.5  # whitened deviations from which the influence of a closure falls
@@ -42,14 +48,14 @@ class Solver:
 
     def __init__(self) -> None:
         self._gtsam = load_gtsam()
-        self._isam: Any = None
-        self._count = 0
-        self._factors: dict[int, int] = {}  # number of a closure: index of its factor
+        self.restart()
 
     def restart(self) -> None:
         """Forget everything: the next update builds the graph anew."""
-        self._isam, self._count = None, 0
-        self._factors = {}
+        self._isam: Any = None
+        self._factors: dict[int, int] = {}  # number of a closure: index of its factor
+        self._ends: set[int] = set()  # nodes that edges have made variables
+        self._runs: dict[int, tuple[int, int]] = {}  # variable: the one before, index of factor
 
     def update(
         self,
@@ -83,16 +89,20 @@ class Solver:
             options.setRelinearizeThreshold(RELINEARIZE)
             options.relinearizeSkip = 1
             self._isam = gtsam.ISAM2(options)
-        self._add_nodes(graph, values, chain, initial, noise, links)
+        runs = self._divide(chain, noise, edges, links)
+        new, replaced = self._add_runs(graph, values, chain, initial, runs, links)
         first = graph.size()
         for number in added:
             graph.add(self._edge(edges[number]))
-        result = self._isam.update(graph, values, removed)
+        result = self._isam.update(graph, values, removed + replaced)
         indices = result.getNewFactorsIndices()
+        for node in new:
+            before, position = self._runs[node]
+            self._runs[node] = before, indices[position]
         for i, number in enumerate(added):
             self._factors[number] = indices[first + i]
         self._isam.update()  # once more: the first one moves the points of linearization
-        return _matrices(gtsam, self._isam.calculateEstimate(), len(chain))
+        return self._nodes(self._isam.calculateEstimate(), runs)
 
     def solve(
         self,
@@ -111,8 +121,9 @@ class Solver:
         """
         gtsam = self._gtsam
         base, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self._count = 0
-        self._add_nodes(base, values, chain, initial, noise, links)
+        self.restart()
+        runs = self._divide(chain, noise, edges, links)
+        self._add_runs(base, values, chain, initial, runs, links)
         options = gtsam.LevenbergMarquardtParams()
         options.setLinearSolverType('MULTIFRONTAL_QR')
         options.setMaxIterations(100)
@@ -122,36 +133,51 @@ class Solver:
                 graph.add(self._edge(edge, kernel))
             values = gtsam.LevenbergMarquardtOptimizer(graph, values, options).optimize()
         self.restart()
-        return _matrices(gtsam, values, len(chain))
+        return self._nodes(values, runs)
 
-    def _add_nodes(
-        self, graph: Any, values: Any, chain: KeyframeChain, initial: np.ndarray,
-        noise: OdometryNoise, links: dict[int, int],
-    ) -> None:  # fmt: skip
-        gtsam = self._gtsam
+    def _divide(
+        self, chain: KeyframeChain, noise: OdometryNoise, edges: dict[int, ResolvedClosure],
+        links: dict[int, int],
+    ) -> Runs:  # fmt: skip
+        self._ends |= {node for edge in edges.values() for node in (edge.query, edge.place)}
+        self._ends |= {node for node in links.values() if node >= 0}
+        return Runs.of(chain, noise, self._ends)
+
+    def _add_runs(
+        self, graph: Any, values: Any, chain: KeyframeChain, initial: np.ndarray, runs: Runs,
+        links: dict[int, int],
+    ) -> tuple[list[int], list[int]]:  # fmt: skip
+        """Add variables and runs; return where runs begin anew, and the factors they replace."""
+        gtsam, new, replaced = self._gtsam, [], []
         diagonal = gtsam.noiseModel.Diagonal.Sigmas
         tight = diagonal(np.full(6, ANCHOR))
         loose = diagonal(np.array([LOOSE_ANGLE] * 3 + [LOOSE_POSITION] * 3))
-        T, previous, travelled = chain.transforms, chain.previous, chain.travelled
-        for node in range(self._count, len(chain)):
-            pose = gtsam.Pose3(initial[node])
-            values.insert(node, pose)
-            before = int(previous[node])
+        for node in np.flatnonzero(runs.variable).tolist():
+            before = int(runs.before[node])
+            known = self._runs.get(node)
+            if known is not None and known[0] == before:
+                continue
+            if known is None:
+                values.insert(node, gtsam.Pose3(initial[node]))
+            else:
+                replaced.append(known[1])
             if before >= 0:
-                step = inverse(T[before]) @ T[node]
-                distance = max(float(travelled[node] - travelled[before]), 0.05)
-                sigmas = np.full(6, noise.rotation * np.sqrt(distance))
-                sigmas[3:] = noise.translation * np.sqrt(distance)
-                graph.add(
-                    gtsam.BetweenFactorPose3(before, node, gtsam.Pose3(step), diagonal(sigmas))
-                )
+                model = gtsam.noiseModel.Gaussian.Covariance(runs.covariance[node])
+                motion = gtsam.Pose3(runs.motion[node])
+                factor = gtsam.BetweenFactorPose3(before, node, motion, model)
             elif chain.session[node] < 0 or links.get(node) == -1:
-                graph.add(gtsam.PriorFactorPose3(node, pose, tight))
+                factor = gtsam.PriorFactorPose3(node, gtsam.Pose3(initial[node]), tight)
             elif node in links:
                 link = links[node]
-                step = inverse(initial[link]) @ initial[node]
-                graph.add(gtsam.BetweenFactorPose3(link, node, gtsam.Pose3(step), loose))
-        self._count = len(chain)
+                step = gtsam.Pose3(inverse(initial[link]) @ initial[node])
+                factor = gtsam.BetweenFactorPose3(link, node, step, loose)
+            else:
+                self._runs[node] = before, -1
+                continue
+            self._runs[node] = before, graph.size()
+            new.append(node)
+            graph.add(factor)
+        return new, replaced
 
     def _edge(self, edge: ResolvedClosure, kernel: float = CAUCHY) -> Any:
         gtsam = self._gtsam
@@ -162,12 +188,10 @@ class Solver:
         measured = gtsam.Pose3(edge.transform)
         return gtsam.BetweenFactorPose3(edge.place, edge.query, measured, model)
 
-
-def _matrices(gtsam: Any, values: Any, count: int) -> np.ndarray:
-    """Return the poses of the keys 0 to count - 1, shape (count, 4, 4)."""
-    rows = gtsam.utilities.extractPose3(values)  # the rotation by rows, then x y z
-    result = np.zeros((count, 4, 4))
-    result[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
-    result[:, :3, 3] = rows[:, 9:]
-    result[:, 3, 3] = 1
-    return result
+    def _nodes(self, values: Any, runs: Runs) -> np.ndarray:
+        """Return all nodes, shape (N, 4, 4), from the values of the variables."""
+        rows = self._gtsam.utilities.extractPose3(values)  # the rotation by rows, then x y z
+        found = np.tile(np.eye(4), (len(runs.variable), 1, 1))
+        found[runs.variable, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
+        found[runs.variable, :3, 3] = rows[:, 9:]
+        return runs.filled(found)

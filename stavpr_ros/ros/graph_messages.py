@@ -31,6 +31,7 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
     """
     relative = message.relative_pose
     on_map = message.query_index < 0 and message.has_poses
+    # a late closure has the window, and so the changes, of the closure published before it
     known: dict[str, Any] = {
         'map_id': (message.map_id or 'map') if on_map else '',
         'place_pose': pose_array(message.place_pose) if on_map else None,

@@ -76,6 +76,7 @@ class RingWorld(World):
             lot_of=np.concatenate([lot_of, lot_of[:, :end] + np.int32(len(lots))], axis=1),
             curvature=np.concatenate([curvature, curvature[:end]]),
             things=np.concatenate([things, ahead]),
+            rigid=True,
         )
         return ring, detour
 

@@ -34,7 +34,7 @@ NEAREST = 0.9  # meters; nearer parts of a thing are not drawn
 
 
 @njit(cache=True, error_model='numpy')
-def draw_things(color, depth, things, bend, camera, light, fine):
+def draw_things(color, depth, things, line, camera, light, fine):
     """
     Draw the things over the scene; they come sorted from far to near.
 
@@ -43,26 +43,32 @@ def draw_things(color, depth, things, bend, camera, light, fine):
     for k in range(len(things)):
         kind = int(things[k, THING_KIND])
         if kind in (CAR, VAN):
-            _draw_car(color, depth, things[k], bend, camera, light, fine)
+            _draw_car(color, depth, things[k], line, camera, light, fine)
         else:
-            _draw_card(color, depth, things[k], bend, camera, light, fine)
+            _draw_card(color, depth, things[k], line, camera, light, fine)
 
 
 @njit(cache=True, error_model='numpy')
-def _draw_card(color, depth, thing, bend, camera, light, fine):
+def _from_camera(line, along, ahead, across):
+    """Return the depth of a point of the street, and meters to the right of its tangent."""
+    cell = max(0, min(int(ahead / CELL), len(line) - 1))
+    forward, right, sine, cosine = line[cell]
+    beyond = ahead - ((int(along / CELL) + 1 + cell) * CELL - along)
+    z = forward + beyond * cosine - across * sine
+    return z, right + beyond * sine + across * cosine
+
+
+@njit(cache=True, error_model='numpy')
+def _draw_card(color, depth, thing, line, camera, light, fine):
     """Draw a tree, lamp or sign as a card that faces the camera."""
     along, across, eye, focal, horizon, yaw, _ = camera
     rows, columns = depth.shape
-    z = thing[THING_ALONG] - along
+    z, right = _from_camera(line, along, thing[THING_ALONG] - along, thing[THING_ACROSS])
     if z < 2.0:
         return
     size, seed, kind = thing[THING_SIZE], int(thing[THING_SEED]), int(thing[THING_KIND])
     scale = focal / z
-    mid = (
-        columns / 2
-        + ((thing[THING_ACROSS] - across + bend[min(int(z / CELL), len(bend) - 1)]) / z - yaw)
-        * focal
-    )
+    mid = columns / 2 + ((right - across) / z - yaw) * focal
     half, tall = (
         (3.3 * size, 9.0 * size) if kind == TREE else (1.5, 7.0) if kind == LAMP else (0.5, 3.2)
     )
@@ -150,14 +156,14 @@ def _sign(u, h, seed):
 
 
 @njit(cache=True, error_model='numpy')
-def _draw_car(color, depth, thing, bend, camera, light, fine):
+def _draw_car(color, depth, thing, line, camera, light, fine):
     """Draw a car or van: its shadow, its body and its cabin."""
     along, across, eye, focal, horizon, yaw, _ = camera
-    z = thing[THING_ALONG] - along
     size, seed, van = thing[THING_SIZE], int(thing[THING_SEED]), thing[THING_KIND] == VAN
     length = (5.2 if van else 4.3) * size
-    shift = bend[max(0, min(int((z + length / 2) / CELL), len(bend) - 1))]
-    u = thing[THING_ACROSS] - across + shift
+    middle = thing[THING_ALONG] - along + length / 2
+    z, u = _from_camera(line, along, middle, thing[THING_ACROSS])
+    z, u = z - length / 2, u - across
     half = 0.98 if van else 0.88
     lens = (focal, horizon, yaw, eye, fine)
     _draw_shadow(color, depth, u, half + 0.25, z - 0.25, z + length + 0.3, lens)

@@ -3,9 +3,9 @@
 """
 The camera in the synthetic street: rays, light, shadows and fog, in numba.
 
-A bend is drawn by moving the street sideways with depth, so that an image column stays a vertical
-plane. One walk along the tables finds all walls of a column; each sample then needs one comparison
-per wall.
+A column of an image is a vertical plane. One walk along the tables of the street finds all walls
+of a column; each sample then needs one comparison per wall. The center line ahead is a table,
+relative to the camera: a bend turns the street, or only moves it sideways with depth.
 """
 
 # Numba infers the types of kernels.
@@ -39,9 +39,10 @@ EYE = 1.55  # height of the camera, meters
 FOCAL = 0.62  # focal length over the width of the image: 78 degrees
 HORIZON = 0.56  # height of the horizon over the height of the image
 FAR = 1e4
+LEAST_TOWARDS = 0.1  # cosine of a ray and the street from which a bend hides the rest
 
 # Columns of the table of walls that a column of samples meets.
-WALL_DEPTH, WALL_TOP, WALL_LOT, WALL_ALONG, WALL_FRONT, WALL_ROW = range(6)
+WALL_DEPTH, WALL_TOP, WALL_LOT, WALL_ALONG, WALL_FRONT, WALL_ROW, WALL_AHEAD = range(7)
 # Light as one array of numbers for the kernels, in this order.
 (SUN, SUN_RIGHT, SUN_AHEAD, SUN_UP, AMBIENT, LAMPS, COVER, WET, FOLIAGE, SUN_AZIMUTH, SKY_SEED,
  FOG, EXPOSURE, WARMTH, RAIN, NOISE) = range(16)  # fmt: skip
@@ -62,11 +63,8 @@ def render(
     :param grain_seed: seed of sensor noise and rain drops.
     :returns: RGB, shape (height, width, 3), uint8.
     """
-    first = int(along / CELL)
-    heading = float(street.headings[first])
-    steps = min(int(VIEW / CELL) - 2, len(street.curvature) - first - 2)
-    turned = np.cumsum(street.curvature[first : first + steps]) * CELL
-    bend = np.cumsum(turned) * CELL
+    heading = float(street.headings[int(along / CELL)])
+    line = center_line_ahead(street, along)
     light = light.copy()
     towards = light[SUN_AZIMUTH] - heading
     level = np.sqrt(1 - light[SUN_UP] ** 2)
@@ -81,8 +79,8 @@ def render(
     # Columns lie together in memory, because the scene is drawn column by column.
     color = np.empty((width, height * SAMPLES, 3), np.float32).transpose(1, 0, 2)
     depth = np.empty((width, height * SAMPLES), np.float32).T
-    _draw_scene(color, depth, street.lots, street.lot_of, bend, street.seed, camera, light)
-    draw_things(color, depth, things, bend, camera, light, SAMPLES)
+    _draw_scene(color, depth, street.lots, street.lot_of, line, street.seed, camera, light)
+    draw_things(color, depth, things, line, camera, light, SAMPLES)
     image = np.empty((height, width, 3), np.uint8)
     _expose(color, depth, light, grain_seed, image)
     if light[RAIN] > 0:
@@ -90,16 +88,44 @@ def render(
     return image
 
 
+def center_line_ahead(street: Street, along: float) -> np.ndarray:
+    """
+    Return the center line at the end of each cell ahead, as seen from its point at ``along``.
+
+    :returns: meters ahead and to the right, sine and cosine of the direction, shape (steps, 4).
+    """
+    first = int(along / CELL)
+    steps = min(int(VIEW / CELL) - 2, len(street.curvature) - first - 2)
+    if not street.rigid:
+        turned = np.cumsum(street.curvature[first : first + steps]) * CELL
+        ahead = (first + 1 + np.arange(steps)) * CELL - along
+        zero = np.zeros(steps)
+        return np.column_stack([ahead, np.cumsum(turned) * CELL, zero, zero + 1])
+    directions = street.headings[first : first + steps + 1] - street.headings[first]
+    middle = (directions[1:] + directions[:-1]) / 2
+    lengths = np.full(steps, CELL)
+    lengths[0] -= along - first * CELL
+    return np.column_stack([
+        np.cumsum(lengths * np.cos(middle)), np.cumsum(lengths * np.sin(middle)),
+        np.sin(directions[1:]), np.cos(directions[1:]),
+    ])  # fmt: skip
+
+
 @njit(cache=True, error_model='numpy')
-def _find_walls(lots, lot_of, bend, along, across, slope, eye, walls):
+def _find_walls(lots, lot_of, line, along, across, slope, eye, walls):
     """Walk along one column's plane; return the number of walls that it can see."""
     count, highest = 0, -FAR
     first = int(along / CELL)
     last_near, last_far = -1, -1
-    z0, u0 = 0.0, across
-    for step in range(len(bend)):
-        z1 = (first + 1 + step) * CELL - along
-        u1 = across + slope * z1 - bend[step]
+    z0, u0, ahead0 = 0.0, across, 0.0
+    for step in range(len(line)):
+        ahead1 = (first + 1 + step) * CELL - along
+        forward, right, sine, cosine = line[step]
+        towards = cosine + slope * sine
+        if towards < LEAST_TOWARDS:
+            break
+        z1 = (forward * cosine + (right - across) * sine) / towards
+        u1 = (across + slope * z1 - right) * cosine - (z1 - forward) * sine
         side = 1 if u1 > 0 else 0
         for row in range(side, 4, 2):
             lot = lot_of[row, first + step]
@@ -112,20 +138,38 @@ def _find_walls(lots, lot_of, bend, along, across, slope, eye, walls):
                     front = abs(u0) < setback
                     part = (setback - abs(u0)) / (abs(u1) - abs(u0)) if front else 0.0
                     z = max(z0 + part * (z1 - z0), 0.05)
-                    place = z + along - lots[lot, LOT_START] if front else abs(u0) - setback
+                    ahead = max(ahead0 + part * (ahead1 - ahead0), 0.05)
+                    place = ahead + along - lots[lot, LOT_START] if front else abs(u0) - setback
                     top = roof_height(lots, lot, place) if front else lots[lot, LOT_HEIGHT]
                     if (top - eye) / z > highest:
                         highest = (top - eye) / z
                         walls[count, WALL_DEPTH], walls[count, WALL_TOP] = z, top
                         walls[count, WALL_LOT], walls[count, WALL_ALONG] = lot, place
                         walls[count, WALL_FRONT], walls[count, WALL_ROW] = front, row
+                        walls[count, WALL_AHEAD] = ahead
                         count += 1
             if row < 2:
                 last_near = inside
             else:
                 last_far = inside
-        z0, u0 = z1, u1
+        z0, u0, ahead0 = z1, u1, ahead1
     return count
+
+
+@njit(cache=True, error_model='numpy')
+def _on_ground(line, along, across, slope, z):
+    """Return meters along the street from the camera, and across, of a point at a depth z."""
+    first, last = int(along / CELL), len(line) - 1
+    ahead, u = z, 0.0
+    for _ in range(4):  # along the tangent at the cell of the last guess
+        cell = min(max(int(ahead / CELL), 0), last)
+        forward, right, sine, cosine = line[cell]
+        beyond, beside = z - forward, across + slope * z - right
+        u = beside * cosine - beyond * sine
+        if sine == 0:
+            break
+        ahead = (first + 1 + cell) * CELL - along + beyond * cosine + beside * sine
+    return ahead, u
 
 
 @njit(cache=True, error_model='numpy')
@@ -175,17 +219,16 @@ def _lit_ground(lots, lot_of, seed, along, across, depth, light):
 
 
 @njit(cache=True, error_model='numpy')
-def _draw_scene(color, depth, lots, lot_of, bend, seed, camera, light):
+def _draw_scene(color, depth, lots, lot_of, line, seed, camera, light):
     """Fill the samples with sky, ground and walls, and their depths."""
     along, across, eye, focal, horizon, yaw, heading = camera
     rows, columns = depth.shape
-    walls = np.empty((MOST_WALLS, 6))
-    bends = len(bend) - 1
+    walls = np.empty((MOST_WALLS, 7))
     sun_rise = light[SUN_UP] / max(0.1, hypot(light[SUN_RIGHT], light[SUN_AHEAD]))
     cloud_seed = int(light[SKY_SEED])
     for x in range(columns):
         slope = (x + 0.5 - columns / 2) / focal + yaw
-        count = _find_walls(lots, lot_of, bend, along, across, slope, eye, walls)
+        count = _find_walls(lots, lot_of, line, along, across, slope, eye, walls)
         azimuth = atan(slope) + heading
         off = (azimuth - light[SUN_AZIMUTH] + 3 * pi) % (2 * pi) - pi
         for y in range(rows):
@@ -200,19 +243,21 @@ def _draw_scene(color, depth, lots, lot_of, bend, seed, camera, light):
                     break
             if hit >= 0:
                 z = walls[hit, WALL_DEPTH]
-                r, g, b = _lit_wall(lots, lot_of, walls, hit, height, along + z, light)
+                at = along + walls[hit, WALL_AHEAD]
+                r, g, b = _lit_wall(lots, lot_of, walls, hit, height, at, light)
             elif rise < -1e-3:
                 z = -eye / rise
-                u = across + slope * z - bend[min(int(z / CELL), bends)]
-                r, g, b = _lit_ground(lots, lot_of, seed, along + z, u, z, light)
+                ahead, u = _on_ground(line, along, across, slope, z)
+                r, g, b = _lit_ground(lots, lot_of, seed, along + ahead, u, z, light)
                 if light[WET] > 0:
-                    puddle = 0.35 + 0.9 * noise((along + z) * 0.5, u * 0.9, 77)
+                    puddle = 0.35 + 0.9 * noise((along + ahead) * 0.5, u * 0.9, 77)
                     shine = light[WET] * min(0.62, 0.1 + z / 60.0) * puddle
                     far = walls[0, WALL_DEPTH]
                     mirrored = 0.5 * (hash01(x, y, 31) - 0.5) - eye - rise * far
                     if count > 0 and mirrored < walls[0, WALL_TOP]:
                         height = max(0.0, mirrored)
-                        mr, mg, mb = _lit_wall(lots, lot_of, walls, 0, height, along + far, light)
+                        at = along + walls[0, WALL_AHEAD]
+                        mr, mg, mb = _lit_wall(lots, lot_of, walls, 0, height, at, light)
                     else:
                         mr = mg = mb = 0.75 * light[AMBIENT]
                     r, g, b = r + (mr - r) * shine, g + (mg - g) * shine, b + (mb - b) * shine

@@ -65,6 +65,8 @@ class Street:
     :param curvature: curvature of the center line, positive to the right, shape (cells,), 1/meter.
     :param things: trees, lamps, signs, shape (things, 5), columns THING_*, float64.
     :param seed: of its layout and of its ground.
+    :param rigid: bends turn the street, so that images agree with poses; else they only move it
+        sideways with depth.
     """
 
     length: float
@@ -73,6 +75,7 @@ class Street:
     curvature: np.ndarray
     things: np.ndarray
     seed: int
+    rigid: bool = False
 
     @cached_property
     def headings(self) -> np.ndarray:

@@ -1,0 +1,387 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Loop closures as edges of a pose graph: worlds of the demonstration, offline, without ROS.
+
+Each drive is recognized from its images with the odometry of its draw, the edges are estimated,
+and the graph is solved. Writes docs/slam_measured.md, and its JSON to benchmarks/results/.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from concurrent.futures import as_completed, ProcessPoolExecutor
+from dataclasses import dataclass, replace
+import json
+import multiprocessing
+import os
+from pathlib import Path
+import tempfile
+import time
+from typing import Any, ClassVar
+
+import numpy as np
+from results import environment, RESULTS, ROOT
+from scipy.spatial.transform import Rotation
+from slam_page import markdown
+from stavpr_ros.demonstration.slam import trajectory_errors
+from stavpr_ros.demonstration.street.laps import (
+    CAMERA_IN_BASE,
+    CARRIED,
+    drive_laps,
+    intrinsics,
+    LapDrive,
+)
+from stavpr_ros.demonstration.street.traverses import SIZE
+from stavpr_ros.mapping.camera import Camera
+from stavpr_ros.pipeline import Pipeline, PipelineSettings
+from stavpr_ros.pose_graph import Closure, optimize, PoseGraph
+from stavpr_ros.pose_graph.alignment import APPEARANCE, IDENTITY
+from stavpr_ros.pose_graph.false_places import FalsePlaces
+from stavpr_ros.pose_graph.transforms import inverse, matrices, planar_poses
+from stavpr_ros.recognition.verification import mutual_matches
+from stavpr_ros.relative_pose import landmarks
+from stavpr_ros.relative_pose.edge import Edge, Source
+from stavpr_ros.relative_pose.estimator import EdgeEstimator
+from stavpr_ros.relative_pose.landmarks import View
+from stavpr_ros.relative_pose.pair import MatchedPair
+from stavpr_ros.sources.frame import ImageRecord
+from tqdm import tqdm
+
+K = intrinsics()
+CAMERA = Camera(*SIZE, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), '', (), tuple(CAMERA_IN_BASE))
+DRIFTS = {'large': 1.0, 'small': 0.06}  # factors on the errors of the odometry
+FALSE = {'random 30': (0.3, False), 'coherent 30': (0.3, True), 'coherent 50': (0.5, True)}
+WRONG_PAIRS = 200  # of each world
+FAR, NEAR = 30.0, 6.0  # meters: a pair of wrong places; a right closure
+PASSES = 4.0  # meters: images of two laps whose relative position is compared
+ONLINE = 60  # images after the first closure behind a break that are watched
+LEAST_ATE = 2.5  # meters: of a carried robot
+OTHER_DRAWS = 2  # of each world, with two sessions and with a carried robot
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A closure: when it was known, the images of it, the pair, its edge, and the measurement."""
+
+    known: int
+    query: int
+    place: int
+    pair: MatchedPair
+    edge: Edge
+    closure: Closure
+    seconds: float
+    is_late: bool
+
+
+class SharedViews(EdgeEstimator):
+    """Keeps views and their matches for all draws of a world: they do not depend on odometry."""
+
+    views: ClassVar[dict[bytes, View]] = {}
+    matches: ClassVar[dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]] = {}
+
+    def _view(self, image: np.ndarray, camera: Camera) -> View:
+        key = image.tobytes()
+        if key not in self.views:
+            self.views[key] = super()._view(image, camera)
+        return self.views[key]
+
+    @classmethod
+    def forget(cls) -> None:
+        """Make room for another world."""
+        cls.views.clear()
+        cls.matches.clear()
+
+
+def _matched(mine: np.ndarray, theirs: np.ndarray, ratio: float) -> tuple[np.ndarray, np.ndarray]:
+    key = id(mine), id(theirs)  # views stay, so numbers stay theirs
+    if key not in SharedViews.matches:
+        SharedViews.matches[key] = mutual_matches(mine, theirs, ratio)
+    return SharedViews.matches[key]
+
+
+def render(seed: int, folder: Path) -> np.ndarray:
+    """Return the images of the laps of a world, rendered once, shape (N, height, width, 3)."""
+    path = folder / f'{seed}.npy'
+    if not path.exists():
+        drive = drive_laps(seed)
+        images = np.stack([drive.frame(i).image for i in range(len(drive))])
+        part = path.with_suffix(f'.{os.getpid()}.npy')
+        np.save(part, images)
+        part.replace(path)
+    return np.load(path, mmap_mode='r')
+
+
+def lap_masks(drive: LapDrive) -> list[np.ndarray]:
+    """Return which images are of each lap."""
+    return [drive.images[:, 0] == lap for lap in range(drive.images[-1, 0] + 1)]
+
+
+def find(
+    drive: LapDrive,
+    images: Sequence[np.ndarray] | np.ndarray,
+    estimator: EdgeEstimator,
+    camera: Camera | None = CAMERA,
+    exclude: int = 50,
+) -> list[Found]:
+    """Recognize a drive and return its closures."""
+    laps = np.array([0, *np.cumsum([drive.images[own, 1].max() + 1 for own in lap_masks(drive)])])
+    pipeline = Pipeline(PipelineSettings(backend='cpu', exclude_places=exclude), 'loop_closure')
+    pipeline.camera = camera
+    odometry, found = planar_poses(drive.odometry), []
+    image_of = {int(stamp): i for i, stamp in enumerate(drive.stamps)}
+    for i, (lap, number) in enumerate(drive.images.tolist()):
+        record = ImageRecord.of_image(images[laps[lap] + number], int(drive.stamps[i]))
+        match = pipeline.process(record, int(drive.stamps[i]), odometry[i])
+        for each in (match, match.late):
+            pair = pipeline.matched_pair(each) if each is not None else None
+            if pair is None or each is None:
+                continue
+            query_stamp = each.window_stamps[each.position]
+            place_stamp = pair.source.place(each.place_index).stamp
+            began = time.thread_time()
+            edge = estimator.estimate(pair, camera, camera)
+            took = time.thread_time() - began
+            changes = tuple(zip(each.window_stamps, each.window_changes, strict=True))
+            if each.is_late:
+                changes = ()
+            if edge.source is Source.NONE:
+                closure = Closure(
+                    query_stamp, place_stamp, IDENTITY, APPEARANCE, False, changes=changes
+                )
+            else:
+                closure = Closure(
+                    query_stamp, place_stamp, edge.pose, edge.covariance, edge.independent,
+                    changes=changes,
+                )  # fmt: skip
+            at = image_of[query_stamp], image_of[place_stamp]
+            found.append(Found(i, *at, pair, edge, closure, took, each.is_late))
+    return found
+
+
+def falsified(drive: LapDrive, found: list[Found], kind: str, seed: int) -> list[Closure]:
+    """Return the closures with a share of wrong places."""
+    false, known, result = FalsePlaces(*FALSE[kind], seed), set[int](), []
+    for each in found:
+        known |= {each.query, each.place}
+        place = false.place(each.place, known)
+        result.append(replace(each.closure, place_stamp=int(drive.stamps[place])))
+    return result
+
+
+def relative(truth: np.ndarray, query: int, place: int) -> np.ndarray:
+    """Return the transform of one image in another, (4, 4), of planar poses (N, 3)."""
+    T = matrices(planar_poses(truth[[place, query]]))
+    return inverse(T[0]) @ T[1]
+
+
+def ate(drive: LapDrive, poses: np.ndarray, count: int | None = None) -> float:
+    """Return the absolute trajectory error of poses (N, 7) of the first images, m."""
+    known = np.isfinite(poses[:count, 0])
+    stamps, truth = drive.stamps[:count][known], planar_poses(drive.truth[:count])[known]
+    return trajectory_errors(stamps, poses[:count][known], truth)[0]
+
+
+def pass_errors(drive: LapDrive, poses: np.ndarray) -> np.ndarray:
+    """Return the errors of relative positions of images of two laps near each other, m."""
+    later = np.flatnonzero(drive.images[:, 0] > 0)
+    errors = []
+    T, truth = matrices(poses), matrices(planar_poses(drive.truth))
+    for q in later.tolist():
+        earlier = np.flatnonzero(drive.images[:, 0] < drive.images[q, 0])
+        away = np.linalg.norm(drive.truth[earlier, :2] - drive.truth[q, :2], axis=1)
+        if away.min() < PASSES:
+            p = earlier[np.argmin(away)]
+            off = (inverse(T[p]) @ T[q] - inverse(truth[p]) @ truth[q])[:3, 3]
+            errors.append(np.linalg.norm(off))
+    return np.array(errors)
+
+
+def edge_errors(drive: LapDrive, found: list[Found]) -> dict[str, list[list[float]]]:
+    """Return for each source along, across (m), heading (rad) and NEES of right edges."""
+    rows: dict[str, list[list[float]]] = {'PNP': [], 'ALIGNED': []}
+    for each in found:
+        true = relative(drive.truth, each.query, each.place)
+        if each.edge.source is Source.NONE or np.hypot(*true[:2, 3]) > NEAR:
+            continue
+        pose, i = each.edge.pose, [0, 1, 5]
+        yaw = Rotation.from_quat(pose[3:]).as_euler('ZYX')[0] - np.arctan2(true[1, 0], true[0, 0])
+        off = np.array([*(pose[:2] - true[:2, 3]), yaw])
+        nees = off @ np.linalg.solve(each.edge.covariance[np.ix_(i, i)], off)
+        rows[each.edge.source.name].append([*off.tolist(), float(nees)])
+    return rows
+
+
+def biases(drive: LapDrive, found: list[Found]) -> dict[str, list[float]]:
+    """Return along the track, on the same lane, what the edge and the place are off, in places."""
+    rows: dict[str, list[float]] = {'edge': [], 'place_index': [], 'late': []}
+    for each in found:
+        laps = drive.images[[each.query, each.place], 0].tolist()
+        true = relative(drive.truth, each.query, each.place)
+        if laps != [2, 0] or np.hypot(*true[:2, 3]) > NEAR or abs(true[1, 3]) > 1:
+            continue
+        spacing = each.pair.spacing
+        rows['late' if each.is_late else 'place_index'].append(float(-true[0, 3] / spacing))
+        if each.edge.source is not Source.NONE:
+            rows['edge'].append(float((each.edge.pose[0] - true[0, 3]) / spacing))
+    return rows
+
+
+def wrong_pairs(drive: LapDrive, found: list[Found], seed: int) -> list[int]:
+    """Return which queries PnP accepts with places elsewhere, 0 or 1 each."""
+    dice, estimator = np.random.default_rng(seed), EdgeEstimator('pnp')
+    accepted: list[int] = []
+    while len(accepted) < WRONG_PAIRS:
+        a, b = (found[i] for i in dice.integers(len(found), size=2))
+        if np.linalg.norm(drive.truth[a.query, :2] - drive.truth[b.place, :2]) < FAR:
+            continue
+        pair = replace(b.pair, query=a.pair.query, query_poses=a.pair.query_poses)
+        accepted.append(int(estimator.estimate(pair, CAMERA, CAMERA).source is Source.PNP))
+    return accepted
+
+
+def measure_drift(drive: LapDrive, found: list[Found], seed: int) -> dict[str, Any]:
+    """Return the errors of a drive, without and with false closures."""
+    odometry = planar_poses(drive.odometry)
+    began = time.thread_time()
+    poses, graph = optimize(drive.stamps, odometry, [each.closure for each in found])
+    before = ate(drive, odometry)
+    right = [
+        np.hypot(*relative(drive.truth, each.query, each.place)[:2, 3]) < NEAR for each in found
+    ]
+    row = {
+        'before': before,
+        'after': ate(drive, poses),
+        'seconds': time.thread_time() - began,
+        'closures': len(found),
+        'right': int(np.sum(right)),
+        'rejected': graph.rejected,
+        'scale': graph.scale,
+        'passes': pass_errors(drive, poses).tolist(),
+        'edges': edge_errors(drive, found),
+        'biases': biases(drive, found),
+        'pnp': sum(
+            each.edge.source is Source.PNP for each, ok in zip(found, right, strict=True) if ok
+        ),
+    }
+    for kind in FALSE:
+        closures = falsified(drive, found, kind, seed)
+        poses, graph = optimize(drive.stamps, odometry, closures)
+        row[kind] = {'after': ate(drive, poses), 'accepted': graph.accepted}
+    return row
+
+
+def measure_sessions(drive: LapDrive, found: list[Found], seed: int) -> dict[str, Any]:
+    """Return the error of two sessions, without and with false closures."""
+    odometry, row = planar_poses(drive.odometry), {}
+    for kind in ('', 'random 30', 'coherent 30'):
+        closures = falsified(drive, found, kind, seed) if kind else [f.closure for f in found]
+        poses, _ = optimize(drive.stamps, odometry, closures)
+        row[kind or 'after'] = ate(drive, poses)
+    return row
+
+
+def measure_carried(drive: LapDrive, found: list[Found]) -> dict[str, Any]:
+    """Return the error of a carried robot, and how soon it was small."""
+    odometry = planar_poses(drive.odometry)
+    poses, final = optimize(drive.stamps, odometry, [each.closure for each in found])
+    behind = [
+        each.known
+        for each in found
+        if each.query >= CARRIED.start
+        and np.hypot(*relative(drive.truth, each.query, each.place)[:2, 3]) < NEAR
+    ]
+    graph, waiting, first, errors = PoseGraph(), list(found), min(behind), []
+    for i in range(first + ONLINE + 1):
+        graph.add_odometry(int(drive.stamps[i]), odometry[i])
+        while waiting and waiting[0].known <= i:
+            graph.add_closure(waiting.pop(0).closure)
+        if i >= first or i % 20 == 0:
+            graph.update()
+        if i >= first:
+            known = [graph.at(stamp) for stamp in drive.stamps[: i + 1].tolist()]
+            missing = np.full(7, np.nan)
+            now = np.array([missing if pose is None else pose for pose in known])
+            errors.append(ate(drive, now, i + 1))
+    above = np.flatnonzero(np.array(errors) > LEAST_ATE)
+    return {
+        'before': ate(drive, odometry),
+        'after': ate(drive, poses),
+        'splits': final.splits,
+        'images': int(above[-1] + 1) if len(above) else 0,
+        'at 50': errors[50],
+    }
+
+
+def measure(seed: int, draw: int, folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Measure a draw of a world, row by row."""
+    images = render(seed, folder)
+    estimator = SharedViews if draw else EdgeEstimator  # the plain one is timed
+    for name, drift in DRIFTS.items():
+        drive = drive_laps(seed, draw, drift)
+        found = find(drive, images, estimator())
+        row = measure_drift(drive, found, 100 * seed + draw)
+        if draw == 0:
+            row['pnp_ms'] = [each.seconds * 1e3 for each in found]
+            row['wrong'] = wrong_pairs(drive, found, seed) if name == 'small' else []
+        yield name, row
+    if draw >= OTHER_DRAWS:
+        return
+    drive = drive_laps(seed, draw, DRIFTS['large'], sessions=2)
+    row = measure_sessions(drive, find(drive, images, estimator()), 100 * seed + draw)
+    yield 'sessions', row
+    for name, drift in DRIFTS.items():
+        drive = drive_laps(seed, draw, drift, carried=True)
+        yield f'carried {name}', measure_carried(drive, find(drive, images, estimator()))
+
+
+def measure_world(seed: int, draws: int, folder: Path, parts: Path) -> int:
+    """Measure a world into one file for each draw; draws that have a file are left out."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    for draw in range(draws):
+        part = parts / f'slam-{seed}-{draw}.json'
+        if not part.exists():
+            vars(landmarks)['mutual_matches'] = _matched if draw else mutual_matches
+            rows = dict(measure(seed, draw, folder))
+            part.write_text(json.dumps({'seed': seed, 'draw': draw, **rows}))
+            print(part.name, flush=True)
+    SharedViews.forget()
+    return seed
+
+
+def main() -> None:
+    """Measure and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--seeds', type=int, nargs='+', default=[41, 42, 43, 44, 45])
+    parser.add_argument('--draws', type=int, default=5, help='of the odometry (%(default)s)')
+    parser.add_argument('--jobs', type=int, default=1, help='processes (%(default)s)')
+    parser.add_argument(
+        '--folder', type=Path, help='keeps images and finished draws: a run continues there'
+    )
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = given.folder or Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        context = multiprocessing.get_context('spawn')
+        with ProcessPoolExecutor(given.jobs, context) as pool:
+            running = [
+                pool.submit(measure_world, seed, given.draws, folder, folder)
+                for seed in given.seeds
+            ]
+            for done in tqdm(as_completed(running), total=len(running), unit='world'):
+                done.result()
+        rows = [
+            json.loads((folder / f'slam-{seed}-{draw}.json').read_text())
+            for seed in given.seeds
+            for draw in range(given.draws)
+        ]
+    about = environment()
+    page = markdown(about, rows)
+    (ROOT / 'docs' / 'slam_measured.md').write_text('\n'.join(page) + '\n')
+    (RESULTS / 'slam.json').write_text(json.dumps({'about': about, 'page': page}, indent=1))
+    print('\n'.join(page))
+
+
+if __name__ == '__main__':
+    main()

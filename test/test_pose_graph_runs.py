@@ -1,0 +1,88 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Runs of keyframes as one factor: covariances, and the same solution as with all keyframes."""
+
+import numpy as np
+import pytest
+from stavpr_ros.demonstration.street.laps import drifted
+from stavpr_ros.pose_graph import optimize, PoseGraph, runs
+from stavpr_ros.pose_graph.odometry import ChainSettings, KeyframeChain, OdometryNoise
+from stavpr_ros.pose_graph.transforms import inverse, planar_poses, to_poses
+from test_pose_graph import circle, closure, LAP, odometry_of, SECOND
+
+NOISE = OdometryNoise(0.05, 0.012)
+
+
+@pytest.fixture(scope='module')
+def chain():
+    """Return a chain far from the origin of its odometry, in two sessions."""
+    chain = KeyframeChain(ChainSettings())
+    poses = planar_poses(circle(1)[:40])
+    poses[:, :2] += 5e5
+    for i, pose in enumerate(poses):
+        chain.add((i + 1) * SECOND, pose)
+    chain.split(25, 26 * SECOND)
+    return chain
+
+
+def test_runs_end_at_edges_sessions_and_after_the_longest(chain):
+    found = runs.Runs.of(chain, NOISE, {3, 17, 38})
+    assert np.flatnonzero(found.variable).tolist() == [0, 3, 10, 17, 20, 25, 35, 38]
+    assert found.before[[0, 2, 3, 12, 25, 26, 39]].tolist() == [-1, 0, 0, 10, -1, 25, 38]
+    assert found.after[[1, 4, 24, 26, 39]].tolist() == [3, 10, -1, 35, -1]
+
+
+def test_covariance_of_a_run_is_that_of_its_steps(chain):
+    found = runs.Runs.of(chain, NOISE, set())
+    T, expected = chain.transforms, np.zeros((6, 6))
+    for k in range(11, 21):
+        length = chain.travelled[k] - chain.travelled[k - 1]
+        change = runs._adjoints((inverse(T[k]) @ T[k - 1])[None])[0]
+        step = np.repeat([NOISE.rotation**2 * length, NOISE.translation**2 * length], 3)
+        expected = change @ expected @ change.T + np.diag(step)
+        assert found.covariance[k] == pytest.approx(expected, rel=1e-6, abs=1e-12)
+
+
+def test_filled_run_continues_to_its_moved_end(chain):
+    found = runs.Runs.of(chain, NOISE, set())
+    values = chain.transforms.copy()
+    values[20] = values[20] @ _moved(0.2, -0.1, 0.02)
+    filled = found.filled(values)
+    assert np.array_equal(filled[found.variable], values[found.variable])
+    off = [to_poses(inverse(chain.transforms[k]) @ filled[k])[:2] for k in range(10, 21)]
+    assert (np.diff(np.linalg.norm(off, axis=1)) > 0).all()
+    before, after = (inverse(filled[k]) @ filled[k + 1] for k in (18, 19))
+    assert before == pytest.approx(after, abs=0.01)  # no jump at the end
+
+
+def _moved(x, y, yaw):
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+
+
+def test_optimize_with_runs_agrees_with_all_keyframes(monkeypatch):
+    truth = circle()
+    closures = [closure(truth, q, q - LAP) for q in range(LAP, 2 * LAP)]
+    stamps = (np.arange(len(truth)) + 1) * SECOND
+    found, _ = optimize(stamps, odometry_of(truth), closures)
+    monkeypatch.setattr(runs, 'LONGEST', 1)
+    every, _ = optimize(stamps, odometry_of(truth), closures)
+    assert np.linalg.norm(found[:, :3] - every[:, :3], axis=1).max() < 0.02
+
+
+def test_update_splits_runs_where_edges_arrive():
+    truth = circle(3)
+    dice = np.random.default_rng(4)
+    odometry = planar_poses(drifted(truth, np.ones(len(truth), bool), dice, 0.3))
+    graph, closures = PoseGraph(), []
+    for i, pose in enumerate(odometry):
+        graph.add_odometry((i + 1) * SECOND, pose)
+        if i >= LAP:
+            closures.append(closure(truth, i, i - LAP, independent=i % 7 == 0))
+            graph.add_closure(closures[-1])
+        if i % 9 == 0:
+            graph.update()
+    graph.update()
+    online = graph.solved.copy()
+    final = graph.update(final=True)
+    assert np.linalg.norm(online[:, :3, 3] - final[:, :3, 3], axis=1).max() < 0.1
