@@ -368,7 +368,7 @@ class PlaceFilter:
             for image in self.came
         ]
 
-    def update(self, z: Array, alpha: float, likely: Array) -> None:
+    def update(self, z: Array, alpha: float, likely: Array, seen: Any = 1.0) -> None:
         """Advance by an image with z-normalized distances to n places."""
         s, n, V = self.settings, len(z), self.V
         levels, speeds = range(self.K), range(V)
@@ -386,14 +386,18 @@ class PlaceFilter:
             for k in levels
         ]  # fmt: skip
         sums = [sum(self.speed_change(w, u) * likely[u] for u in speeds) for w in speeds]
-        G = [[self.speed_change(w, v) * likely[v] / sums[w] for v in speeds] for w in speeds]
+        seen = np.broadcast_to(seen, V)
+        G = [
+            [self.speed_change(w, v) * likely[v] / sums[w] * seen[v] for v in speeds]
+            for w in speeds
+        ]
         step = [round(v * (self.images + 1)) - round(v * self.images) for v in s.speeds]
         new: Array = np.zeros_like(a)
         came: dict[tuple[int, int, int], tuple[int, int] | None] = {}
         for k in levels:
             m = [[sum(G[w][v] * b[k][w][y] for w in speeds) for y in range(n)] for v in speeds]
             birth = off[k] * s.enter / (V * max(n, 1))
-            moved = 0.0
+            lost = sum(sum(row) for row in m)
             for v in speeds:
                 steps = [(1 - 2 * s.spread, step[v]), (s.spread, step[v] + 1)]
                 steps.append((s.spread, max(step[v] - 1, 0)))
@@ -401,7 +405,7 @@ class PlaceFilter:
                     first = max(place for place in self.firsts if place <= y)
                     from_places = [(p * m[v][y - r], y - r) for p, r in steps if y - r >= first]
                     arrived = sum(p for p, _ in from_places)
-                    moved += arrived
+                    lost -= arrived
                     new[k, v, y] = (1 - s.leave) * arrived + birth
                     came[k, v, y] = None
                     if (1 - s.leave) * arrived > birth:
@@ -417,7 +421,7 @@ class PlaceFilter:
                         mu = s.levels[k]
                         new[k, v, y] *= np.exp(alpha * (mu * z[y] - mu * mu / 2))
             on_map = sum(sum(row) for row in b[k])
-            off[k] = off[k] * (1 - s.enter) + s.leave * moved + on_map - moved
+            off[k] = off[k] * (1 - s.enter) + s.leave * (on_map - lost) + lost
         total = float(new.sum()) + sum(off)
         self.a, self.off = new / total, [p / total for p in off]
         self.came.append(came)

@@ -51,7 +51,8 @@ def drive(count, gaps=()):
             z[place] -= 4
         z[image % 5] = np.inf
         z[list(gaps)] = np.inf
-        yield z, 0.0 if image == 6 else 0.3, rng.uniform(0.5, 1, len(SMALL.speeds))
+        speeds = rng.uniform(0.5, 1, (2, len(SMALL.speeds)))
+        yield z, 0.0 if image == 6 else 0.3, *speeds
 
 
 @pytest.mark.parametrize('gaps', [(), (11, 12, 13, 14)])
@@ -60,9 +61,9 @@ def test_update_and_answers_equal_those_of_the_cpu(cuda_filter, gaps):
     cpu = PlaceFilter(N, LAG, SMALL, known)
     cuda = cuda_filter.CudaPlaceFilter(N, LAG, SMALL, known)
     for again in range(2):
-        for image, (z, weight, speeds) in enumerate(drive(11 - 8 * again, gaps)):
-            cpu.update(z, weight, speeds)
-            cuda.update(torch.from_numpy(z).to(cuda._device), weight, speeds)
+        for image, (z, weight, *speeds) in enumerate(drive(11 - 8 * again, gaps)):
+            cpu.update(z, weight, *speeds)
+            cuda.update(torch.from_numpy(z).to(cuda._device), weight, *speeds)
             assert cuda.count == cpu.count == image + 1
             np.testing.assert_allclose(
                 cuda.places_of_states(), cpu.places_of_states(), rtol=1e-3, atol=1e-7

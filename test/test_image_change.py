@@ -124,6 +124,42 @@ def test_speed_weights_after_reset_forget_query():
     np.testing.assert_array_equal(one.speed_weights(0.2), other.speed_weights(0.2))
 
 
+def likelihoods_of(change, query):
+    for i in range(query.shape[1]):
+        found = change.speed_likelihoods(change.next_query(query[:, i]))
+    return found
+
+
+@pytest.mark.parametrize('apart', [1, 2, 3])
+def test_speed_likelihoods_are_highest_at_speed_of_query(apart):
+    change, query = learned(drive_strips(400)), drive_strips(90, seed=1)[:, ::apart]
+    logs = [np.log(likelihoods_of(change, query[:, :i])) for i in range(8, 30)]
+    assert abs(SETTINGS.speeds[int(np.argmax(np.sum(logs, axis=0)))] - apart) <= 0.5
+
+
+def test_speed_likelihoods_of_first_images_are_equal():
+    change, query = learned(drive_strips(100)), drive_strips(APART + 2)
+    np.testing.assert_array_equal(likelihoods_of(change, query[:, :APART]), 1)
+    assert likelihoods_of(change, query).min() < 0.9
+    change.reset()
+    np.testing.assert_array_equal(likelihoods_of(change, query[:, :APART]), 1)
+
+
+def test_speed_likelihoods_reject_a_path_that_stands_while_images_change():
+    found = likelihoods_of(learned(drive_strips(300)), drive_strips(30, seed=2))
+    assert found[SETTINGS.speeds.index(0.0)] < 0.5
+    assert found[SETTINGS.speeds.index(1.0)] > 0.9
+
+
+def test_speed_likelihoods_under_noise_leave_the_speed_likely():
+    """Noise of the query alone looks like a higher speed."""
+    rng, query = np.random.default_rng(0), drive_strips(30, seed=3)
+    query = query + 0.4 * rng.standard_normal(query.shape) / np.sqrt(query.shape[2])
+    query = (query / np.linalg.norm(query, axis=2, keepdims=True)).astype(np.float32)
+    found = likelihoods_of(learned(drive_strips(300)), query)
+    assert found[SETTINGS.speeds.index(1.0)] > 0.9
+
+
 def probable_at(place, n):
     by_place = np.full(n, 0.2 / n)
     by_place[place] += 0.8

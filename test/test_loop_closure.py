@@ -272,7 +272,7 @@ def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
     options, exclude = ROBUST.without('mean_centering', 'whitening'), 12
     closer = LoopCloser(settings_of(options), exclude, laps.settings, limit=90)
     plain = PlainCloser(settings_of(options), exclude, laps)
-    s = FilterSettings()
+    s = FilterSettings(speed_weight=0)
     change, filtered, first = ImageChange(300, s), PlaceFilter(300, 2, s), 0
     for i in range(len(laps)):
         answer = closer.update(laps[i : i + 1])
@@ -286,14 +286,18 @@ def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
         z = plain.normalized(i, first, first + places)
         seen = change.next_query(strips[:, -1])
         assert not change.is_standstill(seen)
-        speeds = change.speed_weights(seen) if i else np.ones(len(s.speeds))
-        filtered.update(z, change.weight(seen), speeds)
+        speeds = np.ones((2, len(s.speeds)))
+        if i:
+            speeds = change.speed_weights(seen), change.speed_likelihoods(seen)
+        filtered.update(z, change.weight(seen), *speeds)
         if answer.sequence is None:
             assert not len(z)
             continue
         belief = filtered.belief(len(z), 2)
         near, probabilities = belief.probabilities(len(z))
-        assert answer.probability == pytest.approx(max(probabilities, default=0), abs=1e-4)
+        share = answer.shares[2] if len(answer.shares) else 0
+        expected = share * max(probabilities, default=0)
+        assert answer.probability == pytest.approx(expected, abs=1e-4)
         if answer.accepted:
             middle = first + int(near[np.argmax(probabilities)])
             assert answer.place_index == pytest.approx(middle, abs=2)
@@ -334,7 +338,7 @@ def test_late_matches_close_what_was_not_certain_at_first():
         state = closer._filter
         belief = state.filter.belief(state.buffer.known, length - 1)
         assert found.probability == pytest.approx(
-            belief.probabilities(state.buffer.known)[1].max()
+            found.shares[0] * belief.probabilities(state.buffer.known)[1].max()
         )
     assert len(late) >= 5
     assert all(abs(query - lap - place) <= CLOSE for query, place in late.items())

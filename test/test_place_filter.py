@@ -46,7 +46,9 @@ LAG = 4
 def random_image(rng, n, s):
     z = rng.standard_normal(n).astype(np.float32)
     z[rng.random(n) < 0.1] = np.inf
-    return z, float(rng.uniform(0.1, 0.5)), rng.uniform(0.1, 1, len(s.speeds))
+    V = len(s.speeds)
+    likelihoods = np.random.default_rng(n).uniform(0.3, 1, V)
+    return z, float(rng.uniform(0.1, 0.5)), rng.uniform(0.1, 1, V), likelihoods
 
 
 def assert_equal(one, plain):

@@ -121,7 +121,7 @@ def test_look_alike_corridors_are_distinguished_by_their_turns():
     matches = drive(PlaceRecognizer(place_map, settings_of()), query, track(-90))
     accepted = np.array([match.accepted for match in matches])
     assert accepted[LENGTH : CORNER - 1].all()
-    assert not accepted[CORNER + 4 : CORNER + 3 * LENGTH].any()
+    assert not accepted[CORNER + 6 : CORNER + 3 * LENGTH].any()
     last = matches[CORNER + LENGTH]
     assert last.status is Status.NO_MATCH
     assert last.reason.endswith('not above 0.500: odometry disagrees with its path')

@@ -259,7 +259,7 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
     def assign(end: int, position: int, place: int) -> None:
         image = end - (length - 1) + position
         if image >= 0:
-            match = matches[end]
+            match = matches[end].at(position)
             found.places[image], found.distances[image] = place, match.score
             found.accepted[image], found.probabilities[image] = match.accepted, match.probability
 

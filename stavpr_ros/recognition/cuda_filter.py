@@ -157,7 +157,13 @@ class CudaPlaceFilter:
         block = self._kernels.BLOCK
         self._runtime.launch(kernel, (-(-count // block), 1), block, *arguments)
 
-    def update(self, z: torch.Tensor, weight: float, speed_weights: np.ndarray) -> None:
+    def update(
+        self,
+        z: torch.Tensor,
+        weight: float,
+        speed_weights: np.ndarray,
+        speed_likelihoods: np.ndarray | float = 1.0,
+    ) -> None:
         """
         Advance by an image.
 
@@ -165,6 +171,7 @@ class CudaPlaceFilter:
             bans a place.
         :param weight: alpha; 0 = the image is no evidence.
         :param speed_weights: relative probability of each speed, (V,).
+        :param speed_likelihoods: of each speed relative to that off the map, (V,).
         """
         s, (K, V), v, n = self.settings, self._shape, self._views, len(z)
         slot = self.count % len(self._origins)
@@ -183,7 +190,8 @@ class CudaPlaceFilter:
         if n:
             self._z[:n] = z
             self._z[self._gaps] = -torch.inf
-            self._speed_factors.copy_(torch.from_numpy(s.speed_changes(speed_weights)))
+            changes = s.speed_changes(speed_weights, speed_likelihoods)
+            self._speed_factors.copy_(torch.from_numpy(changes))
             self._factors.copy_(self._level_changes * self._scale.float())
             self._births.copy_(off * s.enter / (V * real))
             before = self._seen @ self._factors.double()

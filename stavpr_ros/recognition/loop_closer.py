@@ -16,7 +16,7 @@ from stavpr_ros.recognition.cpu_matcher import CpuRouteMatcher
 from stavpr_ros.recognition.match import Match, Status
 from stavpr_ros.recognition.matcher import PRECISIONS
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
-from stavpr_ros.recognition.robust import z_normalized
+from stavpr_ros.recognition.robust import FilterSettings, z_normalized
 from stavpr_ros.recognition.route_features import RouteFeatures
 from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
 from stavpr_ros.recognition.settings import RecognizerSettings
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 EVICTED = 8  # the oldest one in so many is evicted at a time
 AROUND = 30  # places whose mean distance is subtracted: a route has been through several lights
+# A route's mean follows its light late: until then all its images change little
+MODEL = FilterSettings(speed_weight=0)
 LEAST_PLACES = 5  # fewer distances have no meaningful mean and deviation
 
 
@@ -83,7 +85,7 @@ class LoopCloser(SequenceRecognizer):
             raise SettingsError(
                 f'precision {precision!r} is unknown: take one of {", ".join(PRECISIONS)}'
             )
-        super().__init__(settings, feature_settings, 0, to_oldest=True)
+        super().__init__(settings, feature_settings, 0, to_oldest=True, model=MODEL)
         W = feature_settings.strips
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
         self._matcher = _matcher(W, settings.spatial, choose_loop_backend(backend))
@@ -176,6 +178,7 @@ class LoopCloser(SequenceRecognizer):
             match,
             sequence=nearest,
             path=window.path,
+            shares=window.shares,
             probability=1 - nearest.distance,
             is_late=True,
         )

@@ -12,6 +12,8 @@ from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.path import aligned_index, NO_PATH
 from stavpr_ros.errors import InputError
 
+NO_SHARES = np.empty(0)
+
 
 class Status(enum.IntEnum):
     """Status of one image; names and values are the constants of ``stavpr_msgs/PlaceMatch``."""
@@ -58,6 +60,8 @@ class Match:
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
     :param relative: distances are those of mode robust, 1 - probability.
     :param probability: that the nearest sequence is the right place; NaN = unknown (mode paper).
+    :param shares: probability of each place of the path and those close to it, if the sequence is
+        right, (m,); empty in mode paper.
     :param is_late: the place is that of the oldest image of the window instead of the middle one.
     :param late: the match of the oldest image, where it had none as the middle one; None = it had,
         or is not certain now either.
@@ -80,6 +84,7 @@ class Match:
     path: np.ndarray = field(default_factory=lambda: NO_PATH, repr=False)
     relative: bool = False
     probability: float = math.nan
+    shares: np.ndarray = field(default_factory=lambda: NO_SHARES, repr=False)
     is_late: bool = False
     late: 'Match | None' = field(default=None, repr=False)
     window_stamps: tuple[int, ...] = field(default=(), repr=False)
@@ -120,6 +125,13 @@ class Match:
         (``relative``), 1 - probability, which has memory: successive values are correlated.
         """
         return self.sequence.distance if self.sequence else math.nan
+
+    def at(self, position: int) -> 'Match':
+        """Return this as the match of another image of the window, with its probability."""
+        if not len(self.shares) or self.sequence is None:
+            return self
+        share = self.shares[position] / max(self.shares[self.position], 1e-9)
+        return self.with_probability(min(1.0, self.probability * float(share)))
 
     @property
     def score(self) -> float:

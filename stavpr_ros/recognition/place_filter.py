@@ -171,13 +171,20 @@ class PlaceFilter:
         """Return the probability of each place, (room,), float32."""
         return self._by_place[: self._room] * np.float32(self._scale)
 
-    def update(self, z: np.ndarray, weight: float, speed_weights: np.ndarray) -> None:
+    def update(
+        self,
+        z: np.ndarray,
+        weight: float,
+        speed_weights: np.ndarray,
+        speed_likelihoods: np.ndarray | float = 1.0,
+    ) -> None:
         """
         Advance by an image.
 
         :param z: z-normalized distances to the first m places, (m,), float32; +inf bans a place.
         :param weight: alpha; 0 = the image is no evidence.
         :param speed_weights: relative probability of each speed, (V,).
+        :param speed_likelihoods: of each speed relative to that off the map, (V,).
         """
         s, n = self.settings, len(z)
         slot = self._count % len(self._steps)
@@ -201,9 +208,10 @@ class PlaceFilter:
                 z[self._gaps] = NO_PLACE
             advance(
                 self._a, n, np.ascontiguousarray(z), np.float32(weight), self._levels,
-                self._level_changes * np.float32(self._scale), s.speed_changes(speed_weights),
-                self._steps[slot], np.float32(s.spread), np.float32(1 - s.leave), births,
-                self._halos, self._origins[slot], totals, self._by_place, self._maxima,
+                self._level_changes * np.float32(self._scale),
+                s.speed_changes(speed_weights, speed_likelihoods), self._steps[slot],
+                np.float32(s.spread), np.float32(1 - s.leave), births, self._halos,
+                self._origins[slot], totals, self._by_place, self._maxima,
             )  # fmt: skip
         before, lost, seen = totals.sum(axis=0).T if n else np.zeros((3, len(off)))
         if len(self._gaps):  # likelihoods are 1 there

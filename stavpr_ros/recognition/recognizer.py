@@ -30,7 +30,7 @@ from stavpr_ros.recognition.match import (
 )
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.relative_motion import Positions, RelativeMotion
-from stavpr_ros.recognition.robust import MeanCentering, z_normalized
+from stavpr_ros.recognition.robust import FilterSettings, MeanCentering, z_normalized
 from stavpr_ros.recognition.sequence_search import (
     FilterSearch,
     Search,
@@ -56,6 +56,7 @@ class SequenceRecognizer:
     :param places: number of places n.
     :param layout: of a map of several sessions.
     :param to_oldest: see :class:`stavpr_ros.recognition.sequence_search.FilterSearch`.
+    :param model: of the filter.
 
     ``problem`` is why places of the map cannot be reached; empty while they can.
     """
@@ -69,16 +70,17 @@ class SequenceRecognizer:
         places: int,
         layout: SessionLayout | None = None,
         to_oldest: bool = False,
+        model: FilterSettings | None = None,
     ) -> None:
         sequence = settings.sequence
         self._settings, self._feature_settings = settings, feature_settings
         self._options = settings.applied_options
-        self._layout, self._to_oldest = layout, to_oldest
+        self._layout, self._to_oldest, self._model = layout, to_oldest, model
         columns = places if layout is None else layout.width
         self._buffer = SequenceBuffer(sequence.length, columns, sequence.k)
         self._filter = None
         if self._options.place_filter:
-            self._filter = FilterSearch(self._buffer, layout=layout, to_oldest=to_oldest)
+            self._filter = FilterSearch(self._buffer, model, layout, to_oldest)
         self._search: Search = self._filter or LmDtwSearch(self._buffer)
         # x and y of each place, or of the places held; empty = unknown
         self._positions: Positions = ()
@@ -100,7 +102,7 @@ class SequenceRecognizer:
         device = runtime().torch_device
         self._buffer = SequenceBuffer(sequence.length, places, sequence.k, device=device)
         self._filter = FilterSearch(
-            self._buffer, layout=self._layout, to_oldest=self._to_oldest, on_device=True
+            self._buffer, self._model, self._layout, self._to_oldest, on_device=True
         )
         self._filter.change = change
         self._search = self._filter
@@ -253,7 +255,7 @@ class SequenceRecognizer:
         window = self._window
         if self._layout is not None and window.nearest is not None:
             in_places = self._layout.in_places(window.nearest, window.path, window.sequences)
-            self._window = WindowMatch(*in_places)
+            self._window = WindowMatch(*in_places, window.shares)
         self._nearest = nearest = self._window.nearest
         if nearest is None:
             return Match(Status.NO_MATCH, 'the map is empty', threshold)
@@ -268,7 +270,8 @@ class SequenceRecognizer:
                 else f'nearest distance {nearest.distance:.4f} is not below the threshold '
                 f'{threshold:.4f}'
             )
-        return Match(status, reason, threshold, nearest, self._window.path, relative, probability)
+        path, shares = self._window.path, self._window.shares
+        return Match(status, reason, threshold, nearest, path, relative, probability, shares)
 
 
 class PlaceRecognizer(SequenceRecognizer):

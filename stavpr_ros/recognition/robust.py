@@ -114,6 +114,8 @@ class FilterSettings:
     :param leave: probability of leaving the map at an image, and enter: of returning to it.
     :param start: probability of starting on the map.
     :param change_deviation: of the logarithm of the change at one speed.
+    :param speed_weight: exponent of the likelihood of a speed: that of changes of which five are
+        averaged.
     """
 
     speeds: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
@@ -129,6 +131,7 @@ class FilterSettings:
     enter: float = 0.003
     start: float = 0.9
     change_deviation: float = 0.5
+    speed_weight: float = 0.2
 
     def level_changes(self) -> np.ndarray:
         """Return the probability of each level by the one before, (K, K), float32."""
@@ -140,14 +143,17 @@ class FilterSettings:
             changes[k, neighbors] = (1 - changes[k, k]) / max(len(neighbors), 1)
         return changes
 
-    def speed_changes(self, weights: np.ndarray) -> np.ndarray:
+    def speed_changes(
+        self, weights: np.ndarray, likelihoods: np.ndarray | float = 1.0
+    ) -> np.ndarray:
         """
         Return the factors of the speeds for the kernels, (5, V), float32.
 
         To stay, from the speed below, from the one above, of all by the speed after, and from any
-        by the speed before.
+        by the speed before. They include the likelihood of the speed after.
 
         :param weights: relative probability of each speed for this image, (V,).
+        :param likelihoods: of each speed by the latest images relative to that off the map, (V,).
         """
         V = len(self.speeds)
         near, far = (1 - self.keep_speed) * 0.4, (1 - self.keep_speed) * 0.2 / V
@@ -162,6 +168,7 @@ class FilterSettings:
         )
         changes[1, 1:] = near * weights[1:] / total[:-1]
         changes[2, :-1] = near * weights[:-1] / total[1:]
+        changes[:4] *= likelihoods
         return changes
 
 

@@ -16,15 +16,23 @@ import numpy as np
 from stavpr_ros.alignment.lm_dtw import padded_width, SequenceMatch
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.checks import no_nan
+from stavpr_ros.compilation import kernel
 from stavpr_ros.recognition.map_change import APART, MapChange
+from stavpr_ros.recognition.match import NO_SHARES
 from stavpr_ros.recognition.place_filter import CLOSE, distinct, NEGLIGIBLE, PlaceFilter
 from stavpr_ros.recognition.robust import change_between, FilterSettings
 from stavpr_ros.recognition.sessions import Sequences, SessionLayout
 import torch
 
+SPREAD, SCALE = 0.25, 0.4  # deviations of the logarithm: of each change, of all in other light
+NOISE = 0.15  # deviation of what noise adds to all changes
+LEAST_LIKELY = -8.0  # logarithm of the least likelihood of a speed, without its exponent
 SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
 OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
 FLOOR = 1e-3  # least relative probability of a speed
+BAND = 5  # places to either side of the filter's path that its refinement considers
+START_DEVIATION = 3.0  # places, of the path at the oldest image of the window
+STEPS = np.array([0.05, 0.15, 0.6, 0.15, 0.05])  # probability of 2 places less than the path, ...
 
 
 class SequenceBuffer:
@@ -149,6 +157,8 @@ class WindowMatch:
 
     :param nearest: with the second best; None where no sequence is possible.
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
+    :param shares: probability of each place of the path and those close to it, if the sequence is
+        right, (m,); empty in mode paper.
     :param sequences: returns the costs of all sequences, shape (n,), +inf where there is none,
         and their middle places, shape (n,); valid until the next search.
     """
@@ -156,6 +166,7 @@ class WindowMatch:
     nearest: SequenceMatch | None = None
     path: np.ndarray = field(default_factory=lambda: NO_PATH)
     sequences: Callable[[], Sequences] = _no_sequences
+    shares: np.ndarray = field(default_factory=lambda: NO_SHARES)
 
 
 Search = Callable[[int], WindowMatch]
@@ -175,18 +186,32 @@ class ImageChange(MapChange):
 
     def _update_curve(self) -> None:
         super()._update_curve()
-        changes = np.interp(self._settings.speeds, np.arange(APART + 1), self.curve)
-        self._expected = np.log(changes + OFFSET)  # by speed
+        speeds = np.array(self._settings.speeds)
+        left = np.maximum(1 - self.curve, 0)  # of the similarity: it shrinks in one ratio further
+        ratio = min(left[-1] / left[-2], 1) if left[-2] > 0 else 0.0
+        beyond = np.arange(1, int(np.ceil(APART * speeds.max())) - APART + 1)
+        curve = np.append(self.curve, self.curve[-1] + left[-1] * (1 - ratio**beyond))
+        changes = np.interp(np.outer(speeds, range(1, APART + 1)), np.arange(len(curve)), curve)
+        changes += OFFSET
+        covariances = SPREAD**2 * np.eye(APART) + SCALE**2
+        covariances = covariances + NOISE**2 / (changes[:, :, None] * changes[:, None])
+        # by speed and images apart, or by speed alone
+        self._logarithms, self._precisions = np.log(changes), np.linalg.inv(covariances)
+        self._expected = np.log(np.interp(speeds, np.arange(APART + 1), self.curve) + OFFSET)
 
     def reset(self) -> None:
         """Forget the query."""
         self._last: np.ndarray | None = None
         self._latest: deque[float] = deque(maxlen=SMOOTHED)
+        self._moving: deque[np.ndarray] = deque(maxlen=APART + 1)  # images that were no standstill
+        self._by_apart: deque[list[float]] = deque(maxlen=SMOOTHED)  # their latest changes
 
     def next_query(self, strips: np.ndarray) -> float:
         """Return the change of the query's next image (W, d) from the one before, 1 at first."""
         change = 1.0 if self._last is None else change_between(strips, self._last)
         self._last = strips
+        if not self.is_standstill(change):
+            self._moving.append(strips)
         return change
 
     def recenter_query(self, strips: np.ndarray) -> None:
@@ -210,6 +235,64 @@ class ImageChange(MapChange):
         seen = np.log(sum(self._latest) / len(self._latest) + OFFSET)
         off = (seen - self._expected) / self._settings.change_deviation
         return np.asarray(np.exp(-0.5 * off**2) + FLOOR)
+
+    def speed_likelihoods(self, change: float) -> np.ndarray:
+        """
+        Return the likelihood of each speed after another change, of the most likely one 1, (V,).
+
+        The camera has some speed off the map as well: that likelihood is 1. So places that pass
+        more slowly or faster than the images change lose against being off the map. Compared are
+        the logarithms of the changes of images 1 to ``APART`` apart, each the mean of the latest
+        ones, with those on the curve of the map. Light makes all of them smaller or larger, and
+        noise larger: both count as Gaussian errors that the changes have in common.
+        """
+        if len(self._moving) <= APART or not self._settings.speed_weight:
+            return np.ones(len(self._expected))
+        newest = self._moving[-1]
+        before = [self._moving[-1 - apart] for apart in range(2, APART + 1)]
+        self._by_apart.append([change, *(change_between(newest, image) for image in before)])
+        off = np.log(np.mean(self._by_apart, axis=0) + OFFSET) - self._logarithms
+        logs = -0.5 * np.einsum('vi,vij,vj->v', off, self._precisions, off)
+        likely = np.exp(self._settings.speed_weight * np.maximum(logs - logs.max(), LEAST_LIKELY))
+        return np.asarray(likely)
+
+
+@kernel
+def _smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> None:
+    """
+    Write the probability of each offset from a path at each image, by all images of the window.
+
+    The forward-backward algorithm. Images that no offset explains give no evidence.
+
+    :param likelihoods: of each image at each offset, (l, S).
+    :param moves: probability that the offset becomes 2 less, ..., 2 more before an image, (l, 5).
+    :param masses: (l, S), written; its first row holds the probabilities before all images.
+    """
+    l, S = likelihoods.shape
+    for i in range(l):
+        for s in range(S):
+            if i:
+                masses[i, s] = 0
+                for d in range(max(-2, s - S + 1), min(2, s) + 1):
+                    masses[i, s] += masses[i - 1, s - d] * moves[i, d + 2]
+            masses[i, s] *= likelihoods[i, s]
+        total = masses[i].sum()
+        if total > 0:
+            masses[i] /= total
+        else:
+            masses[i] = 1 / S
+    later, seen = np.ones(S), np.empty(S)
+    for i in range(l - 2, -1, -1):
+        seen[:] = later * likelihoods[i + 1]
+        for s in range(S):
+            later[s] = 0
+            for d in range(max(-2, -s), min(2, S - 1 - s) + 1):
+                later[s] += moves[i + 1, d + 2] * seen[s + d]
+        total = later.sum()
+        later[:] = later / total if total > 0 else np.ones(S)
+        combined = masses[i] * later
+        if combined.sum() > 0:
+            masses[i] = combined / combined.sum()
 
 
 class FilterSearch:
@@ -247,14 +330,16 @@ class FilterSearch:
             filter_class = CudaPlaceFilter
         self.filter = filter_class(buffer.places, lag, settings, gaps)
         self.change = ImageChange(places, settings)
-        self._speeds = settings.speeds
+        self._speeds, self._levels = settings.speeds, settings.levels
         self._images: deque[int] = deque(maxlen=buffer.length)  # the filter's image of each
+        self._weights: deque[float] = deque(maxlen=buffer.length)  # exponent alpha of each
 
     def reset(self) -> None:
         """Forget the query."""
         self.filter.reset()
         self.change.reset()
         self._images.clear()
+        self._weights.clear()
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -276,20 +361,24 @@ class FilterSearch:
         :param z: z-normalized distances to the places, (m,), float32; on the filter's device.
         :param change: of the image, from :class:`ImageChange`.
         """
+        weight = 0.0
         if not (self.filter.count and self.change.is_standstill(change)):
-            self.filter.update(z, self.change.weight(change), self._speed_weights(change))
+            weight = self.change.weight(change)
+            self.filter.update(z, weight, *self._speeds_seen(change))
         elif self.change.unlit(self._by_place(len(z))):
-            self.filter.update(z, 0.0, np.ones(len(self._speeds)))
+            self.filter.update(z, 0.0, *np.ones((2, len(self._speeds))))
         self._images.append(self.filter.count - 1)
+        self._weights.append(weight)
 
     def _by_place(self, n: int) -> np.ndarray:
         probabilities = self.filter.places_of_states()[:n]
         return probabilities if self._layout is None else probabilities[self._layout.columns]
 
-    def _speed_weights(self, change: float) -> np.ndarray:
-        if not self.filter.count:
-            return np.ones(len(self._speeds))  # of the first image no change is known
-        return self.change.speed_weights(change)
+    def _speeds_seen(self, change: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return relative probability and likelihood of each speed, (V,) each."""
+        if not self.filter.count:  # of the first image no change is known
+            return np.ones(len(self._speeds)), np.ones(len(self._speeds))
+        return self.change.speed_weights(change), self.change.speed_likelihoods(change)
 
     def __call__(self, nms_radius: int) -> WindowMatch:
         return self.at(self._middle, nms_radius)
@@ -313,20 +402,52 @@ class FilterSearch:
         if self._layout is not None:
             places, probabilities, best = self._layout.shared(belief, CLOSE)
         near = np.abs(belief.places - places[best]) <= CLOSE
-        weights = belief.weights[near]
-        middle = round(float(belief.places[near] @ weights / weights.sum()))
-        path = self._path(belief.ways[near][np.argmax(weights)], position)
+        way = belief.ways[near][np.argmax(belief.weights[near])]
+        refined, shares = self._refined(self._path(way, position), way[0], n)
+        middle = int(refined[position])
         second, found = self._second_best(n, places, probabilities, middle, nms_radius)
-        path[:, 1] += first
+        path = np.stack([np.arange(len(refined)), refined + first], axis=1).astype(np.int32)
         match = SequenceMatch(
             first=int(path[0, 1]),
             last=int(path[-1, 1]),
             middle=middle + first,
-            distance=float(1 - probabilities[best]),
+            distance=float(1 - probabilities[best] * shares[position]),
             second_best_index=second + first if found > 0 else -1,
             second_best_distance=1 - found if found > 0 else float('nan'),
         )
-        return WindowMatch(match, path, lambda: self._sequences(n, first, places, probabilities))
+        sequences = lambda: self._sequences(n, first, places, probabilities)  # noqa: E731
+        return WindowMatch(match, path, sequences, shares)
+
+    def _refined(self, path: np.ndarray, level: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return places near a path that explain the images of the window best, and their shares.
+
+        The speeds of the filter are few, and before the middle its path is a straight line. How
+        far each image's place is from the path is a hidden Markov model: the offset changes little
+        from image to image, and the evidence is the filter's, at the path's level. The place is at
+        the mean of the offset.
+
+        :param path: place of each image, (l,).
+        :param level: index of the mean z-normalized distance of right places.
+        :returns: places, which never go back, (l,), and probabilities of these and those close to
+            them, (l,).
+        """
+        offsets = np.arange(-BAND, BAND + 1)
+        places = path[:, None] + offsets
+        columns = torch.from_numpy(places.clip(0, n - 1))
+        z = self.buffer.rows().gather(1, columns.to(self.buffer.memory.device)).cpu().numpy()
+        exponents = np.array(self._weights)[:, None] * self._levels[level]
+        likelihoods = np.exp(exponents * np.where(np.isfinite(z), z, 0))
+        likelihoods[(places < 0) | (places >= n) | ~np.isfinite(z)] = 0
+        steps = np.diff(path, prepend=path[0])
+        moves = np.where(steps[:, None] + offsets[BAND - 2 : BAND + 3] >= 0, STEPS, 0)
+        moves[1:][np.diff(self._images) == 0] = offsets[BAND - 2 : BAND + 3] == 0
+        masses = np.empty(places.shape)
+        masses[0] = np.exp(-0.5 * (offsets / START_DEVIATION) ** 2)
+        _smooth(likelihoods, moves, masses)
+        refined = path + np.rint(masses @ offsets).astype(np.int64)
+        refined = np.maximum.accumulate(refined.clip(self._lowest(path[-1]), n - 1))
+        return refined, (masses * (np.abs(places - refined[:, None]) <= CLOSE)).sum(axis=1)
 
     def _second_best(
         self, n: int, places: np.ndarray, probabilities: np.ndarray, middle: int, radius: int
@@ -359,14 +480,17 @@ class FilterSearch:
         path = np.stack([np.arange(length), np.full(length, place)], axis=1).astype(np.int32)
         return WindowMatch(match, path, lambda: self._sequences(n, first, nothing, np.empty(0)))
 
+    def _lowest(self, column: int) -> int:
+        """Return the first column of the session that a column is in."""
+        return 0 if self._layout is None else self._layout.first_column(column)
+
     def _path(self, way: np.ndarray, position: int) -> np.ndarray:
-        """Return the place of each image, (l, 2); before the one at a position at one speed."""
+        """Return the place of each image, (l,); before the one at a position at one speed."""
         images = np.array(self._images)
         back = images[-1] - images
         lag = int(back[position])
         places = self.filter.way(way, lag)
         slope = (places[0] - places[lag]) / lag if lag else self._speeds[way[3]]
         earlier = np.maximum(back - lag, 0) * slope
-        path = places[np.minimum(back, lag)] - np.rint(earlier).astype(np.int32)
-        lowest = 0 if self._layout is None else self._layout.first_column(places[0])
-        return np.stack([np.arange(len(path)), np.maximum(path, lowest)], axis=1).astype(np.int32)
+        path = places[np.minimum(back, lag)].astype(np.int64) - np.rint(earlier).astype(np.int64)
+        return np.maximum(path, self._lowest(places[0]))
