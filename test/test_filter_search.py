@@ -2,6 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The search of mode robust: matches of a drive at any speed, off the map and standing."""
 
+from itertools import pairwise, product
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from stavpr_ros.alignment import SequenceSettings
@@ -9,7 +13,7 @@ from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.robust import THRESHOLD
-from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
+from stavpr_ros.recognition.sequence_search import _smooth, FilterSearch, SequenceBuffer
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -90,6 +94,58 @@ def test_match_is_path_and_second_best_of_its_window(recognizer, route):
             assert abs(found.second_best_index - found.middle) > 10
         ranked = recognizer.ranked(3)
         assert [c.place for c in ranked[1:2]] in ([], [answers[-1].sequence.second_best_index])
+
+
+@settings(max_examples=25)
+@given(st.integers(1, 5), st.integers(1, 5), st.integers(0, 999))
+def test_smoothed_offsets_equal_sums_over_all_sequences(images, offsets, seed):
+    rng = np.random.default_rng(seed)
+    likelihoods, moves = rng.random((images, offsets)), rng.random((images, 5))
+    masses = np.empty((images, offsets))
+    masses[0] = start = rng.random(offsets)
+    expected = np.zeros_like(masses)
+    for sequence in product(range(offsets), repeat=images):
+        p = start[sequence[0]]
+        for i, offset in enumerate(sequence):
+            p *= likelihoods[i, offset]
+        for i, (before, after) in enumerate(pairwise(sequence), 1):
+            p *= moves[i, after - before + 2] if abs(after - before) <= 2 else 0
+        expected[range(images), sequence] += p
+    _smooth(likelihoods, moves, masses)
+    np.testing.assert_allclose(masses, expected / expected.sum(axis=1, keepdims=True), atol=1e-9)
+
+
+def test_smoothed_offsets_without_any_likely_one_are_equal():
+    masses = np.ones((3, 4))
+    _smooth(np.zeros((3, 4)), np.ones((3, 5)), masses)
+    np.testing.assert_allclose(masses, 0.25)
+
+
+def test_path_follows_images_whose_speed_changes(recognizer, route):
+    """From the oldest image of the window on, also before the middle, and at dropped images."""
+    rng = np.random.default_rng(4)
+    places = np.flatnonzero(rng.random(PLACES) < 0.6)
+    answers = drive(recognizer, route[:, places], noise=0.5)
+    off = [
+        np.abs(answer.path[:, 1] - places[i - LENGTH + 1 : i + 1])
+        for i, answer in enumerate(answers)
+        if answer.accepted
+    ]
+    assert len(off) > 0.8 * len(places)
+    assert np.mean(np.concatenate(off) <= 2) > 0.98
+    assert np.mean([each[0] <= 2 for each in off]) > 0.95
+
+
+def test_shares_of_path_are_probabilities_and_scale_the_match(recognizer, route):
+    answers = drive(recognizer, route[:, 20:60])[LENGTH:]
+    for answer in answers:
+        assert answer.shares.shape == (LENGTH,)
+        assert 0 <= answer.shares.min() <= answer.shares.max() <= 1 + 1e-9
+        assert answer.probability <= answer.shares[MIDDLE] + 1e-9
+        newest = answer.at(LENGTH - 1)
+        ratio = answer.shares[-1] / answer.shares[MIDDLE]
+        assert newest.probability == pytest.approx(min(1, answer.probability * ratio))
+        assert newest.accepted == (newest.probability > 0.5)
 
 
 def test_path_at_start_of_map_stays_on_it(recognizer, route):

@@ -35,7 +35,7 @@ from stavpr_ros.recognition.robust import (
     z_normalized,
 )
 from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
-from stavpr_ros.recognition.sequence_search import ImageChange
+from stavpr_ros.recognition.sequence_search import BAND, ImageChange
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -267,6 +267,12 @@ def test_route_features_are_centered_by_recent_mean(laps):
     torch.testing.assert_close(route.mean, laps.strips[:, :last].mean(dim=1), atol=1e-6, rtol=0)
 
 
+def of_sequence(belief, best):
+    """Return the probability of places around the best one whose path is one sequence."""
+    weights = zip(belief.places, belief.weights, strict=True)
+    return sum(weight for place, weight in weights if abs(place - best) <= BAND)
+
+
 def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
     """Rows as they are matched with LM-DTW, images' changes, and one filter over all of them."""
     options, exclude = ROBUST.without('mean_centering', 'whitening'), 12
@@ -295,8 +301,10 @@ def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
             continue
         belief = filtered.belief(len(z), 2)
         near, probabilities = belief.probabilities(len(z))
-        share = answer.shares[2] if len(answer.shares) else 0
-        expected = share * max(probabilities, default=0)
+        expected = 0
+        if len(near):
+            best = near[np.argmax(probabilities)]
+            expected = answer.shares[2] * of_sequence(belief, best)
         assert answer.probability == pytest.approx(expected, abs=1e-4)
         if answer.accepted:
             middle = first + int(near[np.argmax(probabilities)])
@@ -337,9 +345,9 @@ def test_late_matches_close_what_was_not_certain_at_first():
         late[oldest] = found.place_index
         state = closer._filter
         belief = state.filter.belief(state.buffer.known, length - 1)
-        assert found.probability == pytest.approx(
-            found.shares[0] * belief.probabilities(state.buffer.known)[1].max()
-        )
+        near, probabilities = belief.probabilities(state.buffer.known)
+        best = near[np.argmax(probabilities)]
+        assert found.probability == pytest.approx(found.shares[0] * of_sequence(belief, best))
     assert len(late) >= 5
     assert all(abs(query - lap - place) <= CLOSE for query, place in late.items())
     closer.reset()

@@ -114,13 +114,13 @@ class FilterSettings:
     :param leave: probability of leaving the map at an image, and enter: of returning to it.
     :param start: probability of starting on the map.
     :param change_deviation: of the logarithm of the change at one speed.
-    :param speed_weight: exponent of the likelihood of a speed: that of changes of which five are
-        averaged.
+    :param speed_weight: exponent of the likelihood of a speed. Below 1, since successive changes,
+        means of five, are not independent.
     """
 
     speeds: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
     levels: tuple[float, ...] = (-1.4, -2.3, -3.4)
-    weight: float = 0.26
+    weight: float = 0.28
     most_change: float = 2.0
     least_change: float = 0.2
     standstill: float = 0.1
@@ -131,7 +131,7 @@ class FilterSettings:
     enter: float = 0.003
     start: float = 0.9
     change_deviation: float = 0.5
-    speed_weight: float = 0.2
+    speed_weight: float = 0.25
 
     def level_changes(self) -> np.ndarray:
         """Return the probability of each level by the one before, (K, K), float32."""

@@ -401,7 +401,10 @@ class FilterSearch:
         best = int(np.argmax(probabilities))
         if self._layout is not None:
             places, probabilities, best = self._layout.shared(belief, CLOSE)
-        near = np.abs(belief.places - places[best]) <= CLOSE
+        apart = np.abs(belief.places - places[best])
+        near = apart <= CLOSE
+        # that the sequence is right: its path is known within the band
+        probable = max(probabilities[best], min(belief.weights[apart <= BAND].sum(), 1))
         way = belief.ways[near][np.argmax(belief.weights[near])]
         refined, shares = self._refined(self._path(way, position), way[0], n)
         middle = int(refined[position])
@@ -411,7 +414,7 @@ class FilterSearch:
             first=int(path[0, 1]),
             last=int(path[-1, 1]),
             middle=middle + first,
-            distance=float(1 - probabilities[best] * shares[position]),
+            distance=float(1 - probable * shares[position]),
             second_best_index=second + first if found > 0 else -1,
             second_best_distance=1 - found if found > 0 else float('nan'),
         )
