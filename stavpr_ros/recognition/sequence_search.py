@@ -32,7 +32,7 @@ OFFSET = 0.02  # added to changes before the logarithm: noise between equal view
 FLOOR = 1e-3  # least relative probability of a speed
 BAND = 5  # places to either side of the filter's path that its refinement considers
 START_DEVIATION = 3.0  # places, of the path at the oldest image of the window
-STEPS = np.array([0.05, 0.15, 0.6, 0.15, 0.05])  # probability of 2 places less than the path, ...
+STEPS = np.array([0.03, 0.12, 0.7, 0.12, 0.03])  # probability of 2 places less than the path, ...
 
 
 class SequenceBuffer:
