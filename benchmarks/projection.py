@@ -105,7 +105,9 @@ def rows(case: Case, kind: str, extractor: FeatureExtractor) -> Iterator[dict[st
 
 def lines(found: list[dict[str, Any]]) -> list[str]:
     """Return the table of the results."""
-    cells = {(one['kind'], one['dimension'], one['case']): {} for one in found}  # type: ignore[var-annotated]
+    cells: dict[tuple[Any, ...], dict[Any, str]] = {
+        (one['kind'], one['dimension'], one['case']): {} for one in found
+    }
     for one in found:
         numbers = (f'{one[key]:.3f}' for key in ('f1', 'precision', 'recall'))
         cells[one['kind'], one['dimension'], one['case']][one['column']] = ' '.join(numbers)

@@ -11,7 +11,8 @@ def claim() -> tuple[int, TextIO]:
     """Return a domain that no process of any tests on this machine has, and its lock."""
     for domain in range(1, 101):
         try:
-            lock = open(f'{tempfile.gettempdir()}/stavpr_test_domain_{domain}', 'w')  # noqa: SIM115
+            path = f'{tempfile.gettempdir()}/stavpr_test_domain_{domain}'
+            lock = open(path, 'w')  # noqa: SIM115
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             continue

@@ -179,7 +179,7 @@ class RouteFeatures:
 
     @property
     def _floats(self) -> torch.Tensor:
-        """The strips before they are rounded."""
+        """Return the strips before they are rounded."""
         assert isinstance(self.strips, torch.Tensor)
         return self.strips
 
