@@ -35,10 +35,11 @@ def limit_threads(count: int) -> None:
     import torch
 
     of_torch, of_opencv = _unlimited()
+    most = numba.config.NUMBA_NUM_THREADS
+    # before torch: the start of numba's threads sets the number of OpenMP's, which is torch's
+    numba.set_num_threads(min(count or most, most))
     torch.set_num_threads(count or of_torch)
     cv2.setNumThreads(count or of_opencv)
-    most = numba.config.NUMBA_NUM_THREADS
-    numba.set_num_threads(min(count or most, most))
 
 
 @cache

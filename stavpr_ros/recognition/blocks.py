@@ -43,7 +43,7 @@ def converted_blocks(
             for places in slices:
                 of_block = pool.submit(lambda places: convert(features[places]), places)
                 pending.append((places, of_block))
-                if len(pending) > 2 * threads:
+                if len(pending) > threads:
                     first, future = pending.popleft()
                     yield first, future.result()
             for first, future in pending:
