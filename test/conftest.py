@@ -75,6 +75,18 @@ def one_thread():
     limit_threads(0)
 
 
+@pytest.fixture(scope='module')
+def cuda_runtime():
+    """Return the CUDA runtime; skip where there is no device."""
+    from stavpr_ros.alignment.cuda.compilation import runtime
+    from stavpr_ros.errors import UnavailableError
+
+    try:
+        return runtime()
+    except UnavailableError as error:
+        pytest.skip(f'{error}; the same test runs in the simulator')
+
+
 @pytest.fixture
 def context():
     """Yield an initialized ROS context."""

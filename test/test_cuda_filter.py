@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.features.extractor import FeatureSettings
 from stavpr_ros.mapping import descriptor_map, Session
@@ -21,17 +20,10 @@ SMALL = FilterSettings(speeds=(0.0, 0.5, 1.0, 2.0, 4.5), levels=(-1.4, -3.4))
 
 
 @pytest.fixture(scope='module')
-def cuda_filter():
-    """Return the module, with small blocks; skip where there is no device."""
-    from stavpr_ros.alignment.cuda.compilation import runtime
-    from stavpr_ros.recognition import cuda_filter
-
-    try:
-        runtime()
-    except UnavailableError as error:
-        pytest.skip(f'{error}; the same test runs in the simulator')
+def cuda_filter(cuda_runtime):
+    """Return the module, with small blocks."""
     from stavpr_ros.alignment.cuda import place_filter as kernels
-    from stavpr_ros.recognition import place_filter, recognizer
+    from stavpr_ros.recognition import cuda_filter, place_filter, recognizer
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, 'BLOCK', 8)

@@ -37,14 +37,9 @@ FILES = (
 
 
 @pytest.fixture(scope='module')
-def runtime():
-    """Return the device or the simulator; skip where there is none."""
-    from stavpr_ros.alignment.cuda import compilation
-
-    try:
-        return compilation.runtime()
-    except UnavailableError as error:
-        pytest.skip(f'{error}; test_kernels_in_simulator_pass runs the same test')
+def runtime(cuda_runtime):
+    """Return the device or the simulator."""
+    return cuda_runtime
 
 
 @pytest.mark.skipif(SIMULATOR, reason='this is the simulator')

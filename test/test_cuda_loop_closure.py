@@ -5,7 +5,6 @@
 import numpy as np
 import pytest
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.features.extractor import FeatureSettings
 from stavpr_ros.recognition import RecognizerSettings, route_features, Status
@@ -19,18 +18,11 @@ SMALL = FilterSettings(speeds=(0.0, 0.5, 1.0, 2.0, 4.5), levels=(-1.4, -3.4), en
 
 
 @pytest.fixture(scope='module')
-def cuda_filter():
-    """Return the module, with small blocks and rooms; skip where there is no device."""
-    from stavpr_ros.alignment.cuda.compilation import runtime
-    from stavpr_ros.recognition import cuda_filter
-
-    try:
-        runtime()
-    except UnavailableError as error:
-        pytest.skip(f'{error}; the same test runs in the simulator')
+def cuda_filter(cuda_runtime):
+    """Return the module, with small blocks and rooms."""
     from stavpr_ros.alignment.cuda import dtw
     from stavpr_ros.alignment.cuda import place_filter as kernels
-    from stavpr_ros.recognition import cuda_matcher, loop_closer, place_filter
+    from stavpr_ros.recognition import cuda_filter, cuda_matcher, loop_closer, place_filter
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, 'BLOCK', 8)

@@ -9,7 +9,7 @@ import oracle
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.cpu.int8 import Int8Strips, rounded_queries
-from stavpr_ros.errors import InputError, SettingsError, UnavailableError
+from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.features.extractor import FeatureSettings
 from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
@@ -25,16 +25,10 @@ TOLERANCE = 1e-5
 
 
 @pytest.fixture(scope='module')
-def matcher_class():
-    """Return the class, with small blocks; skip where there is no device."""
-    from stavpr_ros.alignment.cuda.compilation import runtime
-    from stavpr_ros.recognition.cuda_matcher import CudaMatcher
-
-    try:
-        runtime()
-    except UnavailableError as error:
-        pytest.skip(f'{error}; the same test runs in the simulator')
+def matcher_class(cuda_runtime):
+    """Return the class, with small blocks."""
     from stavpr_ros.alignment.cuda import dtw, lm_dtw
+    from stavpr_ros.recognition.cuda_matcher import CudaMatcher
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dtw, 'BLOCK', 4)

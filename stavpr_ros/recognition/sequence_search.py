@@ -10,6 +10,7 @@ How the change of two images grows with the number of places in between is learn
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -195,9 +196,8 @@ class ImageChange(MapChange):
         changes += OFFSET
         covariances = SPREAD**2 * np.eye(APART) + SCALE**2
         covariances = covariances + NOISE**2 / (changes[:, :, None] * changes[:, None])
-        # by speed and images apart, or by speed alone
-        self._logarithms, self._precisions = np.log(changes), np.linalg.inv(covariances)
-        self._expected = np.log(np.interp(speeds, np.arange(APART + 1), self.curve) + OFFSET)
+        # by speed, and images apart
+        self._expected, self._precisions = np.log(changes), np.linalg.inv(covariances)
 
     def reset(self) -> None:
         """Forget the query."""
@@ -233,7 +233,7 @@ class ImageChange(MapChange):
         """Return the relative probability of each speed after another change, (V,)."""
         self._latest.append(change)
         seen = np.log(sum(self._latest) / len(self._latest) + OFFSET)
-        off = (seen - self._expected) / self._settings.change_deviation
+        off = (seen - self._expected[:, 0]) / self._settings.change_deviation
         return np.asarray(np.exp(-0.5 * off**2) + FLOOR)
 
     def speed_likelihoods(self, change: float) -> np.ndarray:
@@ -251,7 +251,7 @@ class ImageChange(MapChange):
         newest = self._moving[-1]
         before = [self._moving[-1 - apart] for apart in range(2, APART + 1)]
         self._by_apart.append([change, *(change_between(newest, image) for image in before)])
-        off = np.log(np.mean(self._by_apart, axis=0) + OFFSET) - self._logarithms
+        off = np.log(np.mean(self._by_apart, axis=0) + OFFSET) - self._expected
         logs = -0.5 * np.einsum('vi,vij,vj->v', off, self._precisions, off)
         likely = np.exp(self._settings.speed_weight * np.maximum(logs - logs.max(), LEAST_LIKELY))
         return np.asarray(likely)
@@ -418,7 +418,7 @@ class FilterSearch:
             second_best_index=second + first if found > 0 else -1,
             second_best_distance=1 - found if found > 0 else float('nan'),
         )
-        sequences = lambda: self._sequences(n, first, places, probabilities)  # noqa: E731
+        sequences = partial(self._sequences, n, first, places, probabilities)
         return WindowMatch(match, path, sequences, shares)
 
     def _refined(self, path: np.ndarray, level: int, n: int) -> tuple[np.ndarray, np.ndarray]:
