@@ -381,7 +381,7 @@ def test_read_result_counts_images_not_places():
 def plain_match(status, place=-1):
     path = [[0, place - 1], [1, place], [2, place + 1]] if place >= 0 else []
     match = {'status': status, 'sequence_middle': place, 'distance': 0.1, 'path': path}
-    return match | {'received': 0, 'probability': 0.9}
+    return match | {'received': 0, 'probability': 0.9, 'path_probabilities': []}
 
 
 def test_evaluate_records_with_invalid_image_keeps_others_aligned():

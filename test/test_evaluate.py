@@ -370,7 +370,7 @@ def test_evaluate_with_declared_probabilities_shows_their_calibration(
     def declaring(self, *arguments, **options):
         match = update(self, *arguments, **options)
         probability = 0.97 if match.sequence else float('nan')
-        return replace(match, probability=probability, shares=np.empty(0))
+        return replace(match, probability=probability, path_ratios=np.empty(0))
 
     assert report(*pair(folders), '--mode', 'paper')[0]['calibration'] is None
     monkeypatch.setattr(PlaceRecognizer, 'update', declaring)

@@ -136,15 +136,14 @@ def test_path_follows_images_whose_speed_changes(recognizer, route):
     assert np.mean([each[0] <= 2 for each in off]) > 0.95
 
 
-def test_shares_of_path_are_probabilities_and_scale_the_match(recognizer, route):
+def test_places_of_path_have_probabilities_that_scale_the_match(recognizer, route):
     answers = drive(recognizer, route[:, 20:60])[LENGTH:]
     for answer in answers:
-        assert answer.shares.shape == (LENGTH,)
-        assert 0 <= answer.shares.min() <= answer.shares.max() <= 1 + 1e-9
-        assert answer.probability <= answer.shares[MIDDLE] + 1e-9
+        assert answer.path_probabilities.shape == (LENGTH,)
+        assert 0 <= answer.path_probabilities.min() <= answer.path_probabilities.max() <= 1
+        assert answer.path_probabilities[MIDDLE] == pytest.approx(answer.probability)
         newest = answer.at(LENGTH - 1)
-        ratio = answer.shares[-1] / answer.shares[MIDDLE]
-        assert newest.probability == pytest.approx(min(1, answer.probability * ratio))
+        assert newest.probability == pytest.approx(answer.path_probabilities[-1])
         assert newest.accepted == (newest.probability > 0.5)
 
 

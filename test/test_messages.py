@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of matches, field by field, and drawn images; no node that spins."""
 
+from array import array
 from dataclasses import replace
 import math
 
@@ -79,7 +80,8 @@ BLANK = (
     | dict.fromkeys(('window_first', 'window_middle', 'window_last'), HEADER.stamp)
     | dict.fromkeys(('place_stamp', 'newest_stamp'), Time())
     | dict.fromkeys(('place_id', 'newest_id', 'robot_id', 'map_id', 'session'), '')
-    | {'threshold': 0.3, 'header': HEADER, 'path': [], 'has_relative_pose': False}
+    | {'path': [], 'path_probabilities': array('d'), 'has_relative_pose': False}
+    | {'threshold': 0.3, 'header': HEADER}
 )
 
 
@@ -147,6 +149,14 @@ def test_match_message_of_a_match(places):
     same(message, **SEQUENCE, status=PlaceMatch.MATCH, reason='', path=path_of(message),
          place_index=32, newest_index=35, place_stamp=Time(sec=33), newest_stamp=Time(sec=36),
          place_id='id 32', newest_id='id 35', inliers=40)  # fmt: skip
+
+
+def test_match_message_has_the_probability_of_each_place_of_the_path(places):
+    ratios = np.array([0.5, 1, 1, 1.2, 2])
+    match = accepted(probability=0.8, path_ratios=ratios, relative=True)
+    message = match_message(HEADER, match, places)
+    assert list(message.path_probabilities) == pytest.approx([0.4, 0.8, 0.8, 0.96, 1])
+    assert len(message.path_probabilities) == len(message.path)
 
 
 def test_messages_of_a_map_name_the_robot_and_the_map(small_map):

@@ -90,12 +90,14 @@ def match_of(record: dict[str, Any]) -> Match:
             first, last, record['sequence_middle'], record['distance'], -1, nan
         )
     probability = nan if record['probability'] is None else record['probability']
+    of_path = np.array(record['path_probabilities'], float)
     return Match(
         Status[record['status']],
         sequence=sequence,
         path=path,
         relative=not isnan(probability),
         probability=probability,
+        path_ratios=of_path / max(probability, 1e-9) if of_path.size else of_path,
     )
 
 

@@ -178,7 +178,7 @@ class LoopCloser(SequenceRecognizer):
             match,
             sequence=nearest,
             path=window.path,
-            shares=window.shares,
+            path_ratios=window.path_ratios(0),
             probability=1 - nearest.distance,
             is_late=True,
         )

@@ -60,8 +60,8 @@ class Match:
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
     :param relative: distances are those of mode robust, 1 - probability.
     :param probability: that the nearest sequence is the right place; NaN = unknown (mode paper).
-    :param shares: probability of each place of the path and those close to it, if the sequence is
-        right, (m,); empty in mode paper.
+    :param path_ratios: probability of each place of the path over that of the matched place, (m,);
+        empty in mode paper.
     :param is_late: the place is that of the oldest image of the window instead of the middle one.
     :param late: the match of the oldest image, where it had none as the middle one; None = it had,
         or is not certain now either.
@@ -84,7 +84,7 @@ class Match:
     path: np.ndarray = field(default_factory=lambda: NO_PATH, repr=False)
     relative: bool = False
     probability: float = math.nan
-    shares: np.ndarray = field(default_factory=lambda: NO_SHARES, repr=False)
+    path_ratios: np.ndarray = field(default_factory=lambda: NO_SHARES, repr=False)
     is_late: bool = False
     late: 'Match | None' = field(default=None, repr=False)
     window_stamps: tuple[int, ...] = field(default=(), repr=False)
@@ -126,12 +126,16 @@ class Match:
         """
         return self.sequence.distance if self.sequence else math.nan
 
+    @property
+    def path_probabilities(self) -> np.ndarray:
+        """Return the probability of each place of the path, (m,); empty in mode paper."""
+        return np.minimum(self.probability * self.path_ratios, 1)
+
     def at(self, position: int) -> 'Match':
         """Return this as the match of another image of the window, with its probability."""
-        if not len(self.shares) or self.sequence is None:
+        if not len(self.path_ratios) or self.sequence is None:
             return self
-        share = self.shares[position] / max(self.shares[self.position], 1e-9)
-        return self.with_probability(min(1.0, self.probability * float(share)))
+        return self.with_probability(float(self.path_probabilities[position]))
 
     @property
     def score(self) -> float:

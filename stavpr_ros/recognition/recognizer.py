@@ -270,8 +270,8 @@ class SequenceRecognizer:
                 else f'nearest distance {nearest.distance:.4f} is not below the threshold '
                 f'{threshold:.4f}'
             )
-        path, shares = self._window.path, self._window.shares
-        return Match(status, reason, threshold, nearest, path, relative, probability, shares)
+        path, ratios = self._window.path, self._window.path_ratios((length - 1) // 2)
+        return Match(status, reason, threshold, nearest, path, relative, probability, ratios)
 
 
 class PlaceRecognizer(SequenceRecognizer):

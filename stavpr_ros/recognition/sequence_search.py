@@ -169,6 +169,10 @@ class WindowMatch:
     sequences: Callable[[], Sequences] = _no_sequences
     shares: np.ndarray = field(default_factory=lambda: NO_SHARES)
 
+    def path_ratios(self, position: int) -> np.ndarray:
+        """Return the shares over that of the place of one image of the window, (m,)."""
+        return self.shares / max(self.shares[position], 1e-9) if self.shares.size else self.shares
+
 
 Search = Callable[[int], WindowMatch]
 """Matches a full window; the argument is the radius in places of the non-maximum suppression."""

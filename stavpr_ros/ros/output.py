@@ -122,6 +122,7 @@ def match_message(
         sequence = match.sequence
         message.sequence_first, message.sequence_last = sequence.first, sequence.last
         message.sequence_middle = sequence.middle
+        message.path_probabilities = match.path_probabilities.tolist()
         message.path = [AlignedPair(query_index=q, place_index=m) for q, m in match.path.tolist()]
         message.second_best_index = sequence.second_best_index
         message.second_best_distance = sequence.second_best_distance
