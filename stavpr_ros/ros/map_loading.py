@@ -13,7 +13,7 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap, verify_map
 from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.ros.input import END_POLL
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
-from stavpr_ros.threads import call_on_thread
+from stavpr_ros.threads import call_on_thread, yield_processor
 
 LOAD_TIMEOUT = 120.0  # seconds to read a map
 
@@ -94,6 +94,7 @@ class MapLoader:
 
     def _verify(self, path: str, places: PlaceMap) -> None:
         """Compare the file of the map in use with its hashes; log damage, and keep it."""
+        yield_processor()
         try:
             verify_map(places)
             self._node.get_logger().info(f'map {path} is verified')
