@@ -11,6 +11,7 @@ import numpy as np
 from stavpr_ros.pose_graph.consistency import Cluster, ConsistencySettings, Cycles
 from stavpr_ros.pose_graph.odometry import KeyframeChain, OdometryNoise
 
+STANDING = math.log(10)  # evidence that the odometry stood there: it seldom does by chance
 PAUSE = 4.0  # times the usual time between keyframes: the robot was carried then
 RUNS = 6  # latest runs that a cluster may continue
 CLEAR = 4.0  # a closure belongs to the side that it deviates from so many times less
@@ -84,8 +85,10 @@ def _locate(
     changes: Mapping[int, float],
 ) -> Break:
     """
-    Return the break between clusters: at a pause, at a change of the images, or in the middle.
+    Return the break between clusters: at a pause, else where it is most probable, or in the middle.
 
+    There, the images change much, the odometry stands, as a robot that is carried does not drive,
+    and few closures are on the wrong side. Changes are known of images in windows of closures only.
     Windows at the break have images of both sides, so that some closures are on the wrong side.
     """
     last = max(ends[0].members, key=lambda each: each.at)
@@ -102,7 +105,14 @@ def _locate(
     own = own[chain.travelled[own] <= high]
     stamps = chain.stamps[own]
     seen = {t: c for t, c in changes.items() if stamps[0] < t <= stamps[-1] and c > 0}
-    if seen:
+    usual = float(np.median(list(seen.values()))) if seen else 1.0
+    evidence = dict.fromkeys(seen, 0.0)
+    least = np.median(np.diff(stamps)) / 2 if len(own) > 1 else math.inf
+    for time, middle in chain.stood[own[1:]].tolist():
+        if time >= least:
+            during = [t for t in seen if 0 < t - middle + time / 2 <= time] or [middle]
+            evidence |= dict.fromkeys(during, STANDING)
+    if evidence:
         near = [
             each
             for cluster in clusters
@@ -114,13 +124,13 @@ def _locate(
             for cluster in ends
         )
         at = np.array([each.stamp for each in near])
-        usual = float(np.median(list(seen.values())))
 
         def probable(stamp: int) -> float:
             wrong = np.where(at >= stamp, CLEAR * old < new, CLEAR * new < old).sum()
-            return math.log(seen[stamp] / usual) - WRONG_SIDE * float(wrong)
+            change = math.log(seen.get(stamp, usual) / usual)
+            return change + evidence[stamp] - WRONG_SIDE * float(wrong)
 
-        stamp = max(seen, key=probable)
+        stamp = max(evidence, key=probable)
         return Break(int(own[np.searchsorted(stamps, stamp)]), stamp)
     node = int(nodes[len(nodes) // 2]) if len(nodes) else first.query
     return Break(node, int(chain.stamps[node]))

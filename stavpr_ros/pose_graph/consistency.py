@@ -68,10 +68,11 @@ class Cycles:
     """
 
     def __init__(self, chain: KeyframeChain, closures: list[ResolvedClosure]) -> None:
-        query = np.array([each.query for each in closures])
-        place = np.array([each.place for each in closures])
+        self._chain = chain
+        self.query = query = np.array([each.query for each in closures])
+        self.place = place = np.array([each.place for each in closures])
         self.query_session, self.place_session = chain.session[query], chain.session[place]
-        self.query_at, self.place_at = chain.travelled[query], chain.travelled[place]
+        self.query_at = chain.travelled[query]
         self.Q, self.P = chain.transforms[query], chain.transforms[place]
         self.Z = np.array([each.transform for each in closures])
         variances = np.array([np.diag(each.covariance) for each in closures])
@@ -85,37 +86,38 @@ class Cycles:
 
         0 where there is no cycle: the ends are in different sessions.
         """
-        position, angle, variance, angle_variance = self._errors(i, noise)
-        squared = np.maximum(position**2 / variance, angle**2 / angle_variance)
+        off, measured = self._errors(i)
+        squared = (off**2 / (measured + self._odometry(i, noise))).max(axis=0)
         same = self.query_session == self.query_session[i]
         same &= self.place_session == self.place_session[i]
         return np.where(same, squared, 0.0)
 
-    def _errors(
-        self, i: int, noise: OdometryNoise
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return position and angle that cycles with closure i miss by, and their variances."""
+    def _errors(self, i: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return what cycles with closure i miss by, and its variances by both closures.
+
+        :returns: position (m) and angle (rad), each of shape (2, n).
+        """
         places = inverse(self.P[i]) @ self.P
         queries = inverse(self.Q) @ self.Q[i]
         cycle = inverse(self.Z[i]) @ places @ self.Z @ queries
-        along = np.abs(self.place_at - self.place_at[i])
-        driven = np.abs(self.query_at - self.query_at[i])
         lever = (places[:, :3, 3] ** 2).sum(axis=1)
-        variance = (
-            self.position_variance[i]
-            + self.position_variance
-            + lever * (self.angle_variance[i] + self.angle_variance) / 2
-            + noise.position_variance(along)
-            + noise.position_variance(driven)
-        )
-        angle_variance = (
-            self.angle_variance[i]
-            + self.angle_variance
-            + noise.angle_variance(along)
-            + noise.angle_variance(driven)
-        )
-        position = np.linalg.norm(cycle[:, :3, 3], axis=1)
-        return position, angles(cycle), variance, angle_variance
+        turned = self.angle_variance[i] + self.angle_variance
+        moved = self.position_variance[i] + self.position_variance + lever * turned / 2
+        off = np.linalg.norm(cycle[:, :3, 3], axis=1), angles(cycle)
+        return np.array(off), np.array([moved, turned])
+
+    def _odometry(self, i: int, noise: OdometryNoise) -> np.ndarray:
+        """Return the variances of position and angle by the odometry of the cycles, (2, n)."""
+        along = self._chain.ways(self.place[i], self.place)
+        driven = self._chain.ways(self.query[i], self.query)
+        # a bias on both ways cancels where the query drives as the place was driven
+        bent = driven.moment - along.moment @ self.Z[i, :3, :3]
+        length = np.abs(along.length) + np.abs(driven.length)
+        moved = noise.translation**2 * length + noise.rotation**2 * (along.spread + driven.spread)
+        moved += noise.bias**2 * (bent**2).sum(axis=1)
+        turned = noise.rotation**2 * length + (noise.bias * (driven.length - along.length)) ** 2
+        return np.array([moved, turned])
 
     def loop_scale(self, noise: OdometryNoise, scales: np.ndarray) -> float:
         """
@@ -127,17 +129,15 @@ class Cycles:
         if not same.any():
             return float(scales[-1])
         off = inverse(self.Z) @ inverse(self.P) @ self.Q
-        position, angle = np.linalg.norm(off[same, :3, 3], axis=1), angles(off[same])
-        driven = np.abs(self.query_at - self.place_at)[same]
-        likelihood = np.zeros(len(scales))
-        for k, scale in enumerate(scales):
-            own = OdometryNoise(noise.translation * scale, noise.rotation * scale)
-            for error, of, dof in (
-                (position, self.position_variance[same] + own.position_variance(driven), 2),
-                (angle, self.angle_variance[same] + own.angle_variance(driven), 1),
-            ):
-                heavy = (4 + dof) / 2 * np.log1p(error**2 / (4 * of))
-                likelihood[k] -= (heavy + dof / 2 * np.log(of)).sum()
+        off = np.array([np.linalg.norm(off[same, :3, 3], axis=1), angles(off[same])])
+        measured = np.array([self.position_variance, self.angle_variance])[:, same]
+        ways = self._chain.ways(self.query[same], self.place[same])
+        length = np.abs(ways.length)
+        moved = noise.translation**2 * length + noise.rotation**2 * ways.spread
+        moved += noise.bias**2 * (ways.moment**2).sum(axis=1)
+        turned = noise.rotation**2 * length + (noise.bias * length) ** 2
+        odometry = np.array([moved, turned])
+        likelihood = [_likelihood(off, measured + scale**2 * odometry) for scale in scales]
         return float(scales[np.argmax(likelihood)])
 
     def noise_scale(self, noise: OdometryNoise, scales: np.ndarray) -> float:
@@ -153,25 +153,20 @@ class Cycles:
             same &= self.place_session == self.place_session[i]
             driven = np.abs(self.query_at - self.query_at[i])
             same &= (driven > 30) & (driven < 400) & (np.arange(len(same)) > i)
-            if not same.any():
-                continue
-            still = OdometryNoise(0.0, 0.0)
-            position, angle, measured, measured_angle = (
-                values[same] for values in self._errors(i, still)
-            )
-            along = np.abs(self.place_at - self.place_at[i])[same]
-            for k, scale in enumerate(scales):
-                own = OdometryNoise(noise.translation * scale, noise.rotation * scale)
-                moved = own.position_variance(along) + own.position_variance(driven[same])
-                turned = own.angle_variance(along) + own.angle_variance(driven[same])
+            if same.any():
+                off, measured = (each[:, same] for each in self._errors(i))
+                odometry = self._odometry(i, noise)[:, same]
                 for j, factor in enumerate(CLOSURE_FACTORS):
-                    for error, of, dof in (
-                        (position, factor * measured + moved, 2),
-                        (angle, factor * measured_angle + turned, 1),
-                    ):
-                        heavy = (4 + dof) / 2 * np.log1p(error**2 / (4 * of))
-                        likelihood[j, k] -= (heavy + dof / 2 * np.log(of)).sum()
+                    for k, scale in enumerate(scales):
+                        variances = factor * measured + scale**2 * odometry
+                        likelihood[j, k] += _likelihood(off, variances)
         return float(scales[np.argmax(likelihood.max(axis=0))])
+
+
+def _likelihood(off: np.ndarray, variances: np.ndarray) -> float:
+    """Return the logarithm of that of positions and angles by Student's t, each (2, n)."""
+    # errors of the heading dominate: they move a position in one direction
+    return -float((2.5 * np.log1p(off**2 / (4 * variances)) + np.log(variances) / 2).sum())
 
 
 def grow(

@@ -90,13 +90,11 @@ class PoseGraph:
     @property
     def noise(self) -> OdometryNoise:
         """Return the errors of the odometry as estimated."""
-        own, scale = self.settings.noise, min(self.scale, self._loop_scale)
-        return OdometryNoise(own.translation * scale, own.rotation * scale)
+        return self.settings.noise.scaled(min(self.scale, self._loop_scale))
 
     @property
     def _cautious_noise(self) -> OdometryNoise:
-        own, scale = self.settings.noise, min(1.0, self.scale * CAUTION)
-        return OdometryNoise(own.translation * scale, own.rotation * scale)
+        return self.settings.noise.scaled(min(1.0, self.scale * CAUTION))
 
     def add_odometry(self, stamp: int, pose: np.ndarray) -> bool:
         """

@@ -18,19 +18,34 @@ class OdometryNoise:
 
     :param translation: meters per square root of a meter.
     :param rotation: radians per square root of a meter.
+    :param bias: of the rotation, radians per meter: as much as its random error after a kilometer.
     """
 
     translation: float = 0.05
     rotation: float = 0.012
+    bias: float = 0.0004
 
-    def position_variance(self, distance: np.ndarray) -> np.ndarray:
-        """Return the variance of a position after distances (m), of each axis, m^2."""
-        heading = self.rotation**2 * distance**3 / 3  # a random walk of the heading
-        return self.translation**2 * distance + heading
+    def scaled(self, factor: float) -> 'OdometryNoise':
+        """Return errors that are so many times as large."""
+        return OdometryNoise(
+            self.translation * factor, self.rotation * factor, self.bias * factor
+        )
 
-    def angle_variance(self, distance: np.ndarray) -> np.ndarray:
-        """Return the variance of a heading after distances (m), rad^2."""
-        return self.rotation**2 * distance
+
+@dataclass(frozen=True, eq=False)
+class Ways:
+    """
+    Ways between one end and n others: an error of the heading on a way moves its end.
+
+    :param length: m, negative where the other is before the end, shape (n,).
+    :param moment: integral of the position relative to the end, in its axes, m^2, shape (n, 3);
+        negative where the other is before it.
+    :param spread: integral of the squared distance from the end, m^3, shape (n,).
+    """
+
+    length: np.ndarray
+    moment: np.ndarray
+    spread: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -59,6 +74,7 @@ class KeyframeChain:
     """
 
     FIXED = -1
+    STILL = 0.05  # meters that a standing robot moves at most
 
     def __init__(self, settings: ChainSettings) -> None:
         self._settings = settings
@@ -69,11 +85,19 @@ class KeyframeChain:
             'travelled': np.zeros(self._capacity),
             'session': np.zeros(self._capacity, np.int32),
             'previous': np.zeros(self._capacity, np.int64),
+            # longest time that the odometry stood before the node, and its middle
+            'stood': np.zeros((self._capacity, 2), np.int64),
+            # of the way to each node, about the start of its odometry: for `ways`
+            'origin': np.zeros((self._capacity, 3)),
+            'moment': np.zeros((self._capacity, 3)),
+            'second': np.zeros(self._capacity),
         }
         self._count = 0
         self._recorded: list[tuple[list[int], list[int]]] = []  # stamps, nodes; split or not
         self.sessions = 0
         self._tail: tuple[int, np.ndarray] | None = None  # stamp and pose of the newest odometry
+        self._still = self._tail  # the odometry that later ones have not moved from
+        self._stood = (0, 0)
         self._fixed: dict[tuple[str, int], int] = {}
         self._cuts: dict[int, int] = {}  # first nodes after splits, and their stamps
         self.breaks: list[str] = []
@@ -107,6 +131,15 @@ class KeyframeChain:
         return self._arrays['previous'][: self._count]
 
     @property
+    def stood(self) -> np.ndarray:
+        """
+        Return for how long the odometry stood before each node, and when in the middle, (N, 2), ns.
+
+        It is the longest time since the node before.
+        """
+        return self._arrays['stood'][: self._count]
+
+    @property
     def newest(self) -> int:
         """Return the newest keyframe; -1 = none."""
         return self._recorded[-1][1][-1] if self._recorded else -1
@@ -137,13 +170,15 @@ class KeyframeChain:
             near = np.linalg.norm(step[:3, 3]) < self._settings.distance
             turned = (np.trace(step[:3, :3]) - 1) / 2 < np.cos(self._settings.angle)
             self._tail = stamp, pose
+            self._note_standing(stamp, pose)
             if near and not turned:
                 return False
             self._append(stamp, matrices(pose), node)
             return True
         if self._tail is not None:
             self.breaks.append(cause)
-        self._tail = stamp, pose
+        self._tail = self._still = stamp, pose
+        self._stood = (0, 0)
         self._recorded.append(([], []))
         self.sessions += 1
         self._append(stamp, matrices(pose), -1)
@@ -163,28 +198,46 @@ class KeyframeChain:
             return f'the odometry jumped by {moved:.1f} m'
         return ''
 
+    def _note_standing(self, stamp: int, pose: np.ndarray) -> None:
+        assert self._still is not None
+        since, at = self._still
+        if np.linalg.norm(pose[:3] - at[:3]) > self.STILL:
+            self._still = stamp, pose
+        elif stamp - since > self._stood[0]:
+            self._stood = stamp - since, (stamp + since) // 2
+
     def _append(self, stamp: int, transform: np.ndarray, previous: int) -> None:
         travelled, session = 0.0, self.sessions - 1
+        origin, moment, second = transform[:3, 3], np.zeros(3), 0.0
         if previous >= 0:
-            step = transform[:3, 3] - self.transforms[previous][:3, 3]
-            travelled = float(self.travelled[previous] + np.linalg.norm(step))
+            origin = self._arrays['origin'][previous]
+            a, b = self.transforms[previous][:3, 3] - origin, transform[:3, 3] - origin
+            length = float(np.linalg.norm(b - a))
+            travelled = float(self.travelled[previous]) + length
             session = int(self.session[previous])
-        node = self._extend(stamp, transform, travelled, session, previous)
+            moment = self._arrays['moment'][previous] + length * (a + b) / 2
+            second = self._arrays['second'][previous] + length * (a @ a + a @ b + b @ b) / 3
+        node = self._extend(
+            stamp, transform, travelled, session, previous,
+            np.array(self._stood), origin, moment, second,
+        )  # fmt: skip
+        self._stood = (0, 0)
         stamps, nodes = self._recorded[-1]
         stamps.append(stamp)
         nodes.append(node)
 
     def _extend(
-        self, stamp: int, transform: np.ndarray, travelled: float, session: int, previous: int
-    ) -> int:
+        self, stamp: int, transform: np.ndarray, travelled: float, session: int, previous: int,
+        *way: np.ndarray | float,
+    ) -> int:  # fmt: skip
         if self._count == self._capacity:
             self._capacity *= 2
             for name, array in self._arrays.items():
                 grown = np.zeros((self._capacity, *array.shape[1:]), array.dtype)
                 grown[: self._count] = array
                 self._arrays[name] = grown
-        values = (stamp, transform, travelled, session, previous)
-        for array, value in zip(self._arrays.values(), values, strict=True):
+        values = (stamp, transform, travelled, session, previous, *way)
+        for array, value in zip(self._arrays.values(), values, strict=False):
             array[self._count] = value
         self._count += 1
         return self._count - 1
@@ -224,6 +277,22 @@ class KeyframeChain:
             at = interpolate(start, pose, (stamp - stamps[i]) / (after - stamps[i]))
             return node, inverse(self.transforms[node]) @ matrices(at)
         return None
+
+    def ways(self, node: int | np.ndarray, others: np.ndarray) -> Ways:
+        """
+        Return the ways from nodes to others of the same session.
+
+        :param node: one for all others, or as many.
+        :param others: shape (n,).
+        """
+        sums, T = self._arrays, self.transforms[node]
+        away = T[..., :3, 3] - sums['origin'][node]
+        length = self.travelled[others] - self.travelled[node]
+        moment = sums['moment'][others] - sums['moment'][node]
+        spread = sums['second'][others] - sums['second'][node] - 2 * (moment * away).sum(axis=-1)
+        spread += length * (away**2).sum(axis=-1)
+        moment = moment - length[:, None] * away
+        return Ways(length, np.einsum('...ij,...i->...j', T[..., :3, :3], moment), np.abs(spread))
 
     def is_ahead(self, stamp: int) -> bool:
         """Return whether odometry of this stamp may still arrive."""
