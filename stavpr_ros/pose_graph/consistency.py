@@ -72,6 +72,7 @@ class Cycles:
         self.query = query = np.array([each.query for each in closures])
         self.place = place = np.array([each.place for each in closures])
         self.query_session, self.place_session = chain.session[query], chain.session[place]
+        self.recordings = chain.recording[query], chain.recording[place]
         self.query_at = chain.travelled[query]
         self.Q, self.P = chain.transforms[query], chain.transforms[place]
         self.Z = np.array([each.transform for each in closures])
@@ -84,12 +85,12 @@ class Cycles:
         """
         Return the squared deviations of the cycles of closure i with all, shape (n,).
 
-        0 where there is no cycle: the ends are in different sessions.
+        0 where there is no cycle: the ends are in different sessions, splits apart.
         """
         off, measured = self._errors(i)
         squared = (off**2 / (measured + self._odometry(i, noise))).max(axis=0)
-        same = self.query_session == self.query_session[i]
-        same &= self.place_session == self.place_session[i]
+        query, place = self.recordings
+        same = (query == query[i]) & (place == place[i])
         return np.where(same, squared, 0.0)
 
     def _errors(self, i: int) -> tuple[np.ndarray, np.ndarray]:
@@ -200,16 +201,11 @@ def grow(
 
 
 class ConsistentSet:
-    """The contradictions between clusters, kept as the clusters grow, and the accepted ones."""
+    """The contradictions between clusters, kept as the clusters grow."""
 
     def __init__(self, settings: ConsistencySettings) -> None:
         self._settings = settings
-        self._conflicts = np.zeros((64, 64), bool)
-
-    @property
-    def conflicts(self) -> np.ndarray:
-        """Return which clusters contradict each other, (m, m), bool, m >= n."""
-        return self._conflicts
+        self._contradictions = np.zeros((64, 64), bool)  # as if there were no splits
 
     def update(
         self,
@@ -217,27 +213,43 @@ class ConsistentSet:
         changed: set[int],
         chain: KeyframeChain,
         noise: OdometryNoise,
-    ) -> np.ndarray:
+    ) -> None:
         """
-        Return which clusters are accepted, shape (n,), bool.
+        Compare clusters.
 
         :param changed: numbers of the clusters that are new or have grown.
         """
-        n = len(clusters)
-        if n > len(self._conflicts):
-            larger = np.zeros((2 * n, 2 * n), bool)
-            larger[: len(self._conflicts), : len(self._conflicts)] = self._conflicts
-            self._conflicts = larger
-        if n == 0:
-            return np.zeros(0, bool)
-        cycles = Cycles(chain, [cluster.representative for cluster in clusters])
-        for i in changed:
-            row = cycles.deviations(i, noise) > LIMIT
-            self._conflicts[i, :n] = self._conflicts[:n, i] = row
+        n, known = len(clusters), self._contradictions
+        if n > len(known):
+            self._contradictions = np.zeros((2 * n, 2 * n), bool)
+            self._contradictions[: len(known), : len(known)] = known
+        if n:
+            cycles = Cycles(chain, [cluster.representative for cluster in clusters])
+            for i in changed:
+                row = cycles.deviations(i, noise) > LIMIT
+                self._contradictions[i, :n] = self._contradictions[:n, i] = row
+
+    def conflicts(self, clusters: list[Cluster], session: np.ndarray) -> np.ndarray:
+        """
+        Return which clusters contradict each other, shape (n, n), bool.
+
+        :param session: of each node; only closures between the same two sessions can.
+        """
+        edges, n = [cluster.representative for cluster in clusters], len(clusters)
+        query = session[[edge.query for edge in edges]]
+        place = session[[edge.place for edge in edges]]
+        same = (query[:, None] == query) & (place[:, None] == place)
+        return self._contradictions[:n, :n] & same
+
+    def accepted(self, clusters: list[Cluster], session: np.ndarray) -> tuple[np.ndarray, int]:
+        """Return which clusters are accepted, shape (n,), bool, and their weight."""
+        if not clusters:
+            return np.zeros(0, bool), 0
         weights = np.array([cluster.weight for cluster in clusters])
-        return largest_consistent(
-            self._conflicts[:n, :n], weights, weights >= self._settings.support
+        chosen = largest_consistent(
+            self.conflicts(clusters, session), weights, weights >= self._settings.support
         )
+        return chosen, int(weights[chosen].sum())
 
 
 def largest_consistent(

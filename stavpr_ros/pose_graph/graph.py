@@ -84,7 +84,6 @@ class PoseGraph:
         self.scale = 1.0
         self._loop_scale = math.inf  # until there are clusters enough
         self.solved = np.zeros((0, 4, 4))
-        self.splits = 0
         self.counts: Counter[str] = Counter()
 
     @property
@@ -209,15 +208,27 @@ class PoseGraph:
 
     def _decide(self) -> None:
         """Accept and reject clusters; begin a session where they prove a break."""
-        noise = self._cautious_noise
-        self._accepted = self._consistent.update(self._clusters, self._changed, self.chain, noise)
+        settings, chain, noise = self.settings.consistency, self.chain, self._cautious_noise
+        self._consistent.update(self._clusters, self._changed, chain, noise)
         self._changed = set()
-        found = find_break(
-            self.chain, self._clusters, self._consistent.conflicts, noise,
-            self.settings.consistency, self._changes,
+        self._accepted, weight = self._consistent.accepted(self._clusters, chain.session)
+        for node in chain.splits:
+            _, without = self._consistent.accepted(self._clusters, chain.rejoined(node))
+            if weight - without < settings.break_support / 2:
+                self._unsplit(node)  # later closures are against it
+                return
+        found = self._clusters and find_break(
+            chain, self._clusters, self._consistent.conflicts(self._clusters, chain.session),
+            noise, settings, self._changes,
         )  # fmt: skip
-        if found is not None:
-            self._split(found)
+        if found:
+            session = np.where(
+                (chain.session == chain.session[found.node]) & (np.arange(len(chain)) >= found.node),
+                chain.sessions, chain.session,
+            )
+            _, gained = self._consistent.accepted(self._clusters, session)
+            if gained - weight >= settings.break_support / 2:
+                self._split(found)
         support = self.settings.consistency.support
         candidates = sum(cluster.weight >= support for cluster in self._clusters)
         if self.settings.adapt and candidates >= max(LEAST_CLUSTERS, 1.3 * self._scaled_at):
@@ -252,14 +263,20 @@ class PoseGraph:
 
     def _decide_all(self) -> None:
         everything = set(range(len(self._clusters)))
-        self._accepted = self._consistent.update(
-            self._clusters, everything, self.chain, self._cautious_noise
-        )
+        self._consistent.update(self._clusters, everything, self.chain, self._cautious_noise)
+        self._accepted, _ = self._consistent.accepted(self._clusters, self.chain.session)
 
     def _split(self, at: Break) -> None:
         """Begin a session; closures on both sides of a break are no clusters any more."""
         self.chain.split(at.node, at.stamp)
-        self.splits += 1
+        self._begin_anew()
+
+    def _unsplit(self, node: int) -> None:
+        self.chain.unsplit(node)
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Find the nodes and clusters of all closures again."""
         self._solver.restart()
         waiting, self._pending = self._pending, self._known
         self._known, self._clusters, self._edges = [], [], {}
@@ -320,6 +337,11 @@ class PoseGraph:
     def used(self) -> dict[int, ResolvedClosure]:
         """Return the edges of the solution by their numbers."""
         return self._edges
+
+    @property
+    def splits(self) -> int:
+        """Return the number of breaks that closures prove."""
+        return len(self.chain.splits)
 
     @property
     def pending(self) -> int:

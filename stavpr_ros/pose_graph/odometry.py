@@ -70,7 +70,8 @@ class KeyframeChain:
     Keyframes of the odometry in sessions, and fixed places of a map; all are nodes of the graph.
 
     ``stamps`` (ns), ``transforms`` (in the odometry of its session, or in the map), ``travelled``
-    (m), ``session`` (negative = fixed) are arrays of N nodes.
+    (m), ``session`` (negative = fixed) are arrays of N nodes; ``recording`` is the session before
+    splits.
     """
 
     FIXED = -1
@@ -85,6 +86,7 @@ class KeyframeChain:
             'travelled': np.zeros(self._capacity),
             'session': np.zeros(self._capacity, np.int32),
             'previous': np.zeros(self._capacity, np.int64),
+            'recording': np.zeros(self._capacity, np.int32),
             # longest time that the odometry stood before the node, and its middle
             'stood': np.zeros((self._capacity, 2), np.int64),
             # of the way to each node, about the start of its odometry: for `ways`
@@ -99,7 +101,8 @@ class KeyframeChain:
         self._still = self._tail  # the odometry that later ones have not moved from
         self._stood = (0, 0)
         self._fixed: dict[tuple[str, int], int] = {}
-        self._cuts: dict[int, int] = {}  # first nodes after splits, and their stamps
+        # first nodes after splits: the stamps, and the nodes before
+        self._cuts: dict[int, tuple[int, int]] = {}
         self.breaks: list[str] = []
 
     def __len__(self) -> int:
@@ -124,6 +127,11 @@ class KeyframeChain:
     def session(self) -> np.ndarray:
         """Return the session of each node, (N,), int32; negative = a fixed place."""
         return self._arrays['session'][: self._count]
+
+    @property
+    def recording(self) -> np.ndarray:
+        """Return the session of each node without splits, (N,), int32; negative = fixed."""
+        return self._arrays['recording'][: self._count]
 
     @property
     def previous(self) -> np.ndarray:
@@ -208,6 +216,7 @@ class KeyframeChain:
 
     def _append(self, stamp: int, transform: np.ndarray, previous: int) -> None:
         travelled, session = 0.0, self.sessions - 1
+        recording = session
         origin, moment, second = transform[:3, 3], np.zeros(3), 0.0
         if previous >= 0:
             origin = self._arrays['origin'][previous]
@@ -215,10 +224,11 @@ class KeyframeChain:
             length = float(np.linalg.norm(b - a))
             travelled = float(self.travelled[previous]) + length
             session = int(self.session[previous])
+            recording = int(self.recording[previous])
             moment = self._arrays['moment'][previous] + length * (a + b) / 2
             second = self._arrays['second'][previous] + length * (a @ a + a @ b + b @ b) / 3
         node = self._extend(
-            stamp, transform, travelled, session, previous,
+            stamp, transform, travelled, session, previous, recording,
             np.array(self._stood), origin, moment, second,
         )  # fmt: skip
         self._stood = (0, 0)
@@ -228,7 +238,7 @@ class KeyframeChain:
 
     def _extend(
         self, stamp: int, transform: np.ndarray, travelled: float, session: int, previous: int,
-        *way: np.ndarray | float,
+        recording: int, *way: np.ndarray | float,
     ) -> int:  # fmt: skip
         if self._count == self._capacity:
             self._capacity *= 2
@@ -236,7 +246,7 @@ class KeyframeChain:
                 grown = np.zeros((self._capacity, *array.shape[1:]), array.dtype)
                 grown[: self._count] = array
                 self._arrays[name] = grown
-        values = (stamp, transform, travelled, session, previous, *way)
+        values = (stamp, transform, travelled, session, previous, recording, *way)
         for array, value in zip(self._arrays.values(), values, strict=False):
             array[self._count] = value
         self._count += 1
@@ -247,7 +257,9 @@ class KeyframeChain:
         key = (map_id, stamp)
         if key not in self._fixed:
             pose = checked_pose(pose)
-            self._fixed[key] = self._extend(stamp, matrices(pose), 0.0, self.FIXED, -1)
+            self._fixed[key] = self._extend(
+                stamp, matrices(pose), 0.0, self.FIXED, -1, self.FIXED
+            )
         return self._fixed[key]
 
     def find(self, stamp: int) -> tuple[int, np.ndarray] | None:
@@ -269,7 +281,7 @@ class KeyframeChain:
             node, start = nodes[i], to_poses(self.transforms[nodes[i]])
             if i + 1 < len(stamps):
                 after, pose = stamps[i + 1], to_poses(self.transforms[nodes[i + 1]])
-                if stamp >= self._cuts.get(nodes[i + 1], after):
+                if stamp >= self._cuts.get(nodes[i + 1], (after, 0))[0]:
                     node = nodes[i + 1]
             else:
                 assert end is not None
@@ -308,6 +320,21 @@ class KeyframeChain:
         old = self.session[node]
         later = (self.session == old) & (np.arange(self._count) >= node)
         self.session[later] = self.sessions
+        self._cuts[node] = stamp, int(self.previous[node])
         self.previous[node] = -1
-        self._cuts[node] = stamp
         self.sessions += 1
+
+    @property
+    def splits(self) -> list[int]:
+        """Return the first nodes of sessions that began by a split."""
+        return list(self._cuts)
+
+    def unsplit(self, node: int) -> None:
+        """Let a session that began by a split at a node be part of the one before again."""
+        self.session[:] = self.rejoined(node)
+        _, self.previous[node] = self._cuts.pop(node)
+
+    def rejoined(self, node: int) -> np.ndarray:
+        """Return the sessions of the nodes as they would be without a split, (N,)."""
+        before = self.session[self._cuts[node][1]]
+        return np.where(self.session == self.session[node], before, self.session)
