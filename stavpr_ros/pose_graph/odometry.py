@@ -216,7 +216,7 @@ class KeyframeChain:
 
     def _append(self, stamp: int, transform: np.ndarray, previous: int) -> None:
         travelled, session = 0.0, self.sessions - 1
-        recording = session
+        recording = len(self._recorded) - 1
         origin, moment, second = transform[:3, 3], np.zeros(3), 0.0
         if previous >= 0:
             origin = self._arrays['origin'][previous]
@@ -224,7 +224,6 @@ class KeyframeChain:
             length = float(np.linalg.norm(b - a))
             travelled = float(self.travelled[previous]) + length
             session = int(self.session[previous])
-            recording = int(self.recording[previous])
             moment = self._arrays['moment'][previous] + length * (a + b) / 2
             second = self._arrays['second'][previous] + length * (a @ a + a @ b + b @ b) / 3
         node = self._extend(
@@ -331,7 +330,10 @@ class KeyframeChain:
 
     def unsplit(self, node: int) -> None:
         """Let a session that began by a split at a node be part of the one before again."""
+        ended = self.session[node]
         self.session[:] = self.rejoined(node)
+        self.session[self.session > ended] -= 1
+        self.sessions -= 1
         _, self.previous[node] = self._cuts.pop(node)
 
     def rejoined(self, node: int) -> np.ndarray:

@@ -1,0 +1,106 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Ways of the odometry, what closures can contradict, and breaks that begin and end."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stavpr_ros.demonstration.street import laps
+from stavpr_ros.pose_graph import PoseGraph
+from stavpr_ros.pose_graph.odometry import ChainSettings, KeyframeChain
+from stavpr_ros.pose_graph.transforms import inverse, planar_poses
+from test_pose_graph import carried_drive, circle, closure, error, LAP, odometry_of, SECOND, solve
+
+
+def chain_of(poses: np.ndarray, settings: ChainSettings | None = None) -> KeyframeChain:
+    chain = KeyframeChain(settings or ChainSettings())
+    for i, pose in enumerate(poses):
+        chain.add((i + 1) * SECOND, pose)
+    return chain
+
+
+@pytest.mark.parametrize('node', [30, 70])
+def test_ways_of_chain_far_from_origin_are_integrals(node):
+    poses = planar_poses(circle(1))
+    poses[:, :2] += 5e5
+    chain = chain_of(poses)
+    found = chain.ways(node, np.array([50, node]))
+    T = inverse(chain.transforms[node]) @ chain.transforms
+    low, high = min(node, 50), max(node, 50)
+    points = np.concatenate([
+        np.linspace(a, b, 200, endpoint=False) + (b - a) / 400
+        for a, b in zip(T[low:high, :3, 3], T[low + 1 : high + 1, :3, 3], strict=True)
+    ])  # fmt: skip
+    part = abs(found.length[0]) / len(points)
+    side = 1 if node < 50 else -1
+    assert found.length[0] == pytest.approx(side * 40, rel=1e-3)
+    np.testing.assert_allclose(found.moment[0], side * part * points.sum(axis=0), atol=1e-2)
+    assert found.spread[0] == pytest.approx(part * (points**2).sum(), rel=1e-4)
+    assert found.spread[1] == pytest.approx(0, abs=1e-4)
+
+
+def test_optimize_heading_with_bias_rejects_no_closure(monkeypatch):
+    """A constant bias of the heading turns the laps against each other."""
+    monkeypatch.setattr(laps, 'HEADING_BIAS', 0.0008)
+    monkeypatch.setattr(laps, 'HEADING_NOISE', 0.003)
+    truth = circle(3)
+    closures = [closure(truth, q, q % LAP) for q in range(LAP, 3 * LAP)]
+    _, graph = solve(truth, closures)
+    assert graph.rejected == 0
+
+
+def test_add_odometry_that_stands_is_noted_at_the_next_keyframe():
+    poses = planar_poses(np.array([[x, 0.0, 0.0] for x in (0, 2, 4, 4.01, 4.02, 6, 8)]))
+    chain = chain_of(poses)
+    assert len(chain) == 5
+    assert chain.stood.tolist() == [[0, 0], [0, 0], [0, 0], [2 * SECOND, 4 * SECOND], [0, 0]]
+
+
+def test_optimize_carried_robot_without_its_image_is_cut_where_odometry_stands():
+    """No window of a closure has the image at the break; a truck passes five images later."""
+    truth, odometry, closures = carried_drive()
+    unseen = [
+        replace(each, changes=tuple(
+            (stamp, 0.95 if stamp == 146 * SECOND else change)
+            for stamp, change in each.changes if stamp != 141 * SECOND
+        ))
+        for each in closures
+    ]  # fmt: skip
+    found, graph = solve(truth, unseen, odometry)
+    assert graph.splits == 1
+    assert error(found, truth) < 1.5
+
+
+def test_unsplit_restores_the_chain():
+    chain = chain_of(planar_poses(circle(1)))
+    for node in (20, 40):
+        chain.split(node, (node + 1) * SECOND)
+    assert chain.splits == [20, 40]
+    assert np.bincount(chain.session).tolist() == [20, 20, 60]
+    np.testing.assert_array_equal(np.bincount(chain.rejoined(40)), [20, 80])
+    chain.unsplit(20)
+    assert np.bincount(chain.session).tolist() == [40, 60]
+    assert (chain.splits, chain.sessions) == ([40], 2)
+    assert chain.previous[[20, 40]].tolist() == [19, -1]
+    assert set(chain.recording.tolist()) == {0}
+
+
+def test_update_false_break_ends_when_closures_are_against_it():
+    """Forty closures in a row are of one wrong place: as if the robot was carried."""
+    truth = circle(3)
+    graph, splits = PoseGraph(), []
+    for i, pose in enumerate(odometry_of(truth)):
+        graph.add_odometry((i + 1) * SECOND, pose)
+        if i >= LAP:
+            wrong = (i + 40) % LAP if 150 <= i < 190 else None
+            graph.add_closure(closure(truth, i, i % LAP, wrong))
+            if i % 5 == 0:
+                graph.update()
+                splits.append(graph.splits)
+    graph.update(final=True)
+    found = np.array([graph.at((i + 1) * SECOND) for i in range(len(truth))])
+    assert max(splits) == 1
+    assert splits[-1] == 0
+    assert graph.chain.sessions == 1
+    assert error(found, truth) < 1.5
