@@ -146,12 +146,18 @@ def find(
                 changes = ()
             if edge.source is Source.NONE:
                 closure = Closure(
-                    query_stamp, place_stamp, IDENTITY, APPEARANCE, False, changes=changes
+                    query_stamp,
+                    place_stamp,
+                    IDENTITY,
+                    APPEARANCE,
+                    False,
+                    changes=changes,
+                    verified=edge.verified,
                 )
             else:
                 closure = Closure(
                     query_stamp, place_stamp, edge.pose, edge.covariance, edge.independent,
-                    changes=changes,
+                    changes=changes, verified=edge.verified,
                 )  # fmt: skip
             at = image_of[query_stamp], image_of[place_stamp]
             found.append(Found(i, *at, pair, edge, closure, took, each.is_late))

@@ -176,7 +176,8 @@ def main() -> None:
         finally:
             node.send_signal(signal.SIGINT)
             node.wait()
-    figures |= {'map': arguments.map or f'{PLACES} places', 'parameters': arguments.parameter}
+    name = Path(arguments.map).name if arguments.map else f'{PLACES} places'
+    figures |= {'map': name, 'parameters': arguments.parameter}
     figures |= {
         'load_before': load,
         'cpu': cpu_model(),

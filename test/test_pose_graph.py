@@ -126,6 +126,31 @@ def test_optimize_with_wrong_closures_rejects_them(drive, run):
     assert error(found, truth) < 1.3 * error(clean, truth) + 0.1
 
 
+@pytest.mark.parametrize(
+    ('right', 'wrong', 'believed'),
+    [
+        (True, False, 'right'),
+        (True, None, 'wrong'),
+        (None, None, 'wrong'),
+        (False, False, 'wrong'),
+    ],
+    ids=['refuted by keypoints', 'not tried', 'never tried', 'images without keypoints'],
+)
+def test_optimize_longer_run_is_believed_unless_keypoints_refute_it(drive, right, wrong, believed):
+    """20 right closures, and then 30 wrong ones that agree with each other."""
+    truth, closures = drive
+    mixed = [replace(each, verified=right) for each in closures[:20]]
+    mixed += [
+        replace(closure(truth, LAP + k, k, k - 15), verified=wrong) for k in range(LAP - 30, LAP)
+    ]
+    _, graph = solve(truth, mixed)
+    claimed = [truth[edge.query, :2] - truth[edge.place, :2] for edge in graph.edges]
+    is_right = np.linalg.norm(claimed, axis=1) < 5
+    accepted = np.array([edge.accepted for edge in graph.edges])
+    assert accepted[is_right].mean() == pytest.approx(float(believed == 'right'), abs=0.2)
+    assert accepted[~is_right].mean() == pytest.approx(float(believed == 'wrong'), abs=0.2)
+
+
 def test_optimize_carried_robot_begins_session_and_joins_it():
     """The odometry misses 40 m of the way; the closures after it prove it."""
     truth = np.delete(circle(3), np.s_[140:160], axis=0)

@@ -22,6 +22,7 @@ class Closure:
         empty = the place is on the same drive.
     :param changes: stamps (ns) of the images of the window, the newest last, and how much each
         differs from the image before it; more than usual where the robot was carried.
+    :param verified: whether keypoints confirm that it is the same place; None = not tried.
     """
 
     query_stamp: int
@@ -32,6 +33,7 @@ class Closure:
     map_id: str = ''
     place_pose: np.ndarray | None = None
     changes: tuple[tuple[int, float], ...] = ()
+    verified: bool | None = None
 
     def checked(self) -> 'Closure':
         """
@@ -65,6 +67,7 @@ class ResolvedClosure:
     :param covariance: in the axes of the query's node, rotation first, shape (6, 6).
     :param at: distance travelled at the query, m.
     :param number: of the closure, in the order of arrival.
+    :param weight: 1; less where keypoints should have confirmed it, and did not.
     """
 
     query: int
@@ -75,3 +78,4 @@ class ResolvedClosure:
     number: int
     stamp: int
     is_independent: bool
+    weight: float = 1.0

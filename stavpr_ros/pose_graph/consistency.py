@@ -47,12 +47,12 @@ class Cluster:
     """
     Closures that agree, in the order of the query; ``center`` agrees best with the others.
 
-    :param weight: closures at different positions of the query.
+    :param weight: sum of those of closures at different positions of the query.
     """
 
     members: list[ResolvedClosure] = field(default_factory=list)
     center: int = 0
-    weight: int = 0
+    weight: float = 0.0
 
     @property
     def representative(self) -> ResolvedClosure:
@@ -190,13 +190,13 @@ def grow(
             continue
         if Cycles(chain, [last, closure]).deviations(0, noise)[1] > LIMIT:
             continue
-        cluster.weight += abs(closure.at - last.at) > 0.3
+        cluster.weight += closure.weight * (abs(closure.at - last.at) > 0.3)
         cluster.members.append(closure)
         cycles = Cycles(chain, cluster.members)
         squared = [cycles.deviations(i, noise).sum() for i in range(len(cluster.members))]
         cluster.center = int(np.argmin(squared))
         return cluster
-    clusters.append(Cluster([closure], weight=1))
+    clusters.append(Cluster([closure], weight=closure.weight))
     return clusters[-1]
 
 

@@ -75,6 +75,7 @@ class PoseGraph:
         self._pending: list[Closure] = []
         self._known: list[Closure] = []  # those between nodes
         self._changes: dict[int, float] = {}  # of images by their stamps
+        self._verified: Counter[bool] = Counter()  # closures, by what keypoints found
         self._clusters: list[Cluster] = []
         self._accepted = np.zeros(0, bool)
         self._changed: set[int] = set()
@@ -152,6 +153,7 @@ class PoseGraph:
                 i, j, to_place @ measured @ inverse(to_query), covariance,
                 float(self.chain.travelled[i] + np.linalg.norm(to_query[:3, 3])),
                 len(self._known), (closure.query_stamp + newest) // 2, closure.is_independent,
+                self._weight(closure),
             )  # fmt: skip
             self._known.append(closure)
             cluster = grow(
@@ -160,6 +162,17 @@ class PoseGraph:
             )  # fmt: skip
             self._changed.add(self._clusters.index(cluster))
         self._pending = waiting
+
+    def _weight(self, closure: Closure) -> float:
+        """
+        Return how far a closure supports others: the share that keypoints miss of right ones.
+
+        That share is unknown: where they confirm few closures, the images are to blame.
+        """
+        if closure.verified is None:
+            return 1.0
+        self._verified[closure.verified] += 1
+        return 1.0 if closure.verified else self._verified[False] / self._verified.total()
 
     def _place(self, closure: Closure) -> tuple[int, np.ndarray] | None:
         if not closure.map_id:
@@ -280,6 +293,7 @@ class PoseGraph:
         self._solver.restart()
         waiting, self._pending = self._pending, self._known
         self._known, self._clusters, self._edges = [], [], {}
+        self._verified.clear()
         self._resolve()
         self._pending, self._changed = waiting, set()
         self._decide_all()

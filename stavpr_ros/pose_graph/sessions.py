@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sessions of a pose graph: which ones closures join, and where each one is in the map."""
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -50,7 +50,7 @@ def tie(chain: KeyframeChain, accepted: Sequence[Cluster], least: int) -> Ties:
     :param least: closures that join two sessions.
     """
     session = chain.session
-    weights: Counter[tuple[int, int]] = Counter()
+    weights: dict[tuple[int, int], float] = defaultdict(float)
     for a, b, cluster in zip(*session_pairs(chain, accepted), accepted, strict=True):
         weights[min(a, b), max(a, b)] += cluster.weight
     joins = frozenset(pair for pair, w in weights.items() if pair[0] != pair[1] and w >= least)

@@ -38,3 +38,8 @@ class Edge:
     inliers: int = -1
     error: float = math.nan
     independent: bool = False
+
+    @property
+    def verified(self) -> bool | None:
+        """Whether keypoints confirm that it is the same place; None = PnP was not tried."""
+        return self.source is Source.PNP if self.inliers >= 0 else None

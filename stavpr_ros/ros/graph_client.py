@@ -58,6 +58,7 @@ def fetch_graph(
     try:
         wait_until(lambda: int(values.get('closures', 0)) >= closures, f'{closures} closures')
         client = node.create_client(SaveMap, f'{NAME}/save')
+        wait_until(client.service_is_ready, 'its services')
         for file in files:
             future = client.call_async(SaveMap.Request(path=file, overwrite=True))
             wait_until(future.done, f'{file} saved')

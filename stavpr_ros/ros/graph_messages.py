@@ -40,6 +40,7 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
             for pair in message.pairs
             if math.isfinite(pair.query_change) and not message.is_late
         ),
+        'verified': relative.source == RelativePose.PNP if relative.inliers >= 0 else None,
     }
     if message.has_relative_pose and relative.source != RelativePose.NONE:
         covariance = np.array(relative.pose.covariance).reshape(6, 6)
