@@ -11,7 +11,9 @@ import numpy as np
 from stavpr_ros.pose_graph.consistency import Cluster, ConsistencySettings, Cycles
 from stavpr_ros.pose_graph.odometry import KeyframeChain, OdometryNoise
 
-STANDING = math.log(10)  # evidence that the odometry stood there: it seldom does by chance
+STANDING = math.log(
+    10
+)  # evidence of the odometry that stands: else it does in a tenth of the images
 PAUSE = 4.0  # times the usual time between keyframes: the robot was carried then
 RUNS = 6  # latest runs that a cluster may continue
 CLEAR = 4.0  # a closure belongs to the side that it deviates from so many times less
@@ -85,11 +87,12 @@ def _locate(
     changes: Mapping[int, float],
 ) -> Break:
     """
-    Return the break between clusters: at a pause, else where it is most probable, or in the middle.
+    Return the break between clusters: at a pause, else where it is most probable.
 
     There, the images change much, the odometry stands, as a robot that is carried does not drive,
-    and few closures are on the wrong side. Changes are known of images in windows of closures only.
-    Windows at the break have images of both sides, so that some closures are on the wrong side.
+    and few closures are on the wrong side. Changes are known in windows of closures only. Windows
+    at the break have images of both sides, so that some closures are on the wrong side. Without
+    any evidence, the break is in the middle.
     """
     last = max(ends[0].members, key=lambda each: each.at)
     first = min(ends[1].members, key=lambda each: each.at)

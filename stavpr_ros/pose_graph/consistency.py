@@ -241,15 +241,15 @@ class ConsistentSet:
         same = (query[:, None] == query) & (place[:, None] == place)
         return self._contradictions[:n, :n] & same
 
-    def accepted(self, clusters: list[Cluster], session: np.ndarray) -> tuple[np.ndarray, int]:
+    def accepted(self, clusters: list[Cluster], session: np.ndarray) -> tuple[np.ndarray, float]:
         """Return which clusters are accepted, shape (n,), bool, and their weight."""
         if not clusters:
-            return np.zeros(0, bool), 0
+            return np.zeros(0, bool), 0.0
         weights = np.array([cluster.weight for cluster in clusters])
         chosen = largest_consistent(
             self.conflicts(clusters, session), weights, weights >= self._settings.support
         )
-        return chosen, int(weights[chosen].sum())
+        return chosen, float(weights[chosen].sum())
 
 
 def largest_consistent(

@@ -235,11 +235,7 @@ class PoseGraph:
             noise, settings, self._changes,
         )  # fmt: skip
         if found:
-            session = np.where(
-                (chain.session == chain.session[found.node]) & (np.arange(len(chain)) >= found.node),
-                chain.sessions, chain.session,
-            )
-            _, gained = self._consistent.accepted(self._clusters, session)
+            _, gained = self._consistent.accepted(self._clusters, chain.parted(found.node))
             if gained - weight >= settings.break_support / 2:
                 self._split(found)
         support = self.settings.consistency.support

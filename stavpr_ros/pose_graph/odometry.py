@@ -27,9 +27,7 @@ class OdometryNoise:
 
     def scaled(self, factor: float) -> 'OdometryNoise':
         """Return errors that are so many times as large."""
-        return OdometryNoise(
-            self.translation * factor, self.rotation * factor, self.bias * factor
-        )
+        return OdometryNoise(self.translation * factor, self.rotation * factor, self.bias * factor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +96,8 @@ class KeyframeChain:
         self._recorded: list[tuple[list[int], list[int]]] = []  # stamps, nodes; split or not
         self.sessions = 0
         self._tail: tuple[int, np.ndarray] | None = None  # stamp and pose of the newest odometry
-        self._still = self._tail  # the odometry that later ones have not moved from
+        # the odometry that later ones have not moved from
+        self._still: tuple[int, np.ndarray] | None = None
         self._stood = (0, 0)
         self._fixed: dict[tuple[str, int], int] = {}
         # first nodes after splits: the stamps, and the nodes before
@@ -141,7 +140,7 @@ class KeyframeChain:
     @property
     def stood(self) -> np.ndarray:
         """
-        Return for how long the odometry stood before each node, and when in the middle, (N, 2), ns.
+        Return how long the odometry stood before each node, and when: in the middle, (N, 2), ns.
 
         It is the longest time since the node before.
         """
@@ -256,9 +255,7 @@ class KeyframeChain:
         key = (map_id, stamp)
         if key not in self._fixed:
             pose = checked_pose(pose)
-            self._fixed[key] = self._extend(
-                stamp, matrices(pose), 0.0, self.FIXED, -1, self.FIXED
-            )
+            self._fixed[key] = self._extend(stamp, matrices(pose), 0.0, self.FIXED, -1, self.FIXED)
         return self._fixed[key]
 
     def find(self, stamp: int) -> tuple[int, np.ndarray] | None:
@@ -316,12 +313,15 @@ class KeyframeChain:
         :param node: its first keyframe.
         :param stamp: of its first odometry, ns, after the keyframe before.
         """
-        old = self.session[node]
-        later = (self.session == old) & (np.arange(self._count) >= node)
-        self.session[later] = self.sessions
+        self.session[:] = self.parted(node)
         self._cuts[node] = stamp, int(self.previous[node])
         self.previous[node] = -1
         self.sessions += 1
+
+    def parted(self, node: int) -> np.ndarray:
+        """Return the sessions of the nodes as they would be after a split at a node, (N,)."""
+        later = (self.session == self.session[node]) & (np.arange(self._count) >= node)
+        return np.where(later, self.sessions, self.session)
 
     @property
     def splits(self) -> list[int]:
