@@ -26,6 +26,7 @@ MAX_PENDING = 1000  # closures that wait for their odometry
 SCALES = np.geomspace(0.05, 2.0, 16)  # factors on the errors of the odometry that are tried
 LEAST_CLUSTERS = 6  # that these are estimated from
 CAUTION = 1.5  # factor on the estimated errors of the odometry where closures are compared
+MEMORY = 100  # latest closures by which keypoints are judged
 FAR = 8.0  # whitened deviations of a new edge from which all nodes are solved anew
 
 
@@ -75,7 +76,7 @@ class PoseGraph:
         self._pending: list[Closure] = []
         self._known: list[Closure] = []  # those between nodes
         self._changes: dict[int, float] = {}  # of images by their stamps
-        self._verified: Counter[bool] = Counter()  # closures, by what keypoints found
+        self._judged, self._missed = 0, 0.0  # latest closures, and the share not confirmed of them
         self._clusters: list[Cluster] = []
         self._accepted = np.zeros(0, bool)
         self._changed: set[int] = set()
@@ -167,12 +168,13 @@ class PoseGraph:
         """
         Return how far a closure supports others: the share that keypoints miss of right ones.
 
-        That share is unknown: where they confirm few closures, the images are to blame.
+        That share depends on the light: of the latest closures, where they confirm few.
         """
         if closure.verified is None:
             return 1.0
-        self._verified[closure.verified] += 1
-        return 1.0 if closure.verified else self._verified[False] / self._verified.total()
+        self._judged = min(self._judged + 1, MEMORY)
+        self._missed += (1 - closure.verified - self._missed) / self._judged
+        return 1.0 if closure.verified else self._missed
 
     def _place(self, closure: Closure) -> tuple[int, np.ndarray] | None:
         if not closure.map_id:
@@ -289,7 +291,7 @@ class PoseGraph:
         self._solver.restart()
         waiting, self._pending = self._pending, self._known
         self._known, self._clusters, self._edges = [], [], {}
-        self._verified.clear()
+        self._judged, self._missed = 0, 0.0
         self._resolve()
         self._pending, self._changed = waiting, set()
         self._decide_all()
