@@ -25,6 +25,9 @@ from stavpr_ros.pose_graph.transforms import body_covariance, inverse, matrices,
 MAX_PENDING = 1000  # closures that wait for their odometry
 SCALES = np.geomspace(0.05, 2.0, 16)  # factors on the errors of the odometry that are tried
 LEAST_CLUSTERS = 6  # that these are estimated from
+# A break explains at least this share of the closures that stay rejected: of many wrong ones, some
+# agree at random.
+UNEXPLAINED = 0.25
 CAUTION = 1.5  # factor on the estimated errors of the odometry where closures are compared
 MEMORY = 100  # latest closures by which keypoints are judged
 FAR = 8.0  # whitened deviations of a new edge from which all nodes are solved anew
@@ -227,9 +230,11 @@ class PoseGraph:
         self._consistent.update(self._clusters, self._changed, chain, noise)
         self._changed = set()
         self._accepted, weight = self._consistent.accepted(self._clusters, chain.session)
+        rejected = sum(cluster.weight for cluster in self._clusters) - weight
+        least = max(settings.break_support / 2, UNEXPLAINED * rejected)
         for node in chain.splits:
             _, without = self._consistent.accepted(self._clusters, chain.rejoined(node))
-            if weight - without < settings.break_support / 2:
+            if weight - without < least:
                 self._unsplit(node)  # later closures are against it
                 return
         found = self._clusters and find_break(
@@ -238,7 +243,9 @@ class PoseGraph:
         )  # fmt: skip
         if found:
             _, gained = self._consistent.accepted(self._clusters, chain.parted(found.node))
-            if gained - weight >= settings.break_support / 2:
+            if gained - weight >= max(
+                settings.break_support / 2, UNEXPLAINED * (rejected - gained + weight)
+            ):
                 self._split(found)
         support = self.settings.consistency.support
         candidates = sum(cluster.weight >= support for cluster in self._clusters)
