@@ -147,6 +147,22 @@ def test_places_of_path_have_probabilities_that_scale_the_match(recognizer, rout
         assert newest.accepted == (newest.probability > 0.5)
 
 
+def test_equal_places_of_the_map_are_one_place_of_the_path(route):
+    """The camera stood while the map was recorded: how long, the query cannot know."""
+    stop = np.r_[:100, [100] * 40, 101:PLACES]
+    features = features_of(route[:, stop])
+    place_map = PlaceMap(features, None, np.zeros(len(stop), np.int64), ('',) * len(stop))
+    settings = RecognizerSettings(
+        THRESHOLD, sequence=SequenceSettings(LENGTH), nms_radius=10, mode='robust'
+    )
+    recognizer, query = PlaceRecognizer(place_map, settings), features_of(route[:, stop], 1.0, 1)
+    shares = []
+    for i in range(len(query)):
+        recognizer.update(query[i : i + 1])
+        shares.append(recognizer._window.shares)
+    assert np.min(shares[118:135]) > 0.95
+
+
 def test_path_at_start_of_map_stays_on_it(recognizer, route):
     answers = drive(recognizer, route[:, :30])
     for answer in answers[LENGTH - 1 :]:

@@ -454,7 +454,18 @@ class FilterSearch:
         _smooth(likelihoods, moves, masses)
         refined = path + np.rint(masses @ offsets).astype(np.int64)
         refined = np.maximum.accumulate(refined.clip(self._lowest(path[-1]), n - 1))
-        return refined, (masses * (np.abs(places - refined[:, None]) <= CLOSE)).sum(axis=1)
+        close = np.abs(places - refined[:, None]) <= CLOSE
+        close |= self._equal(places.clip(0, n - 1), refined[:, None])
+        return refined, (masses * close).sum(axis=1)
+
+    def _equal(self, places: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """Return which places are in one stretch of equal images with others, as if one place."""
+        if self._layout is not None:
+            places, others = (self._layout.places_of(i) for i in (places, others))
+        first = min(places.min(), others.min())
+        stretches = self.change.stretches(first, max(places.max(), others.max()) + 1)
+        equal: np.ndarray = stretches[places - first] == stretches[others - first]
+        return equal
 
     def _second_best(
         self, n: int, places: np.ndarray, probabilities: np.ndarray, middle: int, radius: int

@@ -61,6 +61,10 @@ class SessionLayout:
         out[torch.from_numpy(self.columns).to(row.device)] = row
         return out
 
+    def places_of(self, columns: np.ndarray) -> np.ndarray:
+        """Return the places of columns; in a gap, the place before it."""
+        return self._places[columns]
+
     def first_column(self, column: int) -> int:
         """Return the first column of a column's session."""
         firsts = self.columns[self.firsts]
@@ -116,7 +120,7 @@ class SessionLayout:
 
         def sequences() -> Sequences:
             costs, columns = in_columns()
-            return costs, self._places[columns]
+            return costs, self.places_of(columns)
 
         path = path.copy()
         path[:, 1] = self._places[path[:, 1]]
