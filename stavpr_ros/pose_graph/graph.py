@@ -29,7 +29,7 @@ LEAST_CLUSTERS = 6  # that these are estimated from
 # agree at random.
 UNEXPLAINED = 0.25
 CAUTION = 1.5  # factor on the estimated errors of the odometry where closures are compared
-MEMORY = 100  # latest closures by which keypoints are judged
+MEMORY = 100  # latest closures by which keypoints are rated
 FAR = 8.0  # whitened deviations of a new edge from which all nodes are solved anew
 
 
@@ -79,7 +79,7 @@ class PoseGraph:
         self._pending: list[Closure] = []
         self._known: list[Closure] = []  # those between nodes
         self._changes: dict[int, float] = {}  # of images by their stamps
-        self._judged, self._missed = 0, 0.0  # latest closures, and the share not confirmed of them
+        self._compared, self._missed = 0, 0.0  # latest closures, and the share not confirmed of them
         self._clusters: list[Cluster] = []
         self._accepted = np.zeros(0, bool)
         self._changed: set[int] = set()
@@ -175,8 +175,8 @@ class PoseGraph:
         """
         if closure.verified is None:
             return 1.0
-        self._judged = min(self._judged + 1, MEMORY)
-        self._missed += (1 - closure.verified - self._missed) / self._judged
+        self._compared = min(self._compared + 1, MEMORY)
+        self._missed += (1 - closure.verified - self._missed) / self._compared
         return 1.0 if closure.verified else self._missed
 
     def _place(self, closure: Closure) -> tuple[int, np.ndarray] | None:
@@ -298,7 +298,7 @@ class PoseGraph:
         self._solver.restart()
         waiting, self._pending = self._pending, self._known
         self._known, self._clusters, self._edges = [], [], {}
-        self._judged, self._missed = 0, 0.0
+        self._compared, self._missed = 0, 0.0
         self._resolve()
         self._pending, self._changed = waiting, set()
         self._decide_all()
