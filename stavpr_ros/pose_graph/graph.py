@@ -79,7 +79,7 @@ class PoseGraph:
         self._pending: list[Closure] = []
         self._known: list[Closure] = []  # those between nodes
         self._changes: dict[int, float] = {}  # of images by their stamps
-        self._compared, self._missed = 0, 0.0  # latest closures, and the share not confirmed of them
+        self._tried, self._missed = 0, 0.0  # latest closures, and the share not confirmed of them
         self._clusters: list[Cluster] = []
         self._accepted = np.zeros(0, bool)
         self._changed: set[int] = set()
@@ -175,8 +175,8 @@ class PoseGraph:
         """
         if closure.verified is None:
             return 1.0
-        self._compared = min(self._compared + 1, MEMORY)
-        self._missed += (1 - closure.verified - self._missed) / self._compared
+        self._tried = min(self._tried + 1, MEMORY)
+        self._missed += (1 - closure.verified - self._missed) / self._tried
         return 1.0 if closure.verified else self._missed
 
     def _place(self, closure: Closure) -> tuple[int, np.ndarray] | None:
@@ -298,7 +298,7 @@ class PoseGraph:
         self._solver.restart()
         waiting, self._pending = self._pending, self._known
         self._known, self._clusters, self._edges = [], [], {}
-        self._compared, self._missed = 0, 0.0
+        self._tried, self._missed = 0, 0.0
         self._resolve()
         self._pending, self._changed = waiting, set()
         self._decide_all()
