@@ -6,7 +6,6 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from functools import cache
 import os
-import sys
 import threading
 from typing import TypeVar
 
@@ -50,12 +49,6 @@ def _unlimited() -> tuple[int, int]:
     import torch
 
     return torch.get_num_threads(), cv2.getNumThreads()
-
-
-def yield_processor() -> None:
-    """Run the calling thread only while no other one wants its core (Linux)."""
-    if sys.platform == 'linux':
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
 def call_on_thread(function: Callable[[], Result], name: str) -> Future[Result]:

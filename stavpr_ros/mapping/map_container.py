@@ -6,7 +6,7 @@ An open map file of any version: manifest, and parts that are read by their posi
 Nothing is mapped into memory: a mapped file that another program shortens ends the process.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 import hashlib
@@ -15,6 +15,7 @@ import json
 import math
 import os
 from pathlib import Path
+import time
 from typing import Any, NamedTuple
 import weakref
 
@@ -110,26 +111,28 @@ class MapFile:
         self.fill(content, part.start)
         return content.view(DTYPES[part.dtype]).reshape(part.shape)
 
-    def verify(self, *names: str) -> None:
+    def verify(self, *names: str, rest: Callable[[float], None] = lambda seconds: None) -> None:
         """
         Compare parts with their hashes, all without names.
 
+        :param rest: called after every ``AT_ONCE`` bytes with the seconds that they took.
         :raises MapFileError: names the damaged part and where it is in the file.
         """
         for name in names or self.parts:
             for start, end, sha256 in self.parts[name].pieces:
-                if self._hash(start, end) != sha256:
+                if self._hash(start, end, rest) != sha256:
                     raise self.damaged(
                         f'is damaged: bytes {start} to {end}, of part {name}, do not match their '
                         'hash'
                     )
 
-    def _hash(self, start: int, end: int) -> str:
+    def _hash(self, start: int, end: int, rest: Callable[[float], None]) -> str:
         digest, content = hashlib.sha256(), np.empty(min(AT_ONCE, end - start), np.uint8)
         for at in range(start, end, AT_ONCE):
-            piece = content[: min(AT_ONCE, end - at)]
+            began, piece = time.perf_counter(), content[: min(AT_ONCE, end - at)]
             self.fill(piece, at)
             digest.update(piece.data)
+            rest(time.perf_counter() - began)
         return digest.hexdigest()
 
     def require_whole(self) -> None:

@@ -8,7 +8,7 @@ explains it; :mod:`stavpr_ros.mapping.map_version1` reads the former one. Nothin
 executed.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -185,16 +185,17 @@ def open_map(path: str | Path) -> PlaceMap:
         return map_content(file)
 
 
-def verify_map(place_map: PlaceMap) -> None:
+def verify_map(place_map: PlaceMap, rest: Callable[[float], None] = lambda seconds: None) -> None:
     """
     Compare all that an opened map left in its file with its hashes; nothing for one in memory.
 
+    :param rest: called now and then with the seconds of work since; what it raises ends the work.
     :raises MapFileError: names the damaged part and where it is in the file.
     """
     features = place_map.features
     if isinstance(features, StoredFeatures):
         with errors_of(features.file.path):
-            features.file.verify()
+            features.file.verify(rest=rest)
 
 
 def is_map(path: str | Path) -> bool:

@@ -119,10 +119,6 @@ class MapChange:
         self.curve[0] = 0
         self.standstill = self._settings.standstill * self.curve[1]
 
-    def stretches(self, first: int, end: int) -> np.ndarray:
-        """Return the number of the stretch of equal places that each is in, (end - first,)."""
-        return np.cumsum(self._from_before[first:end] >= self.standstill)
-
     def unlit(self, by_place: np.ndarray) -> bool:
         """
         Whether equal images are expected where the camera is: places of the map are equal there.

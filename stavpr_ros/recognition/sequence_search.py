@@ -227,6 +227,10 @@ class ImageChange(MapChange):
         """Whether the query's images are equal up to noise: the camera stands, or it is dark."""
         return bool(change < self.standstill)
 
+    def stretches(self, first: int, end: int) -> np.ndarray:
+        """Return the number of the stretch of equal places that each is in, (end - first,)."""
+        return np.cumsum(self._from_before[first:end] >= self.standstill)
+
     def weight(self, change: float) -> float:
         """Return the exponent alpha of the image's likelihood."""
         s = self._settings
@@ -461,7 +465,7 @@ class FilterSearch:
     def _equal(self, places: np.ndarray, others: np.ndarray) -> np.ndarray:
         """Return which places are in one stretch of equal images with others, as if one place."""
         if self._layout is not None:
-            places, others = (self._layout.places_of(i) for i in (places, others))
+            places, others = (self._layout.positions_of(i) for i in (places, others))
         first = min(places.min(), others.min())
         stretches = self.change.stretches(first, max(places.max(), others.max()) + 1)
         equal: np.ndarray = stretches[places - first] == stretches[others - first]

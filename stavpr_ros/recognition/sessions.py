@@ -61,9 +61,9 @@ class SessionLayout:
         out[torch.from_numpy(self.columns).to(row.device)] = row
         return out
 
-    def places_of(self, columns: np.ndarray) -> np.ndarray:
-        """Return the places of columns; in a gap, the place before it."""
-        return self._places[columns]
+    def positions_of(self, columns: np.ndarray) -> np.ndarray:
+        """Return the positions of columns among those of places; in a gap, the one before."""
+        return self.columns.searchsorted(columns, 'right') - 1
 
     def first_column(self, column: int) -> int:
         """Return the first column of a column's session."""
@@ -120,7 +120,7 @@ class SessionLayout:
 
         def sequences() -> Sequences:
             costs, columns = in_columns()
-            return costs, self.places_of(columns)
+            return costs, self._places[columns]
 
         path = path.copy()
         path[:, 1] = self._places[path[:, 1]]

@@ -13,9 +13,10 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap, verify_map
 from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.ros.input import END_POLL
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
-from stavpr_ros.threads import call_on_thread, yield_processor
+from stavpr_ros.threads import call_on_thread
 
 LOAD_TIMEOUT = 120.0  # seconds to read a map
+REST = 4.0  # times what it works, the thread that compares hashes leaves the processor to images
 
 
 class MapLoader:
@@ -43,6 +44,8 @@ class MapLoader:
         self._node, self._read, self._use, self._in_use = node, read, use, in_use
         self._on_change = on_change
         self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._verifying = threading.Thread()  # the latest one
         self.path = self.problem = ''
 
     def load(self, path: str, lock: AbstractContextManager[object] | None = None) -> None:
@@ -63,7 +66,16 @@ class MapLoader:
         )
         # reads all of the file, for seconds: the map is in use meanwhile
         if not places.partial:
-            threading.Thread(target=self._verify, args=(path, places), daemon=True).start()
+            self._verifying = threading.Thread(
+                target=self._verify, args=(path, places), daemon=True
+            )
+            self._verifying.start()
+
+    def stop(self) -> None:
+        """End the comparison of hashes, which holds the map."""
+        self._ended.set()
+        if self._verifying.is_alive():
+            self._verifying.join(END_POLL)
 
     @contextmanager
     def _loading(self, path: str) -> Iterator[None]:
@@ -94,12 +106,16 @@ class MapLoader:
 
     def _verify(self, path: str, places: PlaceMap) -> None:
         """Compare the file of the map in use with its hashes; log damage, and keep it."""
-        yield_processor()
+
+        def rest(seconds: float) -> None:
+            if self._ended.wait(REST * seconds) or self._in_use() is not places:
+                raise MapFileError(f'map {path} is not in use any more')
+
         try:
-            verify_map(places)
+            verify_map(places, rest)
             self._node.get_logger().info(f'map {path} is verified')
         except MapFileError as error:
-            if self._in_use() is places:
+            if self._in_use() is places and not self._ended.is_set():
                 self.problem = f'the map in use is not reliable: {error}'
                 self._node.get_logger().error(self.problem)
                 self._on_change()

@@ -159,6 +159,7 @@ class Runtime:
         finally:
             if not (self.worker.stop() & self._edges.stop()):
                 self._node.left_behind = True
+            self._maps.stop()
             self._close_journals()
             self._output.close()
             self._views.close()
