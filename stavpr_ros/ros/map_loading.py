@@ -16,7 +16,7 @@ from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.threads import call_on_thread
 
 LOAD_TIMEOUT = 120.0  # seconds to read a map
-REST = 4.0  # times what it works, the thread that compares hashes leaves the processor to images
+REST = 20.0  # times what it works, the thread that compares hashes leaves the processor to images
 
 
 class MapLoader:
