@@ -590,7 +590,9 @@ def followed_back(a, least, tops, origins, steps, newest, count, ways, probabili
     for i in range(count):  # all together: each waits for its memory
         slot, left = (newest - i) % len(origins), 0
         for at in range(found):
-            speed, place = _before(ways[at, 1], ways[at, 4], ways[at, 0], origins[slot], steps[slot])
+            speed, place = _before(
+                ways[at, 1], ways[at, 4], ways[at, 0], origins[slot], steps[slot]
+            )
             if place >= 0:
                 ways[left], probabilities[left] = ways[at], probabilities[at]
                 ways[left, 0], ways[left, 4] = place, speed

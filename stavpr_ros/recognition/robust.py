@@ -9,6 +9,7 @@ and successive ones are correlated.
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -369,7 +370,7 @@ def z_normalized(row: np.ndarray, around: int = 0) -> np.ndarray:
 
 
 @reassociating_kernel
-def change_between(a, b):
+def change_between(a: np.ndarray, b: np.ndarray) -> Any:
     """Return the change of two images, unit-norm strips (W, d) each; equal where both are zero."""
     total = np.float32(0)
     for j in range(len(a)):
@@ -383,7 +384,13 @@ def change_between(a, b):
 
 
 @reassociating_kernel
-def _convert_image(strips, mean, directions, change, out):
+def _convert_image(
+    strips: np.ndarray,
+    mean: np.ndarray,
+    directions: np.ndarray,
+    change: np.ndarray,
+    out: np.ndarray,
+) -> None:
     """Write an image (W, d) less a mean, whitened (W, rank, d), (W, rank), of unit norm."""
     for j in range(len(strips)):
         x, y = strips[j], out[j]
@@ -406,12 +413,12 @@ def _convert_image(strips, mean, directions, change, out):
 
 
 @reassociating_kernel
-def _z_normalize(row, z):
+def _z_normalize(row: np.ndarray, z: np.ndarray) -> None:
     """Write a row with mean 0 and deviation 1 of its finite entries, in float64 until then."""
     total, squares, count = 0.0, 0.0, 0
     for x in row:
         known = np.isfinite(x)
-        total += x if known else np.float32(0)
+        total += x if known else 0.0
         count += known
     mean = total / max(count, 1)
     for x in row:

@@ -190,7 +190,7 @@ def _round_places(strips, longest, peak, first, values, reciprocals):
 def _round_queries(strips, longest, peak, values, reciprocals):
     """Round strips (Q, W, d) to int8, and write 1 / length of each rounded one, (Q, W)."""
     for x, j in np.ndindex(reciprocals.shape):
-        strip, squares = strips[x, j], 0
+        strip, squares = strips[x, j], np.int64(0)
         scale = _scale(strip, longest, peak)
         for t in range(len(strip)):
             value = np.int32(np.rint(scale * strip[t]))
