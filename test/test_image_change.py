@@ -4,8 +4,9 @@
 
 import numpy as np
 import pytest
+from stavpr_ros.recognition.blocks import change_between
 from stavpr_ros.recognition.map_change import AHEAD, APART, STRETCH
-from stavpr_ros.recognition.robust import change_between, FilterSettings
+from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.sequence_search import FLOOR, ImageChange, OFFSET, SMOOTHED
 
 pytestmark = pytest.mark.usefixtures('one_thread')

@@ -29,10 +29,10 @@ from stavpr_ros.fleet.neighborhoods import Votes
 from stavpr_ros.fleet.store import place_vectors, sample_places
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import Match, RecognizerSettings, Status
+from stavpr_ros.recognition.blocks import change_between
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
 from stavpr_ros.recognition.robust import (
-    change_between,
     FilterSettings,
     MIN_DEVIATION,
     ROBUST,

@@ -11,7 +11,11 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import Any
 
+import numba as nb
+import numpy as np
+from stavpr_ros.compilation import parallel_kernel, reassociating_kernel
 from stavpr_ros.features import LocalFeatures
 import torch
 
@@ -83,3 +87,60 @@ def one_thread() -> Iterator[int]:
 def _slices(features: LocalFeatures) -> list[slice]:
     n = len(features)
     return [slice(low, min(low + PIECE, n)) for low in range(0, n, PIECE)]
+
+
+class PlaceChanges:
+    """
+    Changes of places that come in blocks, in their order.
+
+    The change of two images is 1 less the mean cosine similarity of their strips, each with the
+    one in the same place.
+
+    :param n: places; 0 = blocks are not looked at.
+    :param apart: most places apart.
+
+    ``changes`` holds those of each place from the ones 1, 2, ... places before, shape (apart, n),
+    float32; 0 where there are no such.
+    """
+
+    def __init__(self, n: int, apart: int) -> None:
+        self.changes: np.ndarray = np.zeros((apart, n), np.float32)
+        self._count = 0
+        self._latest: torch.Tensor | None = None
+
+    def add(self, strips: torch.Tensor) -> None:
+        """Add the next places, unit-norm strips (W, m, d), of any type."""
+        m, n = strips.shape[1], self.changes.shape[1]
+        if not n or not m:
+            return
+        strips = strips.float().cpu()
+        block = strips if self._latest is None else torch.cat([self._latest, strips], dim=1)
+        before = block.shape[1] - m
+        out = np.empty(block.shape[1], np.float32)
+        for apart in range(1, min(len(self.changes), block.shape[1] - 1) + 1):
+            _changes(block.contiguous().numpy(), apart, out)
+            first = max(before, apart)
+            self.changes[apart - 1, self._count + first - before : self._count + m] = out[first:]
+        self._count += m
+        self._latest = block[:, -len(self.changes) :].clone()
+
+
+@reassociating_kernel
+def change_between(a: np.ndarray, b: np.ndarray) -> Any:
+    """Return the change of two images, unit-norm strips (W, d) each; equal where both are zero."""
+    total = np.float32(0)
+    for j in range(len(a)):
+        x, y = a[j], b[j]
+        dot, norm = np.float32(0), np.float32(0)
+        for t in range(len(x)):
+            dot += x[t] * y[t]
+            norm += x[t] * x[t] + y[t] * y[t]
+        total += dot if norm > 0 else np.float32(1)
+    return 1 - total / len(a)
+
+
+@parallel_kernel
+def _changes(strips, apart, out):  # type: ignore[no-untyped-def]
+    """Write the change of each place of (W, n, d) from the one ``apart`` places before, (n,)."""
+    for y in nb.prange(apart, strips.shape[1]):
+        out[y] = change_between(strips[:, y], strips[:, y - apart])

@@ -13,11 +13,15 @@ from torch.nn import functional
 MOST = 512  # most probable places that are copied back: more than are ever excluded
 
 
-def z_normalized_on_device(row: torch.Tensor, around: int = 0) -> torch.Tensor:
+def z_normalized_on_device(
+    row: torch.Tensor, around: int = 0, counted: torch.Tensor | None = None
+) -> torch.Tensor:
     """Return a row as :func:`stavpr_ros.recognition.robust.z_normalized`, without waiting."""
     if not len(row):
         return row
     known = torch.isfinite(row)
+    if counted is not None:
+        known &= counted
     count = known.sum().clamp(min=1)
     values = torch.where(known, row, 0)
     mean = values.sum() / count

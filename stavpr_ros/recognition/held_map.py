@@ -15,9 +15,9 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.map_container import errors_of
 from stavpr_ros.mapping.map_statistics import MapStatistics
 from stavpr_ros.mapping.stored_features import MappedFeatures, StoredFeatures
-from stavpr_ros.recognition.blocks import converted, converted_blocks
+from stavpr_ros.recognition.blocks import converted, converted_blocks, PlaceChanges
 from stavpr_ros.recognition.int8_features import Int8Features, rounded
-from stavpr_ros.recognition.map_change import APART, PlaceChanges
+from stavpr_ros.recognition.map_change import APART
 from stavpr_ros.recognition.robust import (
     MeanCentering,
     RANK,
@@ -27,7 +27,7 @@ from stavpr_ros.recognition.robust import (
 )
 import torch
 
-METHOD = f'mean, whitening {RANK} of {SAMPLE} by {STRENGTH}, changes {APART}, 1'
+METHOD = f'mean, whitening {RANK} of {SAMPLE} by {STRENGTH}, changes {APART}, 2'
 CODES_AT_ONCE = 4096  # places; a multiple of all LANES
 LEAST_PLACES = 1000  # of a map whose statistics are kept: they take the room of some 70 places
 
@@ -61,7 +61,8 @@ def hold(features: LocalFeatures, options: RobustOptions, precision: str) -> Hel
         statistics, note = _usable(features)
     if options.mean_centering or options.whitening:
         centering = MeanCentering(features, options.mean_centering, options.whitening, statistics)
-    seen = PlaceChanges(len(features) if options.place_filter and statistics is None else 0)
+    learns = options.place_filter and statistics is None
+    seen = PlaceChanges(len(features) if learns else 0, APART)
     held: LocalFeatures | Int8Features
     if (
         statistics is not None
@@ -142,7 +143,7 @@ def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics |
         if not note:
             return known
     features = _AsStored(features, storage or stored)
-    centering, seen = MeanCentering(features), PlaceChanges(len(features))
+    centering, seen = MeanCentering(features), PlaceChanges(len(features), APART)
     for _, some in converted_blocks(features, lambda some: centering.places(some).strips):
         seen.add(some)
     assert centering.whitening is not None

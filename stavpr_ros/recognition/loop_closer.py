@@ -224,13 +224,14 @@ class LoopCloser(SequenceRecognizer):
             young.popleft()
         return len(young) if stamp else 0
 
-    def _z_normalized(self, row: np.ndarray) -> np.ndarray:
-        return z_normalized(row, AROUND)
+    def _z_normalized(self, row: np.ndarray, counted: np.ndarray) -> np.ndarray:
+        return z_normalized(row, AROUND, counted)
 
     def _z_normalized_on(self, row: torch.Tensor) -> torch.Tensor:
         from stavpr_ros.recognition.cuda_filter import z_normalized_on_device
 
-        return z_normalized_on_device(row, AROUND)
+        counted = torch.from_numpy(self._counted(len(row))).to(row.device)
+        return z_normalized_on_device(row, AROUND, counted)
 
     def _distances(self) -> torch.Tensor:
         """Return the distances of the newest image to its places; none if they are too few."""

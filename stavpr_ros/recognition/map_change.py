@@ -7,11 +7,10 @@ The change of two images is 1 less the mean cosine similarity of their strips, e
 the same place: 0 for equal images, about 1 for unrelated ones.
 """
 
-import numba as nb
 import numpy as np
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
-from stavpr_ros.compilation import parallel_kernel
-from stavpr_ros.recognition.robust import change_between, FilterSettings
+from stavpr_ros.recognition.blocks import change_between, PlaceChanges
+from stavpr_ros.recognition.robust import camera_moved, FilterSettings, LEAST_MOVED
 import torch
 
 LEARNED_AT_ONCE = 256  # places
@@ -25,8 +24,8 @@ class MapChange:
     """
     Changes of a map from place to place.
 
-    ``curve`` holds the mean change of places 0, 1, ... ``APART`` apart, 1 where none is known;
-    ``standstill`` the change below which a camera stands.
+    ``curve`` holds the mean change of places 0, 1, ... ``APART`` apart while the camera moves, 1
+    where none is known; ``standstill`` the change below which a camera stands.
 
     :param places: places that there is room for.
     """
@@ -35,6 +34,7 @@ class MapChange:
         self._settings = settings
         self._sums, self._counts = np.zeros(APART + 1), np.zeros(APART + 1)
         self._from_before = np.ones(places, np.float32)  # change of each place from the one before
+        self._equal_places: np.ndarray | None = None  # None = not known yet
         self._update_curve()
 
     def learn(
@@ -49,7 +49,7 @@ class MapChange:
         :param firsts: first place of each session.
         """
         n = strips.shape[1]
-        seen = PlaceChanges(n)
+        seen = PlaceChanges(n, APART)
         for low in range(0, n, LEARNED_AT_ONCE):
             seen.add(torch.as_tensor(strips[:, low : low + LEARNED_AT_ONCE]))
         self.take(seen.changes, firsts)
@@ -64,13 +64,14 @@ class MapChange:
         n = changes.shape[1]
         if not n:
             return
+        steps = camera_moved(changes[0])
+        steps[list(firsts)] = False
+        moving = np.ones(n, bool)  # all steps from the place so far before
         for apart in range(1, min(APART, n - 1) + 1):
-            inside = np.ones(n, bool)
-            for first in firsts:
-                inside[first : first + apart] = False
-            known = np.where(inside, changes[apart - 1], np.float32(0))
-            self._sums[apart] = known[apart:].sum(dtype=np.float64)
-            self._counts[apart] = np.count_nonzero(inside)
+            moving[apart - 1 :] &= steps[: n - apart + 1]
+            moving[: apart - 1] = False
+            self._sums[apart] = changes[apart - 1, moving].sum(dtype=np.float64)
+            self._counts[apart] = np.count_nonzero(moving)
         self._from_before[1:] = changes[0, 1:]
         self._from_before[list(firsts)] = 1
         self._update_curve()
@@ -89,6 +90,7 @@ class MapChange:
             for apart in range(1, min(APART, last) + 1)
         ]
         self._from_before[n - 1] = changes[0] if changes else 1
+        self._equal_places = None
         if changes and not changes[0] < self.standstill:
             self._sums[1 : len(changes) + 1] += changes
             self._counts[1 : len(changes) + 1] += 1
@@ -107,17 +109,37 @@ class MapChange:
     def grow(self, places: int) -> None:
         """Make room for more places."""
         more = np.ones(places - len(self._from_before), np.float32)
-        self._from_before = np.append(self._from_before, more)
+        self._from_before, self._equal_places = np.append(self._from_before, more), None
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
         self._from_before = np.append(self._from_before[count:], np.ones(count, np.float32))
+        self._equal_places = None
 
     def _update_curve(self) -> None:
         known = self._counts > 0
         self.curve = np.where(known, self._sums / np.maximum(self._counts, 1), 1)
         self.curve[0] = 0
         self.standstill = self._settings.standstill * self.curve[1]
+        self._equal_places = None
+
+    def distinct(self, n: int) -> np.ndarray:
+        """Return which of n places count, (n,), bool: of a standstill one; all if few would."""
+        distinct = ~self._equal[:n]
+        return distinct if np.count_nonzero(distinct) >= LEAST_MOVED else np.ones(n, bool)
+
+    def stood(self) -> np.ndarray:
+        """Return the places where the map's camera stood, (room,), bool."""
+        stood = self._equal.copy()
+        stood[:-1] |= self._equal[1:]
+        return stood
+
+    @property
+    def _equal(self) -> np.ndarray:
+        """Return which places are equal to the one before up to noise, (room,), bool."""
+        if self._equal_places is None:
+            self._equal_places = self._from_before < self.standstill
+        return self._equal_places
 
     def unlit(self, by_place: np.ndarray) -> bool:
         """
@@ -133,42 +155,3 @@ class MapChange:
         for places in range(min(AHEAD, n)):
             ahead[: n - places] |= equal[places:]
         return bool(by_place[ahead].sum() > UNLIT * by_place.sum())
-
-
-class PlaceChanges:
-    """
-    Changes of places that come in blocks, in their order.
-
-    :param n: places; 0 = blocks are not looked at.
-
-    ``changes`` holds those of each place from the ones 1 to ``APART`` places before, shape
-    (``APART``, n), float32; 0 where there are no such.
-    """
-
-    def __init__(self, n: int) -> None:
-        self.changes: np.ndarray = np.zeros((APART, n), np.float32)
-        self._count = 0
-        self._latest: torch.Tensor | None = None
-
-    def add(self, strips: torch.Tensor) -> None:
-        """Add the next places, unit-norm strips (W, m, d), of any type."""
-        m, n = strips.shape[1], self.changes.shape[1]
-        if not n or not m:
-            return
-        strips = strips.float().cpu()
-        block = strips if self._latest is None else torch.cat([self._latest, strips], dim=1)
-        before = block.shape[1] - m
-        out = np.empty(block.shape[1], np.float32)
-        for apart in range(1, min(APART, block.shape[1] - 1) + 1):
-            _changes(block.contiguous().numpy(), apart, out)
-            first = max(before, apart)
-            self.changes[apart - 1, self._count + first - before : self._count + m] = out[first:]
-        self._count += m
-        self._latest = block[:, -APART:].clone()
-
-
-@parallel_kernel
-def _changes(strips, apart, out):
-    """Write the change of each place of (W, n, d) from the one ``apart`` places before, (n,)."""
-    for y in nb.prange(apart, strips.shape[1]):
-        out[y] = change_between(strips[:, y], strips[:, y - apart])

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 from stavpr_ros.mapping import PlaceMap, select_places
-from stavpr_ros.recognition.blocks import blocks
-from stavpr_ros.recognition.robust import change_between, FilterSettings, MeanCentering
+from stavpr_ros.recognition.blocks import blocks, change_between
+from stavpr_ros.recognition.robust import FilterSettings, MeanCentering
 from tqdm import tqdm
 
 MOVED = 0.1  # of the median step: a camera that moved farther did not stand

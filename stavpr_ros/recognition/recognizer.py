@@ -234,17 +234,24 @@ class SequenceRecognizer:
             session = self._layout.session_of(match.sequence.middle)
         return self._motion.compared(match, self._positions, first, session)
 
-    def _z_normalized(self, row: np.ndarray) -> np.ndarray:
-        return z_normalized(row) if self._layout is None else self._layout.z_normalized(row)
+    def _z_normalized(self, row: np.ndarray, counted: np.ndarray) -> np.ndarray:
+        if self._layout is not None:
+            return self._layout.z_normalized(row, counted)
+        return z_normalized(row, counted=counted)
 
     def _z_normalized_here(self, row: torch.Tensor) -> torch.Tensor:
-        return torch.from_numpy(self._z_normalized(row.cpu().numpy()))
+        return torch.from_numpy(self._z_normalized(row.cpu().numpy(), self._counted(len(row))))
+
+    def _counted(self, n: int) -> np.ndarray:
+        """Return which of the first n places count for the mean distance, (n,), bool."""
+        return np.ones(n, bool) if self._filter is None else self._filter.change.distinct(n)
 
     def _z_normalized_on(self, row: torch.Tensor) -> torch.Tensor:
         from stavpr_ros.recognition.cuda_filter import z_normalized_on_device
 
         runs = [slice(None)] if self._layout is None else self._layout.runs
-        return torch.cat([z_normalized_on_device(row[run]) for run in runs])
+        counted = torch.from_numpy(self._counted(len(row))).to(row.device)
+        return torch.cat([z_normalized_on_device(row[run], counted=counted[run]) for run in runs])
 
     def _match_window(self) -> Match:
         threshold, length = self._settings.threshold, self._settings.sequence.length
@@ -388,10 +395,14 @@ class PlaceRecognizer(SequenceRecognizer):
     def reset(self) -> None:
         """Drop the images of the window, and the running statistics of the query."""
         self._clear_window()
-        if self._centering is not None:
-            self._centering.reset()
-        if self._vectors is not None:
-            self._vectors[1].reset()
+        for centering in self._centerings:
+            centering.reset()
+
+    @property
+    def _centerings(self) -> list[MeanCentering]:
+        """Return the running means of the query."""
+        own = [] if self._centering is None else [self._centering]
+        return own if self._vectors is None else [*own, self._vectors[1]]
 
     def distances(self, features: LocalFeatures) -> np.ndarray:
         """
@@ -448,7 +459,12 @@ class PlaceRecognizer(SequenceRecognizer):
         else:
             stage, centering = self._vectors
             row = stage.distances(strips, weights, centering.next_query(features.vectors))
-        return self._match(row, strips, stamp, position)
+        match = self._match(row, strips, stamp, position)
+        if self._filter is not None:
+            stands = self._filter.change.is_standstill(self._changes[-1])
+            for centering in self._centerings:
+                centering.stands(stands)
+        return match
 
 
 def position_of(pose: np.ndarray | None) -> np.ndarray:

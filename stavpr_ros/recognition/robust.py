@@ -9,7 +9,6 @@ and successive ones are correlated.
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -17,16 +16,24 @@ from stavpr_ros.compilation import reassociating_kernel
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.map_statistics import MapStatistics
-from stavpr_ros.recognition.blocks import converted, converted_blocks, one_thread
+from stavpr_ros.recognition.blocks import (
+    blocks,
+    converted,
+    converted_blocks,
+    one_thread,
+    PlaceChanges,
+)
 import torch
 
 MODES = ('paper', 'robust')
 MIN_PROBABILITY = 0.5  # above which mode robust matches a window
 THRESHOLD = 1 - MIN_PROBABILITY  # of the distance, 1 less the probability
-PRIOR = 20  # images that the statistics of the map count for in those of the query
+PRIOR = 20  # images that the map's mean counts for in the query's, and at most a standstill
 RANK = 64  # directions that whitening shrinks, at most
 SAMPLE = 256  # places that whitening is learned from
 STRENGTH = 1.5  # of whitening: c in the gains of its directions
+LARGE, NOISE = 0.97, 0.05  # quantile of changes from place to place; noise over it, at most
+LEAST_MOVED = 5  # places: fewer have no meaningful mean and deviation
 MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
 
 
@@ -244,7 +251,8 @@ class MeanCentering:
     """
     Subtracts the part of the features that all images of a traverse share, and whitens the rest.
 
-    Features have unit norm again afterwards; zero features stay zero.
+    Features have unit norm again afterwards; zero features stay zero. Where the camera stands, all
+    its images count as one: the others would be the same as its place once it is subtracted.
 
     :param features: those of the map, strips (W, n, d).
     :param centering, whitening: which of the two to apply.
@@ -271,19 +279,25 @@ class MeanCentering:
     def _learn(self, features: LocalFeatures, whitening: bool) -> None:
         total = torch.zeros((len(features.weights), features.dimension), dtype=torch.float64)
         total = total.to(features.weights.device)
-        if self._centering:
-            for _, sums in converted_blocks(features, lambda some: some.strips.sum(dim=1)):
-                total += sums
-        self.mean = (total / max(len(features), 1)).float()  # (W, d)
+        seen = PlaceChanges(len(features), 1)
+        for _, strips in converted_blocks(features, lambda some: some.strips):
+            seen.add(strips)
+            total += strips.sum(dim=1)
+        counted = camera_moved(seen.changes[0])
+        for places, some in blocks(features) if not counted.all() else ():
+            total -= some.strips[:, ~counted[places]].sum(dim=1)
+        count = max(int(np.count_nonzero(counted)), 1)
+        self.mean = (total / count).float() * self._centering  # (W, d)
         if whitening and len(features):
-            some = evenly(len(features), SAMPLE)
-            centered = self.places(features[some]).strips
+            sample = np.flatnonzero(counted)[evenly(count, SAMPLE)]
+            centered = self.places(features[sample]).strips
             self.whitening = Whitening.learned(centered.cpu()).to(centered.device)
 
     def reset(self) -> None:
         """Drop the images of the query."""
         # float64: in float32, the images of a long traverse would be rounded away
-        self._sum, self._count = self.mean.double() * PRIOR, PRIOR
+        self._before = self._sum, self._count = self.mean.double() * PRIOR, PRIOR
+        self._standing = 0  # images
 
     def places(
         self,
@@ -321,10 +335,21 @@ class MeanCentering:
         :param strips: shape (W, d); the same is returned.
         """
         strips = strips.to(self.mean.device)
+        self._before = self._sum, self._count
         if self._centering:
             self._sum = self._sum + strips
             self._count += 1
         return self._converted(strips[:, None], (self._sum / self._count).float())[:, 0]
+
+    def stands(self, stands: bool) -> None:
+        """
+        Take whether the query's camera has stood since the image before the newest.
+
+        Of a standstill, ``PRIOR`` images count: else its place would be the mean.
+        """
+        self._standing = self._standing + 1 if stands else 0
+        if self._standing > PRIOR:
+            self._sum, self._count = self._before
 
 
 def evenly(n: int, count: int) -> np.ndarray:
@@ -350,37 +375,41 @@ def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
     return normalize(centered)
 
 
-def z_normalized(row: np.ndarray, around: int = 0) -> np.ndarray:
+def z_normalized(
+    row: np.ndarray, around: int = 0, counted: np.ndarray | None = None
+) -> np.ndarray:
     """
     Return a row with mean 0 and deviation 1 of its finite entries, shape (n,), float32.
 
     :param around: subtract the mean of so many places to either side as well, in which no place
         counts for less than -1, so that the right one counts little. Images of one light are
         nearer to each other than to all others, wherever they were taken. 0 = no.
+    :param counted: places whose entries count for mean and deviation, (n,), bool; None = all.
     """
     z = np.empty(len(row), np.float32)
-    _z_normalize(row, z)
+    _z_normalize(row, np.ones(len(row), bool) if counted is None else counted, z)
     if not around:
         return z
     clipped = np.where(np.isfinite(z), np.maximum(z, -1), np.float32(0))
     return z - uniform_filter1d(clipped, 2 * around + 1, mode='nearest')
 
 
+def camera_moved(changes: np.ndarray) -> np.ndarray:
+    """
+    Return at which places the camera had moved since the place before, (n,), bool.
+
+    Where it stands, places differ by noise: by less than a twentieth of the large changes, of
+    which the largest ones, from one drive to another, do not count. All have moved if few would.
+
+    :param changes: of each place from the one before, (n,); the first one is not looked at.
+    """
+    large = float(np.quantile(changes, LARGE, method='lower')) if len(changes) else 0.0
+    found: np.ndarray = changes >= NOISE * large
+    found[:1] = True
+    return found if np.count_nonzero(found) >= LEAST_MOVED else np.ones(len(changes), bool)
+
+
 # ------------------------------------------------ kernels: of one image, calls are what takes time
-
-
-@reassociating_kernel
-def change_between(a: np.ndarray, b: np.ndarray) -> Any:
-    """Return the change of two images, unit-norm strips (W, d) each; equal where both are zero."""
-    total = np.float32(0)
-    for j in range(len(a)):
-        x, y = a[j], b[j]
-        dot, norm = np.float32(0), np.float32(0)
-        for t in range(len(x)):
-            dot += x[t] * y[t]
-            norm += x[t] * x[t] + y[t] * y[t]
-        total += dot if norm > 0 else np.float32(1)
-    return 1 - total / len(a)
 
 
 @reassociating_kernel
@@ -413,17 +442,17 @@ def _convert_image(
 
 
 @reassociating_kernel
-def _z_normalize(row: np.ndarray, z: np.ndarray) -> None:
+def _z_normalize(row: np.ndarray, counted: np.ndarray, z: np.ndarray) -> None:
     """Write a row with mean 0 and deviation 1 of its finite entries, in float64 until then."""
     total, squares, count = 0.0, 0.0, 0
-    for x in row:
-        known = np.isfinite(x)
-        total += x if known else 0.0
+    for i in range(len(row)):
+        known = counted[i] & np.isfinite(row[i])
+        total += row[i] if known else 0.0
         count += known
     mean = total / max(count, 1)
-    for x in row:
-        off = x - mean
-        squares += off * off if np.isfinite(x) else 0.0
+    for i in range(len(row)):
+        off = row[i] - mean
+        squares += off * off if counted[i] & np.isfinite(row[i]) else 0.0
     scale = np.float32(1 / max(np.sqrt(squares / max(count, 1)), MIN_DEVIATION))
     for i in range(len(row)):
         z[i] = (row[i] - np.float32(mean)) * scale

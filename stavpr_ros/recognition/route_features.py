@@ -12,8 +12,9 @@ from copy import copy
 
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.recognition.blocks import change_between
 from stavpr_ros.recognition.map_change import APART
-from stavpr_ros.recognition.robust import evenly, unit_norm, Whitening
+from stavpr_ros.recognition.robust import camera_moved, evenly, unit_norm, Whitening
 from stavpr_ros.recognition.route_strips import grown, move_up, rounded_strips, RouteStrips
 import torch
 
@@ -67,9 +68,10 @@ class RouteFeatures:
         self._weights = torch.empty((settings.strips, 0))
         # (W, room): the norm of each feature before it was made unit norm; 0 for zero features
         self._norms = torch.empty((settings.strips, 0), device=self._device)
-        self._sum = self._mean = torch.empty(
-            (settings.strips, 0)
-        )  # of the original features, (W, d)
+        # of the original features of all places, and of those that differ, (W, d)
+        self._sum = self._mean = torch.empty((settings.strips, 0))
+        self._newest = np.empty((settings.strips, 0), np.float32)  # original
+        self._changes = np.empty(0, np.float32)  # from place to place, (room,)
         self._next_mean = 1
 
     @property
@@ -122,6 +124,8 @@ class RouteFeatures:
             norms = torch.cat([length for _, length in moved])
         self._write(newest.contiguous(), norms)
         self._weights[:, self.count] = features.weights[:, 0]
+        before, self._newest = self._newest, strips[:, 0].numpy()
+        self._changes[self.count] = change_between(self._newest, before) if self.count else 0
         self.count += 1
         if self._centering:
             self._sum += strips[:, 0]
@@ -156,12 +160,14 @@ class RouteFeatures:
         kept = self.count - count
         self._weights[:, :kept] = self._weights[:, count : self.count].clone()
         if (self._centering or self._whitens) and not self._is_settled:
-            self._subtract_from_sum(count)
+            self._sum -= self._total(np.ones(count, bool))
             self.count = kept
             self._learn(count)
+            self._changes[:kept] = self._changes[count : count + kept].copy()
             self._next_mean = self.count + count + 1
             return
-        self._subtract_from_sum(count)
+        self._sum -= self._total(np.ones(count, bool))
+        self._changes[:kept] = self._changes[count : self.count].copy()
         if isinstance(self.strips, torch.Tensor):
             move_up(self.strips, count, self.count)
         else:
@@ -200,27 +206,41 @@ class RouteFeatures:
         else:
             self.strips.grow(room)
         self._norms, self._weights = grown(self._norms, room), grown(self._weights, room)
+        self._changes = np.append(self._changes, np.zeros(room - n, np.float32))
 
-    def _subtract_from_sum(self, count: int) -> None:
-        """Subtract the original features of the oldest places from the sum."""
+    def _total(self, places: np.ndarray) -> torch.Tensor:
+        """Return the sum of the original features of some of the oldest places, (W, d)."""
+        total = torch.zeros_like(self._sum)
         if not self._centering:
-            return
-        total, alive = torch.zeros_like(self._mean), self._norms[:, :count].cpu() > 0
-        for low in range(0, count, PIECE):
-            piece = slice(low, min(low + PIECE, count))
-            for j, strips in enumerate(self._float32(piece)):
-                total[j] += (self._norms[j, piece] @ strips).cpu()
-        if self._whitening:
-            total = self._whitening.inverse(total[:, None])[:, 0]
-        self._sum -= total + alive.sum(dim=1, keepdim=True) * self._mean
+            return total
+        for low in range(0, len(places), PIECE):
+            piece = slice(low, min(low + PIECE, len(places)))
+            if not places[piece].any():
+                continue
+            norms = self._norms[:, piece] * torch.from_numpy(places[piece]).to(self._device)
+            of_piece = torch.stack(
+                [a @ b for a, b in zip(norms, self._float32(piece), strict=True)]
+            )
+            if self._there:
+                of_piece = self._there.inverse(of_piece[:, None])[:, 0]
+            total += of_piece.cpu() + (norms > 0).sum(dim=1, keepdim=True).cpu() * self._mean
+        return total
+
+    def _mean_of_distinct(self, first: int, moved_on: np.ndarray) -> torch.Tensor:
+        """Return the mean of the places from ``first`` on at which the camera had moved."""
+        others = np.append(np.zeros(first, bool), ~moved_on)
+        total = self._sum - self._total(others) if others.any() else self._sum
+        return (total / int(np.count_nonzero(moved_on))).float()
 
     def _learn(self, first: int) -> None:
         """Take the present mean and, of a short route, whitening; ``first`` becomes place 0."""
-        mean = (self._sum / self.count).float() if self._centering else self._mean
+        moved_on = camera_moved(self._changes[first : first + self.count])
+        mean = self._mean_of_distinct(first, moved_on) if self._centering else self._mean
         self._shift(first, 0, self._whitened((self._mean - mean)[:, None])[:, 0])
         self._mean = mean
         if self._whitens and self.count <= SETTLED:
-            some = evenly(self.count, SAMPLE)
+            distinct = np.flatnonzero(moved_on)
+            some = distinct[evenly(len(distinct), SAMPLE)]
             whitening = Whitening.learned(unit_norm(self._centered(some)).cpu())
             there = copy(whitening).to(self._device)
             for low in range(0, self.count, AT_ONCE):
@@ -233,7 +253,7 @@ class RouteFeatures:
 
     def _update_mean(self) -> None:
         """Take the present mean for rounded features, and round them again."""
-        mean = (self._sum / self.count).float()
+        mean = self._mean_of_distinct(0, camera_moved(self._changes[: self.count]))
         change = self._whitened((self._mean - mean)[:, None])[:, 0].to(self._device)
         for low in range(0, self.count, PIECE):
             piece = slice(low, min(low + PIECE, self.count))

@@ -18,10 +18,11 @@ from stavpr_ros.alignment.lm_dtw import padded_width, SequenceMatch
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.checks import no_nan
 from stavpr_ros.compilation import kernel
+from stavpr_ros.recognition.blocks import change_between
 from stavpr_ros.recognition.map_change import APART, MapChange
 from stavpr_ros.recognition.match import NO_SHARES
 from stavpr_ros.recognition.place_filter import CLOSE, NEGLIGIBLE, PlaceFilter
-from stavpr_ros.recognition.robust import change_between, FilterSettings
+from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.sessions import Sequences, SessionLayout
 import torch
 
@@ -30,6 +31,7 @@ NOISE = 0.15  # deviation of what noise adds to all changes
 LEAST_LIKELY = -8.0  # logarithm of the least likelihood of a speed, without its exponent
 SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
 OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
+STANDS = 0.05  # relative probability of a standstill, below which the camera moves
 FLOOR = 1e-3  # least relative probability of a speed
 BAND = 5  # places to either side of the filter's path that its refinement considers
 START_DEVIATION = 3.0  # places, of the path at the oldest image of the window
@@ -396,11 +398,25 @@ class FilterSearch:
         weight = 0.0
         if not (self.filter.count and self.change.is_standstill(change)):
             weight = self.change.weight(change)
-            self.filter.update(z, weight, *self._speeds_seen(change))
+            weights, likelihoods = self._speeds_seen(change)
+            if weights[0] < STANDS * weights.max():
+                z = self._moving(z)
+            self.filter.update(z, weight, weights, likelihoods)
         elif self.change.unlit(self._by_place(len(z))):
             self.filter.update(z, 0.0, *np.ones((2, len(self._speeds))))
         self._images.append(self.filter.count - 1)
         self._weights.append(weight)
+
+    def _moving(self, z: np.ndarray | torch.Tensor) -> np.ndarray | torch.Tensor:
+        """Return z, of a moving camera: places where the map's camera stood are not near it."""
+        stood = self.change.stood()
+        if self._layout is not None:
+            places, stood = stood, np.zeros(self._layout.width, bool)
+            stood[self._layout.columns] = places
+        stood = stood[: len(z)]
+        if isinstance(z, torch.Tensor):
+            return torch.where(torch.from_numpy(stood).to(z.device), z.clamp(min=0), z)
+        return np.where(stood, np.maximum(z, 0), z) if stood.any() else z
 
     def _by_place(self, n: int) -> np.ndarray:
         probabilities = self.filter.places_of_states()[:n]

@@ -51,9 +51,9 @@ class SessionLayout:
         is_gap[self.columns] = False
         self.gaps = np.flatnonzero(is_gap)
 
-    def z_normalized(self, row: np.ndarray) -> np.ndarray:
-        """Return a row with mean 0 and deviation 1 in each session, (n,)."""
-        return np.concatenate([z_normalized(row[run]) for run in self.runs])
+    def z_normalized(self, row: np.ndarray, counted: np.ndarray) -> np.ndarray:
+        """Return a row with mean 0 and deviation 1 of the counted places of each session, (n,)."""
+        return np.concatenate([z_normalized(row[run], counted=counted[run]) for run in self.runs])
 
     def spread(self, row: torch.Tensor) -> torch.Tensor:
         """Return distances to places (n,) as those to columns, (width,)."""

@@ -1,0 +1,120 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Long standstills, in the map, of the query, and of a route: all their images count as one."""
+
+import numpy as np
+import pytest
+from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.recognition.robust import camera_moved, z_normalized
+from stavpr_ros.recognition.route_features import RouteFeatures
+import torch
+
+pytestmark = pytest.mark.usefixtures('one_thread')
+PLACES, STOP, STANDING, D = 160, 70, 400, 32
+NOISE = 0.01  # of images of a camera that stands, over the norm of an image
+
+
+def route(seed, light=0, strength=1.0):
+    """Return strips (7, PLACES, D) of a route; neighbors are alike. Routes share their light."""
+    walk = np.random.default_rng(seed).standard_normal((7, PLACES + 2, D)).cumsum(1)
+    shared = np.random.default_rng(1000 + light).standard_normal((7, 1, D))
+    return strength * (walk[:, 2:] - walk[:, :-2]) / 2**0.5 + 2 * shared
+
+
+def with_stop(strips, at=STOP, images=STANDING):
+    """Return strips with a stop, and the place of each image before there was one."""
+    places = np.r_[:at, np.full(images, at), at : strips.shape[1]]
+    return strips[:, places], places
+
+
+def features_of(strips, seed=0):
+    strips = strips / np.linalg.norm(strips, axis=2, keepdims=True)
+    noise = np.random.default_rng(seed).standard_normal(strips.shape) * NOISE / D**0.5
+    strips = torch.from_numpy((strips + noise).astype(np.float32))
+    strips /= strips.norm(dim=2, keepdim=True)
+    return LocalFeatures(
+        strips, torch.ones(strips.shape[:2]), FeatureSettings('gradient', None, 7)
+    )
+
+
+def map_of(features):
+    n = len(features)
+    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
+
+
+def matched(recognizer, features):
+    """Return the place of each image that has a match, by image."""
+    matches = [recognizer.update(features[i : i + 1]) for i in range(len(features))]
+    return {i - 10: match.sequence.middle for i, match in enumerate(matches) if match.accepted}
+
+
+def robust():
+    return RecognizerSettings(0.5, mode='robust')
+
+
+def test_unknown_route_is_not_matched_with_a_map_that_has_a_standstill():
+    strips, places = with_stop(route(1))
+    place_map = map_of(features_of(strips))
+    for seed in range(2, 6):
+        assert not matched(PlaceRecognizer(place_map, robust()), features_of(route(seed)))
+    found = matched(PlaceRecognizer(place_map, robust()), features_of(route(1), 9))
+    assert len(found) > PLACES - 60
+    assert all(abs(places[place] - image) <= 2 for image, place in found.items())
+
+
+def test_query_is_matched_during_a_long_standstill_and_after_it():
+    place_map = map_of(features_of(route(1)))
+    query, places = with_stop(route(1, light=1, strength=0.8), images=2000)
+    found = matched(PlaceRecognizer(place_map, robust()), features_of(query, 9))
+    assert len(found) > len(places) - 60
+    assert all(abs(place - places[image]) <= 2 for image, place in found.items())
+
+
+def test_route_with_a_standstill_is_closed_where_it_comes_back_alone():
+    first, places = with_stop(route(1))
+    unknown = np.concatenate([route(seed) for seed in (2, 3)], axis=1)
+    strips = np.concatenate([first, unknown, route(1)], axis=1)
+    closer = LoopCloser(robust(), 30, FeatureSettings('gradient', None, 7))
+    found = {i: place for i, place in matched(closer, features_of(strips)).items() if i >= STOP}
+    back = first.shape[1] + unknown.shape[1]
+    assert min(found) >= back
+    assert len(found) > PLACES - 60
+    assert all(abs(places[place] - (image - back)) <= 2 for image, place in found.items())
+
+
+@pytest.mark.parametrize('limit', [None, 300])
+def test_mean_of_a_route_counts_a_standstill_once(limit):
+    strips, places = with_stop(route(1), images=150)
+    features = features_of(strips)
+    held = RouteFeatures(features.settings, True, False, limit)
+    for i in range(len(features)):
+        if held.count == limit:
+            held.evict(40)
+        held.append(features[i : i + 1])
+    held._learn(0)
+    kept = places[-held.count :]
+    once = np.flatnonzero(np.diff(kept, prepend=-1)) + len(places) - held.count
+    expected = features.strips[:, once].mean(dim=1)
+    np.testing.assert_allclose(held.mean, expected, atol=1e-5)
+
+
+def test_camera_moved_distinguishes_noise_from_slow_drives():
+    rng = np.random.default_rng(0)
+    moving, noise = rng.uniform(0.05, 0.3, 100), rng.uniform(0.001, 0.002, 1500)
+    assert camera_moved(np.r_[moving, noise, moving]).sum() == 200
+    cuts = np.r_[rng.uniform(0.004, 0.01, 500), np.ones(10), rng.uniform(0.004, 0.01, 500)]
+    assert camera_moved(cuts).all()
+    assert camera_moved(np.zeros(50)).all()
+    assert camera_moved(np.empty(0)).shape == (0,)
+
+
+def test_places_that_do_not_count_have_no_share_in_mean_and_deviation():
+    row = np.random.default_rng(0).normal(3, 2, 50).astype(np.float32)
+    counted = np.arange(50) < 30
+    row[40:] = -9
+    z = z_normalized(row, counted=counted)
+    np.testing.assert_allclose(z[:30], z_normalized(row[:30]), atol=1e-6)
+    np.testing.assert_allclose(z[40:], (-9 - row[:30].mean()) / row[:30].std(), rtol=1e-5)
