@@ -291,6 +291,14 @@ def test_largest_consistent_by_hand():
     assert heavy.tolist() == [False, True, False, True]
 
 
+def test_largest_consistent_where_most_opposed_is_in_the_largest_set_finds_it():
+    conflicts = np.zeros((5, 5), bool)
+    for a, b in ((0, 1), (0, 2), (0, 3), (2, 3), (3, 4)):
+        conflicts[a, b] = conflicts[b, a] = True
+    chosen = largest_consistent(conflicts, np.array([15, 9, 10, 19, 16]), np.ones(5, bool))
+    assert chosen.tolist() == [False, True, True, False, True]  # 35; without other starts 28
+
+
 def test_body_covariance_turned_by_90_degrees_swaps_axes():
     T = matrices(np.array([0, 0, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)]))
     covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
