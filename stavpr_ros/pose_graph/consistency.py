@@ -18,6 +18,7 @@ from stavpr_ros.pose_graph.odometry import KeyframeChain, OdometryNoise
 from stavpr_ros.pose_graph.transforms import angles, inverse
 
 LIMIT = 9.0  # squared deviations
+SIGNIFICANT = 1.92  # difference of logarithms of likelihoods: 95 %, one degree of freedom
 STARTS = 100  # rejected clusters that the search begins with as well
 CLOSURE_FACTORS = (0.05, 0.2, 1.0)  # on the covariances of closures that are tried
 
@@ -125,7 +126,10 @@ class Cycles:
         """
         Return the factor on the errors of the odometry that most probably left these loops open.
 
-        Few closures, and short loops, have no cycles that :meth:`noise_scale` could use.
+        Few closures, and short loops, have no cycles that :meth:`noise_scale` could use. It is the
+        least factor unless the likelihood ratio excludes that one.
+
+        :param scales: rising.
         """
         same = self.query_session == self.place_session
         if not same.any():
@@ -140,7 +144,8 @@ class Cycles:
         turned = noise.rotation**2 * length + (noise.bias * length) ** 2
         odometry = np.array([moved, turned])
         likelihood = [_likelihood(off, measured + scale**2 * odometry) for scale in scales]
-        return float(scales[np.argmax(likelihood)])
+        best = int(np.argmax(likelihood))
+        return float(scales[best if likelihood[best] > likelihood[0] + SIGNIFICANT else 0])
 
     def noise_scale(self, noise: OdometryNoise, scales: np.ndarray) -> float:
         """

@@ -272,10 +272,10 @@ class PoseGraph:
 
     def _adapt_to_loops(self) -> None:
         """Trust the odometry in the solution as far as the first closed loops allow."""
-        members = [each for cluster in self._accepted_clusters() for each in cluster.members]
-        if members:
+        edges = [each for cluster in self._accepted_clusters() for each in independent(cluster)]
+        if edges:
             before = self._loop_scale
-            self._loop_scale = Cycles(self.chain, members).loop_scale(self.settings.noise, SCALES)
+            self._loop_scale = Cycles(self.chain, edges).loop_scale(self.settings.noise, SCALES)
             if not 0.7 < self._loop_scale / before < 1.4:
                 self._solver.restart()
 
