@@ -10,6 +10,7 @@ from stavpr_ros.features import LocalFeatures, Projection
 from stavpr_ros.features.extractor import normalize
 from stavpr_ros.mapping.place_map import PlaceMap
 import torch
+from torch.nn import functional
 
 PIECE = 1024  # places at a time: those of an opened map stay in its file
 
@@ -50,12 +51,13 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
 def _directions(features: LocalFeatures, d: int, wanted: int) -> torch.Tensor:
     """Return the principal directions, (d, m), float64, those of the largest variance last."""
     W, n = features.weights.shape
-    if wanted <= W * n < d:  # the products of fewer strips than dimensions
+    if W * n < d:  # the products of fewer strips than dimensions; beyond them, zeros
         strips = features[:].strips.double()
         centered = (strips - strips.mean(dim=1, keepdim=True)).flatten(0, 1)
         _, vectors = torch.linalg.eigh(centered @ centered.T)
         directions = vectors.T @ centered
-        return (directions / directions.norm(dim=1, keepdim=True).clamp_(min=1e-9)).T
+        directions /= directions.norm(dim=1, keepdim=True).clamp_(min=1e-9)
+        return functional.pad(directions.T, (max(wanted - W * n, 0), 0))
     total = torch.zeros((W, d), dtype=torch.float64)
     squares = torch.zeros((d, d), dtype=torch.float64)
     for low in range(0, n, PIECE):

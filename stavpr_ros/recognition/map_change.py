@@ -170,14 +170,5 @@ class PlaceChanges:
 @parallel_kernel
 def _changes(strips, apart, out):
     """Write the change of each place of (W, n, d) from the one ``apart`` places before, (n,)."""
-    W, n, d = strips.shape
-    for y in nb.prange(apart, n):
-        total = np.float32(0)
-        for j in range(W):
-            a, b = strips[j, y], strips[j, y - apart]
-            dot, norm = np.float32(0), np.float32(0)
-            for i in range(d):
-                dot += a[i] * b[i]
-                norm += a[i] * a[i] + b[i] * b[i]
-            total += dot if norm > 0 else np.float32(1)
-        out[y] = 1 - total / W
+    for y in nb.prange(apart, strips.shape[1]):
+        out[y] = change_between(strips[:, y], strips[:, y - apart])

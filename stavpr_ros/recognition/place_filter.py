@@ -80,12 +80,10 @@ class Belief:
 
         :returns: places, ascending, (m,), and their probabilities.
         """
-        near = distinct(self.places[:, None] + np.arange(-CLOSE, CLOSE + 1))
-        near = near[(near >= 0) & (near < n)]
-        sums = np.concatenate([[0], np.cumsum(self.weights)])
-        low = np.searchsorted(self.places, near - CLOSE)
-        high = np.searchsorted(self.places, near + CLOSE, 'right')
-        return near, np.minimum(sums[high] - sums[low], 1)
+        most = len(self.places) * (2 * CLOSE + 1)
+        near, sums = np.empty(most, np.int64), np.empty(most)
+        count = _sum_close(self.places, self.weights, n, near, sums)
+        return near[:count], sums[:count]
 
 
 class PlaceFilter:
@@ -255,9 +253,9 @@ class PlaceFilter:
         """Return the ``TOP`` most probable places, int64; they lie in blocks with large maxima."""
         blocks = max(1, -(-n // BLOCK))
         some = np.sort(np.argpartition(self._maxima[:blocks], max(blocks - TOP, 0))[-TOP:])
-        places = (some[:, None] * BLOCK + np.arange(BLOCK)).ravel()
-        places = places[places < n]
-        return places[np.argpartition(self._by_place[places], max(len(places) - TOP, 0))[-TOP:]]
+        places = np.empty(min(TOP, n), np.int64)
+        _largest(self._by_place, some, n, places)
+        return places
 
     def probable_blocks(self) -> np.ndarray:
         """Return the first places of the ``TOP`` blocks with the most probable places, (m,)."""
@@ -268,17 +266,10 @@ class PlaceFilter:
         """
         Return the most probable place now and its probability, 0 if all are excluded.
 
-        :param excluded: places that do not count.
+        :param excluded: places that do not count, ascending.
         """
-        maxima, by_block = self._maxima.copy(), self._by_place.reshape(-1, BLOCK)
-        touched = distinct(excluded // BLOCK)
-        left = by_block[touched]
-        left[np.searchsorted(touched, excluded // BLOCK), excluded % BLOCK] = 0
-        maxima[touched] = left.max(axis=1)
-        block = int(np.argmax(maxima))
-        values = by_block[block].copy()
-        values[excluded[excluded // BLOCK == block] % BLOCK] = 0
-        return block * BLOCK + int(np.argmax(values)), float(maxima[block]) * self._scale
+        place, probability = _most_probable(self._by_place, self._maxima, excluded)
+        return place, probability * self._scale
 
     def way(self, state: np.ndarray, images: int) -> np.ndarray:
         """
@@ -301,24 +292,11 @@ def belief_of(ways: np.ndarray, probabilities: np.ndarray) -> Belief:
     :param ways: of each state, (m, 5): place then, level, speed and place now, speed then.
     :param probabilities: of each state, (m,), float64.
     """
-    order = np.lexsort((-probabilities, ways[:, 0]))  # the most probable first, of each place
-    places = ways[order, 0]
-    is_first = _differ(places)
-    weights = np.bincount(np.cumsum(is_first) - 1, probabilities[order])
-    return Belief(places[is_first], weights, ways[order[is_first], 1:])
-
-
-def distinct(values: np.ndarray) -> np.ndarray:
-    """Return the different values, ascending, as ``np.unique``; of few, in a tenth of the time."""
-    values = np.sort(values, axis=None)
-    return values[_differ(values)]
-
-
-def _differ(values: np.ndarray) -> np.ndarray:
-    """Return which of some sorted values differ from the one before."""
-    differ = np.ones(len(values), bool)
-    np.not_equal(values[1:], values[:-1], out=differ[1:])
-    return differ
+    order = np.argsort(ways[:, 0], kind='stable')
+    best, weights = np.empty(len(order), np.int64), np.zeros(len(order))
+    count = _merge(ways, probabilities, order, best, weights)
+    found = ways[best[:count]]
+    return Belief(found[:, 0], weights[:count], found[:, 1:])
 
 
 def _move_up(values: np.ndarray, count: int, none: int) -> None:
@@ -554,6 +532,17 @@ def advance(
 
 
 @kernel
+def _before(k, v, y, origins, steps):
+    """Return speed and place of a state one image before, -1 as place where it was off the map."""
+    origin = (origins[y // BLOCK, k, v // 2, y % BLOCK] >> (v % 2 * 4)) & 15
+    if origin == BORN:
+        return v, -1
+    r, step, change = steps[v], origin // 3, origin % 3
+    places = r if step == 0 else r + 1 if step == 1 else max(r - 1, 0)
+    return v - (change == 1) + (change == 2), y - places
+
+
+@kernel
 def trace_back(k, v, y, origins, steps, newest, count, places):
     """
     Follow the most probable way to a state back.
@@ -564,30 +553,15 @@ def trace_back(k, v, y, origins, steps, newest, count, places):
     :param count: images to go back, at most m.
     :param places: (count + 1,), written: the place at each image, newest first; from where the
         way came onto the map on, -1.
-    :returns: speed at the last place.
     """
-    m = len(origins)
     places[0] = y
     for i in range(count):
-        slot = (newest - i) % m
-        origin = (origins[slot, y // BLOCK, k, v // 2, y % BLOCK] >> (v % 2 * 4)) & 15
-        if origin == BORN:
-            places[i + 1 :] = -1
-            return v
-        step, change = origin // 3, origin % 3
-        r = steps[slot, v]
-        if step == 0:
-            y -= r
-        elif step == 1:
-            y -= r + 1
-        elif r > 0:
-            y -= r - 1
-        if change == 1:
-            v -= 1
-        elif change == 2:
-            v += 1
+        slot = (newest - i) % len(origins)
+        v, y = _before(k, v, y, origins[slot], steps[slot])
         places[i + 1] = y
-    return v
+        if y < 0:
+            places[i + 1 :] = -1
+            return
 
 
 @kernel
@@ -603,18 +577,95 @@ def followed_back(a, least, tops, origins, steps, newest, count, ways, probabili
     :param probabilities: (m K V,), written: of these states.
     :returns: how many were on the map then.
     """
-    places = np.empty(count + 1, np.int32)
     found = 0
     for y in tops:
         for k in range(a.shape[1]):
             for v in range(a.shape[2]):
                 p = a[y // BLOCK, k, v, y % BLOCK]
-                if p < least:
-                    continue
-                speed = trace_back(k, v, y, origins, steps, newest, count, places)
-                if places[count] >= 0:
-                    ways[found, 0], ways[found, 1], ways[found, 2] = places[count], k, v
-                    ways[found, 3], ways[found, 4] = y, speed
+                if p >= least:
+                    ways[found, 0], ways[found, 1], ways[found, 2] = y, k, v
+                    ways[found, 3], ways[found, 4] = y, v
                     probabilities[found] = p
                     found += 1
+    for i in range(count):  # all together: each waits for its memory
+        slot, left = (newest - i) % len(origins), 0
+        for at in range(found):
+            speed, place = _before(
+                ways[at, 1], ways[at, 4], ways[at, 0], origins[slot], steps[slot]
+            )
+            if place >= 0:
+                ways[left], probabilities[left] = ways[at], probabilities[at]
+                ways[left, 0], ways[left, 4] = place, speed
+                left += 1
+        found = left
     return found
+
+
+@kernel
+def _largest(by_place, blocks, n, places):
+    """Write the places below n of some blocks that have the largest sums, the largest first."""
+    values, last = np.full(len(places), -1, np.float32), len(places) - 1
+    for block in blocks:
+        for y in range(block * BLOCK, min((block + 1) * BLOCK, n)):
+            if by_place[y] <= values[last]:
+                continue
+            at = last
+            while at > 0 and values[at - 1] < by_place[y]:
+                values[at], places[at] = values[at - 1], places[at - 1]
+                at -= 1
+            values[at], places[at] = by_place[y], y
+
+
+@kernel
+def _merge(ways, probabilities, order, best, weights):
+    """
+    Add up the probabilities of ways that come from the same place.
+
+    :param ways: see :func:`belief_of`; order: of their places, ascending.
+    :param best, weights: of each place, its most probable way and its sum, written.
+    :returns: how many places there are.
+    """
+    found = -1
+    for i in order:
+        if found < 0 or ways[i, 0] != ways[best[found], 0]:
+            found += 1
+            best[found] = i
+        elif probabilities[i] > probabilities[best[found]]:
+            best[found] = i
+        weights[found] += probabilities[i]
+    return found + 1
+
+
+@kernel
+def _sum_close(places, weights, n, near, sums):
+    """Write the places of n close to any of some, ascending, and their probabilities <= 1."""
+    found = low = end = 0
+    for place in places:
+        for y in range(max(place - CLOSE, end), min(place + CLOSE + 1, n)):
+            while places[low] < y - CLOSE:
+                low += 1
+            total, i = 0.0, low
+            while i < len(places) and places[i] <= y + CLOSE:
+                total += weights[i]
+                i += 1
+            near[found], sums[found] = y, min(total, 1.0)
+            found, end = found + 1, y + 1
+    return found
+
+
+@kernel
+def _most_probable(by_place, maxima, excluded):
+    """Return the place with the largest sum but some, ascending, and the sum; 0 if all are."""
+    best, at, i = F(-1), 0, 0
+    for block in range(len(maxima)):
+        while i < len(excluded) and excluded[i] < block * BLOCK:
+            i += 1
+        if maxima[block] <= best:
+            continue
+        for y in range(block * BLOCK, (block + 1) * BLOCK):
+            while i < len(excluded) and excluded[i] < y:
+                i += 1
+            value = F(0) if i < len(excluded) and excluded[i] == y else by_place[y]
+            if value > best:
+                best, at = value, y
+    return at, best

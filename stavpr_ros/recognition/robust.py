@@ -9,9 +9,11 @@ and successive ones are correlated.
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
+from stavpr_ros.compilation import reassociating_kernel
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.map_statistics import MapStatistics
@@ -186,12 +188,14 @@ class Whitening:
 
     :param directions: u_i, shape (W, rank, d), float32.
     :param gains: g_i, shape (W, rank), float64.
+
+    ``change`` holds g_i - 1, shape (W, 1, rank), float32.
     """
 
     def __init__(self, directions: torch.Tensor, gains: torch.Tensor) -> None:
         self.directions, self.gains = directions, gains
         gains = gains[:, None]
-        self._change, self._inverse = (gains - 1).float(), (1 / gains - 1).float()
+        self.change, self._inverse = (gains - 1).float(), (1 / gains - 1).float()
 
     @staticmethod
     def learned(strips: torch.Tensor) -> 'Whitening':
@@ -203,7 +207,7 @@ class Whitening:
 
     def __call__(self, strips: torch.Tensor) -> torch.Tensor:
         """Return features (W, n, d) with the directions shrunk, of less than unit norm."""
-        return self._scaled(strips, self._change)
+        return self._scaled(strips, self.change)
 
     def inverse(self, strips: torch.Tensor) -> torch.Tensor:
         """Return the features that became these."""
@@ -219,7 +223,7 @@ class Whitening:
 
     def to(self, device: torch.device) -> 'Whitening':
         """Return this, moved to a device."""
-        for name in ('directions', '_change', '_inverse'):
+        for name in ('directions', 'change', '_inverse'):
             setattr(self, name, getattr(self, name).to(device))
         return self
 
@@ -295,8 +299,20 @@ class MeanCentering:
         return converted(features, lambda strips: self._converted(strips, self.mean), dtype, see)
 
     def _converted(self, strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
+        if strips.shape[1] == 1 and not strips.is_cuda:
+            return self._converted_image(strips[:, 0], mean)[:, None]
         centered = without_mean(strips, mean)
         return centered if self.whitening is None else normalize(self.whitening(centered))
+
+    def _converted_image(self, strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
+        W, d = strips.shape
+        directions, change = torch.empty((W, 0, d)), torch.empty((W, 1, 0))
+        if self.whitening is not None:
+            directions, change = self.whitening.directions, self.whitening.change
+        out = np.empty((W, d), np.float32)
+        arguments = strips, mean, directions, change[:, 0]
+        _convert_image(*(each.contiguous().numpy() for each in arguments), out)
+        return torch.from_numpy(out)
 
     def next_query(self, strips: torch.Tensor) -> torch.Tensor:
         """
@@ -342,18 +358,72 @@ def z_normalized(row: np.ndarray, around: int = 0) -> np.ndarray:
         counts for less than -1, so that the right one counts little. Images of one light are
         nearer to each other than to all others, wherever they were taken. 0 = no.
     """
-    known = row[np.isfinite(row)]
-    if not known.size:
-        return row
-    z = (row - known.mean()) / np.float32(max(known.std(), MIN_DEVIATION))
+    z = np.empty(len(row), np.float32)
+    _z_normalize(row, z)
     if not around:
         return z
     clipped = np.where(np.isfinite(z), np.maximum(z, -1), np.float32(0))
     return z - uniform_filter1d(clipped, 2 * around + 1, mode='nearest')
 
 
-def change_between(a: np.ndarray, b: np.ndarray) -> float:
+# ------------------------------------------------ kernels: of one image, calls are what takes time
+
+
+@reassociating_kernel
+def change_between(a: np.ndarray, b: np.ndarray) -> Any:
     """Return the change of two images, unit-norm strips (W, d) each; equal where both are zero."""
-    similarity = np.einsum('jd,jd->j', a, b)
-    similarity[~(a.any(axis=1) | b.any(axis=1))] = 1
-    return float(1 - similarity.mean())
+    total = np.float32(0)
+    for j in range(len(a)):
+        x, y = a[j], b[j]
+        dot, norm = np.float32(0), np.float32(0)
+        for t in range(len(x)):
+            dot += x[t] * y[t]
+            norm += x[t] * x[t] + y[t] * y[t]
+        total += dot if norm > 0 else np.float32(1)
+    return 1 - total / len(a)
+
+
+@reassociating_kernel
+def _convert_image(
+    strips: np.ndarray,
+    mean: np.ndarray,
+    directions: np.ndarray,
+    change: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Write an image (W, d) less a mean, whitened (W, rank, d), (W, rank), of unit norm."""
+    for j in range(len(strips)):
+        x, y = strips[j], out[j]
+        alive = np.float32(x.any())
+        y[:] = alive * (x - mean[j])
+        parts = np.empty(directions.shape[1], np.float32)
+        for i in range(len(parts)):
+            direction, part = directions[j, i], np.float32(0)
+            for t in range(len(y)):
+                part += direction[t] * y[t]
+            parts[i] = part * change[j, i]
+        for i in range(len(parts)):
+            direction, part = directions[j, i], parts[i]
+            for t in range(len(y)):
+                y[t] += part * direction[t]
+        squares = np.float32(0)
+        for t in range(len(y)):
+            squares += y[t] * y[t]
+        y /= max(np.sqrt(squares), np.float32(1e-12))
+
+
+@reassociating_kernel
+def _z_normalize(row: np.ndarray, z: np.ndarray) -> None:
+    """Write a row with mean 0 and deviation 1 of its finite entries, in float64 until then."""
+    total, squares, count = 0.0, 0.0, 0
+    for x in row:
+        known = np.isfinite(x)
+        total += x if known else 0.0
+        count += known
+    mean = total / max(count, 1)
+    for x in row:
+        off = x - mean
+        squares += off * off if np.isfinite(x) else 0.0
+    scale = np.float32(1 / max(np.sqrt(squares / max(count, 1)), MIN_DEVIATION))
+    for i in range(len(row)):
+        z[i] = (row[i] - np.float32(mean)) * scale

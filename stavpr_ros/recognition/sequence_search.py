@@ -20,7 +20,7 @@ from stavpr_ros.checks import no_nan
 from stavpr_ros.compilation import kernel
 from stavpr_ros.recognition.map_change import APART, MapChange
 from stavpr_ros.recognition.match import NO_SHARES
-from stavpr_ros.recognition.place_filter import CLOSE, distinct, NEGLIGIBLE, PlaceFilter
+from stavpr_ros.recognition.place_filter import CLOSE, NEGLIGIBLE, PlaceFilter
 from stavpr_ros.recognition.robust import change_between, FilterSettings
 from stavpr_ros.recognition.sessions import Sequences, SessionLayout
 import torch
@@ -266,6 +266,30 @@ class ImageChange(MapChange):
 
 
 @kernel
+def _see(
+    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int,
+    likelihoods: np.ndarray, moves: np.ndarray,
+) -> None:  # fmt: skip
+    """
+    Write what :func:`_smooth` reads.
+
+    :param z: z-normalized distances of each image to the places near the path, (l, S).
+    :param path: place of each image, (l,).
+    :param exponents: of their likelihoods: alpha times the mean of right places, (l,).
+    :param images: the filter's image of each, (l,): none moves that is that of the one before.
+    :param n: places.
+    """
+    for i in range(len(path)):
+        for s in range(z.shape[1]):
+            inside = 0 <= path[i] + s - BAND < n and np.isfinite(z[i, s])
+            likelihoods[i, s] = np.exp(exponents[i] * z[i, s]) if inside else 0
+        step = path[i] - path[i - 1] if i else 0
+        moves[i] = np.where(np.arange(step - 2, step + 3) >= 0, STEPS, 0)
+        if i and images[i] == images[i - 1]:
+            moves[i] = 0, 0, 1, 0, 0
+
+
+@kernel
 def _smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> None:
     """
     Write the probability of each offset from a path at each image, by all images of the window.
@@ -445,21 +469,19 @@ class FilterSearch:
         """
         offsets = np.arange(-BAND, BAND + 1)
         places = path[:, None] + offsets
-        columns = torch.from_numpy(places.clip(0, n - 1))
-        z = self.buffer.rows().gather(1, columns.to(self.buffer.memory.device)).cpu().numpy()
-        exponents = np.array(self._weights)[:, None] * self._levels[level]
-        likelihoods = np.exp(exponents * np.where(np.isfinite(z), z, 0))
-        likelihoods[(places < 0) | (places >= n) | ~np.isfinite(z)] = 0
-        steps = np.diff(path, prepend=path[0])
-        moves = np.where(steps[:, None] + offsets[BAND - 2 : BAND + 3] >= 0, STEPS, 0)
-        moves[1:][np.diff(self._images) == 0] = offsets[BAND - 2 : BAND + 3] == 0
+        inside = places.clip(0, n - 1)
+        columns = torch.from_numpy(inside).to(self.buffer.memory.device)
+        z = self.buffer.rows().gather(1, columns).cpu().numpy()
+        exponents = np.array(self._weights) * self._levels[level]
+        likelihoods, moves = np.empty(places.shape), np.empty((len(path), len(STEPS)))
+        _see(z, path, exponents, np.array(self._images), n, likelihoods, moves)
         masses = np.empty(places.shape)
         masses[0] = np.exp(-0.5 * (offsets / START_DEVIATION) ** 2)
         _smooth(likelihoods, moves, masses)
         refined = path + np.rint(masses @ offsets).astype(np.int64)
         refined = np.maximum.accumulate(refined.clip(self._lowest(path[-1]), n - 1))
         close = np.abs(places - refined[:, None]) <= CLOSE
-        close |= self._equal(places.clip(0, n - 1), refined[:, None])
+        close |= self._equal(inside, refined[:, None])
         return refined, (masses * close).sum(axis=1)
 
     def _equal(self, places: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -476,7 +498,7 @@ class FilterSearch:
     ) -> tuple[int, float]:
         """Return the most probable place beyond a radius, and its probability, 0 if none."""
         around = np.arange(max(0, middle - radius), min(n, middle + radius + 1))
-        now, faint = self.filter.most_probable(distinct(np.append(around, places)))
+        now, faint = self.filter.most_probable(np.sort(np.append(around, places)))
         faint *= NEGLIGIBLE
         apart = np.abs(places - middle) > radius
         if apart.any():

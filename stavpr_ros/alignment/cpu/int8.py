@@ -186,6 +186,19 @@ def _round_places(strips, longest, peak, first, values, reciprocals):
             reciprocals[j, y] = np.float32(1 / np.sqrt(squares)) if squares else np.float32(0)
 
 
+@kernel
+def _round_queries(strips, longest, peak, values, reciprocals):
+    """Round strips (Q, W, d) to int8, and write 1 / length of each rounded one, (Q, W)."""
+    for x, j in np.ndindex(reciprocals.shape):
+        strip, squares = strips[x, j], np.int64(0)
+        scale = _scale(strip, longest, peak)
+        for t in range(len(strip)):
+            value = np.int32(np.rint(scale * strip[t]))
+            squares += value * value
+            values[x, j, t] = value
+        reciprocals[x, j] = np.float32(1 / np.sqrt(squares)) if squares else np.float32(0)
+
+
 @parallel_kernel
 def _copy_places(codes, j, first, values, reciprocals):
     """
@@ -281,17 +294,11 @@ def rounded_queries(queries: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     :param queries: shape (W, Q, d), float32, on any device.
     :returns: int8, (Q, W, d); 1 / length of each rounded strip, (Q, W), float32.
     """
-    d = queries.shape[2]
-    strips = queries.transpose(0, 1).cpu().numpy()
-    lengths = np.linalg.norm(strips, axis=2)
-    peaks = np.abs(strips).max(axis=2, initial=0)
-    with np.errstate(divide='ignore'):
-        scales = np.minimum(_longest(d) / lengths, np.float32(QUERY_PEAK) / peaks)
-    scales[lengths == 0] = 0
-    rounded = np.rint(strips * scales[:, :, None]).astype(np.int8)
-    squares = (rounded.astype(np.int64) ** 2).sum(axis=2)
-    reciprocals = np.where(squares > 0, 1 / np.sqrt(np.maximum(squares, 1)), 0)
-    return rounded, reciprocals.astype(np.float32)
+    W, Q, d = queries.shape
+    rounded, reciprocals = np.empty((Q, W, d), np.int8), np.empty((Q, W), np.float32)
+    strips = queries.transpose(0, 1).contiguous().cpu().numpy()
+    _round_queries(strips, _longest(d), np.float32(QUERY_PEAK), rounded, reciprocals)
+    return rounded, reciprocals
 
 
 def tiled(queries: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
