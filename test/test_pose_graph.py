@@ -281,6 +281,12 @@ def test_update_closure_of_unknown_stamp_is_counted(drive):
     assert graph.pending == 1
 
 
+def test_optimize_images_between_keyframes_have_their_odometry():
+    poses = planar_poses(np.array([[0, 0, 0], [0.2, 0, 0], [0.3, 0.1, 0], [1.5, 0, 0.0]]))
+    found, _ = optimize(SECOND * np.arange(1, 5), poses, [])
+    np.testing.assert_allclose(found[:, :3], poses[:, :3], atol=1e-9)
+
+
 def test_largest_consistent_by_hand():
     conflicts = np.zeros((4, 4), bool)
     conflicts[0, 1] = conflicts[1, 0] = conflicts[1, 2] = conflicts[2, 1] = True
