@@ -281,6 +281,12 @@ def test_update_closure_of_unknown_stamp_is_counted(drive):
     assert graph.pending == 1
 
 
+def test_optimize_images_between_keyframes_have_their_odometry():
+    poses = planar_poses(np.array([[0, 0, 0], [0.2, 0, 0], [0.3, 0.1, 0], [1.5, 0, 0.0]]))
+    found, _ = optimize(SECOND * np.arange(1, 5), poses, [])
+    np.testing.assert_allclose(found[:, :3], poses[:, :3], atol=1e-9)
+
+
 def test_largest_consistent_by_hand():
     conflicts = np.zeros((4, 4), bool)
     conflicts[0, 1] = conflicts[1, 0] = conflicts[1, 2] = conflicts[2, 1] = True
@@ -289,6 +295,14 @@ def test_largest_consistent_by_hand():
     assert light.tolist() == [True, False, True, True]
     heavy = largest_consistent(conflicts, np.array([3, 9, 3, 1]), everyone)
     assert heavy.tolist() == [False, True, False, True]
+
+
+def test_largest_consistent_where_most_opposed_is_in_the_largest_set_finds_it():
+    conflicts = np.zeros((5, 5), bool)
+    for a, b in ((0, 1), (0, 2), (0, 3), (2, 3), (3, 4)):
+        conflicts[a, b] = conflicts[b, a] = True
+    chosen = largest_consistent(conflicts, np.array([15, 9, 10, 19, 16]), np.ones(5, bool))
+    assert chosen.tolist() == [False, True, True, False, True]  # 35; without other starts 28
 
 
 def test_body_covariance_turned_by_90_degrees_swaps_axes():

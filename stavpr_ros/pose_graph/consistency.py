@@ -18,6 +18,8 @@ from stavpr_ros.pose_graph.odometry import KeyframeChain, OdometryNoise
 from stavpr_ros.pose_graph.transforms import angles, inverse
 
 LIMIT = 9.0  # squared deviations
+SIGNIFICANT = 1.92  # difference of logarithms of likelihoods: 95 %, one degree of freedom
+STARTS = 100  # rejected clusters that the search begins with as well
 CLOSURE_FACTORS = (0.05, 0.2, 1.0)  # on the covariances of closures that are tried
 
 
@@ -39,7 +41,7 @@ class ConsistencySettings:
     support: int = 3
     join_support: int = 8
     break_support: int = 32
-    break_distance: float = 50.0
+    break_distance: float = 40.0
 
 
 @dataclass(eq=False)
@@ -124,7 +126,10 @@ class Cycles:
         """
         Return the factor on the errors of the odometry that most probably left these loops open.
 
-        Few closures, and short loops, have no cycles that :meth:`noise_scale` could use.
+        Few closures, and short loops, have no cycles that :meth:`noise_scale` could use. It is the
+        least factor unless the likelihood ratio excludes that one.
+
+        :param scales: rising.
         """
         same = self.query_session == self.place_session
         if not same.any():
@@ -139,7 +144,8 @@ class Cycles:
         turned = noise.rotation**2 * length + (noise.bias * length) ** 2
         odometry = np.array([moved, turned])
         likelihood = [_likelihood(off, measured + scale**2 * odometry) for scale in scales]
-        return float(scales[np.argmax(likelihood)])
+        best = int(np.argmax(likelihood))
+        return float(scales[best if likelihood[best] > likelihood[0] + SIGNIFICANT else 0])
 
     def noise_scale(self, noise: OdometryNoise, scales: np.ndarray) -> float:
         """
@@ -258,13 +264,32 @@ def largest_consistent(
     """
     Return a set without conflicts and of large weight.
 
-    While there are conflicts, the candidate is removed whose opponents weigh most in relation to
-    its own weight; the removed ones without conflicts are added again, heavy ones first.
+    Removing those that are most opposed ends in a set that one change may not improve: it is done
+    again with each rejected candidate in the set, heavy ones first, and the largest set counts.
 
     :param conflicts: symmetric, shape (n, n), bool.
     :param weights: shape (n,).
     :param candidates: shape (n,), bool.
     :returns: shape (n,), bool.
+    """
+    chosen = _without_conflicts(conflicts, weights, candidates)
+    rejected = np.flatnonzero(candidates & ~chosen)
+    for i in rejected[np.argsort(-weights[rejected], kind='stable')][:STARTS]:
+        if not chosen[i]:
+            other = _without_conflicts(conflicts, weights, candidates & ~conflicts[i])
+            if weights[other].sum() > weights[chosen].sum():
+                chosen = other
+    return chosen
+
+
+def _without_conflicts(
+    conflicts: np.ndarray, weights: np.ndarray, candidates: np.ndarray
+) -> np.ndarray:
+    """
+    Return a set without conflicts, shape (n,), bool.
+
+    While there are conflicts, the candidate is removed whose opponents weigh most in relation to
+    its own weight; the removed ones without conflicts are added again, heavy ones first.
     """
     chosen = candidates.copy()
     opposed = conflicts @ (weights * chosen).astype(float)

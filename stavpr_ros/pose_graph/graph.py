@@ -272,10 +272,10 @@ class PoseGraph:
 
     def _adapt_to_loops(self) -> None:
         """Trust the odometry in the solution as far as the first closed loops allow."""
-        members = [each for cluster in self._accepted_clusters() for each in cluster.members]
-        if members:
+        edges = [each for cluster in self._accepted_clusters() for each in independent(cluster)]
+        if edges:
             before = self._loop_scale
-            self._loop_scale = Cycles(self.chain, members).loop_scale(self.settings.noise, SCALES)
+            self._loop_scale = Cycles(self.chain, edges).loop_scale(self.settings.noise, SCALES)
             if not 0.7 < self._loop_scale / before < 1.4:
                 self._solver.restart()
 
@@ -308,12 +308,18 @@ class PoseGraph:
         return [cluster for cluster, taken in pairs if taken]
 
     def _select(self, accepted: list[Cluster], ties: Ties) -> dict[int, ResolvedClosure]:
-        """Return the edges of the solution by their numbers."""
+        """
+        Return the edges of the solution by their numbers.
+
+        Where even the least errors of the odometry explain the first loops, the closures measure
+        them less precisely than the odometry, and would add their own errors.
+        """
         query, place = session_pairs(self.chain, accepted)
+        precise = self._loop_scale == SCALES[0]
         return {
             each.number: each
             for cluster, a, b in zip(accepted, query, place, strict=True)
-            if ties.allows(a, b)
+            if ties.allows(a, b) and not (precise and a == b)
             for each in independent(cluster)
         }
 
@@ -367,12 +373,20 @@ class PoseGraph:
         """Return the number of closures that wait for their odometry."""
         return len(self._pending)
 
-    def at(self, stamp: int) -> np.ndarray | None:
-        """Return the corrected pose at a stamp (ns), shape (7,); None = unknown."""
+    def at(self, stamp: int, odometry: np.ndarray | None = None) -> np.ndarray | None:
+        """
+        Return the corrected pose at a stamp (ns), shape (7,); None = unknown.
+
+        :param odometry: at the stamp, shape (7,); without it, that between keyframes is
+            interpolated.
+        """
         found = self.chain.find(stamp)
         if found is None or found[0] >= len(self.solved):
             return None
-        return to_poses(self.solved[found[0]] @ found[1])
+        node, motion = found
+        if odometry is not None:
+            motion = inverse(self.chain.transforms[node]) @ matrices(odometry)
+        return to_poses(self.solved[node] @ motion)
 
     def map_to_odom(self) -> np.ndarray:
         """Return the transform from the newest odometry's frame to the map, shape (7,)."""

@@ -38,6 +38,6 @@ def optimize(
             graph.update()
     graph.update()
     graph.update(final=True)
-    found = [graph.at(stamp) for stamp in stamps.tolist()]
+    found = [graph.at(t, pose) for t, pose in zip(stamps.tolist(), odometry, strict=True)]
     missing = np.full(7, np.nan)
     return np.array([missing if pose is None else pose for pose in found]), graph
