@@ -353,7 +353,7 @@ class FleetRecognizer(SequenceRecognizer):
         layout = CityLayout(places, firsts, same_as, self._settings.nms_radius)
         sequence = self._settings.sequence
         self._layout = layout
-        self._buffer = SequenceBuffer(sequence.length, layout.width, sequence.k)
+        self._buffer = SequenceBuffer(sequence.length, layout.width, sequence.k, copies=1)
         model, share = FilterSettings(), len(places) / len(self._city)
         model = replace(model, start=model.start * share, enter=model.enter * share)
         self._search = self._filter = FilterSearch(self._buffer, model, layout)
