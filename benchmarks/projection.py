@@ -23,7 +23,7 @@ from stavpr_ros.evaluation.evaluate import evaluate_on_map
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.builder import extract_features
-from stavpr_ros.mapping.reduction import with_principal_components
+from stavpr_ros.mapping.reduction import STRIPS_A_DIRECTION, with_principal_components
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.robust import THRESHOLD
 import torch
@@ -85,7 +85,8 @@ def rows(case: Case, kind: str, extractor: FeatureExtractor) -> Iterator[dict[st
     whole = PlaceMap(places, None, np.zeros(n, np.int64), ('',) * n)
     settings = RecognizerSettings(THRESHOLD, mode='robust')
     for name, (projection, dimension, precision) in COLUMNS.items():
-        if dimension >= places.dimension:
+        limit = len(places.weights) * n // STRIPS_A_DIRECTION
+        if dimension >= places.dimension or (projection == 'pca' and dimension > limit):
             continue
         place_map, images = projected(whole, query, projection, dimension)
         evaluation = evaluate_on_map(

@@ -148,13 +148,19 @@ def test_reset_empties_window(small_map):
     assert one.update(small_map.features[:1]).status is Status.WARMING_UP
 
 
-def test_sequence_buffer_holds_last_rows_in_order():
-    buffer = SequenceBuffer(3, 2, 4)
+@pytest.mark.parametrize('copies', [1, 2])
+def test_sequence_buffer_holds_last_rows_in_order(copies):
+    buffer = SequenceBuffer(3, 2, 4, copies=copies)
+    assert len(buffer.memory) == 3 * copies
     for value in range(8):
         buffer.push(torch.tensor([value, -value], dtype=torch.float32), 10 * value)
         assert len(buffer) == min(value + 1, 3)
         assert buffer.stamps == tuple(10 * i for i in range(max(0, value - 2), value + 1))
+        assert buffer.newest().tolist() == [value, -value]
         if buffer.full:
+            columns = np.array([[0, 1], [1, 0], [1, 1]])
+            expected = [[value - 2, 2 - value], [1 - value, value - 1], [-value, -value]]
+            assert buffer.at(columns).tolist() == expected
             rows = buffer.rows()
             assert rows[:, 0].tolist() == [value - 2, value - 1, value]
             assert rows.is_contiguous()
@@ -164,8 +170,9 @@ def test_sequence_buffer_holds_last_rows_in_order():
     assert torch.isinf(buffer.rows()).all()
 
 
-def test_sequence_buffer_that_grows_and_evicts_keeps_rows():
-    buffer = SequenceBuffer(2, 3, 4)
+@pytest.mark.parametrize('copies', [1, 2])
+def test_sequence_buffer_that_grows_and_evicts_keeps_rows(copies):
+    buffer = SequenceBuffer(2, 3, 4, copies=copies)
     buffer.push(torch.tensor([1.0, 2.0]))
     assert buffer.known == 2
     buffer.grow(5)

@@ -13,7 +13,6 @@ from stavpr_ros.mapping import build_map as map_of
 from stavpr_ros.mapping import GrowingMap, load_map, PlaceMap, select_places
 from stavpr_ros.mapping.reduction import with_principal_components
 from stavpr_ros.sources.frame import Frame
-import torch
 
 D = 6
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -48,14 +47,11 @@ def test_directions_are_those_of_largest_variance(count):
     np.testing.assert_allclose(reduced.features.strips, projected, atol=1e-5)
 
 
-def test_map_of_fewer_strips_than_components_is_reduced_without_loss(whole):
+def test_more_directions_than_a_third_of_the_strips_are_rejected(whole):
     few = select_places(whole, np.arange(3))
-    reduced = with_principal_components(few, 30)
-    x = few.features.strips - few.features.strips.mean(dim=1, keepdim=True)
-    matrix = torch.from_numpy(reduced.projection.matrix)
-    assert matrix.shape == (224, 30)
-    assert not matrix[:, : 30 - 7 * 3].any()
-    torch.testing.assert_close(x @ matrix @ matrix.T, x, rtol=0, atol=1e-4)
+    assert with_principal_components(few, 7).dimension == 7
+    with pytest.raises(SettingsError, match=r'pca:8: the map has 21 strips .* at most 7'):
+        with_principal_components(few, 8)
 
 
 def test_query_of_reduced_map_is_projected_as_its_places(whole):

@@ -205,6 +205,7 @@ class FleetRecognizer(SequenceRecognizer):
         sampled, change = row[: self._sampled], 1.0
         if self._images:
             change = change_between(strips.numpy(), self._images[-1].strips.numpy())
+        self._centering.stands(change < self._learned.standstill)
         mean, deviation = float(sampled.mean()), max(float(sampled.std()), MIN_DEVIATION)
         z = (row[self._sampled :] - np.float32(mean)) / np.float32(deviation)
         image = _Image(strips, features.weights[:, 0], change, stamp, mean, deviation, z)
@@ -353,7 +354,7 @@ class FleetRecognizer(SequenceRecognizer):
         layout = CityLayout(places, firsts, same_as, self._settings.nms_radius)
         sequence = self._settings.sequence
         self._layout = layout
-        self._buffer = SequenceBuffer(sequence.length, layout.width, sequence.k)
+        self._buffer = SequenceBuffer(sequence.length, layout.width, sequence.k, copies=1)
         model, share = FilterSettings(), len(places) / len(self._city)
         model = replace(model, start=model.start * share, enter=model.enter * share)
         self._search = self._filter = FilterSearch(self._buffer, model, layout)

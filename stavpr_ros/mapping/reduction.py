@@ -10,9 +10,9 @@ from stavpr_ros.features import LocalFeatures, Projection
 from stavpr_ros.features.extractor import normalize
 from stavpr_ros.mapping.place_map import PlaceMap
 import torch
-from torch.nn import functional
 
 PIECE = 1024  # places at a time: those of an opened map stay in its file
+STRIPS_A_DIRECTION = 3  # of fewer, directions follow chance (docs/performance.md)
 
 
 def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
@@ -22,7 +22,8 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
     The directions are the same for all strips, and learned from all places. They stay as they are
     when the map grows: images are projected by the matrix that the map holds.
 
-    :param dimension: at least 1 and below that of the features.
+    :param dimension: at least 1, below that of the features, and so small that the map has
+        ``STRIPS_A_DIRECTION`` strips for each.
     :raises SettingsError: another dimension.
     """
     features = place_map.features
@@ -31,7 +32,13 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
         raise SettingsError(
             f'projection pca:{dimension}: the features have {d} dimensions, take 1 to {d - 1}'
         )
-    basis = _directions(features, d, dimension)[:, -dimension:].float()
+    if dimension * STRIPS_A_DIRECTION > W * n:
+        raise SettingsError(
+            f'projection pca:{dimension}: the map has {W * n} strips ({n} places), '
+            f'{STRIPS_A_DIRECTION} are needed for a direction: take at most '
+            f'{W * n // STRIPS_A_DIRECTION}, or add places'
+        )
+    basis = _directions(features, d)[:, -dimension:].float()
     matrix, name = basis.numpy(), f'principal components {d} -> {dimension} of {n} places'
     if before := place_map.projection:
         matrix, name = before.matrix @ matrix, f'{before.name}, {name}'
@@ -48,16 +55,15 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
     )
 
 
-def _directions(features: LocalFeatures, d: int, wanted: int) -> torch.Tensor:
+def _directions(features: LocalFeatures, d: int) -> torch.Tensor:
     """Return the principal directions, (d, m), float64, those of the largest variance last."""
     W, n = features.weights.shape
-    if W * n < d:  # the products of fewer strips than dimensions; beyond them, zeros
+    if W * n < d:  # the products of fewer strips than dimensions
         strips = features[:].strips.double()
         centered = (strips - strips.mean(dim=1, keepdim=True)).flatten(0, 1)
         _, vectors = torch.linalg.eigh(centered @ centered.T)
         directions = vectors.T @ centered
-        directions /= directions.norm(dim=1, keepdim=True).clamp_(min=1e-9)
-        return functional.pad(directions.T, (max(wanted - W * n, 0), 0))
+        return (directions / directions.norm(dim=1, keepdim=True).clamp_(min=1e-9)).T
     total = torch.zeros((W, d), dtype=torch.float64)
     squares = torch.zeros((d, d), dtype=torch.float64)
     for low in range(0, n, PIECE):

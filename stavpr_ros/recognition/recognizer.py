@@ -77,7 +77,8 @@ class SequenceRecognizer:
         self._options = settings.applied_options
         self._layout, self._to_oldest, self._model = layout, to_oldest, model
         columns = places if layout is None else layout.width
-        self._buffer = SequenceBuffer(sequence.length, columns, sequence.k)
+        copies = 1 if self._options.place_filter else 2
+        self._buffer = SequenceBuffer(sequence.length, columns, sequence.k, copies=copies)
         self._filter = None
         if self._options.place_filter:
             self._filter = FilterSearch(self._buffer, model, layout, to_oldest)
@@ -100,7 +101,7 @@ class SequenceRecognizer:
             self._filter.change,
         )
         device = runtime().torch_device
-        self._buffer = SequenceBuffer(sequence.length, places, sequence.k, device=device)
+        self._buffer = SequenceBuffer(sequence.length, places, sequence.k, device=device, copies=1)
         self._filter = FilterSearch(
             self._buffer, self._model, self._layout, self._to_oldest, on_device=True
         )
@@ -159,8 +160,7 @@ class SequenceRecognizer:
 
         :returns: shape (n,), float32; lower is nearer.
         """
-        buffer = self._buffer
-        return self._by_place(buffer.rows()[-1, : buffer.places].cpu().numpy())
+        return self._by_place(self._buffer.newest().cpu().numpy())
 
     def window_rows(self) -> tuple[np.ndarray, int]:
         """

@@ -40,9 +40,8 @@ STEPS = np.array([0.03, 0.12, 0.7, 0.12, 0.03])  # probability of 2 places less 
 
 class SequenceBuffer:
     """
-    A ring of the last l rows that always lies contiguous in memory, oldest row first.
+    A ring of the last l rows.
 
-    Every row is written twice, l rows apart, so that the last l rows are one slice of the memory.
     Rows are checked when they are pushed; the searches over the buffer trust them.
 
     :param length: rows l.
@@ -51,6 +50,8 @@ class SequenceBuffer:
     :param row_width: words from row to row for n places and k; the padding that a kernel needs
         behind the places is +inf.
     :param device: of the memory.
+    :param copies: times that each row is written, l rows apart. 2 = the last l rows are always one
+        slice of the memory, oldest row first, as LM-DTW takes them; 1 = half the memory.
     """
 
     def __init__(
@@ -60,8 +61,9 @@ class SequenceBuffer:
         k: int,
         row_width: Callable[[int, int], int] = padded_width,
         device: torch.device | str = 'cpu',
+        copies: int = 2,
     ) -> None:
-        self.length, self.k = int(length), k
+        self.length, self.k, self._copies = int(length), k, copies
         self._row_width = row_width
         self._first = self._known = self._count = 0
         self._stamps: deque[int] = deque(maxlen=self.length)
@@ -70,10 +72,10 @@ class SequenceBuffer:
     def _allocate(self, places: int, device: torch.device) -> None:
         self.places = places
         self.memory = torch.full(
-            (2 * self.length, self._row_width(places, self.k)), torch.inf, device=device
+            (self._copies * self.length, self._row_width(places, self.k)), torch.inf, device=device
         )
-        twice = self.memory.view(2, self.length, -1)
-        self._slots = [twice[:, slot, :places] for slot in range(self.length)]
+        copies = self.memory.view(self._copies, self.length, -1)
+        self._slots = [copies[:, slot, :places] for slot in range(self.length)]
 
     def __len__(self) -> int:
         return min(self._count, self.length)
@@ -125,8 +127,20 @@ class SequenceBuffer:
         self._count += 1
 
     def rows(self) -> torch.Tensor:
-        """Return the window, (l, n + padding), float32, a contiguous view; padding is +inf."""
+        """Return the window, (l, n + padding), float32; padding is +inf. A view of two copies."""
+        if self._copies == 1:
+            return self.memory.roll(-self.oldest, dims=0)
         return self.memory[self.oldest : self.oldest + self.length]
+
+    def newest(self) -> torch.Tensor:
+        """Return the row of the newest image, (n,), a view."""
+        return self._slots[self.oldest - 1][0]
+
+    def at(self, columns: np.ndarray) -> np.ndarray:
+        """Return entries of the window, oldest row first, by their columns, (l, m) each."""
+        rows = (self.oldest + np.arange(self.length)) % self.length
+        found = self.memory[torch.from_numpy(rows[:, None]), torch.from_numpy(columns)]
+        return found.cpu().numpy()
 
     def clear(self) -> None:
         """Empty the window."""
@@ -486,8 +500,7 @@ class FilterSearch:
         offsets = np.arange(-BAND, BAND + 1)
         places = path[:, None] + offsets
         inside = places.clip(0, n - 1)
-        columns = torch.from_numpy(inside).to(self.buffer.memory.device)
-        z = self.buffer.rows().gather(1, columns).cpu().numpy()
+        z = self.buffer.at(inside)
         exponents = np.array(self._weights) * self._levels[level]
         likelihoods, moves = np.empty(places.shape), np.empty((len(path), len(STEPS)))
         _see(z, path, exponents, np.array(self._images), n, likelihoods, moves)
