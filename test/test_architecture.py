@@ -27,7 +27,7 @@ MAY_IMPORT = {
     'features': set(),
     'mapping': {'alignment', 'sources', 'features'},
     'recognition': {'alignment', 'features', 'mapping'},
-    'fleet': {'features', 'mapping', 'recognition'},
+    'fleet': {'alignment', 'features', 'mapping', 'recognition'},
     'relative_pose': {'alignment', 'features', 'mapping', 'recognition'},
     'pipeline': {'fleet', *CORE[:6]},
     'pose_graph': {'mapping'},

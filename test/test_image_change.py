@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.recognition.blocks import change_between
+from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.recognition.map_change import AHEAD, APART, STRETCH
 from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.sequence_search import FLOOR, ImageChange, OFFSET, SMOOTHED

@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, StavprError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.fleet.city_map import CityMap
@@ -29,7 +30,6 @@ from stavpr_ros.fleet.neighborhoods import Votes
 from stavpr_ros.fleet.store import place_vectors, sample_places
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import Match, RecognizerSettings, Status
-from stavpr_ros.recognition.blocks import change_between
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
 from stavpr_ros.recognition.robust import (

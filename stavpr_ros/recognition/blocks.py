@@ -11,11 +11,11 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
 
 import numba as nb
 import numpy as np
-from stavpr_ros.compilation import parallel_kernel, reassociating_kernel
+from stavpr_ros.alignment.cpu.dot import change_between
+from stavpr_ros.compilation import parallel_kernel
 from stavpr_ros.features import LocalFeatures
 import torch
 
@@ -123,20 +123,6 @@ class PlaceChanges:
             self.changes[apart - 1, self._count + first - before : self._count + m] = out[first:]
         self._count += m
         self._latest = block[:, -len(self.changes) :].clone()
-
-
-@reassociating_kernel
-def change_between(a: np.ndarray, b: np.ndarray) -> Any:
-    """Return the change of two images, unit-norm strips (W, d) each; equal where both are zero."""
-    total = np.float32(0)
-    for j in range(len(a)):
-        x, y = a[j], b[j]
-        dot, norm = np.float32(0), np.float32(0)
-        for t in range(len(x)):
-            dot += x[t] * y[t]
-            norm += x[t] * x[t] + y[t] * y[t]
-        total += dot if norm > 0 else np.float32(1)
-    return 1 - total / len(a)
 
 
 @parallel_kernel

@@ -8,9 +8,10 @@ the same place: 0 for equal images, about 1 for unrelated ones.
 """
 
 import numpy as np
+from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
-from stavpr_ros.recognition.blocks import change_between, PlaceChanges
-from stavpr_ros.recognition.robust import camera_moved, FilterSettings, LEAST_MOVED
+from stavpr_ros.recognition.blocks import PlaceChanges
+from stavpr_ros.recognition.robust import camera_moved, FilterSettings
 import torch
 
 LEARNED_AT_ONCE = 256  # places
@@ -34,7 +35,6 @@ class MapChange:
         self._settings = settings
         self._sums, self._counts = np.zeros(APART + 1), np.zeros(APART + 1)
         self._from_before = np.ones(places, np.float32)  # change of each place from the one before
-        self._equal_places: np.ndarray | None = None  # None = not known yet
         self._update_curve()
 
     def learn(
@@ -90,7 +90,7 @@ class MapChange:
             for apart in range(1, min(APART, last) + 1)
         ]
         self._from_before[n - 1] = changes[0] if changes else 1
-        self._equal_places = None
+        self._equal[n - 1] = self._from_before[n - 1] < self.standstill
         if changes and not changes[0] < self.standstill:
             self._sums[1 : len(changes) + 1] += changes
             self._counts[1 : len(changes) + 1] += 1
@@ -109,37 +109,23 @@ class MapChange:
     def grow(self, places: int) -> None:
         """Make room for more places."""
         more = np.ones(places - len(self._from_before), np.float32)
-        self._from_before, self._equal_places = np.append(self._from_before, more), None
+        self._from_before = np.append(self._from_before, more)
+        self._find_equal()
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
         self._from_before = np.append(self._from_before[count:], np.ones(count, np.float32))
-        self._equal_places = None
+        self._find_equal()
 
     def _update_curve(self) -> None:
         known = self._counts > 0
         self.curve = np.where(known, self._sums / np.maximum(self._counts, 1), 1)
         self.curve[0] = 0
         self.standstill = self._settings.standstill * self.curve[1]
-        self._equal_places = None
+        self._find_equal()
 
-    def distinct(self, n: int) -> np.ndarray:
-        """Return which of n places count, (n,), bool: of a standstill one; all if few would."""
-        distinct = ~self._equal[:n]
-        return distinct if np.count_nonzero(distinct) >= LEAST_MOVED else np.ones(n, bool)
-
-    def stood(self) -> np.ndarray:
-        """Return the places where the map's camera stood, (room,), bool."""
-        stood = self._equal.copy()
-        stood[:-1] |= self._equal[1:]
-        return stood
-
-    @property
-    def _equal(self) -> np.ndarray:
-        """Return which places are equal to the one before up to noise, (room,), bool."""
-        if self._equal_places is None:
-            self._equal_places = self._from_before < self.standstill
-        return self._equal_places
+    def _find_equal(self) -> None:
+        self._equal = self._from_before < self.standstill  # to the place before, up to noise
 
     def unlit(self, by_place: np.ndarray) -> bool:
         """

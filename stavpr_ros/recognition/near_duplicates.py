@@ -5,8 +5,9 @@
 from dataclasses import replace
 
 import numpy as np
+from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.mapping import PlaceMap, select_places
-from stavpr_ros.recognition.blocks import blocks, change_between
+from stavpr_ros.recognition.blocks import blocks
 from stavpr_ros.recognition.robust import FilterSettings, MeanCentering
 from tqdm import tqdm
 

@@ -11,10 +11,15 @@ are places, so that a place is seldom rounded again.
 from copy import copy
 
 import numpy as np
+from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.recognition.blocks import change_between
 from stavpr_ros.recognition.map_change import APART
-from stavpr_ros.recognition.robust import camera_moved, evenly, unit_norm, Whitening
+from stavpr_ros.recognition.robust import (
+    camera_moved,
+    evenly,
+    unit_norm,
+    Whitening,
+)
 from stavpr_ros.recognition.route_strips import grown, move_up, rounded_strips, RouteStrips
 import torch
 

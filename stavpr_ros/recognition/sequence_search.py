@@ -14,15 +14,15 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.alignment.lm_dtw import padded_width, SequenceMatch
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.checks import no_nan
 from stavpr_ros.compilation import kernel
-from stavpr_ros.recognition.blocks import change_between
 from stavpr_ros.recognition.map_change import APART, MapChange
 from stavpr_ros.recognition.match import NO_SHARES
 from stavpr_ros.recognition.place_filter import CLOSE, NEGLIGIBLE, PlaceFilter
-from stavpr_ros.recognition.robust import FilterSettings
+from stavpr_ros.recognition.robust import FilterSettings, LEAST_MOVED
 from stavpr_ros.recognition.sessions import Sequences, SessionLayout
 import torch
 
@@ -243,9 +243,20 @@ class ImageChange(MapChange):
         """Whether the query's images are equal up to noise: the camera stands, or it is dark."""
         return bool(change < self.standstill)
 
+    def distinct(self, n: int) -> np.ndarray:
+        """Return which of n places count, (n,), bool: of a standstill one; all if few would."""
+        distinct = ~self._equal[:n]
+        return distinct if np.count_nonzero(distinct) >= LEAST_MOVED else np.ones(n, bool)
+
+    def stood(self) -> np.ndarray:
+        """Return the places where the map's camera stood, (places there is room for,), bool."""
+        stood = self._equal.copy()
+        stood[:-1] |= self._equal[1:]
+        return stood
+
     def stretches(self, first: int, end: int) -> np.ndarray:
         """Return the number of the stretch of equal places that each is in, (end - first,)."""
-        return np.cumsum(self._from_before[first:end] >= self.standstill)
+        return np.cumsum(~self._equal[first:end])
 
     def weight(self, change: float) -> float:
         """Return the exponent alpha of the image's likelihood."""

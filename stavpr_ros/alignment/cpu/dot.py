@@ -235,3 +235,17 @@ def vertical_image_distances(features, queries, cell_weights, weights, xi, out):
                 aligned = align_lanes(flat, at, W * FEW_IMAGES, FEW_IMAGES, weights, xi, edge)
                 store(lanes, at, aligned)
             out[x, first : first + count] = lanes[:count]
+
+
+@reassociating_kernel
+def change_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the change of two images, unit-norm strips (W, d) each; equal where both are zero."""
+    total = np.float32(0)
+    for j in range(len(a)):
+        x, y = a[j], b[j]
+        dot, norm = np.float32(0), np.float32(0)
+        for t in range(len(x)):
+            dot += x[t] * y[t]
+            norm += x[t] * x[t] + y[t] * y[t]
+        total += dot if norm > 0 else np.float32(1)
+    return 1 - total / len(a)  # type: ignore[return-value]
