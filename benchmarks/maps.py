@@ -176,10 +176,10 @@ def main() -> None:
     parser.add_argument('--output', type=Path, help='JSON file')
     parser.add_argument('--start', nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.start:
-        from stavpr_ros.threads import wait_passively
+    from stavpr_ros.threads import wait_passively
 
-        wait_passively()
+    wait_passively()  # as the node does; the processes that are timed inherit it
+    if arguments.start:
         path, precision, cache = arguments.start
         print(json.dumps(start(Path(path), precision, cache)))
         return

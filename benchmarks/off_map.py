@@ -45,7 +45,8 @@ START_IMAGES, SMALL_MAP = 30, 40
 TOWER = 'tower'
 WARPED = (DAY, 'walk_day', NIGHT, 'walk_night_map')
 SETS = (*WARPED, 'corridor', 'nordland', TOWER)
-CHANGES = ('same', '0.5x', 'varying', '2x', '3x', 'stop 30', 'stop 100', 'drop 0.3')
+STANDING = 200  # places of a standstill in a map
+CHANGES = ('same', '0.5x', 'varying', '2x', '3x', 'stop 30', 'stop 100', 'stop 1000', 'drop 0.3')
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,6 +248,12 @@ def start_numbers(counts: Sequence[int | None]) -> dict[str, Any]:
     }
 
 
+def with_standstill(place_map: PlaceMap) -> PlaceMap:
+    """Return a map whose camera stood for ``STANDING`` places more in its middle."""
+    n = len(place_map)
+    return select_places(place_map, np.sort(np.append(np.arange(n), np.full(STANDING, n // 2))))
+
+
 @dataclass
 class Measurement:
     """
@@ -295,11 +302,18 @@ class Measurement:
             self.add('start', name, start_numbers(counts))
 
     def floors(self, floors: dict[str, PlaceMap]) -> None:
-        """Add the row of floors on maps of other floors: each match is wrong."""
+        """Add the rows of floors on maps of other floors: each match is wrong."""
+        self.left += self._floors(TOWER, floors, floors)
+        standing = {name: with_standstill(place_map) for name, place_map in floors.items()}
+        self._floors(f'{TOWER}, standstill', standing, floors)
+
+    def _floors(
+        self, name: str, maps: dict[str, PlaceMap], floors: dict[str, PlaceMap]
+    ) -> list[Outcome]:
         pairs = [(a, b) for a in floors for b in floors if a != b][:: self.coarser]
         shares, found = {}, []
         for map_name, query_name in tqdm(pairs, desc='floors', leave=False):
-            place_map, query = floors[map_name], floors[query_name]
+            place_map, query = maps[map_name], floors[query_name]
             nothing = GroundTruth(len(query), len(place_map), np.zeros(0, np.int64))
             one = outcome(place_map, query.features, nothing)
             shares[f'{query_name} on {map_name}'] = float(one.accepted.mean())
@@ -308,8 +322,8 @@ class Measurement:
         worst = max(shares, key=shares.__getitem__)
         matched = int(np.count_nonzero(pooled.accepted))
         values = {'images': len(pooled.accepted), 'matched': matched, 'pairs': len(pairs)}
-        self.add('floors', TOWER, values | {'worst_pair': worst, 'worst': shares[worst]})
-        self.left += found
+        self.add('floors', name, values | {'worst_pair': worst, 'worst': shares[worst]})
+        return found
 
     def finish(self) -> Results:
         """Add the pooled rows, and return all."""

@@ -349,6 +349,7 @@ def test_table_of_synthetic_route_has_every_section(route, monkeypatch):
     floors = rows['floors/g/tower']
     assert (floors['pairs'], floors['images']) == (2, 120)
     assert floors['matched'] >= 100  # the same place under another name
+    assert rows['floors/g/tower, standstill']['images'] == 120
     about = results.environment(named_commit='abc')
     text = '\n'.join(off_map_page.markdown(about, json.loads(json.dumps(rows, allow_nan=False))))
     for title in ('Detours', 'Floors', 'Drives', 'The route in reverse', 'Start', 'Calibration'):
