@@ -87,6 +87,12 @@ def test_z_normalized_on_device_equals_that_of_the_cpu(cuda_filter):
     for values in (row, np.full(5, 0.5, np.float32), np.full(3, np.inf, np.float32)):
         found = cuda_filter.z_normalized_on_device(torch.from_numpy(values))
         np.testing.assert_allclose(found, z_normalized(values), rtol=1e-4, atol=1e-5)
+        counted = np.arange(len(values)) % 3 > 0
+        found = cuda_filter.z_normalized_on_device(
+            torch.from_numpy(values), counted=torch.from_numpy(counted)
+        )
+        expected = z_normalized(values, counted=counted)
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(('sessions', 'precision'), [(False, 'int8'), (True, 'float16')])
@@ -95,6 +101,7 @@ def test_recognizer_in_mode_robust_equals_that_of_the_cpu(cuda_filter, sessions,
     generator = torch.Generator().manual_seed(0)
     strips = torch.randn(3, n, d, generator=generator)
     strips /= strips.norm(dim=2, keepdim=True)
+    strips[:, 12:15] = strips[:, 11:12]  # the camera stood
     weights = torch.full((3, n), 3**-0.5)
     features = LocalFeatures(strips, weights, FeatureSettings('gradient', None, 3))
     place_map = descriptor_map(features)
