@@ -202,7 +202,7 @@ class FleetRecognizer(SequenceRecognizer):
             )
         strips = self._centering.next_query(features.strips[:, 0])
         row = self._matcher.distances(strips, features.weights[:, 0]).numpy()
-        sampled, change = row[: self._sampled], 1.0
+        sampled, change = row[: self._sampled][self._learned.distinct(self._sampled)], 1.0
         if self._images:
             change = change_between(strips.numpy(), self._images[-1].strips.numpy())
         self._centering.stands(change < self._learned.standstill)
