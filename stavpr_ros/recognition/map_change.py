@@ -11,11 +11,12 @@ import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.recognition.blocks import PlaceChanges
-from stavpr_ros.recognition.robust import camera_moved, FilterSettings
+from stavpr_ros.recognition.robust import change_weights, FilterSettings
 import torch
 
 LEARNED_AT_ONCE = 256  # places
 APART = 5  # places apart up to which the map's changes are learned
+STANDING = 0.05  # weight of a place by its change, up to which the curve is not learned from it
 AHEAD = 8  # places within which an unlit stretch may begin
 STRETCH = 4  # places in a row, at least, equal each to the one before: an unlit stretch
 UNLIT = 0.3  # probability of such places above which equal images do not mean standstill
@@ -64,7 +65,7 @@ class MapChange:
         n = changes.shape[1]
         if not n:
             return
-        steps = camera_moved(changes[0])
+        steps = change_weights(changes[0]) > STANDING
         steps[list(firsts)] = False
         moving = np.ones(n, bool)  # all steps from the place so far before
         for apart in range(1, min(APART, n - 1) + 1):

@@ -32,8 +32,8 @@ PRIOR = 20  # images that the map's mean counts for in the query's, and at most 
 RANK = 64  # directions that whitening shrinks, at most
 SAMPLE = 256  # places that whitening is learned from
 STRENGTH = 1.5  # of whitening: c in the gains of its directions
-LARGE, NOISE = 0.97, 0.05  # quantile of changes from place to place; noise over it, at most
-LEAST_MOVED = 5  # places: fewer have no meaningful mean and deviation
+LARGE, SLOW = 0.97, 0.25  # quantile of changes from place to place; share below which one creeps
+LEAST_DISTINCT = 5  # places: fewer have no meaningful mean and deviation
 MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
 
 
@@ -283,14 +283,13 @@ class MeanCentering:
         for _, strips in converted_blocks(features, lambda some: some.strips):
             seen.add(strips)
             total += strips.sum(dim=1)
-        counted = camera_moved(seen.changes[0])
-        for places, some in blocks(features) if not counted.all() else ():
-            total -= some.strips[:, ~counted[places]].sum(dim=1)
-        count = max(int(np.count_nonzero(counted)), 1)
-        self.mean = (total / count).float() * self._centering  # (W, d)
+        weights = change_weights(seen.changes[0])
+        for places, some in blocks(features) if weights.min(initial=1) < 1 else ():
+            less = torch.from_numpy(1 - weights[places]).to(total.device)
+            total -= (some.strips * less[:, None]).sum(dim=1)
+        self.mean = (total / max(weights.sum(), 1)).float() * self._centering  # (W, d)
         if whitening and len(features):
-            sample = np.flatnonzero(counted)[evenly(count, SAMPLE)]
-            centered = self.places(features[sample]).strips
+            centered = self.places(features[evenly_weighted(weights, SAMPLE)]).strips
             self.whitening = Whitening.learned(centered.cpu()).to(centered.device)
 
     def reset(self) -> None:
@@ -357,6 +356,12 @@ def evenly(n: int, count: int) -> np.ndarray:
     return np.unique(np.linspace(0, max(n - 1, 0), min(n, count)).astype(np.int64))
 
 
+def evenly_weighted(weights: np.ndarray, count: int) -> np.ndarray:
+    """Return at most ``count`` places, evenly spaced by their weights, 1 at most, int64."""
+    sums = weights.cumsum()
+    return np.unique(np.searchsorted(sums, evenly(int(sums[-1]), count) + 0.5))
+
+
 def unit_norm(strips: torch.Tensor) -> torch.Tensor:
     """Return features (..., d) with unit norm; zero ones stay zero."""
     return normalize(strips.clone())
@@ -394,19 +399,21 @@ def z_normalized(
     return z - uniform_filter1d(clipped, 2 * around + 1, mode='nearest')
 
 
-def camera_moved(changes: np.ndarray) -> np.ndarray:
+def change_weights(changes: np.ndarray) -> np.ndarray:
     """
-    Return at which places the camera had moved since the place before, (n,), bool.
+    Return how much each place counts, (n,): less where the camera stood or crept.
 
-    Where it stands, places differ by noise: by less than a twentieth of the large changes, of
-    which the largest ones, from one drive to another, do not count. All have moved if few would.
+    In proportion to the change from the place before, up to ``SLOW`` of the large changes; the
+    largest ones, from one drive to another, do not matter.
 
-    :param changes: of each place from the one before, (n,); the first one is not looked at.
+    :param changes: of each place from the one before, (n,); that of the first does not matter.
     """
     large = float(np.quantile(changes, LARGE, method='lower')) if len(changes) else 0.0
-    found: np.ndarray = changes >= NOISE * large
-    found[:1] = True
-    return found if np.count_nonzero(found) >= LEAST_MOVED else np.ones(len(changes), bool)
+    weights: np.ndarray = (
+        np.minimum(changes / (SLOW * large), 1) if large else np.ones(len(changes))
+    )
+    weights[:1] = 1
+    return weights
 
 
 # ------------------------------------------------ kernels: of one image, calls are what takes time

@@ -15,8 +15,8 @@ from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.map_change import APART
 from stavpr_ros.recognition.robust import (
-    camera_moved,
-    evenly,
+    change_weights,
+    evenly_weighted,
     unit_norm,
     Whitening,
 )
@@ -73,7 +73,7 @@ class RouteFeatures:
         self._weights = torch.empty((settings.strips, 0))
         # (W, room): the norm of each feature before it was made unit norm; 0 for zero features
         self._norms = torch.empty((settings.strips, 0), device=self._device)
-        # of the original features of all places, and of those that differ, (W, d)
+        # of the original features, and weighted by the change from place to place, (W, d)
         self._sum = self._mean = torch.empty((settings.strips, 0))
         self._newest = np.empty((settings.strips, 0), np.float32)  # original
         self._changes = np.empty(0, np.float32)  # from place to place, (room,)
@@ -165,13 +165,13 @@ class RouteFeatures:
         kept = self.count - count
         self._weights[:, :kept] = self._weights[:, count : self.count].clone()
         if (self._centering or self._whitens) and not self._is_settled:
-            self._sum -= self._total(np.ones(count, bool))
+            self._sum -= self._total(np.ones(count))
             self.count = kept
             self._learn(count)
             self._changes[:kept] = self._changes[count : count + kept].copy()
             self._next_mean = self.count + count + 1
             return
-        self._sum -= self._total(np.ones(count, bool))
+        self._sum -= self._total(np.ones(count))
         self._changes[:kept] = self._changes[count : self.count].copy()
         if isinstance(self.strips, torch.Tensor):
             move_up(self.strips, count, self.count)
@@ -213,39 +213,40 @@ class RouteFeatures:
         self._norms, self._weights = grown(self._norms, room), grown(self._weights, room)
         self._changes = np.append(self._changes, np.zeros(room - n, np.float32))
 
-    def _total(self, places: np.ndarray) -> torch.Tensor:
-        """Return the sum of the original features of some of the oldest places, (W, d)."""
+    def _total(self, weights: np.ndarray) -> torch.Tensor:
+        """Return the weighted sum of the original features of the oldest places, (W, d)."""
         total = torch.zeros_like(self._sum)
         if not self._centering:
             return total
-        for low in range(0, len(places), PIECE):
-            piece = slice(low, min(low + PIECE, len(places)))
-            if not places[piece].any():
+        for low in range(0, len(weights), PIECE):
+            piece = slice(low, min(low + PIECE, len(weights)))
+            if not weights[piece].any():
                 continue
-            norms = self._norms[:, piece] * torch.from_numpy(places[piece]).to(self._device)
-            of_piece = torch.stack(
-                [a @ b for a, b in zip(norms, self._float32(piece), strict=True)]
-            )
+            of_place = torch.from_numpy(weights[piece]).float().to(self._device)
+            norms, alive = self._norms[:, piece] * of_place, self._norms[:, piece] > 0
+            sums = [own @ strips for own, strips in zip(norms, self._float32(piece), strict=True)]
+            of_piece = torch.stack(sums)
             if self._there:
                 of_piece = self._there.inverse(of_piece[:, None])[:, 0]
-            total += of_piece.cpu() + (norms > 0).sum(dim=1, keepdim=True).cpu() * self._mean
+            total += (
+                of_piece.cpu() + (alive * of_place).sum(dim=1, keepdim=True).cpu() * self._mean
+            )
         return total
 
-    def _mean_of_distinct(self, first: int, moved_on: np.ndarray) -> torch.Tensor:
-        """Return the mean of the places from ``first`` on at which the camera had moved."""
-        others = np.append(np.zeros(first, bool), ~moved_on)
-        total = self._sum - self._total(others) if others.any() else self._sum
-        return (total / int(np.count_nonzero(moved_on))).float()
+    def _weighted_mean(self, first: int, weights: np.ndarray) -> torch.Tensor:
+        """Return the mean of the places from ``first`` on, of these weights."""
+        less = np.append(np.zeros(first), 1 - weights)
+        total = self._sum - self._total(less) if less.any() else self._sum
+        return (total / weights.sum()).float()
 
     def _learn(self, first: int) -> None:
         """Take the present mean and, of a short route, whitening; ``first`` becomes place 0."""
-        moved_on = camera_moved(self._changes[first : first + self.count])
-        mean = self._mean_of_distinct(first, moved_on) if self._centering else self._mean
+        weights = change_weights(self._changes[first : first + self.count])
+        mean = self._weighted_mean(first, weights) if self._centering else self._mean
         self._shift(first, 0, self._whitened((self._mean - mean)[:, None])[:, 0])
         self._mean = mean
         if self._whitens and self.count <= SETTLED:
-            distinct = np.flatnonzero(moved_on)
-            some = distinct[evenly(len(distinct), SAMPLE)]
+            some = evenly_weighted(weights, SAMPLE)
             whitening = Whitening.learned(unit_norm(self._centered(some)).cpu())
             there = copy(whitening).to(self._device)
             for low in range(0, self.count, AT_ONCE):
@@ -258,7 +259,7 @@ class RouteFeatures:
 
     def _update_mean(self) -> None:
         """Take the present mean for rounded features, and round them again."""
-        mean = self._mean_of_distinct(0, camera_moved(self._changes[: self.count]))
+        mean = self._weighted_mean(0, change_weights(self._changes[: self.count]))
         change = self._whitened((self._mean - mean)[:, None])[:, 0].to(self._device)
         for low in range(0, self.count, PIECE):
             piece = slice(low, min(low + PIECE, self.count))

@@ -22,7 +22,7 @@ from stavpr_ros.compilation import kernel
 from stavpr_ros.recognition.map_change import APART, MapChange
 from stavpr_ros.recognition.match import NO_SHARES
 from stavpr_ros.recognition.place_filter import CLOSE, NEGLIGIBLE, PlaceFilter
-from stavpr_ros.recognition.robust import FilterSettings, LEAST_MOVED
+from stavpr_ros.recognition.robust import FilterSettings, LEAST_DISTINCT
 from stavpr_ros.recognition.sessions import Sequences, SessionLayout
 import torch
 
@@ -246,7 +246,7 @@ class ImageChange(MapChange):
     def distinct(self, n: int) -> np.ndarray:
         """Return which of n places count, (n,), bool: of a standstill one; all if few would."""
         distinct = ~self._equal[:n]
-        return distinct if np.count_nonzero(distinct) >= LEAST_MOVED else np.ones(n, bool)
+        return distinct if np.count_nonzero(distinct) >= LEAST_DISTINCT else np.ones(n, bool)
 
     def stood(self) -> np.ndarray:
         """Return the places where the map's camera stood, (places there is room for,), bool."""
