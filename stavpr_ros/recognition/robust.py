@@ -32,7 +32,8 @@ PRIOR = 20  # images that the map's mean counts for in the query's, and at most 
 RANK = 64  # directions that whitening shrinks, at most
 SAMPLE = 256  # places that whitening is learned from
 STRENGTH = 1.5  # of whitening: c in the gains of its directions
-LARGE, SLOW = 0.97, 0.25  # quantile of changes from place to place; share below which one creeps
+LARGE = 0.97  # quantile of changes from place to place
+NOISE, SLOW = 0.02, 0.1  # shares of it: of a camera that stands at most, and creeps
 LEAST_DISTINCT = 5  # places: fewer have no meaningful mean and deviation
 MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
 
@@ -403,15 +404,15 @@ def change_weights(changes: np.ndarray) -> np.ndarray:
     """
     Return how much each place counts, (n,): less where the camera stood or crept.
 
-    In proportion to the change from the place before, up to ``SLOW`` of the large changes; the
-    largest ones, from one drive to another, do not matter.
+    Nothing below a change from the place before of ``NOISE``, fully above ``SLOW`` of the large
+    changes, and in proportion between; the largest, from one drive to another, do not matter.
 
     :param changes: of each place from the one before, (n,); that of the first does not matter.
     """
     large = float(np.quantile(changes, LARGE, method='lower')) if len(changes) else 0.0
-    weights: np.ndarray = (
-        np.minimum(changes / (SLOW * large), 1) if large else np.ones(len(changes))
-    )
+    if not large:
+        return np.ones(len(changes))
+    weights: np.ndarray = np.clip((changes / large - NOISE) / (SLOW - NOISE), 0, 1)
     weights[:1] = 1
     return weights
 
