@@ -46,7 +46,8 @@ TOWER = 'tower'
 WARPED = (DAY, 'walk_day', NIGHT, 'walk_night_map')
 SETS = (*WARPED, 'corridor', 'nordland', TOWER)
 STANDING = 200  # places of a standstill in a map
-CHANGES = ('same', '0.5x', 'varying', '2x', '3x', 'stop 30', 'stop 100', 'stop 1000', 'drop 0.3')
+LONG_STOP = 'stop 1000'  # not pooled: so many images of one probability
+CHANGES = ('same', '0.5x', 'varying', '2x', '3x', 'stop 30', 'stop 100', 'drop 0.3', LONG_STOP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,10 +283,10 @@ class Measurement:
         found = dict(drives(pair))
         for name, each in found.items():
             self.add('drives', name, each.numbers())
+        pooled = [each for name, each in found.items() if not name.endswith(LONG_STOP)]
         if len(found) > 1:
-            pooled = Outcome.pooled(list(found.values()))
-            self.add('drives', f'{pair.name}/all', pooled.numbers())
-        self.driven += found.values()
+            self.add('drives', f'{pair.name}/all', Outcome.pooled(pooled).numbers())
+        self.driven += pooled
         bar(f'{pair.name} in reverse order')
         if not pair.long:
             self.add('reverse', pair.name, changed(pair, DriveChanges(reverse=True)).numbers())

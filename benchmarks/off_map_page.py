@@ -152,7 +152,8 @@ SECTIONS: tuple[tuple[str, str, str, tuple[str, ...], Callable[..., list[str]]],
         'drives',
         'Drives at other speeds, with stops and dropped images',
         'Half speed shows every image twice; "stop" repeats the image in the middle so many '
-        'times; "drop" leaves images out with this probability; "all" pools the rows above it. '
+        'times; "drop" leaves images out with this probability; "all" pools the rows above it '
+        'but the stop of 1000. '
         'Best F1 is over all thresholds, P and R are those of the default.',
         ('map and query / change', 'images', 'best F1', 'P', 'R', 'R at 100 % P'),
         _drive_cells,
