@@ -73,7 +73,7 @@ class RouteFeatures:
         self._weights = torch.empty((settings.strips, 0))
         # (W, room): the norm of each feature before it was made unit norm; 0 for zero features
         self._norms = torch.empty((settings.strips, 0), device=self._device)
-        # of the original features, and weighted by the change from place to place, (W, d)
+        # sum of the original features, and their mean weighted by `change_weights`, (W, d)
         self._sum = self._mean = torch.empty((settings.strips, 0))
         self._newest = np.empty((settings.strips, 0), np.float32)  # original
         self._changes = np.empty(0, np.float32)  # from place to place, (room,)
