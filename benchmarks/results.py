@@ -141,12 +141,14 @@ def versions() -> dict[str, str]:
 def environment(device: str = 'cpu', named_commit: str = '') -> dict[str, Any]:
     """Return machine, versions, commit and date of a run, for a call before it begins."""
     import numba
+    from stavpr_ros.alignment.cpu.simd import LANES
     import torch
 
     machine: dict[str, Any] = {
         'cpu': cpu_model(),
         'architecture': platform.machine(),
         'instruction_sets': instruction_sets(),
+        'vector_bits': 32 * LANES,  # of the kernels; less than there are by NUMBA_CPU_FEATURES
         'cores': len(os.sched_getaffinity(0)),
         'torch_threads': torch.get_num_threads(),
         'numba_threads': numba.get_num_threads(),
@@ -184,8 +186,8 @@ def heading(title: str, about: dict[str, Any]) -> list[str]:
 
 
 def file_name(machine: dict[str, Any]) -> str:
-    """Return the name of a machine for file names."""
-    name = machine.get('gpu') or f'{machine["cpu"]} {machine["cores"]} cores'
+    """Return the name of a machine for file names, on a CPU with the vectors of the kernels."""
+    name = machine.get('gpu') or '{cpu} {cores} cores {vector_bits} bit'.format(**machine)
     return re.sub(r'[^a-z0-9]+', '-', name.lower()).strip('-')
 
 

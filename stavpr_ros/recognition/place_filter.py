@@ -39,6 +39,7 @@ from stavpr_ros.alignment.cpu.simd import (
     load,
     load_bytes,
     load_splat,
+    prefetch,
     select,
     splat,
     store,
@@ -46,6 +47,7 @@ from stavpr_ros.alignment.cpu.simd import (
 )
 from stavpr_ros.compilation import kernel, parallel_kernel
 from stavpr_ros.recognition.robust import FilterSettings
+import torch
 
 F, INT = np.float32, np.int32
 PLACES = 2048  # that a thread takes at a time
@@ -56,6 +58,7 @@ LEAST, MOST = -87.0, 80.0  # exponents that float32 holds
 TOP = 64  # places whose states are followed back
 NEGLIGIBLE = 1e-3  # of the most probable state: states below are not followed back
 CLOSE = 2  # places: the probability of a place is that of so many to either side, too
+LINE = 16  # numbers of a cache line
 ALL_BORN = BORN | BORN << 4  # two origins
 
 
@@ -119,7 +122,7 @@ class PlaceFilter:
         K, V = len(self._levels), len(self._speeds)
         self._room, blocks = room, max(1, -(-room // BLOCK))
         # not normalized: times scale, the states are probabilities
-        self._a: np.ndarray = np.zeros((blocks, K, V, BLOCK), np.float32)
+        self._a: np.ndarray = torch.zeros((blocks, K, V, BLOCK)).numpy()
         self._by_place: np.ndarray = np.zeros(blocks * BLOCK, np.float32)  # sums of the states
         self._maxima: np.ndarray = np.zeros(blocks, np.float32)  # of these, by block
         shape = len(self._steps), blocks, K, (V + 1) // 2, BLOCK
@@ -459,6 +462,14 @@ def _sum_of_lanes(values, at):
     return total
 
 
+@kernel
+def _scratch(size):
+    """Return zeros, (size,), that begin with a cache line."""
+    memory = np.zeros(size + LINE, np.float32)
+    first = -memory.ctypes.data % (LINE * memory.itemsize) // memory.itemsize
+    return memory[first : first + size]
+
+
 @parallel_kernel
 def advance(
     a, n, z, weight, mu, levels, speeds, steps, spread, stay_on, births, halos, origins, totals,
@@ -487,13 +498,15 @@ def advance(
     reach, halves, parts = halos.shape[3], origins.shape[2], (n + PLACES - 1) // PLACES
     width, size = reach + BLOCK, K * V * BLOCK
     states, flat_halos, flat_origins = a.reshape(-1), halos.reshape(-1), origins.reshape(-1)
-    for part in nb.prange(1, parts):
-        halos[part] = a[part * PLACES // BLOCK - 1, :, :, BLOCK - reach :]
+    for part in range(1, parts):  # no work worth waking a thread
+        for row in range(K * V):
+            before = ((part * PLACES // BLOCK - 1) * K * V + row + 1) * BLOCK - reach
+            for x in range(0, reach, LANES):
+                store(flat_halos, (part * K * V + row) * reach + x, load(states, before + x))
     for part in nb.prange(parts):
-        mixed = np.empty(K * V * width, np.float32)
-        seen, places = np.empty((K, BLOCK), np.float32), np.empty(BLOCK, np.float32)
-        b = np.zeros((V + 1) * LANES, np.float32)
-        sums, lanes = np.zeros(K * LANES, np.float32), np.empty(LANES, np.float32)
+        mixed, places = _scratch(K * V * width), _scratch(BLOCK)
+        seen, b = _scratch(K * BLOCK).reshape(K, BLOCK), _scratch((V + 1) * LANES)
+        sums, lanes = _scratch(K * LANES), np.empty(LANES, np.float32)
         blocks = (min(n - part * PLACES, PLACES) + BLOCK - 1) // BLOCK
         for block in range(blocks - 1, -1, -1):
             first = part * PLACES + block * BLOCK
@@ -516,6 +529,9 @@ def advance(
                 total = splat(F(0))
                 for v in range(V):
                     row, step = (k * V + v) * width, steps[v]
+                    following = (max(at - 1, 0) * K * V + k * V + v) * BLOCK
+                    for line in range(following, following + BLOCK, LINE):
+                        prefetch(states, line)
                     if first + count == n:
                         ending = mixed[row : row + reach + count]
                         totals[at, k, 1] += _lost(ending, step, spread)
@@ -587,8 +603,11 @@ def followed_back(a, least, tops, origins, steps, newest, count, ways, probabili
                     ways[found, 3], ways[found, 4] = y, v
                     probabilities[found] = p
                     found += 1
+    _, blocks, _, halves, _ = origins.shape
+    flat = origins.reshape(-1)
     for i in range(count):  # all together: each waits for its memory
         slot, left = (newest - i) % len(origins), 0
+        earlier = (newest - i - 1) % len(origins) * blocks
         for at in range(found):
             speed, place = _before(
                 ways[at, 1], ways[at, 4], ways[at, 0], origins[slot], steps[slot]
@@ -596,6 +615,8 @@ def followed_back(a, least, tops, origins, steps, newest, count, ways, probabili
             if place >= 0:
                 ways[left], probabilities[left] = ways[at], probabilities[at]
                 ways[left, 0], ways[left, 4] = place, speed
+                row = ((earlier + place // BLOCK) * a.shape[1] + ways[at, 1]) * halves
+                prefetch(flat, (row + speed // 2) * BLOCK + place % BLOCK)
                 left += 1
         found = left
     return found

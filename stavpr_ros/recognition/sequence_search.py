@@ -115,13 +115,14 @@ class SequenceBuffer:
         :raises InputError: NaN or -inf in the row; the buffer is unchanged. Not checked on a CUDA
             device, which would have to be waited for.
         """
-        if not row.is_cuda and not float(row.sum()) > -torch.inf:
-            no_nan(row.numpy(), 'image distances')
         slot, m = self._slots[self._count % self.length], len(row)
-        if m == self.places:
-            slot.copy_(row)
-        else:
+        if row.is_cuda:
             slot[:, :m], slot[:, m:] = row, torch.inf
+        else:  # by NumPy: torch wakes a thread for a row of 32,768 places
+            values, entries = row.numpy(), slot.numpy()
+            if not values.sum() > -np.inf:
+                no_nan(values, 'image distances')
+            entries[:, :m], entries[:, m:] = values, np.inf
         self._known = max(self._known, m)
         self._stamps.append(stamp)
         self._count += 1

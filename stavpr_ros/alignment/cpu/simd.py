@@ -28,6 +28,7 @@ def _lanes() -> int:
 
 
 LANES = _lanes()
+PREFETCH = 0, 2, 1  # to read; into the second cache; data
 
 
 class Vector(types.Type):
@@ -145,6 +146,26 @@ def store_bytes(typing: Any, array: Any, offset: Any, vector: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, vector), generate
+
+
+@intrinsic
+def prefetch(typing: Any, array: Any, offset: Any) -> Any:
+    """Bring the cache line of a number of a flat array nearer: it is read and written soon."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        byte, whole = ir.IntType(8).as_pointer(), ir.IntType(32)
+        function_type = ir.FunctionType(ir.VoidType(), [byte, whole, whole, whole])
+        name = 'llvm.prefetch.p0'
+        function = builder.module.globals.get(name) or ir.Function(
+            builder.module, function_type, name
+        )
+        address = builder.bitcast(builder.gep(data, [arguments[1]]), byte)
+        is_write, locality, is_data = (ir.Constant(whole, value) for value in PREFETCH)
+        builder.call(function, [address, is_write, locality, is_data])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), generate
 
 
 @intrinsic
