@@ -15,7 +15,7 @@ PIECES = 256  # of an array that threads read
 READ_MB = {'cpu': 1024, 'cuda': 8192}
 
 
-def _reader(threads: int) -> Callable[[np.ndarray], float]:
+def reader(threads: int) -> Callable[[np.ndarray], float]:
     """Compile the sum over an array, in pieces."""
     import numba as nb
 
@@ -38,7 +38,7 @@ def _reader(threads: int) -> Callable[[np.ndarray], float]:
 def read_bandwidth(megabytes: int, threads: int, seconds: float) -> float:
     """Return the bytes per second that this number of cores reads from memory."""
     x = np.ones(megabytes * 2**20 // 4, np.float32)
-    read = _reader(threads)
+    read = reader(threads)
     return x.nbytes / best_seconds(lambda: read(x), 'cpu', seconds)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from lower_bounds import Peaks
 from memory import Memory, TARGET
-from results import heading, number_text, Row, seconds_text, Skipped, table
+from results import heading, number_text, READING, Row, seconds_text, Skipped, table
 from targets import cells_per_s, Target, TARGETS
 
 ROBUST_STAGES = (
@@ -49,8 +49,10 @@ def frame_section(rows: Sequence[Row]) -> list[str]:
             seconds_text(s)
             for s in (*parts, sum(parts), row.median_s, row.spread_s, row.lower_bound_s)
         ]
-        lines.append([*_sizes(row)[2:], *texts, number_text(row.ratio)])
-    head = (*SIZES[2:], *ROBUST_STAGES, 'sum', 'frame', 'spread', 'lower bound', 'ratio')
+        over = [number_text(1 / peer.ratio) for peer in row.peers if peer.name == READING]
+        lines.append([*_sizes(row)[2:], *texts, number_text(row.ratio), *(over or ['-'])])
+    last = 'sum', 'frame', 'spread', 'lower bound', 'ratio', f'over {READING}, in turn'
+    head = (*SIZES[2:], *ROBUST_STAGES, *last)
     return ['## A frame in mode robust (the default), stage by stage', '', *table(head, lines)]
 
 

@@ -11,9 +11,11 @@ from typing import Any
 from baselines import accumulated, PlainFilter, prange, sample
 from data import free_bytes, make_features, make_window
 import lower_bounds as bounds
-from lower_bounds import Sizes
+from lower_bounds import ITEM_BYTES, Sizes
+import numba as nb
 import numpy as np
-from peaks import slower_than_float32
+from peaks import reader, slower_than_float32
+from results import READING
 from run import Peer, Run
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.alignment.lm_dtw import (
@@ -217,9 +219,20 @@ def feature_stages(run: Run, n: int, d: int, precisions: Sequence[str], seed: in
         for mode in MODES:
             call = frame(places, queries, mode, precision, run.device)
             works = frame_works(sizes, mode, precision)
-            run.measure('frame', size, call, works, peers, precision, mode)
+            # of mode paper, the product is the larger part of the work
+            beside = peers if mode == 'paper' else map_reading(sizes, precision, run.device)
+            run.measure('frame', size, call, works, beside, precision, mode)
             del call
             gc.collect()
+
+
+def map_reading(sizes: Sizes, precision: str, device: str) -> list[Peer]:
+    """Return the reading of as many bytes as the map has, as a peer; none on a GPU."""
+    if device != 'cpu':
+        return []
+    content = np.ones(sizes.W * sizes.n * sizes.d * ITEM_BYTES.get(precision, 1) // 4, np.float32)
+    call = partial(reader(nb.get_num_threads()), content)
+    return [Peer(READING, timed(call), 'as many bytes read once, on all cores', partial=True)]
 
 
 def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:

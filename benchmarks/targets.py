@@ -5,16 +5,20 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from results import Row
+from results import READING, Row
+
+CELLS, PRANGE, LIBROSA = 'cells per second', 'times plain prange', 'times librosa'
+PRODUCT, BOUND = 'over the float32 product', 'over the lower bound'
+READ = f'over {READING}, in turn'
 
 
 def _times(peer: str) -> Callable[[Row], float | None]:
     return lambda row: next((time.ratio for time in row.peers if time.name == peer), None)
 
 
-def _over_product(row: Row) -> float | None:
-    ratio = _times('torch float32')(row)
-    return 1 / ratio if ratio else None
+def _over(peer: str) -> Callable[[Row], float | None]:
+    times = _times(peer)
+    return lambda row: 1 / ratio if (ratio := times(row)) else None
 
 
 def cells_per_s(row: Row) -> float | None:
@@ -23,11 +27,12 @@ def cells_per_s(row: Row) -> float | None:
 
 
 VALUES: dict[str, Callable[[Row], float | None]] = {
-    'cells per second': cells_per_s,
-    'times plain prange': _times('prange'),
-    'times librosa': _times('librosa'),
-    'over the float32 product': _over_product,
-    'over the lower bound': lambda row: row.ratio,
+    CELLS: cells_per_s,
+    PRANGE: _times('prange'),
+    LIBROSA: _times('librosa'),
+    PRODUCT: _over('torch float32'),
+    READ: _over(READING),
+    BOUND: lambda row: row.ratio,
     'seconds': lambda row: row.median_s,
 }
 
@@ -64,8 +69,6 @@ class Target:
         return found <= self.wanted if self.relation == '<=' else found >= self.wanted
 
 
-CELLS, PRANGE, LIBROSA = 'cells per second', 'times plain prange', 'times librosa'
-PRODUCT, BOUND = 'over the float32 product', 'over the lower bound'
 TARGETS = (
     Target('cpu', 'lm_dtw', 'paper', 20_000, 0, 'float32', CELLS, '>=', 2.5e9),
     Target('cpu', 'lm_dtw', 'paper', 20_000, 0, 'float32', PRANGE, '>=', 8),
@@ -75,6 +78,9 @@ TARGETS = (
     Target('cpu', 'lm_dtw', 'paper', 100_000, 0, 'float32', LIBROSA, '>=', 100),
     Target('cpu', 'distance_matrix', '', 2_000, 512, 'float32', PRODUCT, '<=', 1.25),
     Target('cpu', 'distance_matrix', '', 20_000, 512, 'float32', PRODUCT, '<=', 1.25),
+    Target('cpu', 'frame', 'robust', 20_000, 224, 'float32', READ, '<=', 1.5),
+    Target('cpu', 'frame', 'robust', 20_000, 512, 'float32', READ, '<=', 1.5),
+    Target('cpu', 'frame', 'robust', 100_000, 224, 'float32', READ, '<=', 1.5),
     Target('cpu', 'frame', 'paper', 20_000, 512, 'float32', BOUND, '<=', 1.5),
     Target('cpu', 'frame', 'paper', 20_000, 512, 'float16', PRODUCT, '<=', 0.6),
     Target('cpu', 'frame', 'paper', 100_000, 512, 'float16', 'seconds', '<=', 0.1),
