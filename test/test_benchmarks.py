@@ -488,7 +488,7 @@ def test_city_holds_real_places_at_its_first():
 
 
 def test_graph_of_committed_results_is_drawn(tmp_path):
-    path = results.RESULTS / 'matching-amd-epyc-2-cores-256-bit.json'
+    path = results.RESULTS / 'matching-amd-epyc-2-cores-512-bit.json'
     rows = graphs.read(path)
     assert {row.stage for row in rows} >= {'image_distances', 'filter_update', 'frame'}
     graphs.draw(rows, tmp_path / 'graph.png')
