@@ -67,7 +67,7 @@ def test_optimize_without_the_ratio_would_move_precise_odometry(monkeypatch):
 
 @pytest.mark.parametrize(('off', 'moves'), [(0.0, False), (0.4, False), (6.0, True)])
 def test_loop_scale_of_one_loop_is_least_unless_excluded(off, moves):
-    """One closure of .5 m: a loop of 80 m that stays open by less says nothing."""
+    """One closure of .5 m: a loop of 80 m that stays open by less is no evidence."""
     graph = PoseGraph()
     poses = planar_poses(circle(1)[:, :3] * [0.4, 0.4, 1])
     for i, pose in enumerate(poses):
