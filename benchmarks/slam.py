@@ -8,47 +8,31 @@ and the graph is solved. Writes docs/slam_measured.md, and its JSON to benchmark
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import as_completed, ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import json
 import multiprocessing
 import os
 from pathlib import Path
 import tempfile
 import time
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from results import environment, RESULTS, ROOT
 from scipy.spatial.transform import Rotation
 from slam_page import markdown
+from slam_pairs import CAMERA, Found, recognized, SharedViews, with_edges
 from stavpr_ros.demonstration.slam import trajectory_errors
-from stavpr_ros.demonstration.street.laps import (
-    CAMERA_IN_BASE,
-    CARRIED,
-    drive_laps,
-    intrinsics,
-    LapDrive,
-)
-from stavpr_ros.demonstration.street.traverses import SIZE
-from stavpr_ros.mapping.camera import Camera
-from stavpr_ros.pipeline import Pipeline, PipelineSettings
+from stavpr_ros.demonstration.street.laps import CARRIED, drive_laps, LapDrive
 from stavpr_ros.pose_graph import Closure, optimize, PoseGraph
-from stavpr_ros.pose_graph.alignment import APPEARANCE, IDENTITY
 from stavpr_ros.pose_graph.false_places import FalsePlaces
 from stavpr_ros.pose_graph.transforms import inverse, matrices, planar_poses
-from stavpr_ros.recognition.verification import mutual_matches
-from stavpr_ros.relative_pose import landmarks
-from stavpr_ros.relative_pose.edge import Edge, Source
+from stavpr_ros.relative_pose.edge import Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
-from stavpr_ros.relative_pose.landmarks import View
-from stavpr_ros.relative_pose.pair import MatchedPair
-from stavpr_ros.sources.frame import ImageRecord
 from tqdm import tqdm
 
-K = intrinsics()
-CAMERA = Camera(*SIZE, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), '', (), tuple(CAMERA_IN_BASE))
 DRIFTS = {'large': 1.0, 'small': 0.06}  # factors on the errors of the odometry
 FALSE = {'random 30': (0.3, False), 'coherent 30': (0.3, True), 'coherent 50': (0.5, True)}
 WRONG_PAIRS = 200  # of each world
@@ -57,46 +41,6 @@ PASSES = 4.0  # meters: images of two laps whose relative position is compared
 ONLINE = 60  # images after the first closure behind a break that are watched
 LEAST_ATE = 2.5  # meters: of a carried robot
 OTHER_DRAWS = 2  # of each world, with two sessions and with a carried robot
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """A closure: when it was known, the images of it, the pair, its edge, and the measurement."""
-
-    known: int
-    query: int
-    place: int
-    pair: MatchedPair
-    edge: Edge
-    closure: Closure
-    seconds: float
-    is_late: bool
-
-
-class SharedViews(EdgeEstimator):
-    """Keeps views and their matches for all draws of a world: they do not depend on odometry."""
-
-    views: ClassVar[dict[bytes, View]] = {}
-    matches: ClassVar[dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]] = {}
-
-    def _view(self, image: np.ndarray, camera: Camera) -> View:
-        key = image.tobytes()
-        if key not in self.views:
-            self.views[key] = super()._view(image, camera)
-        return self.views[key]
-
-    @classmethod
-    def forget(cls) -> None:
-        """Make room for another world."""
-        cls.views.clear()
-        cls.matches.clear()
-
-
-def _matched(mine: np.ndarray, theirs: np.ndarray, ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    key = id(mine), id(theirs)  # views stay, so numbers stay theirs
-    if key not in SharedViews.matches:
-        SharedViews.matches[key] = mutual_matches(mine, theirs, ratio)
-    return SharedViews.matches[key]
 
 
 def render(seed: int, folder: Path) -> np.ndarray:
@@ -109,59 +53,6 @@ def render(seed: int, folder: Path) -> np.ndarray:
         np.save(part, images)
         part.replace(path)
     return np.load(path, mmap_mode='r')
-
-
-def lap_masks(drive: LapDrive) -> list[np.ndarray]:
-    """Return which images are of each lap."""
-    return [drive.images[:, 0] == lap for lap in range(drive.images[-1, 0] + 1)]
-
-
-def find(
-    drive: LapDrive,
-    images: Sequence[np.ndarray] | np.ndarray,
-    estimator: EdgeEstimator,
-    camera: Camera | None = CAMERA,
-    exclude: int = 50,
-) -> list[Found]:
-    """Recognize a drive and return its closures."""
-    laps = np.array([0, *np.cumsum([drive.images[own, 1].max() + 1 for own in lap_masks(drive)])])
-    pipeline = Pipeline(PipelineSettings(backend='cpu', exclude_places=exclude), 'loop_closure')
-    pipeline.camera = camera
-    odometry, found = planar_poses(drive.odometry), []
-    image_of = {int(stamp): i for i, stamp in enumerate(drive.stamps)}
-    for i, (lap, number) in enumerate(drive.images.tolist()):
-        record = ImageRecord.of_image(images[laps[lap] + number], int(drive.stamps[i]))
-        match = pipeline.process(record, int(drive.stamps[i]), odometry[i])
-        for each in (match, match.late):
-            pair = pipeline.matched_pair(each) if each is not None else None
-            if pair is None or each is None:
-                continue
-            query_stamp = each.window_stamps[each.position]
-            place_stamp = pair.source.place(each.place_index).stamp
-            began = time.thread_time()
-            edge = estimator.estimate(pair, camera, camera)
-            took = time.thread_time() - began
-            changes = tuple(zip(each.window_stamps, each.window_changes, strict=True))
-            if each.is_late:
-                changes = ()
-            if edge.source is Source.NONE:
-                closure = Closure(
-                    query_stamp,
-                    place_stamp,
-                    IDENTITY,
-                    APPEARANCE,
-                    False,
-                    changes=changes,
-                    verified=edge.verified,
-                )
-            else:
-                closure = Closure(
-                    query_stamp, place_stamp, edge.pose, edge.covariance, edge.independent,
-                    changes=changes, verified=edge.verified,
-                )  # fmt: skip
-            at = image_of[query_stamp], image_of[place_stamp]
-            found.append(Found(i, *at, pair, edge, closure, took, each.is_late))
-    return found
 
 
 def falsified(drive: LapDrive, found: list[Found], kind: str, seed: int) -> list[Closure]:
@@ -321,23 +212,27 @@ def measure_carried(drive: LapDrive, found: list[Found]) -> dict[str, Any]:
 def measure(seed: int, draw: int, folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Measure a draw of a world, row by row."""
     images = render(seed, folder)
-    estimator = SharedViews if draw else EdgeEstimator  # the plain one is timed
+
+    def found(drive: LapDrive, name: str, timed: bool = False) -> list[Found]:
+        pairs = recognized(drive, images, folder / f'pairs-{seed}-{draw}-{name}.pkl')
+        return with_edges(drive, pairs, EdgeEstimator() if timed else SharedViews())
+
     for name, drift in DRIFTS.items():
         drive = drive_laps(seed, draw, drift)
-        found = find(drive, images, estimator())
-        row = measure_drift(drive, found, 100 * seed + draw)
+        closures = found(drive, name, draw == 0)
+        row = measure_drift(drive, closures, 100 * seed + draw)
         if draw == 0:
-            row['pnp_ms'] = [each.seconds * 1e3 for each in found]
-            row['wrong'] = wrong_pairs(drive, found, seed) if name == 'small' else []
+            row['pnp_ms'] = [each.seconds * 1e3 for each in closures]
+            row['wrong'] = wrong_pairs(drive, closures, seed) if name == 'small' else []
         yield name, row
     if draw >= OTHER_DRAWS:
         return
     drive = drive_laps(seed, draw, DRIFTS['large'], sessions=2)
-    row = measure_sessions(drive, find(drive, images, estimator()), 100 * seed + draw)
-    yield 'sessions', row
+    yield 'sessions', measure_sessions(drive, found(drive, 'sessions'), 100 * seed + draw)
     for name, drift in DRIFTS.items():
         drive = drive_laps(seed, draw, drift, carried=True)
-        yield f'carried {name}', measure_carried(drive, find(drive, images, estimator()))
+        kind = f'carried {name}'
+        yield kind, measure_carried(drive, found(drive, kind.replace(' ', '-')))
 
 
 def measure_world(seed: int, draws: int, folder: Path, parts: Path) -> int:
@@ -348,11 +243,10 @@ def measure_world(seed: int, draws: int, folder: Path, parts: Path) -> int:
     for draw in range(draws):
         part = parts / f'slam-{seed}-{draw}.json'
         if not part.exists():
-            vars(landmarks)['mutual_matches'] = _matched if draw else mutual_matches
             rows = dict(measure(seed, draw, folder))
             part.write_text(json.dumps({'seed': seed, 'draw': draw, **rows}))
             print(part.name, flush=True)
-    SharedViews.forget()
+    SharedViews.views.clear()
     return seed
 
 
@@ -363,7 +257,7 @@ def main() -> None:
     parser.add_argument('--draws', type=int, default=5, help='of the odometry (%(default)s)')
     parser.add_argument('--jobs', type=int, default=1, help='processes (%(default)s)')
     parser.add_argument(
-        '--folder', type=Path, help='keeps images and finished draws: a run continues there'
+        '--folder', type=Path, help='keeps images, pairs and finished draws: a run continues there'
     )
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:

@@ -17,7 +17,8 @@ from typing import Any
 from data import data_folder
 import numpy as np
 from results import environment, RESULTS, ROOT, table
-from slam import ate, DRIFTS, find
+from slam import ate, DRIFTS
+from slam_pairs import recognize, with_edges
 from stavpr_ros.demonstration.street.laps import drifted, LapDrive, RingWorld
 from stavpr_ros.demonstration.street.traverses import LENGTH
 from stavpr_ros.evaluation.ground_truth import GroundTruth
@@ -83,7 +84,9 @@ def measure(
     images: list[np.ndarray], drive: LapDrive, exclude: int
 ) -> tuple[dict[str, Any], np.ndarray]:
     """Return the errors of a drive, and the optimized poses."""
-    found = find(drive, images, EdgeEstimator(), None, exclude)
+    found = with_edges(
+        drive, recognize(drive, images, None, exclude), EdgeEstimator(), camera=None
+    )
     odometry = planar_poses(drive.odometry)
     poses, graph = optimize(drive.stamps, odometry, [each.closure for each in found])
     before, after = ate(drive, odometry), ate(drive, poses)

@@ -77,7 +77,7 @@ def test_triangulate_of_exact_views_returns_the_points():
     around = [0, 1, 3, 4]
     neighbors = list(zip([views[i] for i in around], motions([poses[i] for i in around], poses[2]),
                          strict=True))  # fmt: skip
-    landmarks = triangulate(views[2], neighbors)
+    landmarks = triangulate(views[2], neighbors, 2)
     assert len(landmarks.points) > 140  # others are far ahead, without parallax
     true = in_camera(points, poses[2], CAMERA)
     away = np.linalg.norm(landmarks.points[:, None] - true, axis=2).min(axis=1)
@@ -94,7 +94,7 @@ def test_triangulate_corrects_the_rotation_of_the_odometry():
     around = [0, 1, 3, 4]
     wrong = motions([measured[i] for i in around], measured[2])
     neighbors = list(zip([views[i] for i in around], wrong, strict=True))
-    landmarks = triangulate(views[2], neighbors)
+    landmarks = triangulate(views[2], neighbors, 2)
     assert len(landmarks.points) > 200
     true = motions([poses[i] for i in around], poses[2])
     for found, expected in zip(landmarks.motions, true, strict=True):
@@ -107,10 +107,8 @@ def test_pnp_covariance_fits_the_errors(seed):
     """Of 60 noisy queries, the mean normalized square of the errors is near its 6 dimensions."""
     points, center = points_ahead(80, seed), pose(0)
     views = views_of(points, [center, *[pose(x) for x in (-4, -3, 3, 4)]])
-    landmarks = triangulate(
-        views[0], list(zip(views[1:], motions([pose(x) for x in (-4, -3, 3, 4)], center),
-                           strict=True))
-    )  # fmt: skip
+    around = motions([pose(x) for x in (-4, -3, 3, 4)], center)
+    landmarks = triangulate(views[0], list(zip(views[1:], around, strict=True)), 2)
     mount = matrix_of(np.array(FORWARD))
     squares = []
     for query in (pose(0.6, 1.2, 0.05), pose(-0.4, -0.5, -0.03)):
@@ -131,7 +129,8 @@ def test_pnp_counts_each_keypoint_once_and_rejects_other_points():
     points = points_ahead(60)
     center, aside = pose(0), [pose(-2), pose(2)]
     views = views_of(points, [center, *aside])
-    landmarks = triangulate(views[0], list(zip(views[1:], motions(aside, center), strict=True)))
+    around = list(zip(views[1:], motions(aside, center), strict=True))
+    landmarks = triangulate(views[0], around, 1)
     query = views_of(points, [pose(0.5, 0.5)])[0]
     once, twice = solve_pnp(query, [landmarks]), solve_pnp(query, [landmarks, landmarks])
     assert once.inliers == twice.inliers > 30

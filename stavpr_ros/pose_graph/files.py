@@ -85,6 +85,5 @@ def save_graph(graph: PoseGraph, path: str, force: Force = False) -> int:
 
 
 def _trajectory(graph: PoseGraph) -> str:
-    driven = graph.chain.session[: len(graph.solved)] >= 0
-    stamps = graph.chain.stamps[: len(graph.solved)][driven]
-    return tum_text(stamps, to_poses(graph.solved[driven]))
+    stamps, _, corrected = graph.chain.trajectory(graph.solved)
+    return tum_text(stamps, to_poses(corrected))

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping.trajectory import checked_pose, interpolate, SECOND
-from stavpr_ros.pose_graph.transforms import inverse, matrices, to_poses
+from stavpr_ros.mapping.trajectory import checked_pose, SECOND
+from stavpr_ros.pose_graph.track import OdometryTrack
+from stavpr_ros.pose_graph.transforms import inverse, matrices
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,8 @@ class KeyframeChain:
             'second': np.zeros(self._capacity),
         }
         self._count = 0
-        self._recorded: list[tuple[list[int], list[int]]] = []  # stamps, nodes; split or not
+        # stamps and nodes, split or not, and the odometry between them
+        self._recorded: list[tuple[list[int], list[int], OdometryTrack]] = []
         self.sessions = 0
         self._tail: tuple[int, np.ndarray] | None = None  # stamp and pose of the newest odometry
         # the odometry that later ones have not moved from
@@ -178,7 +180,9 @@ class KeyframeChain:
             turned = (np.trace(step[:3, :3]) - 1) / 2 < np.cos(self._settings.angle)
             self._tail = stamp, pose
             self._note_standing(stamp, pose)
-            if near and not turned:
+            is_keyframe = bool(turned or not near)
+            self._recorded[-1][2].add(stamp, pose, is_keyframe)
+            if not is_keyframe:
                 return False
             self._append(stamp, matrices(pose), node)
             return True
@@ -186,7 +190,9 @@ class KeyframeChain:
             self.breaks.append(cause)
         self._tail = self._still = stamp, pose
         self._stood = (0, 0)
-        self._recorded.append(([], []))
+        track = OdometryTrack(self._settings.distance, self._settings.angle)
+        track.add(stamp, pose, True)
+        self._recorded.append(([], [], track))
         self.sessions += 1
         self._append(stamp, matrices(pose), -1)
         return True
@@ -230,7 +236,7 @@ class KeyframeChain:
             np.array(self._stood), origin, moment, second,
         )  # fmt: skip
         self._stood = (0, 0)
-        stamps, nodes = self._recorded[-1]
+        stamps, nodes, _ = self._recorded[-1]
         stamps.append(stamp)
         nodes.append(node)
 
@@ -265,26 +271,45 @@ class KeyframeChain:
         After a split it is the keyframe after the stamp, where that is on the same side. None
         = no odometry at this stamp; the latest recording counts where stamps repeat.
         """
-        for number in range(len(self._recorded) - 1, -1, -1):
-            stamps, nodes = self._recorded[number]
-            end = self._tail if number == len(self._recorded) - 1 else None
-            last = stamps[-1] if end is None else end[0]
-            if not stamps[0] <= stamp <= last:
+        for stamps, nodes, track in reversed(self._recorded):
+            first, last = track.span
+            if not first <= stamp <= last:
                 continue
             i = bisect_right(stamps, stamp) - 1
             if stamps[i] == stamp:
                 return nodes[i], np.eye(4)
-            node, start = nodes[i], to_poses(self.transforms[nodes[i]])
-            if i + 1 < len(stamps):
-                after, pose = stamps[i + 1], to_poses(self.transforms[nodes[i + 1]])
-                if stamp >= self._cuts.get(nodes[i + 1], (after, 0))[0]:
-                    node = nodes[i + 1]
-            else:
-                assert end is not None
-                after, pose = end[0], end[1]
-            at = interpolate(start, pose, (stamp - stamps[i]) / (after - stamps[i]))
-            return node, inverse(self.transforms[node]) @ matrices(at)
+            node = nodes[i]
+            if i + 1 < len(nodes) and stamp >= self._cut(nodes[i + 1], stamps[i + 1]):
+                node = nodes[i + 1]
+            return node, inverse(self.transforms[node]) @ matrices(track.at(stamp))
         return None
+
+    def _cut(self, node: int, stamp: int) -> int:
+        """Return from which stamp on odometry belongs to a keyframe, which has the given one."""
+        return self._cuts.get(node, (stamp, 0))[0]
+
+    def trajectory(self, solved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """
+        Return the odometry that is kept, and where it is in the map: each with its keyframe.
+
+        :param solved: transforms of the first nodes in the map, shape (n, 4, 4).
+        :returns: stamps (m,), ns; transforms of the odometry and in the map, (m, 4, 4) each.
+        """
+        rows = []
+        for keyframes, numbers, track in self._recorded:
+            stamps, poses = track.kept
+            nodes = np.array(numbers)
+            i = np.searchsorted(keyframes, stamps, 'right') - 1
+            for node, (cut, _) in self._cuts.items():
+                if node in numbers:  # what follows the cut is of the session that it begins
+                    at = numbers.index(node)
+                    i[(i == at - 1) & (stamps >= cut)] = at
+            known = nodes[i] < len(solved)
+            rows.append((stamps[known], matrices(poses[known]), nodes[i[known]]))
+        if not rows:
+            return np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros((0, 4, 4))
+        stamps, odometry, own = (np.concatenate(each) for each in zip(*rows, strict=True))
+        return stamps, odometry, solved[own] @ inverse(self.transforms[own]) @ odometry
 
     def ways(self, node: int | np.ndarray, others: np.ndarray) -> Ways:
         """

@@ -167,15 +167,30 @@ def mutual_matches(
     none = np.empty(0, np.intp)
     if not len(mine) or len(theirs) < 2:
         return none, none
-    how = (cv2.CV_32S, cv2.NORM_HAMMING) if mine.dtype == np.uint8 else (cv2.CV_32F, cv2.NORM_L2)
-    distances, nearest = cv2.batchDistance(mine, theirs, how[0], normType=how[1], K=2)
-    clear = np.flatnonzero(distances[:, 0] < ratio * distances[:, 1])
-    matched = nearest[clear, 0]
-    if not len(clear):
-        return clear, matched
-    _, back = cv2.batchDistance(theirs[matched], mine, how[0], normType=how[1], K=1)
-    mutual = back[:, 0] == clear
-    return clear[mutual], matched[mutual]
+    if mine.dtype == np.uint8:
+        distances, nearest = cv2.batchDistance(
+            mine, theirs, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2
+        )
+        clear = np.flatnonzero(distances[:, 0] < ratio * distances[:, 1])
+        matched = nearest[clear, 0]
+        if not len(clear):
+            return clear, matched
+        _, back = cv2.batchDistance(
+            theirs[matched], mine, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=1
+        )
+        mutual = back[:, 0] == clear
+        return clear[mutual], matched[mutual]
+    # squares of L2 by one product: exact, as those of SIFT are whole numbers below 2**24
+    squares = mine @ theirs.T
+    squares *= -2
+    squares += (mine * mine).sum(axis=1)[:, None]
+    squares += (theirs * theirs).sum(axis=1)
+    rows, nearest = np.arange(len(mine)), squares.argmin(axis=1)
+    back = squares.argmin(axis=0)
+    least = squares[rows, nearest].copy()
+    squares[rows, nearest] = np.inf
+    clear = (least < ratio**2 * squares.min(axis=1)) & (back[nearest] == rows)
+    return np.flatnonzero(clear), nearest[clear]
 
 
 class PlaceVerifier:

@@ -174,7 +174,8 @@ class EdgeEstimator:
         view = self._view_of(pair, place, camera)
         if view is None or not neighbors:
             raise InputError('the place has no neighbors with poses and thumbnails')
-        return triangulate(view, neighbors), reach, indices
+        before = sum(index < place for index in indices)
+        return triangulate(view, neighbors, before), reach, indices
 
     def _view_of(self, pair: MatchedPair, index: int, camera: Camera) -> View | None:
         """Return the view of a place; None if its thumbnail is damaged."""

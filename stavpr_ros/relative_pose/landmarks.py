@@ -10,16 +10,14 @@ import cv2
 import numpy as np
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.recognition.verification import mutual_matches
-from stavpr_ros.relative_pose.transforms import cross_matrices
+from stavpr_ros.relative_pose.bundle import LEAST_SHARE, Observations, odometry_information
 
 RATIO = 0.8  # of the distances to the nearest and the second nearest descriptor
 FEATURES = 600  # most keypoints of a thumbnail
 CONTRAST = 0.02  # of SIFT; thumbnails are small, so that weaker keypoints count
 PIXELS = (6.0, 4.0, 3.0, 2.0)  # how far an observation may be off its landmark, round by round
+STEPS = 2  # of the bundle adjustment in each round but the last
 MOST_SHIFT = 2.0  # deviation of a landmark in an image one meter away, pixels
-LEAST_SHARE = 1 / 500  # least inverse depth, 1/m: everything beyond is at infinity
-# Deviations of the odometry between places: of the translation, m and share of it, of the rotation
-SHIFT, TURN = (0.02, 0.02), 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,114 +73,44 @@ def view_of(image: np.ndarray, camera: Camera) -> View:
     return View(camera.rays(points, width, height), descriptors, focal)
 
 
-def triangulate(place: View, neighbors: Sequence[tuple[View, np.ndarray]]) -> Landmarks:
+def triangulate(
+    place: View, neighbors: Sequence[tuple[View, np.ndarray]], before: int
+) -> Landmarks:
     """
     Triangulate the keypoints of a place.
 
     A landmark is on the ray r of its keypoint, at the inverse depth rho: a neighbor with the
     motion (R, t) observes it in the direction R r + rho t, which is linear in rho. The motions are
-    of odometry; they and the inverse depths are refined in turn.
+    of odometry; they are refined together with the inverse depths (:mod:`.bundle`).
 
-    :param neighbors: other views, each with the transform (4, 4) from the optical frame of the
-        place to that of the view, meters.
+    :param neighbors: other views in the order of the drive, each with the transform (4, 4) from
+        the optical frame of the place to that of the view, meters.
+    :param before: the number of those before the place.
     """
-    seen = _Observations.of(place, neighbors)
-    k = len(place.rays)
-    motions = np.array([motion for _, motion in neighbors])
-    prior = motions.copy()
+    seen = _observed(place, neighbors)
+    prior = motions = np.array([motion for _, motion in neighbors])
+    trust = odometry_information(prior, before)
     use = np.ones(len(seen.keypoint), bool)
-    rho = np.full(k, LEAST_SHARE)
+    rho = np.full(len(place.rays), LEAST_SHARE)
     for limit in PIXELS:
         for _ in range(2):
-            rho, information = seen.depths(motions, rho, use, k)
+            rho, information = seen.depths(motions, rho, use)
             off, ahead = seen.residuals(motions, rho)
             use = ahead & (np.linalg.norm(off, axis=1) * place.focal < limit)
         if limit != PIXELS[-1]:
-            motions = seen.refined(motions, prior, rho, use, place.focal)
+            used = seen.chosen(use)
+            for _ in range(STEPS):
+                motions, rho = used.refined(motions, rho, prior, trust, place.focal)
     good = information * MOST_SHIFT**2 > 1
-    rays = np.column_stack([place.rays, np.ones(k)])
+    rays = np.column_stack([place.rays, np.ones(len(place.rays))])
     return Landmarks(rays[good] / rho[good, None], place.descriptors[good], motions)
 
 
-@dataclass(frozen=True, eq=False)
-class _Observations:
-    """
-    Keypoints of the place, seen from its neighbors: m pairs.
-
-    :param keypoint: its number, shape (m,); neighbor: number of the neighbor.
-    :param ray: of the keypoint in the place, shape (m, 3); seen: in the neighbor, (m, 2).
-    """
-
-    keypoint: np.ndarray
-    neighbor: np.ndarray
-    ray: np.ndarray
-    seen: np.ndarray
-
-    @classmethod
-    def of(cls, place: View, neighbors: Sequence[tuple[View, np.ndarray]]) -> '_Observations':
-        """Match the place with each neighbor."""
-        pairs = [
-            mutual_matches(place.descriptors, view.descriptors, RATIO) for view, _ in neighbors
-        ]
-        keypoint = np.concatenate([mine for mine, _ in pairs]).astype(np.intp)
-        neighbor = np.repeat(np.arange(len(pairs)), [len(mine) for mine, _ in pairs])
-        rays = np.column_stack([place.rays, np.ones(len(place.rays))])
-        seen = [view.rays[theirs] for (_, theirs), (view, _) in zip(pairs, neighbors, strict=True)]
-        return cls(keypoint, neighbor, rays[keypoint], np.concatenate(seen))
-
-    def _turned(self, motions: np.ndarray) -> np.ndarray:
-        return np.einsum('mij,mj->mi', motions[self.neighbor, :3, :3], self.ray)
-
-    def depths(
-        self, motions: np.ndarray, rho: np.ndarray, use: np.ndarray, k: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the inverse depths of the k keypoints, and their information, (k,) each."""
-        base, slope = self._turned(motions), motions[self.neighbor, :3, 3]
-        # (base + rho slope)_xy = seen (base + rho slope)_z
-        a = slope[:, :2] - self.seen * slope[:, 2:]
-        b = self.seen * base[:, 2:] - base[:, :2]
-        depth = np.maximum(base[:, 2] + rho[self.keypoint] * slope[:, 2], 0.05)
-        weight = use / depth**2
-        information = np.bincount(self.keypoint, weight * (a * a).sum(axis=1), k)
-        rho = np.bincount(self.keypoint, weight * (a * b).sum(axis=1), k)
-        return np.maximum(rho / np.maximum(information, 1e-12), LEAST_SHARE), information
-
-    def residuals(self, motions: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far observations are off, (m, 2), and whether they are ahead, (m,)."""
-        direction = (
-            self._turned(motions) + rho[self.keypoint, None] * motions[self.neighbor, :3, 3]
-        )
-        ahead = direction[:, 2] > 1e-6
-        return direction[:, :2] / np.where(ahead, direction[:, 2], 1)[:, None] - self.seen, ahead
-
-    def refined(
-        self, motions: np.ndarray, prior: np.ndarray, rho: np.ndarray, use: np.ndarray,
-        focal: float,
-    ) -> np.ndarray:  # fmt: skip
-        """Return the motions after a step of Gauss and Newton each, near to those of odometry."""
-        turned = self._turned(motions)
-        direction = turned + rho[self.keypoint, None] * motions[self.neighbor, :3, 3]
-        off, _ = self.residuals(motions, rho)
-        x, y, z = direction.T
-        z = np.maximum(z, 1e-6)
-        zero = np.zeros_like(z)
-        projection = np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]])
-        projection = focal * projection.transpose(2, 0, 1)
-        jacobian = np.concatenate(
-            [projection * rho[self.keypoint, None, None], -projection @ cross_matrices(turned)],
-            axis=2,
-        )
-        result = motions.copy()
-        for number, (motion, before) in enumerate(zip(motions, prior, strict=True)):
-            own = use & (self.neighbor == number)
-            rows, error = jacobian[own].reshape(-1, 6), focal * off[own].ravel()
-            weights = np.repeat(1 / (1 + (error.reshape(-1, 2) ** 2).sum(axis=1)), 2)
-            shift = SHIFT[0] + SHIFT[1] * np.linalg.norm(before[:3, 3])
-            trust = np.concatenate([np.full(3, shift**-2), np.full(3, TURN**-2)])
-            turn = cv2.Rodrigues(motion[:3, :3] @ before[:3, :3].T)[0].ravel()
-            moved = np.concatenate([motion[:3, 3] - before[:3, 3], turn])
-            normal = rows.T @ (weights[:, None] * rows) + np.diag(trust)
-            step = -np.linalg.solve(normal, rows.T @ (weights * error) + trust * moved)
-            result[number, :3, 3] += step[:3]
-            result[number, :3, :3] = cv2.Rodrigues(step[3:])[0] @ motion[:3, :3]
-        return result
+def _observed(place: View, neighbors: Sequence[tuple[View, np.ndarray]]) -> Observations:
+    """Match the place with each neighbor."""
+    pairs = [mutual_matches(place.descriptors, view.descriptors, RATIO) for view, _ in neighbors]
+    keypoint = np.concatenate([mine for mine, _ in pairs]).astype(np.intp)
+    neighbor = np.repeat(np.arange(len(pairs)), [len(mine) for mine, _ in pairs])
+    rays = np.column_stack([place.rays, np.ones(len(place.rays))])
+    seen = [view.rays[theirs] for (_, theirs), (view, _) in zip(pairs, neighbors, strict=True)]
+    return Observations(keypoint, neighbor, rays[keypoint], np.concatenate(seen))

@@ -74,13 +74,11 @@ def path_message(frame: str, stamps: np.ndarray, poses: np.ndarray) -> Path:
 
 
 def paths(graph: PoseGraph, frame: str) -> tuple[Path, Path]:
-    """Return the path of the odometry, and the corrected one."""
-    driven = graph.chain.session[: len(graph.solved)] >= 0
-    stamps = graph.chain.stamps[: len(graph.solved)][driven]
-    before = graph.chain.transforms[: len(graph.solved)][driven]
+    """Return the path of the odometry, and the corrected one, with the poses between keyframes."""
+    stamps, before, after = graph.chain.trajectory(graph.solved)
     return (
         path_message(frame, stamps, to_poses(before)),
-        path_message(frame, stamps, to_poses(graph.solved[driven])),
+        path_message(frame, stamps, to_poses(after)),
     )
 
 

@@ -1,0 +1,133 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The closures of a drive for the benchmark of the pose graph: recognition, then their edges."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+import pickle
+import time
+from typing import Any, ClassVar
+
+import numpy as np
+from stavpr_ros.demonstration.street.laps import CAMERA_IN_BASE, intrinsics, LapDrive
+from stavpr_ros.demonstration.street.traverses import SIZE
+from stavpr_ros.mapping.camera import Camera
+from stavpr_ros.pipeline import Pipeline, PipelineSettings
+from stavpr_ros.pose_graph import Closure
+from stavpr_ros.pose_graph.alignment import APPEARANCE, IDENTITY
+from stavpr_ros.pose_graph.transforms import planar_poses
+from stavpr_ros.relative_pose.edge import Edge, Source
+from stavpr_ros.relative_pose.estimator import EdgeEstimator
+from stavpr_ros.relative_pose.landmarks import View
+from stavpr_ros.relative_pose.pair import MatchedPair
+from stavpr_ros.sources.frame import ImageRecord
+
+K = intrinsics()
+CAMERA = Camera(*SIZE, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), '', (), tuple(CAMERA_IN_BASE))
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """A recognized pair: when it was known, its images, and the changes of its window."""
+
+    known: int
+    query: int
+    place: int
+    pair: MatchedPair
+    changes: tuple[tuple[int, float], ...]
+    is_late: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A closure: when it was known, the images of it, the pair, its edge, and the measurement."""
+
+    known: int
+    query: int
+    place: int
+    pair: MatchedPair
+    edge: Edge
+    closure: Closure
+    seconds: float
+    is_late: bool
+
+
+class SharedViews(EdgeEstimator):
+    """Keeps the views of all draws of a world: they do not depend on odometry."""
+
+    views: ClassVar[dict[bytes, View]] = {}
+
+    def _view(self, image: np.ndarray, camera: Camera) -> View:
+        key = image.tobytes()
+        if key not in self.views:
+            self.views[key] = super()._view(image, camera)
+        return self.views[key]
+
+
+def recognize(
+    drive: LapDrive,
+    images: Sequence[np.ndarray] | np.ndarray,
+    camera: Camera | None = CAMERA,
+    exclude: int = 50,
+) -> list[Matched]:
+    """Recognize a drive and return its pairs."""
+    own = [drive.images[:, 0] == lap for lap in range(drive.images[-1, 0] + 1)]
+    laps = np.array([0, *np.cumsum([drive.images[lap, 1].max() + 1 for lap in own])])
+    pipeline = Pipeline(PipelineSettings(backend='cpu', exclude_places=exclude), 'loop_closure')
+    pipeline.camera = camera
+    odometry, found = planar_poses(drive.odometry), []
+    image_of = {int(stamp): i for i, stamp in enumerate(drive.stamps)}
+    route: Any = None  # pairs without their map can be kept in a file
+    for i, (lap, number) in enumerate(drive.images.tolist()):
+        record = ImageRecord.of_image(images[laps[lap] + number], int(drive.stamps[i]))
+        match = pipeline.process(record, int(drive.stamps[i]), odometry[i])
+        for each in (match, match.late):
+            pair = pipeline.matched_pair(each) if each is not None else None
+            if pair is None or each is None:
+                continue
+            query = image_of[each.window_stamps[each.position]]
+            place = image_of[pair.source.place(each.place_index).stamp]
+            changes = tuple(zip(each.window_stamps, each.window_changes, strict=True))
+            changes = () if each.is_late else changes
+            pair = replace(pair, source=route)
+            found.append(Matched(i, query, place, pair, changes, each.is_late))
+    return found
+
+
+def recognized(drive: LapDrive, images: np.ndarray, path: Path) -> list[Matched]:
+    """Return the pairs of a drive, recognized once: a file of this program keeps them."""
+    if not path.exists():
+        part = path.with_suffix('.part')
+        part.write_bytes(pickle.dumps(recognize(drive, images)))
+        part.replace(path)
+    found: list[Matched] = pickle.loads(path.read_bytes())
+    return found
+
+
+def with_edges(
+    drive: LapDrive,
+    pairs: list[Matched],
+    estimator: EdgeEstimator,
+    camera: Camera | None = CAMERA,
+) -> list[Found]:
+    """Return the closures of pairs, in their order."""
+    found = []
+    for each in pairs:
+        began = time.thread_time()
+        edge = estimator.estimate(each.pair, camera, camera)
+        took = time.thread_time() - began
+        stamps = int(drive.stamps[each.query]), int(drive.stamps[each.place])
+        appearance = edge.source is Source.NONE
+        closure = Closure(
+            *stamps,
+            IDENTITY if appearance else edge.pose,
+            APPEARANCE if appearance else edge.covariance,
+            edge.independent,
+            changes=each.changes,
+            verified=edge.verified,
+        )
+        found.append(
+            Found(each.known, each.query, each.place, each.pair, edge, closure, took, each.is_late)
+        )
+    return found
