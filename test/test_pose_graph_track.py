@@ -9,7 +9,7 @@ from stavpr_ros.pose_graph.files import save_graph
 from stavpr_ros.pose_graph.odometry import KeyframeChain
 from stavpr_ros.pose_graph.track import MOST
 from stavpr_ros.pose_graph.transforms import planar_poses, to_poses
-from stavpr_ros.ros.graph_messages import paths
+from stavpr_ros.ros.graph_messages import path_messages
 from test_pose_graph import circle, closure, error, LAP, odometry_of, SECOND
 
 RATE = 20  # poses of the odometry between two images of a circle
@@ -63,7 +63,7 @@ def test_saved_trajectory_has_the_odometry_between_keyframes(solved, tmp_path):
     exact = [graph.at(t, pose) for t, pose in zip(stamps.tolist(), odometry, strict=True)]
     assert np.linalg.norm(found - np.array(exact)[:, :2], axis=1).max() < 0.1
     assert error(found, truth) < 1
-    before, after = paths(graph, 'map')
+    before, after = path_messages('map', *graph.chain.trajectory(graph.solved))
     assert len(before.poses) == len(after.poses) == len(rows)
 
 

@@ -239,7 +239,7 @@ def test_edge_of_other_images_is_aligned_with_the_reason():
     estimator = EdgeEstimator()
     edge = estimator.estimate(replace(pair, query=other.query), CAMERA, CAMERA)
     assert edge.source is Source.ALIGNED
-    assert 'inliers are fewer than 12' in edge.reason
+    assert 'inliers are fewer than 14' in edge.reason
     edge = EdgeEstimator('pnp').estimate(replace(pair, query=other.query), CAMERA, CAMERA)
     assert edge.source is Source.NONE
 

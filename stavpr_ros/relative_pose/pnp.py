@@ -11,7 +11,7 @@ from stavpr_ros.recognition.verification import mutual_matches
 from stavpr_ros.relative_pose.landmarks import Landmarks, RATIO, View
 from stavpr_ros.relative_pose.transforms import cross_matrices, inverse
 
-LEAST_INLIERS = 12  # keypoints of the query; one of 1,000 pairs of wrong places had as many
+LEAST_INLIERS = 14  # keypoints of the query; 1,000 pairs of wrong places had 12 at most
 PIXELS = 2.5  # of an inlier, off its landmark
 ITERATIONS, CONFIDENCE = 500, 0.999
 

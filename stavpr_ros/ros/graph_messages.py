@@ -73,12 +73,13 @@ def path_message(frame: str, stamps: np.ndarray, poses: np.ndarray) -> Path:
     return path
 
 
-def paths(graph: PoseGraph, frame: str) -> tuple[Path, Path]:
-    """Return the path of the odometry, and the corrected one, with the poses between keyframes."""
-    stamps, before, after = graph.chain.trajectory(graph.solved)
+def path_messages(
+    frame: str, stamps: np.ndarray, odometry: np.ndarray, corrected: np.ndarray
+) -> tuple[Path, Path]:
+    """Return the path of the odometry, and the corrected one; transforms are (N, 4, 4) each."""
     return (
-        path_message(frame, stamps, to_poses(before)),
-        path_message(frame, stamps, to_poses(after)),
+        path_message(frame, stamps, to_poses(odometry)),
+        path_message(frame, stamps, to_poses(corrected)),
     )
 
 

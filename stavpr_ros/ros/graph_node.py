@@ -25,7 +25,7 @@ from stavpr_ros.pose_graph import ChainSettings, GraphSettings, PoseGraph
 from stavpr_ros.pose_graph.files import save_graph
 from stavpr_ros.pose_graph.transforms import matrices, to_poses
 from stavpr_ros.ros.diagnostics import one_status
-from stavpr_ros.ros.graph_messages import closure_of, edge_markers, paths
+from stavpr_ros.ros.graph_messages import closure_of, edge_markers, path_messages
 from stavpr_ros.ros.navigation import tf_message, transform_message
 from stavpr_ros.ros.output import nanoseconds, pose_message
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, repeat_responses
@@ -288,11 +288,12 @@ class PoseGraphNode(ManagedNode):
         with self._lock:
             if not len(self._graph.solved):
                 return
-            before, after = paths(self._graph, self._frame)
+            trajectory = self._graph.chain.trajectory(self._graph.solved)
             markers = edge_markers(self._graph, self._frame)
             transform = transform_message(
                 self._graph.map_to_odom(), self._frame, self._odometry_frame
             )
+        before, after = path_messages(self._frame, *trajectory)  # a second of long drives
         transform.header.stamp = after.header.stamp
         self._path_before.publish(before)
         self._path.publish(after)
