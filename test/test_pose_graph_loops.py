@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from stavpr_ros.demonstration.street.laps import drifted
 from stavpr_ros.pose_graph import Closure, PoseGraph
-from stavpr_ros.pose_graph.consistency import Cycles
-from stavpr_ros.pose_graph.graph import LEAST_CLUSTERS, SCALES
+from stavpr_ros.pose_graph.acceptance import Acceptance, LEAST_CLUSTERS, SCALES
+from stavpr_ros.pose_graph.cycles import Cycles
 from stavpr_ros.pose_graph.odometry import OdometryNoise
 from stavpr_ros.pose_graph.transforms import inverse, matrices, planar_poses, to_poses
 from test_pose_graph import circle, error, LAP, SECOND, solve
@@ -59,7 +59,7 @@ def test_optimize_loops_that_contradict_odometry_move_the_solution(draw):
 
 
 def test_optimize_without_the_ratio_would_move_precise_odometry(monkeypatch):
-    monkeypatch.setattr(PoseGraph, '_adapt_to_loops', lambda graph: None)
+    monkeypatch.setattr(Acceptance, '_estimate_from_loops', lambda _: False)
     truth, odometry, closures = short_loop(0, PRECISE)
     found, _ = solve(truth, closures, odometry)
     assert error(found, truth) > 3 * error(odometry, truth)
@@ -77,7 +77,7 @@ def test_loop_scale_of_one_loop_is_least_unless_excluded(off, moves):
     covariance = np.diag([0.5, 0.5, 0.5, 0.02, 0.02, 0.02]) ** 2
     graph.add_closure(Closure(LAP * SECOND, SECOND, to_poses(Z), covariance))
     graph.update()
-    edge = graph._clusters[0].representative
+    edge = graph._acceptance.clusters[0].representative
     scale = Cycles(graph.chain, [edge]).loop_scale(OdometryNoise(), SCALES)
     assert (scale > SCALES[0]) == moves
 
@@ -92,6 +92,6 @@ def test_rule_ends_where_there_are_clusters_enough():
         Z = to_poses(inverse(T[q - LAP]) @ T[q])
         graph.add_closure(Closure((q + 1) * SECOND, (q - LAP + 1) * SECOND, Z, WIDE))
     graph.update()
-    assert len(graph._clusters) >= LEAST_CLUSTERS
-    assert graph._loop_scale == math.inf
+    assert len(graph._acceptance.clusters) >= LEAST_CLUSTERS
+    assert graph._acceptance.loop_scale == math.inf
     assert graph.noise == OdometryNoise().scaled(graph.scale)

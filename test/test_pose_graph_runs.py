@@ -7,7 +7,7 @@ import pytest
 from stavpr_ros.demonstration.street.laps import drifted
 from stavpr_ros.pose_graph import optimize, PoseGraph, runs
 from stavpr_ros.pose_graph.odometry import ChainSettings, KeyframeChain, OdometryNoise
-from stavpr_ros.pose_graph.transforms import inverse, planar_poses, to_poses
+from stavpr_ros.pose_graph.transforms import adjoints, inverse, planar_poses, to_poses
 from test_pose_graph import circle, closure, LAP, odometry_of, SECOND
 
 NOISE = OdometryNoise(0.05, 0.012)
@@ -37,7 +37,7 @@ def test_covariance_of_a_run_is_that_of_its_steps(chain):
     T, expected = chain.transforms, np.zeros((6, 6))
     for k in range(11, 21):
         length = chain.travelled[k] - chain.travelled[k - 1]
-        change = runs._adjoints((inverse(T[k]) @ T[k - 1])[None])[0]
+        change = adjoints((inverse(T[k]) @ T[k - 1])[None])[0]
         step = np.repeat([NOISE.rotation**2 * length, NOISE.translation**2 * length], 3)
         expected = change @ expected @ change.T + np.diag(step)
         assert found.covariance[k] == pytest.approx(expected, rel=1e-6, abs=1e-12)

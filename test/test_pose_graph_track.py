@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.pose_graph import ChainSettings, PoseGraph
+from stavpr_ros.pose_graph import ChainSettings, GraphSettings, PoseGraph
 from stavpr_ros.pose_graph.files import save_graph
 from stavpr_ros.pose_graph.odometry import KeyframeChain
 from stavpr_ros.pose_graph.track import MOST
@@ -34,8 +34,7 @@ def solved() -> tuple[PoseGraph, np.ndarray, np.ndarray, np.ndarray]:
     yaw = np.unwrap(2 * np.arctan2(coarse[:, 5], coarse[:, 6]))
     odometry = planar_poses(fine(np.column_stack([coarse[:, :2], yaw])))
     stamps = SECOND + np.arange(len(odometry), dtype=np.int64) * (SECOND // RATE)
-    graph = PoseGraph()
-    graph.chain = KeyframeChain(ChainSettings(1.9, 1.0))
+    graph = PoseGraph(GraphSettings(ChainSettings(1.9, 1.0)))
     for stamp, pose in zip(stamps.tolist(), odometry, strict=True):
         graph.add_odometry(stamp, pose)
     for query in range(LAP, 2 * LAP):

@@ -8,14 +8,15 @@ from itertools import pairwise
 import math
 
 import numpy as np
-from stavpr_ros.pose_graph.consistency import Cluster, ConsistencySettings, Cycles
+from stavpr_ros.pose_graph.consistency import Cluster, ConsistencySettings
+from stavpr_ros.pose_graph.cycles import Cycles
 from stavpr_ros.pose_graph.odometry import KeyframeChain, OdometryNoise
 
 STANDING = math.log(
     10
 )  # evidence of the odometry that stands: else it does in a tenth of the images
 PAUSE = 4.0  # times the usual time between keyframes: the robot was carried then
-RUNS = 6  # latest runs that a cluster may continue
+REACH = 100.0  # meters without closures that a run continues after
 CLEAR = 4.0  # a closure belongs to the side that it deviates from so many times less
 WRONG_SIDE = 0.1  # cost of a closure on the wrong side of a break, in logarithms of a change
 
@@ -59,9 +60,13 @@ def find_break(
         ]
         runs: list[list[int]] = []
         for _, i in sorted(own):
-            agreeing = [run for run in runs[-RUNS:] if not conflicts[i, run[-1]]]
+            since = clusters[i].members[0].at - REACH
+            agreeing = [
+                run for run in runs
+                if clusters[run[-1]].members[-1].at >= since and not conflicts[i, run[-1]]
+            ]  # fmt: skip
             if agreeing:
-                agreeing[-1].append(i)
+                max(agreeing, key=lambda run: clusters[run[-1]].members[-1].at).append(i)
             else:
                 runs.append([i])
         long = [run for run in runs if _is_long([clusters[i] for i in run], settings)]

@@ -10,17 +10,16 @@ Maximization*, ICRA 2018). Closures of successive images that agree are a cluste
 clusters, a set without contradictions and of large weight is accepted.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
 from stavpr_ros.pose_graph.closures import ResolvedClosure
+from stavpr_ros.pose_graph.cycles import Cycles
 from stavpr_ros.pose_graph.odometry import KeyframeChain, OdometryNoise
-from stavpr_ros.pose_graph.transforms import angles, inverse
 
-LIMIT = 9.0  # squared deviations
-SIGNIFICANT = 1.92  # difference of logarithms of likelihoods: 95 %, one degree of freedom
+LIMIT = 16.0  # squared deviations
 STARTS = 100  # rejected clusters that the search begins with as well
-CLOSURE_FACTORS = (0.05, 0.2, 1.0)  # on the covariances of closures that are tried
 
 
 @dataclass(frozen=True)
@@ -62,120 +61,6 @@ class Cluster:
         return self.members[self.center]
 
 
-class Cycles:
-    """
-    Cycles of closures: their ends and measurements as arrays.
-
-    :param closures: at least one.
-    """
-
-    def __init__(self, chain: KeyframeChain, closures: list[ResolvedClosure]) -> None:
-        self._chain = chain
-        self.query = query = np.array([each.query for each in closures])
-        self.place = place = np.array([each.place for each in closures])
-        self.query_session, self.place_session = chain.session[query], chain.session[place]
-        self.recordings = chain.recording[query], chain.recording[place]
-        self.query_at = chain.travelled[query]
-        self.Q, self.P = chain.transforms[query], chain.transforms[place]
-        self.Z = np.array([each.transform for each in closures])
-        variances = np.array([np.diag(each.covariance) for each in closures])
-        self.angle_variance = variances[:, :3].max(axis=1)
-        # planar motion: the two larger of the three
-        self.position_variance = np.sort(variances[:, 3:], axis=1)[:, 1:].mean(axis=1)
-
-    def deviations(self, i: int, noise: OdometryNoise) -> np.ndarray:
-        """
-        Return the squared deviations of the cycles of closure i with all, shape (n,).
-
-        0 where there is no cycle: the ends are in different sessions, splits apart.
-        """
-        off, measured = self._errors(i)
-        squared = (off**2 / (measured + self._odometry(i, noise))).max(axis=0)
-        query, place = self.recordings
-        same = (query == query[i]) & (place == place[i])
-        return np.where(same, squared, 0.0)
-
-    def _errors(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return what cycles with closure i miss by, and its variances by both closures.
-
-        :returns: position (m) and angle (rad), each of shape (2, n).
-        """
-        places = inverse(self.P[i]) @ self.P
-        queries = inverse(self.Q) @ self.Q[i]
-        cycle = inverse(self.Z[i]) @ places @ self.Z @ queries
-        lever = (places[:, :3, 3] ** 2).sum(axis=1)
-        turned = self.angle_variance[i] + self.angle_variance
-        moved = self.position_variance[i] + self.position_variance + lever * turned / 2
-        off = np.linalg.norm(cycle[:, :3, 3], axis=1), angles(cycle)
-        return np.array(off), np.array([moved, turned])
-
-    def _odometry(self, i: int, noise: OdometryNoise) -> np.ndarray:
-        """Return the variances of position and angle by the odometry of the cycles, (2, n)."""
-        along = self._chain.ways(self.place[i], self.place)
-        driven = self._chain.ways(self.query[i], self.query)
-        # a bias on both ways cancels where the query drives as the place was driven
-        bent = driven.moment - along.moment @ self.Z[i, :3, :3]
-        length = np.abs(along.length) + np.abs(driven.length)
-        moved = noise.translation**2 * length + noise.rotation**2 * (along.spread + driven.spread)
-        moved += noise.bias**2 * (bent**2).sum(axis=1)
-        turned = noise.rotation**2 * length + (noise.bias * (driven.length - along.length)) ** 2
-        return np.array([moved, turned])
-
-    def loop_scale(self, noise: OdometryNoise, scales: np.ndarray) -> float:
-        """
-        Return the factor on the errors of the odometry that most probably left these loops open.
-
-        Few closures, and short loops, have no cycles that :meth:`noise_scale` could use. It is the
-        least factor unless the likelihood ratio excludes that one.
-
-        :param scales: rising.
-        """
-        same = self.query_session == self.place_session
-        if not same.any():
-            return float(scales[-1])
-        off = inverse(self.Z) @ inverse(self.P) @ self.Q
-        off = np.array([np.linalg.norm(off[same, :3, 3], axis=1), angles(off[same])])
-        measured = np.array([self.position_variance, self.angle_variance])[:, same]
-        ways = self._chain.ways(self.query[same], self.place[same])
-        length = np.abs(ways.length)
-        moved = noise.translation**2 * length + noise.rotation**2 * ways.spread
-        moved += noise.bias**2 * (ways.moment**2).sum(axis=1)
-        turned = noise.rotation**2 * length + (noise.bias * length) ** 2
-        odometry = np.array([moved, turned])
-        likelihood = [_likelihood(off, measured + scale**2 * odometry) for scale in scales]
-        best = int(np.argmax(likelihood))
-        return float(scales[best if likelihood[best] > likelihood[0] + SIGNIFICANT else 0])
-
-    def noise_scale(self, noise: OdometryNoise, scales: np.ndarray) -> float:
-        """
-        Return the factor on the errors of the odometry that the cycles have most probably.
-
-        Student's t with 4 degrees of freedom: few wrong closures do not decide. The covariances of
-        the closures may be too large or too small: the most probable of some factors is taken.
-        """
-        likelihood = np.zeros((len(CLOSURE_FACTORS), len(scales)))
-        for i in range(len(self.Z)):
-            same = self.query_session == self.query_session[i]
-            same &= self.place_session == self.place_session[i]
-            driven = np.abs(self.query_at - self.query_at[i])
-            same &= (driven > 30) & (driven < 400) & (np.arange(len(same)) > i)
-            if same.any():
-                off, measured = (each[:, same] for each in self._errors(i))
-                odometry = self._odometry(i, noise)[:, same]
-                for j, factor in enumerate(CLOSURE_FACTORS):
-                    for k, scale in enumerate(scales):
-                        variances = factor * measured + scale**2 * odometry
-                        likelihood[j, k] += _likelihood(off, variances)
-        return float(scales[np.argmax(likelihood.max(axis=0))])
-
-
-def _likelihood(off: np.ndarray, variances: np.ndarray) -> float:
-    """Return the logarithm of that of positions and angles by Student's t, each (2, n)."""
-    # errors of the heading dominate: they move a position in one direction
-    return -float((2.5 * np.log1p(off**2 / (4 * variances)) + np.log(variances) / 2).sum())
-
-
 def grow(
     clusters: list[Cluster],
     closure: ResolvedClosure,
@@ -194,6 +79,9 @@ def grow(
             continue
         if chain.session[closure.place] != chain.session[last.place]:
             continue
+        places = chain.travelled[[last.place, closure.place]]
+        if abs(places[1] - places[0]) > settings.gap:
+            continue  # over a long way, much would agree
         if Cycles(chain, [last, closure]).deviations(0, noise)[1] > LIMIT:
             continue
         cluster.weight += closure.weight * (abs(closure.at - last.at) > 0.3)
@@ -221,7 +109,7 @@ class ConsistentSet:
         noise: OdometryNoise,
     ) -> None:
         """
-        Compare clusters.
+        Compare the clusters that have closures enough.
 
         :param changed: numbers of the clusters that are new or have grown.
         """
@@ -229,11 +117,13 @@ class ConsistentSet:
         if n > len(known):
             self._contradictions = np.zeros((2 * n, 2 * n), bool)
             self._contradictions[: len(known), : len(known)] = known
-        if n:
-            cycles = Cycles(chain, [cluster.representative for cluster in clusters])
-            for i in changed:
-                row = cycles.deviations(i, noise) > LIMIT
-                self._contradictions[i, :n] = self._contradictions[:n, i] = row
+        able = [i for i in range(n) if clusters[i].weight >= self._settings.support]
+        if able:
+            cycles = Cycles(chain, [clusters[i].representative for i in able])
+            for number, i in enumerate(able):
+                if i in changed:
+                    row = cycles.deviations(number, noise) > LIMIT
+                    self._contradictions[i, able] = self._contradictions[able, i] = row
 
     def conflicts(self, clusters: list[Cluster], session: np.ndarray) -> np.ndarray:
         """
@@ -247,14 +137,20 @@ class ConsistentSet:
         same = (query[:, None] == query) & (place[:, None] == place)
         return self._contradictions[:n, :n] & same
 
-    def accepted(self, clusters: list[Cluster], session: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return which clusters are accepted, shape (n,), bool, and their weight."""
+    def accepted(
+        self, clusters: list[Cluster], session: np.ndarray, without: Collection[int] = ()
+    ) -> tuple[np.ndarray, float]:
+        """
+        Return which clusters are accepted, shape (n,), bool, and their weight.
+
+        :param without: numbers of clusters that are not.
+        """
         if not clusters:
             return np.zeros(0, bool), 0.0
         weights = np.array([cluster.weight for cluster in clusters])
-        chosen = largest_consistent(
-            self.conflicts(clusters, session), weights, weights >= self._settings.support
-        )
+        candidates = weights >= self._settings.support
+        candidates[list(without)] = False
+        chosen = largest_consistent(self.conflicts(clusters, session), weights, candidates)
         return chosen, float(weights[chosen].sum())
 
 

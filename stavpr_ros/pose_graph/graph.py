@@ -4,31 +4,19 @@
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-import math
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.pose_graph.breaks import Break, find_break
+from stavpr_ros.pose_graph.acceptance import Acceptance, independent
+from stavpr_ros.pose_graph.breaks import Break
 from stavpr_ros.pose_graph.closures import Closure, ResolvedClosure
-from stavpr_ros.pose_graph.consistency import (
-    Cluster,
-    ConsistencySettings,
-    ConsistentSet,
-    Cycles,
-    grow,
-)
+from stavpr_ros.pose_graph.consistency import Cluster, ConsistencySettings
 from stavpr_ros.pose_graph.odometry import ChainSettings, KeyframeChain, OdometryNoise
 from stavpr_ros.pose_graph.sessions import extended, placed, session_pairs, tie, Ties
 from stavpr_ros.pose_graph.solver import CAUCHY, Solver, WIDE
 from stavpr_ros.pose_graph.transforms import body_covariance, inverse, matrices, to_poses
 
 MAX_PENDING = 1000  # closures that wait for their odometry
-SCALES = np.geomspace(0.05, 2.0, 16)  # factors on the errors of the odometry that are tried
-LEAST_CLUSTERS = 6  # that these are estimated from
-# A break explains at least this share of the closures that stay rejected: of many wrong ones, some
-# agree at random.
-UNEXPLAINED = 0.25
-CAUTION = 1.5  # factor on the estimated errors of the odometry where closures are compared
 MEMORY = 100  # latest closures by which keypoints are rated
 FAR = 8.0  # whitened deviations of a new edge from which all nodes are solved anew
 
@@ -74,31 +62,28 @@ class PoseGraph:
     def reset(self) -> None:
         """Forget everything."""
         self.chain = KeyframeChain(self.settings.keyframes)
-        self._consistent = ConsistentSet(self.settings.consistency)
+        self._acceptance = Acceptance(
+            self.chain, self.settings.noise, self.settings.consistency, self.settings.adapt
+        )
         self._solver.restart()
         self._pending: list[Closure] = []
         self._known: list[Closure] = []  # those between nodes
         self._changes: dict[int, float] = {}  # of images by their stamps
         self._tried, self._missed = 0, 0.0  # latest closures, and the share not confirmed of them
-        self._clusters: list[Cluster] = []
-        self._accepted = np.zeros(0, bool)
-        self._changed: set[int] = set()
         self._ties = Ties()
         self._edges: dict[int, ResolvedClosure] = {}
-        self._scaled_at = 0
-        self.scale = 1.0
-        self._loop_scale = math.inf  # until there are clusters enough
         self.solved = np.zeros((0, 4, 4))
         self.counts: Counter[str] = Counter()
 
     @property
     def noise(self) -> OdometryNoise:
         """Return the errors of the odometry as estimated."""
-        return self.settings.noise.scaled(min(self.scale, self._loop_scale))
+        return self._acceptance.noise
 
     @property
-    def _cautious_noise(self) -> OdometryNoise:
-        return self.settings.noise.scaled(min(1.0, self.scale * CAUTION))
+    def scale(self) -> float:
+        """Return the factor of these errors that the clusters have."""
+        return self._acceptance.scale
 
     def add_odometry(self, stamp: int, pose: np.ndarray) -> bool:
         """
@@ -160,11 +145,7 @@ class PoseGraph:
                 self._weight(closure),
             )  # fmt: skip
             self._known.append(closure)
-            cluster = grow(
-                self._clusters, resolved, self.chain, self._cautious_noise,
-                self.settings.consistency,
-            )  # fmt: skip
-            self._changed.add(self._clusters.index(cluster))
+            self._acceptance.add(resolved)
         self._pending = waiting
 
     def _weight(self, closure: Closure) -> float:
@@ -196,22 +177,12 @@ class PoseGraph:
         self._resolve()
         if not len(self.chain):
             return self.solved
-        if self._changed:
+        if self._acceptance.has_changed:
             self._decide()
-        accepted = self._accepted_clusters()
-        ties = tie(self.chain, accepted, self.settings.consistency.join_support)
-        moved = ties.moved_since(self._ties)
-        edges = self._select(accepted, ties)
-        if moved:
-            initial = placed(self.chain, accepted, ties)
-        else:
-            initial = extended(self.chain, self.solved, ties)
-            if far := self._far(edges, initial):
-                # such edges would have no influence on the robust solution
-                moved = True
-                session = self.chain.session
-                if any(session[edge.query] != session[edge.place] for edge in far):
-                    initial = placed(self.chain, accepted, ties)
+        ties, edges, initial, moved = self._arrange()
+        while self._acceptance.refute(initial, ties, final):
+            self._solver.restart()
+            ties, edges, initial, moved = self._arrange()
         if moved:
             self._solver.restart()
         if final or moved:
@@ -226,63 +197,36 @@ class PoseGraph:
 
     def _decide(self) -> None:
         """Accept and reject clusters; begin a session where they prove a break."""
-        settings, chain, noise = self.settings.consistency, self.chain, self._cautious_noise
-        self._consistent.update(self._clusters, self._changed, chain, noise)
-        self._changed = set()
-        self._accepted, weight = self._consistent.accepted(self._clusters, chain.session)
-        rejected = sum(cluster.weight for cluster in self._clusters) - weight
-        least = max(settings.break_support / 2, UNEXPLAINED * rejected)
-        for node in chain.splits:
-            _, without = self._consistent.accepted(self._clusters, chain.rejoined(node))
-            if weight - without < least:
-                self._unsplit(node)  # later closures are against it
-                return
-        found = self._clusters and find_break(
-            chain, self._clusters, self._consistent.conflicts(self._clusters, chain.session),
-            noise, settings, self._changes,
-        )  # fmt: skip
+        self._acceptance.compare()
+        ended = self._acceptance.ended_break()
+        if ended is not None:
+            self._unsplit(ended)  # later closures are against it
+            return
+        found = self._acceptance.new_break(self._changes)
         if found:
-            _, gained = self._consistent.accepted(self._clusters, chain.parted(found.node))
-            if gained - weight >= max(
-                settings.break_support / 2, UNEXPLAINED * (rejected - gained + weight)
-            ):
-                self._split(found)
-        support = self.settings.consistency.support
-        candidates = sum(cluster.weight >= support for cluster in self._clusters)
-        if self.settings.adapt and candidates >= max(LEAST_CLUSTERS, 1.3 * self._scaled_at):
-            self._scaled_at, self._loop_scale = candidates, math.inf
-            self._adapt()
-        elif self.settings.adapt and not self._scaled_at:
-            self._adapt_to_loops()
-
-    def _adapt(self) -> None:
-        """Estimate the errors of the odometry anew, not from what the last estimate accepts."""
-        before, self.scale = self.scale, 1.0
-        self._decide_all()
-        chosen = np.flatnonzero(self._accepted)
-        if len(chosen) >= LEAST_CLUSTERS:
-            chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, 60).astype(int))]
-            cycles = Cycles(self.chain, [self._clusters[i].representative for i in chosen])
-            self.scale = cycles.noise_scale(self.settings.noise, SCALES)
-        if 0.7 < self.scale / before < 1.4:
-            self.scale = before
-        else:
+            self._split(found)
+        if self._acceptance.adapt():
             self._solver.restart()
-        self._decide_all()
 
-    def _adapt_to_loops(self) -> None:
-        """Trust the odometry in the solution as far as the first closed loops allow."""
-        edges = [each for cluster in self._accepted_clusters() for each in independent(cluster)]
-        if edges:
-            before = self._loop_scale
-            self._loop_scale = Cycles(self.chain, edges).loop_scale(self.settings.noise, SCALES)
-            if not 0.7 < self._loop_scale / before < 1.4:
-                self._solver.restart()
+    def _arrange(self) -> tuple[Ties, dict[int, ResolvedClosure], np.ndarray, bool]:
+        """
+        Tie the sessions by the accepted closures.
 
-    def _decide_all(self) -> None:
-        everything = set(range(len(self._clusters)))
-        self._consistent.update(self._clusters, everything, self.chain, self._cautious_noise)
-        self._accepted, _ = self._consistent.accepted(self._clusters, self.chain.session)
+        :returns: the ties; the edges of the solution; the nodes before it (N, 4, 4); whether these
+            are not the last estimate.
+        """
+        accepted = self._acceptance.accepted
+        ties = tie(self.chain, accepted, self.settings.consistency.join_support)
+        moved = ties.moved_since(self._ties)
+        edges = self._select(accepted, ties)
+        if moved:
+            return ties, edges, placed(self.chain, accepted, ties), True
+        initial = extended(self.chain, self.solved, ties)
+        far, session = self._far(edges, initial), self.chain.session
+        if any(session[edge.query] != session[edge.place] for edge in far):
+            initial = placed(self.chain, accepted, ties)
+        # such edges would have no influence on the robust solution
+        return ties, edges, initial, bool(far)
 
     def _split(self, at: Break) -> None:
         """Begin a session; closures on both sides of a break are no clusters any more."""
@@ -297,15 +241,12 @@ class PoseGraph:
         """Find the nodes and clusters of all closures again."""
         self._solver.restart()
         waiting, self._pending = self._pending, self._known
-        self._known, self._clusters, self._edges = [], [], {}
+        self._known, self._edges = [], {}
+        self._acceptance.restart()
         self._tried, self._missed = 0, 0.0
         self._resolve()
-        self._pending, self._changed = waiting, set()
-        self._decide_all()
-
-    def _accepted_clusters(self) -> list[Cluster]:
-        pairs = zip(self._clusters, self._accepted, strict=False)
-        return [cluster for cluster, taken in pairs if taken]
+        self._pending = waiting
+        self._acceptance.compare_all()
 
     def _select(self, accepted: list[Cluster], ties: Ties) -> dict[int, ResolvedClosure]:
         """
@@ -315,7 +256,7 @@ class PoseGraph:
         them less precisely than the odometry, and would add their own errors.
         """
         query, place = session_pairs(self.chain, accepted)
-        precise = self._loop_scale == SCALES[0]
+        precise = self._acceptance.is_precise
         return {
             each.number: each
             for cluster, a, b in zip(accepted, query, place, strict=True)
@@ -342,16 +283,17 @@ class PoseGraph:
     @property
     def edges(self) -> list[GraphEdge]:
         """Return all closures between nodes."""
+        found = self._acceptance
         return [
             GraphEdge(each.query, each.place, bool(taken))
-            for cluster, taken in zip(self._clusters, self._accepted, strict=False)
+            for cluster, taken in zip(found.clusters, found.chosen, strict=False)
             for each in cluster.members
         ]
 
     @property
     def accepted(self) -> int:
         """Return the number of accepted closures."""
-        return sum(len(cluster.members) for cluster in self._accepted_clusters())
+        return sum(len(cluster.members) for cluster in self._acceptance.accepted)
 
     @property
     def rejected(self) -> int:
@@ -398,9 +340,3 @@ class PoseGraph:
             if node < 0:
                 node = len(self.solved) - 1
         return to_poses(self.solved[node] @ inverse(self.chain.transforms[node]))
-
-
-def independent(cluster: Cluster) -> list[ResolvedClosure]:
-    """Return the closures of a cluster whose errors do not correlate; at least the best one."""
-    marked = [each for each in cluster.members if each.is_independent]
-    return marked or [cluster.representative]

@@ -39,12 +39,18 @@ class Ways:
     :param length: m, negative where the other is before the end, shape (n,).
     :param moment: integral of the position relative to the end, in its axes, m^2, shape (n, 3);
         negative where the other is before it.
-    :param spread: integral of the squared distance from the end, m^3, shape (n,).
+    :param second: integral of the position times itself, m^3, shape (n, 3, 3).
     """
 
     length: np.ndarray
     moment: np.ndarray
-    spread: np.ndarray
+    second: np.ndarray
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Return the integral of the squared distance from the end, m^3, shape (n,)."""
+        result: np.ndarray = np.trace(self.second, axis1=-2, axis2=-1)
+        return result
 
 
 @dataclass(frozen=True)
@@ -91,7 +97,7 @@ class KeyframeChain:
             # of the way to each node, about the start of its odometry: for `ways`
             'origin': np.zeros((self._capacity, 3)),
             'moment': np.zeros((self._capacity, 3)),
-            'second': np.zeros(self._capacity),
+            'second': np.zeros((self._capacity, 3, 3)),
         }
         self._count = 0
         # stamps and nodes, split or not, and the odometry between them
@@ -222,7 +228,7 @@ class KeyframeChain:
     def _append(self, stamp: int, transform: np.ndarray, previous: int) -> None:
         travelled, session = 0.0, self.sessions - 1
         recording = len(self._recorded) - 1
-        origin, moment, second = transform[:3, 3], np.zeros(3), 0.0
+        origin, moment, second = transform[:3, 3], np.zeros(3), np.zeros((3, 3))
         if previous >= 0:
             origin = self._arrays['origin'][previous]
             a, b = self.transforms[previous][:3, 3] - origin, transform[:3, 3] - origin
@@ -230,7 +236,10 @@ class KeyframeChain:
             travelled = float(self.travelled[previous]) + length
             session = int(self.session[previous])
             moment = self._arrays['moment'][previous] + length * (a + b) / 2
-            second = self._arrays['second'][previous] + length * (a @ a + a @ b + b @ b) / 3
+            # Simpson's rule is exact for squares
+            points = np.array([a, (a + b) / 2, b])
+            second = points.T @ (points * np.array([[1.0], [4.0], [1.0]])) * length / 6
+            second += self._arrays['second'][previous]
         node = self._extend(
             stamp, transform, travelled, session, previous, recording,
             np.array(self._stood), origin, moment, second,
@@ -322,10 +331,14 @@ class KeyframeChain:
         away = T[..., :3, 3] - sums['origin'][node]
         length = self.travelled[others] - self.travelled[node]
         moment = sums['moment'][others] - sums['moment'][node]
-        spread = sums['second'][others] - sums['second'][node] - 2 * (moment * away).sum(axis=-1)
-        spread += length * (away**2).sum(axis=-1)
+        lever = moment[:, :, None] * away[..., None, :]
+        second = sums['second'][others] - sums['second'][node] - lever - lever.swapaxes(1, 2)
+        second += length[:, None, None] * (away[..., :, None] * away[..., None, :])
+        second *= np.sign(length)[:, None, None]
         moment = moment - length[:, None] * away
-        return Ways(length, np.einsum('...ij,...i->...j', T[..., :3, :3], moment), np.abs(spread))
+        R = T[..., :3, :3]
+        turned = np.swapaxes(R, -1, -2) @ second @ R
+        return Ways(length, np.einsum('...ij,...i->...j', R, moment), turned)
 
     def is_ahead(self, stamp: int) -> bool:
         """Return whether odometry of this stamp may still arrive."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 from stavpr_ros.pose_graph.odometry import KeyframeChain, OdometryNoise
-from stavpr_ros.pose_graph.transforms import inverse
+from stavpr_ros.pose_graph.transforms import adjoints, cross, inverse
 
 LONGEST = 10  # keyframes of a run
 SHORTEST = 0.05  # meters that a step counts at least
@@ -88,7 +88,7 @@ class Runs:
         )
         share = np.linalg.solve(self.covariance[after], error[:, :, None])
         rest = inverse(self.motion[after]) @ self.motion[inner]  # the node as seen from the end
-        step = self.covariance[inner] @ _adjoints(rest).transpose(0, 2, 1) @ share
+        step = self.covariance[inner] @ adjoints(rest).transpose(0, 2, 1) @ share
         step = step[:, :, 0]
         result[inner, :3, 3] += np.einsum('nij,nj->ni', result[inner, :3, :3], step[:, 3:])
         turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
@@ -119,25 +119,9 @@ def _covariances(
     turn, shift, unit = noise.rotation**2, noise.translation**2, np.eye(3)
     result = np.zeros((len(order), 6, 6))
     result[:, :3, :3] = turn * total[:, None, None] * unit
-    lever = turn * _cross(moment)
+    lever = turn * cross(moment)
     result[:, 3:, :3], result[:, :3, 3:] = lever, lever.transpose(0, 2, 1)
     result[:, 3:, 3:] = shift * total[:, None, None] * unit
     trace = np.trace(second, axis1=1, axis2=2)
     result[:, 3:, 3:] += turn * (trace[:, None, None] * unit - second)
     return result
-
-
-def _adjoints(motions: np.ndarray) -> np.ndarray:
-    """Return the adjoints of motions (n, 4, 4), rotation first, shape (n, 6, 6)."""
-    R = motions[:, :3, :3]
-    result = np.zeros((len(motions), 6, 6))
-    result[:, :3, :3] = result[:, 3:, 3:] = R
-    result[:, 3:, :3] = _cross(motions[:, :3, 3]) @ R
-    return result
-
-
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    """Return the matrices (n, 3, 3) of the cross products with vectors (n, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)

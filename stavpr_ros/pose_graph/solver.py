@@ -119,9 +119,47 @@ class Solver:
         :param kernels: of Cauchy, one solution after the other: a narrow one does not pull edges
             from afar.
         """
+        self.restart()
+        _, values, runs = self._optimized(chain, initial, edges, noise, links, kernels)
+        self.restart()
+        return self._nodes(values, runs)
+
+    def residuals(
+        self, chain: KeyframeChain, initial: np.ndarray, edges: dict[int, ResolvedClosure],
+        others: dict[int, ResolvedClosure], noise: OdometryNoise, links: dict[int, int],
+    ) -> tuple[np.ndarray, dict[int, tuple[np.ndarray, np.ndarray]]]:  # fmt: skip
+        """
+        Return what edges miss the solution by that some of them have by least squares.
+
+        Arguments as in `update`.
+
+        :param edges: of the solution.
+        :param others: further ones, with keys that ``edges`` has not.
+        :returns: transforms of all nodes, shape (N, 4, 4); for each edge what it misses by in its
+            own deviations, shape (6,), and the covariance of the solution there, (6, 6).
+        """
+        gtsam = self._gtsam
+        self.restart()
+        self._ends |= {node for edge in others.values() for node in (edge.query, edge.place)}
+        graph, values, runs = self._optimized(chain, initial, edges, noise, links, (None,))
+        marginals, found = gtsam.Marginals(graph, values), {}
+        for key, edge in (edges | others).items():
+            joint = marginals.jointMarginalCovariance(gtsam.KeyVector([edge.place, edge.query]))
+            covariance = joint.fullMatrix()  # in the order of the nodes
+            if edge.query < edge.place:
+                covariance = np.roll(covariance, 6, axis=(0, 1))
+            change, missed = self._edge(edge, None).linearize(values).jacobian()
+            found[key] = missed, change @ covariance @ change.T
+        self.restart()
+        return self._nodes(values, runs), found
+
+    def _optimized(
+        self, chain: KeyframeChain, initial: np.ndarray, edges: dict[int, ResolvedClosure],
+        noise: OdometryNoise, links: dict[int, int], kernels: tuple[float | None, ...],
+    ) -> tuple[Any, Any, Runs]:  # fmt: skip
+        """Return the graph, its variables by Levenberg-Marquardt, and the runs."""
         gtsam = self._gtsam
         base, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self.restart()
         runs = self._divide(chain, noise, edges, links)
         self._add_runs(base, values, chain, initial, runs, links)
         options = gtsam.LevenbergMarquardtParams()
@@ -132,8 +170,7 @@ class Solver:
             for edge in edges.values():
                 graph.add(self._edge(edge, kernel))
             values = gtsam.LevenbergMarquardtOptimizer(graph, values, options).optimize()
-        self.restart()
-        return self._nodes(values, runs)
+        return graph, values, runs
 
     def _divide(
         self, chain: KeyframeChain, noise: OdometryNoise, edges: dict[int, ResolvedClosure],
@@ -179,12 +216,12 @@ class Solver:
             graph.add(factor)
         return new, replaced
 
-    def _edge(self, edge: ResolvedClosure, kernel: float = CAUCHY) -> Any:
+    def _edge(self, edge: ResolvedClosure, kernel: float | None = CAUCHY) -> Any:
         gtsam = self._gtsam
-        model = gtsam.noiseModel.Robust.Create(
-            gtsam.noiseModel.mEstimator.Cauchy.Create(kernel),
-            gtsam.noiseModel.Gaussian.Covariance(edge.covariance),
-        )
+        model = gtsam.noiseModel.Gaussian.Covariance(edge.covariance)
+        if kernel is not None:
+            estimator = gtsam.noiseModel.mEstimator.Cauchy.Create(kernel)
+            model = gtsam.noiseModel.Robust.Create(estimator, model)
         measured = gtsam.Pose3(edge.transform)
         return gtsam.BetweenFactorPose3(edge.place, edge.query, measured, model)
 

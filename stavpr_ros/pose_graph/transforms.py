@@ -63,3 +63,35 @@ def body_covariance(covariance: np.ndarray, transform: np.ndarray) -> np.ndarray
     change[:3, 3:] = change[3:, :3] = turn
     result: np.ndarray = change @ covariance @ change.T
     return result
+
+
+def logarithms(motions: np.ndarray) -> np.ndarray:
+    """
+    Return the logarithms of motions (n, 4, 4), rotation first, shape (n, 6).
+
+    A turn about any one point is exact (Sola et al., *A micro Lie theory for state estimation in
+    robotics*, 2018, equations 174 and 179).
+    """
+    turn = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
+    half = np.maximum(np.linalg.norm(turn, axis=1), 1e-4) / 2
+    hat, shift = cross(turn), motions[:, :3, 3, None]
+    once = hat @ shift
+    rest = (1 - half / np.tan(half)) / (4 * half**2)
+    moved = shift - once / 2 + rest[:, None, None] * (hat @ once)
+    return np.concatenate([turn, moved[:, :, 0]], axis=1)
+
+
+def adjoints(motions: np.ndarray) -> np.ndarray:
+    """Return the adjoints of motions (n, 4, 4), rotation first, shape (n, 6, 6)."""
+    R = motions[:, :3, :3]
+    result = np.zeros((len(motions), 6, 6))
+    result[:, :3, :3] = result[:, 3:, 3:] = R
+    result[:, 3:, :3] = cross(motions[:, :3, 3]) @ R
+    return result
+
+
+def cross(vectors: np.ndarray) -> np.ndarray:
+    """Return the matrices (n, 3, 3) of the cross products with vectors (n, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
