@@ -10,7 +10,7 @@ from stavpr_ros.pose_graph.closures import ResolvedClosure
 from stavpr_ros.pose_graph.consistency import Cluster, ConsistencySettings, ConsistentSet, grow
 from stavpr_ros.pose_graph.cycles import Cycles
 from stavpr_ros.pose_graph.odometry import KeyframeChain, OdometryNoise
-from stavpr_ros.pose_graph.refutation import refuted
+from stavpr_ros.pose_graph.refutation import Refutation
 from stavpr_ros.pose_graph.sessions import Ties
 
 SCALES = np.geomspace(0.05, 2.0, 16)  # factors on the errors of the odometry that are tried
@@ -204,7 +204,8 @@ class Acceptance:
             for i in np.flatnonzero(self.chosen)
             if self._counts(self.clusters[i].representative, ties)
         }
-        found = refuted(self._chain, initial, whole, self.cautious_noise, ties.links)
+        together = Refutation(self._chain, self.cautious_noise, ties.links)
+        found = together.refuted(initial, whole)
         self._tested, self._tested_at = True, accepted
         if found:
             self._refuted |= set(found)
