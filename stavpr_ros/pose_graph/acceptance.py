@@ -21,7 +21,7 @@ UNEXPLAINED = 0.25
 SAMPLE, CYCLES = 120, 60  # clusters at most for that: compared, and whose cycles are used
 CAUTION = 1.5  # factor on the estimated errors of the odometry where closures are compared
 SAME = 0.7, 1.4  # a factor that changes by less is the same
-MORE = 1.3  # so many times as many clusters: the factor is estimated anew
+MORE = 1.3  # so many times as many clusters: factor and breaks are decided anew
 GROWN = 1.05  # so many times as many accepted clusters: they are tested together anew
 
 
@@ -39,6 +39,8 @@ class Acceptance:
         self._chain, self._noise, self._settings, self._adapt = chain, noise, settings, adapt
         self._consistent = ConsistentSet(settings)
         self._scaled_at = 0
+        # breaks that ended: first nodes, and the weight of all closures then
+        self._denied: list[tuple[int, float]] = []
         self.scale = 1.0
         self.loop_scale = math.inf  # until there are clusters enough
         self.restart()
@@ -110,11 +112,13 @@ class Acceptance:
 
     def ended_break(self) -> int | None:
         """Return the first node behind a break that closures do not prove any more."""
-        weight = self._weight(self._chain.session)
-        rejected = sum(cluster.weight for cluster in self.clusters) - weight
-        least = max(self._settings.break_support / 2, UNEXPLAINED * rejected)
         for node in self._chain.splits:
-            if weight - self._weight(self._chain.rejoined(node)) < least:
+            without = self._weight(self._chain.rejoined(node))
+            if not self._is_proved(self._weight(self._chain.session), without):
+                return node
+            # many that it lets agree may be refuted by all together
+            if not self._is_proved(sum(cluster.weight for cluster in self.accepted), without):
+                self._denied.append((node, self._total))
                 return node
         return None
 
@@ -127,10 +131,21 @@ class Acceptance:
         )  # fmt: skip
         if not found:
             return None
-        weight, gained = self._weight(chain.session), self._weight(chain.parted(found.node))
-        rejected = sum(cluster.weight for cluster in self.clusters) - gained
-        is_proved = gained - weight >= max(settings.break_support / 2, UNEXPLAINED * rejected)
-        return found if is_proved else None
+        for node, total in self._denied:
+            way = abs(chain.travelled[found.node] - chain.travelled[node])
+            if way < settings.break_distance and self._total < MORE * total:
+                return None
+        gained, weight = self._weight(chain.parted(found.node)), self._weight(chain.session)
+        return found if self._is_proved(gained, weight) else None
+
+    @property
+    def _total(self) -> float:
+        return sum(cluster.weight for cluster in self.clusters)
+
+    def _is_proved(self, weight: float, without: float) -> bool:
+        """Return whether a break is proved, by the weights that agree with and without it."""
+        rejected = UNEXPLAINED * (self._total - weight)
+        return weight - without >= max(self._settings.break_support / 2, rejected)
 
     def adapt(self) -> bool:
         """

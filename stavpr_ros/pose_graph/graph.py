@@ -4,6 +4,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from stavpr_ros.errors import InputError
@@ -42,6 +43,22 @@ class GraphEdge:
     query: int
     place: int
     accepted: bool
+
+
+class Arranged(NamedTuple):
+    """
+    What is solved.
+
+    :param ties: of the sessions.
+    :param edges: by their numbers.
+    :param initial: transforms of all nodes, shape (N, 4, 4).
+    :param moved: whether these are not the last estimate.
+    """
+
+    ties: Ties
+    edges: dict[int, ResolvedClosure]
+    initial: np.ndarray
+    moved: bool
 
 
 class PoseGraph:
@@ -179,10 +196,7 @@ class PoseGraph:
             return self.solved
         if self._acceptance.has_changed:
             self._decide()
-        ties, edges, initial, moved = self._arrange()
-        while self._acceptance.refute(initial, ties, final):
-            self._solver.restart()
-            ties, edges, initial, moved = self._arrange()
+        ties, edges, initial, moved = self._settle(final)
         if moved:
             self._solver.restart()
         if final or moved:
@@ -208,25 +222,32 @@ class PoseGraph:
         if self._acceptance.adapt():
             self._solver.restart()
 
-    def _arrange(self) -> tuple[Ties, dict[int, ResolvedClosure], np.ndarray, bool]:
-        """
-        Tie the sessions by the accepted closures.
+    def _settle(self, final: bool) -> Arranged:
+        """Reject clusters that all others together refute, and breaks that only they proved."""
+        arranged = self._arrange()
+        while self._acceptance.refute(arranged.initial, arranged.ties, final):
+            self._solver.restart()
+            arranged = self._arrange()
+        ended = self._acceptance.ended_break()
+        if ended is None:
+            return arranged
+        self._unsplit(ended)
+        return self._settle(final)
 
-        :returns: the ties; the edges of the solution; the nodes before it (N, 4, 4); whether these
-            are not the last estimate.
-        """
+    def _arrange(self) -> Arranged:
+        """Tie the sessions by the accepted closures."""
         accepted = self._acceptance.accepted
         ties = tie(self.chain, accepted, self.settings.consistency.join_support)
         moved = ties.moved_since(self._ties)
         edges = self._select(accepted, ties)
         if moved:
-            return ties, edges, placed(self.chain, accepted, ties), True
+            return Arranged(ties, edges, placed(self.chain, accepted, ties), True)
         initial = extended(self.chain, self.solved, ties)
         far, session = self._far(edges, initial), self.chain.session
         if any(session[edge.query] != session[edge.place] for edge in far):
             initial = placed(self.chain, accepted, ties)
         # such edges would have no influence on the robust solution
-        return ties, edges, initial, bool(far)
+        return Arranged(ties, edges, initial, bool(far))
 
     def _split(self, at: Break) -> None:
         """Begin a session; closures on both sides of a break are no clusters any more."""
