@@ -9,6 +9,7 @@ import pytest
 from stavpr_ros.demonstration.street import laps
 from stavpr_ros.pose_graph import PoseGraph
 from stavpr_ros.pose_graph.odometry import ChainSettings, KeyframeChain
+from stavpr_ros.pose_graph.refutation import Refutation
 from stavpr_ros.pose_graph.transforms import inverse, planar_poses
 from test_pose_graph import carried_drive, circle, closure, error, LAP, odometry_of, SECOND, solve
 
@@ -105,3 +106,26 @@ def test_update_false_break_ends_when_closures_are_against_it():
     assert splits[-1] == 0
     assert graph.chain.sessions == 1
     assert error(found, truth) < 1.5
+
+
+def test_update_break_that_only_refuted_closures_prove_ends_and_stays_ended(monkeypatch):
+    truth, odometry, closures = carried_drive()
+    behind, splits = closures[-1].query_stamp // SECOND - 40, []
+    monkeypatch.setattr(Refutation, 'refuted', lambda _, __, edges: [
+        key for key, (edge, _) in edges.items() if edge.query >= behind
+    ])  # fmt: skip
+    split = KeyframeChain.split
+    monkeypatch.setattr(KeyframeChain, 'split', lambda chain, node, stamp: (
+        splits.append(len(graph.edges)), split(chain, node, stamp)
+    ))  # fmt: skip
+    graph, waiting = PoseGraph(), list(closures)
+    for i, pose in enumerate(odometry):
+        graph.add_odometry((i + 1) * SECOND, pose)
+        while waiting and waiting[0].query_stamp <= (i + 1) * SECOND:
+            graph.add_closure(waiting.pop(0))
+        if i % 5 == 0:
+            graph.update()
+    graph.update(final=True)
+    assert splits
+    assert graph.splits == 0
+    assert (np.array(splits[1:]) >= 1.3 * np.array(splits[:-1])).all()
