@@ -2,9 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Edges that agree with each other one, and contradict all others together."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from stavpr_ros.demonstration.street.laps import drifted
+from stavpr_ros.pose_graph import optimize
 from stavpr_ros.pose_graph.consistency import LIMIT
 from stavpr_ros.pose_graph.cycles import Cycles
 from stavpr_ros.pose_graph.false_places import FalsePlaces
@@ -106,3 +109,30 @@ def test_optimize_with_half_of_the_closures_false_in_runs(draw, monkeypatch):
     assert ratio_of_drive(draw) < 0.2
     monkeypatch.setattr(Refutation, 'refuted', lambda *_: [])
     assert ratio_of_drive(draw) > 0.35
+
+
+def two_sessions(covariance=None):
+    """Return stamps, odometry, and closures within each of two sessions of two laps."""
+    truth, lap = circle(4), 100
+    stamps = (np.arange(len(truth)) + 1) * 10**9
+    stamps[2 * lap :] += 1000 * 10**9
+    dice, noticed = np.random.default_rng(1), np.ones(len(truth), bool)
+    odometry = planar_poses(drifted(truth, noticed, dice, 1.0))
+    queries = [*range(lap, 2 * lap), *range(3 * lap, 4 * lap)]
+    closures = [closure(truth, q, q - lap, None, stamps) for q in queries]
+    if covariance is not None:
+        closures = [replace(each, covariance=covariance) for each in closures]
+    return stamps, odometry, closures
+
+
+def test_optimize_sessions_that_nothing_joins_are_compared_each():
+    _, graph = optimize(*two_sessions())
+    assert graph.chain.sessions == 2
+    assert graph.accepted >= 198
+
+
+@pytest.mark.parametrize('variance', [1e-8, 1e4])
+def test_optimize_ill_conditioned_edges_are_not_compared_together(variance):
+    found, graph = optimize(*two_sessions(np.eye(6) * variance))
+    assert np.isfinite(found).all()
+    assert graph.accepted >= 198

@@ -141,7 +141,9 @@ class Solver:
         gtsam = self._gtsam
         self.restart()
         self._ends |= {node for edge in others.values() for node in (edge.query, edge.place)}
-        graph, values, runs = self._optimized(chain, initial, edges, noise, links, (None,))
+        # no edge compares sessions that nothing joins: loosely tied, they would be ill-conditioned
+        anchors = dict.fromkeys(links, -1)
+        graph, values, runs = self._optimized(chain, initial, edges, noise, anchors, (None,))
         marginals, found = gtsam.Marginals(graph, values), {}
         for key, edge in (edges | others).items():
             joint = marginals.jointMarginalCovariance(gtsam.KeyVector([edge.place, edge.query]))
