@@ -109,7 +109,7 @@ def test_update_false_break_ends_when_closures_are_against_it():
 
 
 def test_update_break_that_only_refuted_closures_prove_ends_and_stays_ended(monkeypatch):
-    truth, odometry, closures = carried_drive()
+    _, odometry, closures = carried_drive()
     behind, splits = closures[-1].query_stamp // SECOND - 40, []
     monkeypatch.setattr(Refutation, 'refuted', lambda _, __, edges: [
         key for key, (edge, _) in edges.items() if edge.query >= behind
