@@ -128,11 +128,13 @@ def two_sessions(covariance=None):
 def test_optimize_sessions_that_nothing_joins_are_compared_each():
     _, graph = optimize(*two_sessions())
     assert graph.chain.sessions == 2
+    assert graph.uncompared == 0
     assert graph.accepted >= 198
 
 
 @pytest.mark.parametrize('variance', [1e-8, 1e4])
-def test_optimize_ill_conditioned_edges_are_not_compared_together(variance):
+def test_optimize_ill_conditioned_edges_are_counted_and_not_compared_together(variance):
     found, graph = optimize(*two_sessions(np.eye(6) * variance))
     assert np.isfinite(found).all()
     assert graph.accepted >= 198
+    assert (graph.uncompared > 0) == (variance < 1)

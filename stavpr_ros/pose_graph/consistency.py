@@ -18,7 +18,7 @@ from stavpr_ros.pose_graph.closures import ResolvedClosure
 from stavpr_ros.pose_graph.cycles import Cycles
 from stavpr_ros.pose_graph.odometry import KeyframeChain, OdometryNoise
 
-LIMIT = 16.0  # squared deviations
+LIMIT = 16.0  # squared deviations: 99.9 % for motion in a plane, of three dimensions
 STARTS = 100  # rejected clusters that the search begins with as well
 
 

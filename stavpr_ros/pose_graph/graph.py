@@ -66,7 +66,7 @@ class PoseGraph:
     Keyframes of the odometry and the loop closures between them.
 
     Add odometry and closures in any order of arrival, and update now and then. ``counts`` has the
-    closures by what became of them; ``problems`` the latest reasons of rejected input.
+    input that is left out, by its reason.
 
     :raises UnavailableError: GTSAM is not installed.
     """
@@ -325,6 +325,11 @@ class PoseGraph:
     def used(self) -> dict[int, ResolvedClosure]:
         """Return the edges of the solution by their numbers."""
         return self._edges
+
+    @property
+    def uncompared(self) -> int:
+        """Return how often the graph was too ill-conditioned to compare all closures together."""
+        return self._acceptance.uncompared
 
     @property
     def splits(self) -> int:

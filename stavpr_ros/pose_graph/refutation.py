@@ -20,7 +20,6 @@ STARTS = 3  # edges left out that a search keeps
 ROUNDS = 4  # of leaving out and taking in
 FLOOR = 1e-6  # of the variance of an edge: as much is left where nothing else knows its ends
 
-
 Weighted = dict[int, tuple[ResolvedClosure, float]]  # edges by any keys, with their weights
 
 
@@ -42,23 +41,21 @@ class Refutation:
 
         What is left may be the lighter of two sides, where edges support each other: it is
         searched again with some of those that were left out, heavy ones first, and the heaviest
-        set counts. None are refuted where the graph is too ill-conditioned for its covariance, as
-        by edges of a tenth of a millimeter.
+        set counts.
 
         :param initial: transforms of all nodes, shape (N, 4, 4).
+        :raises RuntimeError: the graph is too ill-conditioned for its covariance, as by edges of a
+            tenth of a millimeter.
         """
 
         def weight(keys: list[int]) -> float:
             return sum(edges[key][1] for key in keys)
 
-        try:
-            found = self._left_out(initial, edges, None) or []
-            for key in sorted(found, key=lambda key: -edges[key][1])[:STARTS]:
-                other = self._left_out(initial, edges, key) if key in found else None
-                if other is not None and weight(other) < weight(found):
-                    found = other
-        except RuntimeError:  # of GTSAM
-            return []
+        found = self._left_out(initial, edges, None) or []
+        for key in sorted(found, key=lambda key: -edges[key][1])[:STARTS]:
+            other = self._left_out(initial, edges, key) if key in found else None
+            if other is not None and weight(other) < weight(found):
+                found = other
         return found
 
     def _left_out(

@@ -343,6 +343,7 @@ class PoseGraphNode(ManagedNode):
             'rejected_closures': graph.rejected,
             'waiting_closures': graph.pending,
             'closures_of_unknown_stamps': unknown,
+            'comparisons_left_out': graph.uncompared,
             'odometry_error_factor': f'{graph.scale:.2f}',
             'last_problem': self.problem,
             **{name.replace(' ', '_'): count for name, count in self.counts.items()},
