@@ -18,8 +18,10 @@ export MAP QUERY LOOP SLAM
 SETUP = $(PYTHON) -E tools/setup_venv.py
 RUN = $(SETUP) run
 OPTIONS = --torch-index '$(TORCH_INDEX)' --with
-TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN) pytest -n 2 --dist loadfile test
+TESTS := test stavpr_slam/test stavpr_lab/test
+TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN) pytest -n 2 --dist loadfile $(TESTS)
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
+LAB := install/stavpr_lab/lib/stavpr_lab
 
 .PHONY: help setup build demo evaluate test test-long lint docs bench bench-quick accuracy off-map \
 	shell clean distclean development
@@ -39,19 +41,19 @@ help: ## list the targets (the default)
 setup: ## create .venv with the pinned Python packages and the ROS 2 Jazzy wheels
 	@$(SETUP) setup $(OPTIONS) $(EXTRAS)
 
-build: ## setup, then build stavpr_msgs and stavpr_ros with colcon
+build: ## setup, then build the packages with colcon
 	@$(SETUP) build $(OPTIONS) $(EXTRAS)
 
 ifdef SLAM
 demo: override EXTRAS += slam
 endif
 demo: build ## run the node on the synthetic street, or on your images (MAP= QUERY= LOOP= ARGS=)
-	@$(RUN) $(EXECUTABLES)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
+	@$(RUN) $(LAB)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
 		$(if $(LOOP),--loop "$$LOOP") $(if $(SLAM),--slam "$$SLAM") $(ARGS)
 
 evaluate: override EXTRAS += evaluation
 evaluate: build ## evaluate the recognition of QUERY= on MAP=: metrics, plots, a report (ARGS=)
-	@$(RUN) $(EXECUTABLES)/evaluate $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
+	@$(RUN) $(LAB)/evaluate $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
 		$(ARGS)
 
 test: lint docs ## lint, build the documentation, and run the tests but the long ones (ARGS=)
@@ -83,7 +85,7 @@ off-map: build ## measure mode robust off the map, at night, at other speeds (AR
 	@OMP_WAIT_POLICY=PASSIVE $(RUN) python benchmarks/off_map.py $(ARGS)
 
 shell: build ## open a bash in which the built packages are found
-	@echo 'The executables are in $(EXECUTABLES)/. Leave with exit.'
+	@echo 'The executables are in $(EXECUTABLES)/ and $(LAB)/. Leave with exit.'
 	@$(RUN) env PS1='(stavpr_ros) \w\$$ ' bash --norc -i || true
 
 clean: ## remove build/ install/ log/ docs/_build/

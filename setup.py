@@ -3,6 +3,9 @@
 """
 Package description for both ways to install: ``colcon build`` and ``pip install .``.
 
+colcon runs ``setup.py install`` of each package. pip builds a wheel of this folder, with the
+Python packages of stavpr_slam and stavpr_lab in it, since it does not find these as dependencies.
+
 Both install the command ``stavpr`` on the PATH, and the executables of ``ros2 run`` as plain
 scripts in ``lib/stavpr_ros``. The latter are data files, not entry points: pip writes entry
 points of any name into ``bin``, where ``node`` or ``record`` would be too generic, and the
@@ -10,30 +13,22 @@ scripts that setuptools generates for entry points require the distributions bel
 Debian's packages provide under other names.
 """
 
+from configparser import ConfigParser
 from glob import glob
 from pathlib import Path
+import sys
 
 from setuptools import find_packages, setup
 
 NAME = 'stavpr_ros'
-EXECUTABLES = (
-    'node',
-    'build_map',
-    'map',
-    'weights',
-    'export_model',
-    'replay',
-    'demo',
-    'record',
-    'monitor',
-    'pose_graph',
-    'bridge',
-    'evaluate',
-    'experiments',
-)
+SIBLINGS = ('stavpr_slam', 'stavpr_lab')
+WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel', 'sdist'}.isdisjoint(sys.argv)
 
-# The command `evaluate` is part of every installation.
-EVALUATION = ['jinja2>=3.1', 'scikit-learn>=1.4']
+# Commands of other packages print there where they are.
+EXECUTABLES = ('node', 'build_map', 'map', 'weights', 'replay', 'record', 'monitor')
+MOVED = ('demo', 'evaluate', 'experiments', 'export_model', 'pose_graph', 'bridge')
+
+EVALUATION = ['jinja2>=3.1', 'matplotlib>=3.6', 'scikit-learn>=1.4']
 TEST = ['hypothesis>=6.98', 'pytest>=7.4', 'PyYAML>=6.0', 'safetensors>=0.4']
 LINT = [
     'flake8>=7.0',
@@ -47,11 +42,19 @@ LINT = [
     'ruff>=0.9',
 ]
 
-
 def files_in(folder: str) -> list[str]:
     """List the files of a folder, relative to this one."""
     return sorted(path for path in glob(f'{folder}/*') if Path(path).is_file())
 
+
+packages = find_packages(include=[NAME, f'{NAME}.*'])
+entry_points = {'console_scripts': [f'stavpr = {NAME}.commands.stavpr:main']}
+for sibling in SIBLINGS if WHEEL else ():
+    packages += find_packages(sibling, include=[sibling, f'{sibling}.*'])
+    configuration = ConfigParser()
+    configuration.read(f'{sibling}/setup.cfg')
+    for group, lines in configuration['options.entry_points'].items():
+        entry_points.setdefault(group, []).extend(lines.split('\n'))
 
 setup(
     name=NAME,
@@ -61,19 +64,19 @@ setup(
     author='The stavpr_ros authors',
     maintainer='The stavpr_ros maintainers',
     maintainer_email='maintainers@stavpr-ros.org',
-    packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', '**/*.css', '**/*.html', '**/*.jinja', '**/*.js']},
+    packages=packages,
+    package_dir={sibling: f'{sibling}/{sibling}' for sibling in SIBLINGS},
+    package_data={'': ['py.typed', '*.html', '*.jinja']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', files_in('config')),
         (f'share/{NAME}/launch', files_in('launch')),
-        (f'lib/{NAME}', [f'scripts/{name}' for name in EXECUTABLES]),
+        (f'lib/{NAME}', [f'scripts/{name}' for name in EXECUTABLES + MOVED]),
     ],
     python_requires='>=3.11',
     install_requires=[
         'llvmlite',  # the version that numba pins
-        'matplotlib>=3.6',
         'numba>=0.59',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
@@ -82,7 +85,7 @@ setup(
         'scipy>=1.11',
         'torch>=2.2',
         'tqdm>=4.66',
-        *EVALUATION,
+        *(EVALUATION if WHEEL else []),
     ],
     extras_require={
         'cuda': ['numba-cuda>=0.30'],
@@ -98,5 +101,5 @@ setup(
         'test': TEST,
     },
     zip_safe=False,
-    entry_points={'console_scripts': [f'stavpr = {NAME}.commands.stavpr:main']},
+    entry_points=entry_points,
 )

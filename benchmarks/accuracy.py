@@ -19,16 +19,16 @@ from typing import Any
 from data import data_folder, NoDataError
 import numpy as np
 from results import environment, heading, RESULTS, table, write
-from stavpr_ros.errors import UnavailableError
-from stavpr_ros.evaluation.evaluate import (
+from stavpr_lab.evaluation.evaluate import (
     evaluate_loop_closures,
     evaluate_on_map,
     Evaluation,
     recognize_traverse,
 )
-from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import accepted_counts
-from stavpr_ros.evaluation.warp import cropped, KINDS, warp_indices
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_lab.evaluation.metrics import accepted_counts
+from stavpr_lab.evaluation.warp import cropped, KINDS, warp_indices
+from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, PlaceMap

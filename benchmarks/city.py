@@ -23,7 +23,7 @@ from data import data_folder
 import numpy as np
 from results import commit, cpu_model, RESULTS, ROOT, table
 from scipy.signal import lfilter
-from stavpr_ros.evaluation.warp import warp_indices
+from stavpr_lab.evaluation.warp import warp_indices
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import PlaceMap, save_map
 from stavpr_ros.mapping.builder import extract_features

@@ -19,7 +19,7 @@ from city import written_between
 from data import data_folder
 import numpy as np
 from results import RESULTS, ROOT, table
-from stavpr_ros.evaluation.evaluate import evaluate_on_map
+from stavpr_lab.evaluation.evaluate import evaluate_on_map
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.builder import extract_features

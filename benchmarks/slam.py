@@ -24,13 +24,14 @@ from results import environment, RESULTS, ROOT
 from scipy.spatial.transform import Rotation
 from slam_page import markdown
 from slam_pairs import CAMERA, Found, recognized, SharedViews, with_edges
-from stavpr_ros.demonstration.slam import trajectory_errors
-from stavpr_ros.demonstration.street.laps import CARRIED, drive_laps, LapDrive
-from stavpr_ros.pose_graph import Closure, optimize, PoseGraph
-from stavpr_ros.pose_graph.false_places import FalsePlaces
-from stavpr_ros.pose_graph.transforms import inverse, matrices, planar_poses
+from stavpr_lab.demonstration.slam import trajectory_errors
+from stavpr_lab.demonstration.street.laps import CARRIED, drive_laps, LapDrive
+from stavpr_ros.mapping.transforms import inverse, matrices
 from stavpr_ros.relative_pose.edge import Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
+from stavpr_slam.pose_graph import Closure, optimize, PoseGraph
+from stavpr_slam.pose_graph.false_places import FalsePlaces
+from stavpr_slam.pose_graph.transforms import planar_poses
 from tqdm import tqdm
 
 DRIFTS = {'large': 1.0, 'small': 0.06}  # factors on the errors of the odometry

@@ -10,18 +10,18 @@ import time
 from typing import Any, ClassVar
 
 import numpy as np
-from stavpr_ros.demonstration.street.laps import CAMERA_IN_BASE, intrinsics, LapDrive
-from stavpr_ros.demonstration.street.traverses import SIZE
+from stavpr_lab.demonstration.street.laps import CAMERA_IN_BASE, intrinsics, LapDrive
+from stavpr_lab.demonstration.street.traverses import SIZE
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.pipeline import Pipeline, PipelineSettings
-from stavpr_ros.pose_graph import Closure
-from stavpr_ros.pose_graph.alignment import APPEARANCE, IDENTITY
-from stavpr_ros.pose_graph.transforms import planar_poses
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.landmarks import View
 from stavpr_ros.relative_pose.pair import MatchedPair
 from stavpr_ros.sources.frame import ImageRecord
+from stavpr_slam.pose_graph import Closure
+from stavpr_slam.pose_graph.alignment import APPEARANCE, IDENTITY
+from stavpr_slam.pose_graph.transforms import planar_poses
 
 K = intrinsics()
 CAMERA = Camera(*SIZE, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), '', (), tuple(CAMERA_IN_BASE))

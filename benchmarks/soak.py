@@ -157,7 +157,7 @@ def main() -> None:
     )
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
-    from stavpr_ros.ros.live import executable, private_domain
+    from stavpr_lab.demonstration.live import executable, private_domain
     from stavpr_ros.ros.process import prepare_transport
 
     environment, load = private_domain(), os.getloadavg()[0]

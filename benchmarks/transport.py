@@ -99,7 +99,7 @@ def measure(
 @contextmanager
 def running(names: list[str], kind: str, map_path: Path) -> Iterator[None]:
     """Run nodes of these names while the block runs."""
-    from stavpr_ros.ros.live import executable
+    from stavpr_lab.demonstration.live import executable
 
     transport = 'raw' if kind == 'raw' else 'compressed'
     with ExitStack() as stack:
@@ -138,7 +138,7 @@ def main() -> None:
     )
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
-    from stavpr_ros.ros.live import private_domain
+    from stavpr_lab.demonstration.live import private_domain
     from stavpr_ros.ros.process import prepare_transport
 
     os.environ.update(private_domain())

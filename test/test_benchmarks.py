@@ -33,10 +33,10 @@ import results
 from results import PeerTime, Row
 from run import Peer, Run
 import stages
+from stavpr_lab.evaluation.drive import DriveChanges
+from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.alignment import match_sequence, SequenceDistances
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
-from stavpr_ros.evaluation.drive import DriveChanges
-from stavpr_ros.evaluation.ground_truth import GroundTruth
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.match import Match, Status

@@ -22,14 +22,14 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from scipy.spatial.transform import Rotation
 from stavpr_msgs.msg import LoopClosure
-from stavpr_ros.commands.bridge import main
 from stavpr_ros.errors import UnavailableError
-from stavpr_ros.pose_graph import Closure
-from stavpr_ros.pose_graph.foreign import body_information, ForeignKeyframes, keyframe_edge
-from stavpr_ros.pose_graph.transforms import inverse, matrices, to_poses
-from stavpr_ros.ros.bridges.bridge import interfaces
-from stavpr_ros.ros.graph_messages import pose_array
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.ros.output import nanoseconds
+from stavpr_slam.commands.bridge import main
+from stavpr_slam.pose_graph import Closure
+from stavpr_slam.pose_graph.foreign import body_information, ForeignKeyframes, keyframe_edge
+from stavpr_slam.ros.bridges.bridge import interfaces
+from stavpr_slam.ros.graph_messages import pose_array
 
 PLACE = np.array([0, 0, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)])  # heading y
 COVARIANCE = np.diag([0.2, 0.1, 0.3, 0.01, 0.02, 0.03]) ** 2

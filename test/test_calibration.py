@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.evaluation.calibration import calibrate
+from stavpr_lab.evaluation.calibration import calibrate
 
 NAN = float('nan')
 

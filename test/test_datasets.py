@@ -5,8 +5,8 @@
 import cv2
 import numpy as np
 import pytest
+from stavpr_lab.evaluation.paper.datasets import open_dataset
 from stavpr_ros.errors import SettingsError, SourceError
-from stavpr_ros.evaluation.paper.datasets import open_dataset
 
 
 def fill(folder, count, value=0):

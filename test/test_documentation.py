@@ -13,7 +13,7 @@ from evaluation_commands import write_images
 import pytest
 from stavpr_ros.commands import stavpr
 from stavpr_ros.parameters import PARAMETERS
-from stavpr_ros.ros.bridges.bridge import EdgeBridge
+from stavpr_slam.ros.bridges.bridge import EdgeBridge
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').glob('*.md'))]

@@ -4,9 +4,9 @@
 
 import numpy as np
 import pytest
+from stavpr_lab.evaluation.drive import DriveChanges
+from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.evaluation.drive import DriveChanges
-from stavpr_ros.evaluation.ground_truth import GroundTruth
 
 # four images in six places: 0 -> 1; 1 -> 2, 3; 2 -> nothing; 3 -> 0, 5
 PAIRS = [(0, 1), (1, 2), (1, 3), (3, 0), (3, 5)]

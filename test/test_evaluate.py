@@ -12,10 +12,10 @@ import cv2
 from evaluation_commands import read_json, runner, write_images
 import numpy as np
 import pytest
+from stavpr_lab.commands import evaluate
+from stavpr_lab.evaluation.evaluate import recognize_all
+from stavpr_lab.evaluation.metrics import best_f1, image_matches
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-from stavpr_ros.commands import evaluate
-from stavpr_ros.evaluation.evaluate import recognize_all
-from stavpr_ros.evaluation.metrics import best_f1, image_matches
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings

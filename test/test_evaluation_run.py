@@ -4,18 +4,18 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.alignment import SequenceMatch, SequenceSettings
-from stavpr_ros.errors import InputError
-from stavpr_ros.evaluation import evaluate as module
-from stavpr_ros.evaluation.evaluate import (
+from stavpr_lab.evaluation import evaluate as module
+from stavpr_lab.evaluation.evaluate import (
     evaluate_traverse,
     recognize_traverse,
     ReducedDistances,
     TraverseResults,
 )
-from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import Ranking
-from stavpr_ros.evaluation.report import worst_mistakes
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_lab.evaluation.metrics import Ranking
+from stavpr_lab.evaluation.report import worst_mistakes
+from stavpr_ros.alignment import SequenceMatch, SequenceSettings
+from stavpr_ros.errors import InputError
 from stavpr_ros.recognition import Match, RecognizerSettings, Status
 
 

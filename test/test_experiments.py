@@ -6,18 +6,18 @@ from conftest import route_images
 from evaluation_commands import read_json, runner, write_images
 import numpy as np
 import pytest
-from stavpr_ros.commands import experiments
-from stavpr_ros.errors import SettingsError
-from stavpr_ros.evaluation.evaluate import evaluate_on_map
-from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.paper.datasets import Dataset
-from stavpr_ros.evaluation.paper.experiments import (
+from stavpr_lab.commands import experiments
+from stavpr_lab.evaluation.evaluate import evaluate_on_map
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_lab.evaluation.paper.datasets import Dataset
+from stavpr_lab.evaluation.paper.experiments import (
     BaselineInputs,
     DatasetExperiment,
     PRESETS,
     sweep_configurations,
 )
-from stavpr_ros.evaluation.paper.published import published_f1
+from stavpr_lab.evaluation.paper.published import published_f1
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map
 from stavpr_ros.recognition import RecognizerSettings

@@ -8,7 +8,7 @@ import re
 from evaluation_commands import runner
 import numpy as np
 import pytest
-from stavpr_ros.commands import export_model
+from stavpr_lab.commands import export_model
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class, settings_class

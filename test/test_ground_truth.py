@@ -7,9 +7,9 @@ import pickle
 import cv2
 import numpy as np
 import pytest
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_lab.evaluation.ground_truth_files import read_poses
 from stavpr_ros.errors import InputError, SourceError
-from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.ground_truth_files import read_poses
 
 # three queries in five places: 0 -> 1, 2; 1 -> nothing; 2 -> 4
 PAIRS = [(0, 1), (0, 2), (2, 4)]
@@ -268,7 +268,7 @@ def test_from_poses_by_hand():
 
 
 def test_from_poses_in_chunks_equals_all_at_once(monkeypatch):
-    monkeypatch.setattr('stavpr_ros.evaluation.ground_truth.CHUNK', 7)
+    monkeypatch.setattr('stavpr_lab.evaluation.ground_truth.CHUNK', 7)
     poses = np.array([pose(float(i)) for i in range(5)])
     expected = GroundTruth.identity(5, 5, 1).pairs
     np.testing.assert_array_equal(GroundTruth.from_poses(poses, poses, 1).pairs, expected)

@@ -12,10 +12,10 @@ from llvmlite import binding, ir
 import numpy as np
 import oracle
 import pytest
+from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_ros.alignment import image_distances, SpatialSettings
 from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.mapping import build_map, extract_features

@@ -5,8 +5,8 @@
 import cv2
 from map_examples import VERSION1
 import pytest
+from stavpr_lab.demonstration.live import run_live
 from stavpr_ros.errors import StavprError
-from stavpr_ros.ros.live import run_live
 
 
 def test_run_live_returns_why_the_node_cannot_start(tmp_path, route):

@@ -5,10 +5,8 @@
 import numpy as np
 import oracle
 import pytest
-from stavpr_ros.alignment import SequenceMatch
-from stavpr_ros.errors import InputError
-from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import (
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_lab.evaluation.metrics import (
     best_f1,
     counts_at,
     evaluate_ranking,
@@ -16,6 +14,8 @@ from stavpr_ros.evaluation.metrics import (
     Ranking,
     smallest_indices,
 )
+from stavpr_ros.alignment import SequenceMatch
+from stavpr_ros.errors import InputError
 from stavpr_ros.recognition import Match, Status
 
 pytest.importorskip('sklearn', reason='the extra evaluation is not installed')

@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 from scipy.io import savemat
+from stavpr_lab.features.netvlad import STAGES
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.features.netvlad import STAGES
 from stavpr_ros.features.paper_networks import VGG16Fc6
 from stavpr_ros.features.registry import backbone_class, settings_class
 import torch

@@ -7,10 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from stavpr_ros.demonstration.plots import demo_sheet
-from stavpr_ros.evaluation.calibration import calibrate
-from stavpr_ros.evaluation.metrics import ImageMatches
-from stavpr_ros.evaluation.plots import (
+from stavpr_lab.demonstration.plots import demo_sheet
+from stavpr_lab.evaluation.calibration import calibrate
+from stavpr_lab.evaluation.metrics import ImageMatches
+from stavpr_lab.evaluation.plots import (
     distance_histogram,
     drive,
     match_overview,
@@ -19,7 +19,7 @@ from stavpr_ros.evaluation.plots import (
     reduced_matrix,
     reliability,
 )
-from stavpr_ros.evaluation.records import TraverseEvaluation
+from stavpr_lab.evaluation.records import TraverseEvaluation
 from stavpr_ros.pipeline.overlay import match_image, NO_MATCH, RIGHT
 
 QUERIES, PLACES, THRESHOLD = 40, 30, 0.5

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stavpr_ros.demonstration.street import laps
-from stavpr_ros.pose_graph import PoseGraph
-from stavpr_ros.pose_graph.odometry import ChainSettings, KeyframeChain
-from stavpr_ros.pose_graph.refutation import Refutation
-from stavpr_ros.pose_graph.transforms import inverse, planar_poses
+from stavpr_lab.demonstration.street import laps
+from stavpr_ros.mapping.transforms import inverse
+from stavpr_slam.pose_graph import PoseGraph
+from stavpr_slam.pose_graph.odometry import ChainSettings, KeyframeChain
+from stavpr_slam.pose_graph.refutation import Refutation
+from stavpr_slam.pose_graph.transforms import planar_poses
 from test_pose_graph import carried_drive, circle, closure, error, LAP, odometry_of, SECOND, solve
 
 

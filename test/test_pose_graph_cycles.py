@@ -6,18 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from stavpr_ros.pose_graph.acceptance import SCALES
-from stavpr_ros.pose_graph.closures import ResolvedClosure
-from stavpr_ros.pose_graph.consistency import ConsistencySettings, grow
-from stavpr_ros.pose_graph.cycles import Cycles
-from stavpr_ros.pose_graph.odometry import ChainSettings, KeyframeChain, OdometryNoise
-from stavpr_ros.pose_graph.transforms import (
-    inverse,
-    logarithms,
-    matrices,
-    planar_poses,
-    to_poses,
-)
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
+from stavpr_slam.pose_graph.acceptance import SCALES
+from stavpr_slam.pose_graph.closures import ResolvedClosure
+from stavpr_slam.pose_graph.consistency import ConsistencySettings, grow
+from stavpr_slam.pose_graph.cycles import Cycles
+from stavpr_slam.pose_graph.odometry import ChainSettings, KeyframeChain, OdometryNoise
+from stavpr_slam.pose_graph.transforms import logarithms, planar_poses
 
 NOISE = OdometryNoise(0.05, 0.003, 0.0001)
 COVARIANCE = np.diag([0.01, 0.01, 0.02, 0.3, 0.2, 0.1]) ** 2

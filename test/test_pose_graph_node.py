@@ -16,9 +16,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
-from stavpr_ros.pose_graph.transforms import planar_poses
-from stavpr_ros.ros.graph_messages import closure_of
 from stavpr_ros.ros.output import pose_message, time_message
+from stavpr_slam.pose_graph.transforms import planar_poses
+from stavpr_slam.ros.graph_messages import closure_of
 from test_pose_graph import circle, closure, error, LAP, NOISE, odometry_of
 
 

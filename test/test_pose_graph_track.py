@@ -4,12 +4,13 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.pose_graph import ChainSettings, GraphSettings, PoseGraph
-from stavpr_ros.pose_graph.files import save_graph
-from stavpr_ros.pose_graph.odometry import KeyframeChain
-from stavpr_ros.pose_graph.track import MOST
-from stavpr_ros.pose_graph.transforms import planar_poses, to_poses
-from stavpr_ros.ros.graph_messages import path_messages
+from stavpr_ros.mapping.transforms import to_poses
+from stavpr_slam.pose_graph import ChainSettings, GraphSettings, PoseGraph
+from stavpr_slam.pose_graph.files import save_graph
+from stavpr_slam.pose_graph.odometry import KeyframeChain
+from stavpr_slam.pose_graph.track import MOST
+from stavpr_slam.pose_graph.transforms import planar_poses
+from stavpr_slam.ros.graph_messages import path_messages
 from test_pose_graph import circle, closure, error, LAP, odometry_of, SECOND
 
 RATE = 20  # poses of the odometry between two images of a circle

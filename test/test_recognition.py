@@ -7,6 +7,7 @@ from dataclasses import replace
 from conftest import route_images
 import numpy as np
 import pytest
+from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_ros.alignment import (
     align_sequence,
     best_match,
@@ -15,7 +16,6 @@ from stavpr_ros.alignment import (
     SpatialSettings,
 )
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
-from stavpr_ros.evaluation.evaluate import recognize_all
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.recognition.verification import mutual_matches
 from stavpr_ros.relative_pose.bundle import odometry_information, SHIFT, TURN
 from stavpr_ros.relative_pose.landmarks import triangulate
-from stavpr_ros.relative_pose.transforms import inverse, matrix_of, pose_of
 from test_relative_pose import motions, points_ahead, pose, views_of
 
 
@@ -24,10 +24,10 @@ def test_triangulate_corrects_the_steps_of_poor_odometry(seed):
     points = points_ahead(300, seed)
     views = views_of(points, poses, noise=0.3)
     measured = [np.eye(4)]
-    for before, after in pairwise(map(matrix_of, poses)):
-        noise = matrix_of(pose(*rng.normal(0, (0.04, 0.005, 0.012))))
+    for before, after in pairwise(map(matrices, poses)):
+        noise = matrices(pose(*rng.normal(0, (0.04, 0.005, 0.012))))
         measured.append(measured[-1] @ inverse(before) @ after @ noise)
-    wrong = motions([pose_of(each) for each in measured], pose_of(measured[4]))
+    wrong = motions([to_poses(each) for each in measured], to_poses(measured[4]))
     true = motions(poses, poses[4])
     del views[4:5], wrong[4], true[4]
     place = views_of(points, poses[4:5], noise=0.3, seed=1)[0]

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import encode_thumbnail, load_map, merge_maps, save_map, thumbnail_of
 from stavpr_ros.mapping.camera import Camera, FORWARD
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.relative_pose.edge import Source
 from stavpr_ros.relative_pose.estimator import APART, EdgeEstimator
 from stavpr_ros.relative_pose.landmarks import triangulate, View
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import AROUND, MatchedPair
 from stavpr_ros.relative_pose.pnp import LEAST_INLIERS, solve_pnp
-from stavpr_ros.relative_pose.transforms import inverse, matrix_of, pose_of
 
 SIZE = 320, 240
 SPACING = 1.0  # meters between places
@@ -60,14 +60,14 @@ def views_of(points, poses, noise=0.0, seed=1):
 
 
 def in_camera(points, base, camera):
-    to = inverse(matrix_of(base) @ matrix_of(np.array(camera.mount)))
+    to = inverse(matrices(base) @ matrices(np.array(camera.mount)))
     return points @ to[:3, :3].T + to[:3, 3]
 
 
 def motions(poses, center):
-    mount = matrix_of(np.array(FORWARD))
-    own = matrix_of(center) @ mount
-    return [inverse(matrix_of(each) @ mount) @ own for each in poses]
+    mount = matrices(np.array(FORWARD))
+    own = matrices(center) @ mount
+    return [inverse(matrices(each) @ mount) @ own for each in poses]
 
 
 def test_triangulate_of_exact_views_returns_the_points():
@@ -109,10 +109,10 @@ def test_pnp_covariance_fits_the_errors(seed):
     views = views_of(points, [center, *[pose(x) for x in (-4, -3, 3, 4)]])
     around = motions([pose(x) for x in (-4, -3, 3, 4)], center)
     landmarks = triangulate(views[0], list(zip(views[1:], around, strict=True)), 2)
-    mount = matrix_of(np.array(FORWARD))
+    mount = matrices(np.array(FORWARD))
     squares = []
     for query in (pose(0.6, 1.2, 0.05), pose(-0.4, -0.5, -0.03)):
-        true = inverse(mount) @ matrix_of(query) @ mount
+        true = inverse(mount) @ matrices(query) @ mount
         for trial in range(30):
             view = views_of(points, [query], noise=0.5, seed=1)[0]
             rng = np.random.default_rng(trial)
@@ -186,8 +186,8 @@ def scene(camera, query, seed=0, say=lambda p: p):
     poses = np.array([pose(i * SPACING) for i in range(PLACES)])
     near = range(PLACE - AROUND, PLACE + AROUND + 1)
     thumbnails = {i: encode_thumbnail(render(points, textures, poses[i], camera)) for i in near}
-    true = matrix_of(poses[PLACE]) @ matrix_of(query)
-    image = thumbnail_of(render(points, textures, pose_of(true), camera))
+    true = matrices(poses[PLACE]) @ matrices(query)
+    image = thumbnail_of(render(points, textures, to_poses(true), camera))
     return MatchedPair(
         object(), PLACE, image, *driven(), 0, np.array([say(each) for each in poses]), thumbnails
     )
@@ -327,7 +327,7 @@ def test_align_follows_the_track_of_the_places_in_a_bend():
     corners = np.concatenate([[[0, 0]], np.cumsum(steps, axis=0)[:-1]])
     poses = np.array([pose(*at, yaw) for at, yaw in zip(corners, turns, strict=True)])
     edge = align(plain_pair(*driven(2.0), poses))
-    expected = pose_of(inverse(matrix_of(poses[PLACE])) @ matrix_of(poses[PLACE + 2]))
+    expected = to_poses(inverse(matrices(poses[PLACE])) @ matrices(poses[PLACE + 2]))
     np.testing.assert_allclose(edge.pose, expected, atol=0.06)
     direction = expected[:3] / np.linalg.norm(expected[:3])
     assert direction @ edge.covariance[:3, :3] @ direction < 0.5

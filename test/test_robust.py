@@ -4,13 +4,13 @@
 
 import numpy as np
 import pytest
+from stavpr_lab.demonstration.street import first_traverse, World
+from stavpr_lab.evaluation.evaluate import recognize_all
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_lab.evaluation.metrics import best_f1, counts_at, image_matches
+from stavpr_lab.evaluation.warp import warp_indices
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-from stavpr_ros.demonstration.street import first_traverse, World
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.evaluation.evaluate import recognize_all
-from stavpr_ros.evaluation.ground_truth import GroundTruth
-from stavpr_ros.evaluation.metrics import best_f1, counts_at, image_matches
-from stavpr_ros.evaluation.warp import warp_indices
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import extract_features, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status

@@ -4,9 +4,9 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.evaluation.metrics import best_f1
-from stavpr_ros.evaluation.paper.datasets import open_dataset
-from stavpr_ros.evaluation.seqslam import (
+from stavpr_lab.evaluation.metrics import best_f1
+from stavpr_lab.evaluation.paper.datasets import open_dataset
+from stavpr_lab.evaluation.seqslam import (
     enhance_contrast,
     match_differences,
     preprocess,

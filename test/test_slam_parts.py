@@ -12,16 +12,16 @@ import pytest
 import rclpy
 from rclpy.context import Context
 from sensor_msgs.msg import CameraInfo
+from stavpr_lab.commands import demo
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure, RelativePose
-from stavpr_ros.commands import demo
 from stavpr_ros.errors import StavprError
-from stavpr_ros.pose_graph import PoseGraph
-from stavpr_ros.pose_graph.false_places import NEAR, RUN
 from stavpr_ros.ros.camera import CameraInput
-from stavpr_ros.ros.false_closures import FalseClosures
-from stavpr_ros.ros.graph_client import fetch_graph
-from stavpr_ros.ros.graph_messages import closure_of
 from stavpr_ros.ros.output import pose_message, time_message
+from stavpr_slam.pose_graph import PoseGraph
+from stavpr_slam.pose_graph.false_places import NEAR, RUN
+from stavpr_slam.ros.false_closures import FalseClosures
+from stavpr_slam.ros.graph_client import fetch_graph
+from stavpr_slam.ros.graph_messages import closure_of
 from test_pose_graph import circle, closure, error, LAP, odometry_of
 
 

@@ -11,12 +11,12 @@ from bags import SECOND, TEXT, writing
 import cv2
 import numpy as np
 import pytest
+from stavpr_lab.demonstration.bag_writer import write_bag
 from stavpr_ros import output_file
 from stavpr_ros.errors import ImageError, OutputError, SettingsError, SourceError
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import BagSource, COMPRESSED, RAW
 from stavpr_ros.sources.bag_file import open_bag
-from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 
 T0 = 1_700_000_000_000_000_000

@@ -7,8 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from stavpr_ros.errors import InputError
-from stavpr_ros.evaluation.ssm_vpr import (
+from stavpr_lab.evaluation.ssm_vpr import (
     cubes,
     learn_whitening,
     PcaWhitening,
@@ -16,6 +15,7 @@ from stavpr_ros.evaluation.ssm_vpr import (
     SsmVpr,
     SsmVprSettings,
 )
+from stavpr_ros.errors import InputError
 import torch
 
 SMALL = SsmVprSettings(large=3, large_dimension=10, small_dimension=12, neighbors=4, candidates=3)

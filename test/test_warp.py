@@ -4,8 +4,8 @@
 
 import numpy as np
 import pytest
+from stavpr_lab.evaluation.warp import cropped, STOP, warp_indices
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.evaluation.warp import cropped, STOP, warp_indices
 from stavpr_ros.sources.frame import Frame
 
 

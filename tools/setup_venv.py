@@ -3,9 +3,9 @@
 """
 Set up stavpr_ros without a ROS installation; the Makefile calls this program.
 
-It installs ROS 2 Jazzy and the Python packages from wheels into ``.venv``, and builds stavpr_msgs
-and stavpr_ros with colcon. The syntax is that of Python 3.6, so that an unsupported Python reports
-the supported versions instead of a SyntaxError.
+It installs ROS 2 Jazzy and the Python packages from wheels into ``.venv``, and builds the packages
+of this repository with colcon. The syntax is that of Python 3.6, so that an unsupported Python
+reports the supported versions instead of a SyntaxError.
 """
 
 import argparse
@@ -37,13 +37,15 @@ LOCKED_EXTRAS = (
 )  # fmt: skip
 EXTRAS = (*LOCKED_EXTRAS, 'cuda')
 
-# The files that a package is built from, in build order: stavpr_ros depends on stavpr_msgs.
+# The files that a package is built from, in build order: each depends on those before.
 SOURCES = {
     'stavpr_msgs': ('stavpr_msgs',),
     'stavpr_ros': (
         'package.xml', 'setup.py', 'setup.cfg', 'pyproject.toml',
         'resource', 'config', 'launch', 'scripts', 'stavpr_ros',
     ),
+    'stavpr_slam': ('stavpr_slam',),
+    'stavpr_lab': ('stavpr_lab',),
 }  # fmt: skip
 
 # Variables of another ROS, of another Python, or of the make that runs this program.
@@ -257,7 +259,7 @@ def install(extras: list, torch_index: str) -> None:
 
 
 def build() -> None:
-    """Build both packages from nothing, unless they were built from the same sources."""
+    """Build each package from nothing, unless it was built from the same sources."""
     python = ROOT / '.venv' / 'bin' / 'python3'
     requirements = ['requirements/locked/base.txt']
     for package, sources in SOURCES.items():
@@ -272,8 +274,9 @@ def build() -> None:
         # colcon's own flags for make include -l, which stalls a build on a loaded machine.
         command = ['env', f'MAKEFLAGS=-j{os.cpu_count()}']
         command += [python, '-m', 'colcon', '--log-base', 'log', 'build']
-        # colcon does not look for packages inside a package, so both folders are named.
-        command += ['--base-paths', '.', 'stavpr_msgs', '--packages-select', package]
+        # colcon does not look for packages inside a package, so all folders are named.
+        command += ['--base-paths', '.', *(name for name in SOURCES if name != 'stavpr_ros')]
+        command += ['--packages-select', package]
         command += ['--cmake-args', '-DCMAKE_BUILD_TYPE=Release', '-DBUILD_TESTING=OFF']
         command += [f'-DPython3_EXECUTABLE={python}']
         run_logged(package, f'Building {package}', command)

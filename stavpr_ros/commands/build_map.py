@@ -178,7 +178,7 @@ def _keyframes(arguments: argparse.Namespace) -> 'KeyframeSettings':
 
 def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajectory | None':
     """Read the poses of all images of the source, or the odometry."""
-    from stavpr_ros.evaluation.ground_truth_files import read_poses
+    from stavpr_lab.evaluation.ground_truth_files import read_poses
     from stavpr_ros.mapping import Trajectory
     from stavpr_ros.sources.bag import read_odometry
 

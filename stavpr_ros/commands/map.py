@@ -3,18 +3,22 @@
 """``ros2 run stavpr_ros map``: show, check, convert, compact, export, merge, recover maps."""
 
 import argparse
+from collections.abc import Callable
 from datetime import datetime, UTC
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
+from stavpr_ros import plugins
 from stavpr_ros.commands import map_recover
 from stavpr_ros.commands.program import make_parser, run_program
-from stavpr_ros.errors import MapFileError, SettingsError
+from stavpr_ros.errors import MapFileError, SettingsError, UnavailableError
 from stavpr_ros.output_file import ARRAYS, atomic_output, MAP, PNG, require_replaceable
 
 if TYPE_CHECKING:
     from stavpr_ros.mapping import PlaceMap
+
+TOOLS = {'align': 'stavpr_slam', 'plot': 'stavpr_lab'}  # and the packages that have them
 
 EPILOG = """
 examples:
@@ -97,7 +101,7 @@ def _parser() -> argparse.ArgumentParser:
         '--align',
         action='store_true',
         help='move the poses of each further map into the frame of the first, by the places that '
-        'are recognized on it; requires gtsam',
+        'are recognized on it; requires the package stavpr_slam, and gtsam',
     )
     action.add_argument(
         '--different-routes',
@@ -140,10 +144,20 @@ def _info(arguments: argparse.Namespace) -> None:
     place_map = open_map(arguments.map)
     print(describe(place_map, Path(arguments.map)))
     if arguments.plot:
-        from stavpr_ros.commands.map_plot import plot_map
-
-        plot_map(place_map, Path(arguments.plot))
+        _tool('plot')(place_map, Path(arguments.plot))
         print(f'plot       {arguments.plot}')
+
+
+def _tool(name: str) -> Callable[..., Any]:
+    """Return a function that another package provides."""
+    tools = plugins.load(plugins.MAP_TOOLS)
+    if name not in tools:
+        raise UnavailableError(
+            f'--{name} needs the package {TOOLS[name]}, which is not installed: build it, or '
+            '`pip install .` in the repository'
+        )
+    tool: Callable[..., Any] = tools[name]
+    return tool
 
 
 def describe(place_map: 'PlaceMap', path: Path) -> str:
@@ -253,36 +267,12 @@ def _merge(arguments: argparse.Namespace) -> None:
     for place_map in maps:
         verify_map(place_map)
     if arguments.align:
-        maps[1:] = [_aligned(place_map, maps[0]) for place_map in maps[1:]]
+        align = _tool('align')
+        maps[1:] = [align(place_map, maps[0]) for place_map in maps[1:]]
     merged = merge_maps(maps, [Path(path).stem for path in arguments.maps])
     if not arguments.different_routes:
         merged = with_same_places(merged, progress=True)
     _write(merged, arguments)
-
-
-def _aligned(place_map: 'PlaceMap', reference: 'PlaceMap') -> 'PlaceMap':
-    """Return a map in the frame of another, by the places that are recognized on it."""
-    from dataclasses import replace
-
-    import numpy as np
-    from stavpr_ros.errors import InputError
-    from stavpr_ros.pose_graph import align_maps
-    from stavpr_ros.pose_graph.transforms import matrices, to_poses
-    from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-
-    if place_map.poses is None or reference.poses is None:
-        raise InputError('--align: a map has no poses; expected maps recorded with odometry')
-    recognizer = PlaceRecognizer(reference, RecognizerSettings(threshold=0.5, mode='robust'))
-    pairs = []
-    for i in range(len(place_map)):
-        match = recognizer.update(place_map.features[i : i + 1])
-        if match.accepted and len(match.path):
-            position, place = match.path[len(match.path) // 2].tolist()
-            pairs.append((i - int(match.path[-1, 0]) + position, place))
-    found = np.array(pairs, np.int64).reshape(-1, 2)
-    print(f'{len(found)} of {len(place_map)} places are recognized on the first map')
-    transform = align_maps(reference.poses, place_map.poses, found)
-    return replace(place_map, poses=to_poses(transform @ matrices(place_map.poses)), map_id='')
 
 
 def _sessions(arguments: argparse.Namespace) -> None:
@@ -333,18 +323,13 @@ def _recover(arguments: argparse.Namespace) -> int:
 
 
 def _upload(arguments: argparse.Namespace) -> None:
-    from stavpr_ros.fleet import upload
     from stavpr_ros.mapping import open_map, verify_map
-    from stavpr_ros.pipeline.maps_folder import ADDRESSES, is_address
+    from stavpr_ros.mapping.stores import store_of
 
-    if not is_address(arguments.address):
-        raise SettingsError(
-            f'{arguments.address} is no address: expected one that begins with '
-            f'{", ".join(ADDRESSES)}'
-        )
+    store = store_of(arguments.address)
     place_map = open_map(arguments.map)
     verify_map(place_map)
-    upload(place_map, arguments.address, arguments.force)
+    store.upload(place_map, arguments.address, arguments.force)
     print(f'{arguments.address}: {len(place_map)} places')
 
 

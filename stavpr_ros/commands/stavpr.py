@@ -7,36 +7,41 @@ import importlib.util
 import sys
 
 import stavpr_ros
+from stavpr_ros import plugins
+from stavpr_ros.commands import Command, COMMANDS
 
 ROS_MODULES = ('rclpy', 'ament_index_python', 'stavpr_msgs')
 
-
-COMMANDS = {
-    'build_map': 'build a reference map from a folder of images or a bag',
-    'map': 'show, check, convert, export, merge and recover maps',
-    'weights': 'download the published weights of a network',
-    'export_model': 'make one ONNX file of a network of vectors and maps',
-    'evaluate': 'evaluate the recognition of one traverse on the map of another',
-    'experiments': "reproduce the paper's tables on local data sets",
-    'node': 'run the place-recognition node (ROS 2)',
-    'replay': 'publish a bag or a folder of images to the node (ROS 2)',
-    'record': 'write matches or loop closures to a JSON Lines file (ROS 2)',
-    'monitor': 'show the node in a web browser (ROS 2)',
-    'pose_graph': 'correct odometry by loop closures (ROS 2)',
-    'bridge': 'pass loop closures on to RTAB-Map and others (ROS 2)',
-    'demo': 'build, run and evaluate everything on a synthetic street (ROS 2)',
+PACKAGES = {
+    'export_model': 'stavpr_lab',
+    'evaluate': 'stavpr_lab',
+    'experiments': 'stavpr_lab',
+    'demo': 'stavpr_lab',
+    'pose_graph': 'stavpr_slam',
+    'bridge': 'stavpr_slam',
 }
-NEED_ROS = ('node', 'replay', 'record', 'monitor', 'pose_graph', 'bridge', 'demo')
+"""Packages of the commands that are not in this one, for the message where one is missing."""
+
+
+def all_commands() -> dict[str, Command]:
+    """Return the commands of this package and of all others that are installed."""
+    found = dict(COMMANDS)
+    for table in plugins.load(plugins.COMMANDS).values():
+        found = table | found
+    return found
 
 
 def usage() -> str:
     """Return the help text."""
-    rows = ''.join(f'  {name:<14}{summary}\n' for name, summary in COMMANDS.items())
+    rows = ''.join(
+        f'  {name:<14}{row.summary}{" (ROS 2)" * row.needs_ros}\n'
+        for name, row in all_commands().items()
+    )
     return (
         'usage: stavpr COMMAND [OPTION ...]\n'
         '       stavpr COMMAND --help | --help | --version\n\n'
         f'commands:\n{rows}\n'
-        'In a sourced ROS 2 workspace, `ros2 run stavpr_ros COMMAND` runs the same commands.'
+        'In a sourced ROS 2 workspace, `ros2 run PACKAGE COMMAND` runs the same commands.'
     )
 
 
@@ -66,13 +71,15 @@ def main(args: list[str] | None = None) -> int:
     if name == '--version':
         print(f'stavpr {stavpr_ros.__version__}')
         return 0
-    if name not in COMMANDS:
-        print(
-            f'stavpr: unknown command {name!r}; choose from {", ".join(COMMANDS)}', file=sys.stderr
-        )
+    command = COMMANDS.get(name) or all_commands().get(name)
+    if command is None:
+        remedy = f'choose from {", ".join(all_commands())}'
+        if name in PACKAGES:
+            remedy = f'it is in the package {PACKAGES[name]}, which is not installed'
+        print(f'stavpr: unknown command {name!r}: {remedy}', file=sys.stderr)
         return 2
     missing = [module for module in ROS_MODULES if importlib.util.find_spec(module) is None]
-    if missing and name in NEED_ROS:
+    if missing and command.needs_ros:
         print(
             f'stavpr {name}: needs ROS 2, but Python finds no {", ".join(missing)}: source '
             '/opt/ros/jazzy/setup.bash and the install/setup.bash of the workspace that colcon '
@@ -80,7 +87,7 @@ def main(args: list[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 2
-    exit_code: int = importlib.import_module(f'stavpr_ros.commands.{name}').main(rest)
+    exit_code: int = importlib.import_module(command.module).main(rest)
     return exit_code
 
 

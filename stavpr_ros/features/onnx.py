@@ -14,8 +14,8 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from stavpr_lab.features.export import BATCH, TOLERANCE
 from stavpr_ros.errors import SettingsError, UnavailableError
-from stavpr_ros.features.export import BATCH, TOLERANCE
 from stavpr_ros.features.extractor import resize_square, TEST_SIDE
 from stavpr_ros.features.outputs import as_maps, as_vectors
 from stavpr_ros.features.registry import OnnxSettings

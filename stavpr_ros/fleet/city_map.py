@@ -3,7 +3,7 @@
 """A map whose places are elsewhere: what was fetched of them is known."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from stavpr_ros.features import LocalFeatures
@@ -62,7 +62,7 @@ class CityMap(PlaceMap):
     fetched_ids: dict[int, str] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, store: PlaceStore) -> 'CityMap':
+    def of(cls, store: PlaceStore) -> Self:
         """Return the map in a store, with the places of the sample known."""
         index = store.index
         n, sample = index.places, index.sample

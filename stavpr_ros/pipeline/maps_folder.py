@@ -7,13 +7,6 @@ from pathlib import Path
 
 from stavpr_ros.errors import SettingsError
 
-ADDRESSES = ('faiss:', 'qdrant:', 'qdrant+https:')
-
-
-def is_address(path: str) -> bool:
-    """Return whether this is the address of a fleet's map, not a file: docs/fleet.md."""
-    return path.startswith(ADDRESSES)
-
 
 def maps_folder(parameter: str) -> Path:
     """

@@ -3,16 +3,14 @@
 """The three operations: each updates its places, its recognizer, or both with one image."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, TYPE_CHECKING
+from typing import ClassVar
 
 import numpy as np
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap, PlaceMap
-from stavpr_ros.recognition import Match, PlaceRecognizer, Status
+from stavpr_ros.recognition import Match, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
-
-if TYPE_CHECKING:
-    from stavpr_ros.fleet import FleetRecognizer
+from stavpr_ros.recognition.recognizer import SequenceRecognizer
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +37,7 @@ class Localization:
     name: ClassVar[str] = 'localization'
     extractor: FeatureExtractor
     places: PlaceMap
-    recognizer: 'PlaceRecognizer | FleetRecognizer'
+    recognizer: SequenceRecognizer
 
     def update(self, observation: Observation) -> Match:
         """Match the window that ends with an image."""

@@ -14,8 +14,9 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class, settings_from_json
 from stavpr_ros.mapping.keyframes import KeyframeSettings
+from stavpr_ros.mapping.stores import is_address
 from stavpr_ros.parameters import BY_NAME
-from stavpr_ros.pipeline.maps_folder import is_address, maps_folder
+from stavpr_ros.pipeline.maps_folder import maps_folder
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.loop_closer import choose_loop_backend, least_limit
 from stavpr_ros.recognition.robust import MIN_PROBABILITY, options_of

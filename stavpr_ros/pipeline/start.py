@@ -5,21 +5,19 @@
 from dataclasses import dataclass
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import MapFileError, SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, open_map, PlaceMap, verify_map
-from stavpr_ros.pipeline.maps_folder import is_address
+from stavpr_ros.mapping.stores import is_address, store_of
 from stavpr_ros.pipeline.operations import Localization, LoopClosing, Mapping, Operation
 from stavpr_ros.pipeline.settings import PipelineSettings
-from stavpr_ros.recognition import PlaceRecognizer
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.loop_closer import LoopCloser
-
-if TYPE_CHECKING:
-    from stavpr_ros.fleet import FleetRecognizer
+from stavpr_ros.recognition.recognizer import SequenceRecognizer
 
 BLANK = np.zeros((480, 640, 3), np.uint8)
 
@@ -33,6 +31,14 @@ class LoadedMap:
     extractor: FeatureExtractor
 
 
+@runtime_checkable
+class PartialMap(Protocol):
+    """A map in a store: it recognizes with the places that it has fetched."""
+
+    def recognizer(self, settings: RecognizerSettings) -> SequenceRecognizer:
+        """Return a recognizer of the map; SettingsError for settings that it does not have."""
+
+
 def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
     """
     Read a map, on any thread; its features stay in the file until an operation takes them.
@@ -44,19 +50,11 @@ def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
         maps = ', '.join(sorted(file.name for file in Path(path).glob('*.stavpr')))
         remedy = f'name one of its maps: {maps}' if maps else 'build a map of its images'
         raise MapFileError(f'{path} is a folder, not a map: {remedy} (build_map makes map files)')
-    place_map = _opened(path)
+    place_map = store_of(path).open_map(path) if is_address(path) else open_map(path)
     extractor = place_map.extractor(
         choose_backend(settings.backend), settings.model_path, settings.allow_torchscript
     )
     return LoadedMap(path, place_map, extractor)
-
-
-def _opened(path: str) -> PlaceMap:
-    if not is_address(path):
-        return open_map(path)
-    from stavpr_ros.fleet import open_city_map
-
-    return open_city_map(path)
 
 
 def start_operation(
@@ -107,9 +105,7 @@ def start_operation(
     return LoopClosing(extractor, route, closer)
 
 
-def _recognizer(
-    settings: PipelineSettings, place_map: PlaceMap
-) -> 'PlaceRecognizer | FleetRecognizer':
+def _recognizer(settings: PipelineSettings, place_map: PlaceMap) -> SequenceRecognizer:
     if not place_map.partial:
         backend = settings.matching_backend('localization')
         return PlaceRecognizer(place_map, settings.recognition(), backend, settings.precision)
@@ -118,10 +114,8 @@ def _recognizer(
             f'backend {settings.backend}, precision {settings.precision}: the map of a fleet is '
             'matched on the CPU in float32; take backend auto or cpu, and precision float32'
         )
-    from stavpr_ros.fleet import CityMap, FleetRecognizer
-
-    assert isinstance(place_map, CityMap)
-    return FleetRecognizer(place_map, settings.recognition())
+    assert isinstance(place_map, PartialMap)
+    return place_map.recognizer(settings.recognition())
 
 
 def _loop_closer(
@@ -139,7 +133,7 @@ def _loop_closer(
 
 
 def _warm_up(
-    recognizer: 'PlaceRecognizer | FleetRecognizer | LoopCloser',
+    recognizer: SequenceRecognizer | LoopCloser,
     extractor: FeatureExtractor,
     images: int,
 ) -> None:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frame by frame: distances of the newest image, nearest sequence of the window, status."""
 
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import replace
 import math
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
 TIMED = 3  # images, to compare the time of one with the time budget
 
 
-class SequenceRecognizer:
+class SequenceRecognizer(ABC):
     """
     The window of a query and its match; base of :class:`PlaceRecognizer` and ``LoopCloser``.
 
@@ -58,10 +59,12 @@ class SequenceRecognizer:
     :param to_oldest: see :class:`stavpr_ros.recognition.sequence_search.FilterSearch`.
     :param model: of the filter.
 
-    ``problem`` is why places of the map cannot be reached; empty while they can.
+    ``problem`` is why places of the map cannot be reached, empty while they can; ``stages`` what
+    a time budget chose, empty without one.
     """
 
     problem = ''
+    stages = ''
 
     def __init__(
         self,
@@ -89,6 +92,22 @@ class SequenceRecognizer:
         self._window = WindowMatch()  # of the newest image
         self._nearest: SequenceMatch | None = None
         self._changes: deque[float] = deque(maxlen=sequence.length)  # of the window
+
+    @abstractmethod
+    def update(
+        self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
+    ) -> Match:
+        """
+        Add the next image and match the window that ends with it.
+
+        :param features: of one image.
+        :param stamp: ns, 0 = unknown.
+        :param pose: by odometry, shape (7,), or None.
+        """
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Drop the images of the window."""
 
     def _match_on_device(self) -> None:
         """Move the window and the filter to the CUDA device."""

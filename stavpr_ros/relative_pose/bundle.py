@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from stavpr_ros.relative_pose.transforms import cross_matrices, inverse
+from stavpr_ros.mapping.transforms import cross, inverse
 
 # Deviations of a step of the odometry: of the translation, m and share of it; of the rotation, rad
 # per square root of a meter.
@@ -84,7 +84,7 @@ class Observations:
         projection = np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]])
         projection = focal * projection.transpose(2, 0, 1)
         by_motion = np.concatenate(
-            [projection * rho[self.keypoint, None, None], -projection @ cross_matrices(turned)],
+            [projection * rho[self.keypoint, None, None], -projection @ cross(turned)],
             axis=2,
         )
         by_depth = np.einsum('mij,mj->mi', projection, slope)
@@ -137,7 +137,7 @@ def odometry_information(motions: np.ndarray, before: int) -> np.ndarray:
             effect = np.zeros((len(farther), 6, 6))
             # a turn of the step moves all behind it, about its start
             effect[:, :3, :3] = effect[:, 3:, 3:] = motions[farther, :3, :3] @ own[:3, :3].T
-            arm = cross_matrices((step[:3, :3] @ last[:3, 3])[None])[0]
+            arm = cross((step[:3, :3] @ last[:3, 3])[None])[0]
             effect[:, :3, 3:] = -effect[:, :3, :3] @ arm
             rows = np.ix_(farther, range(6), farther, range(6))
             covariance[rows] += np.einsum('aij,j,bkj->aibk', effect, variances, effect)

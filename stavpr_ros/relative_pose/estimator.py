@@ -14,12 +14,12 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.place_map import decode_thumbnail
+from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View, view_of
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import BESIDE, MatchedPair, NEIGHBORS
 from stavpr_ros.relative_pose.pnp import LEAST_INLIERS, PnpPose, solve_pnp
-from stavpr_ros.relative_pose.transforms import cross_matrices, inverse, matrix_of, pose_of
 
 METHODS = ('auto', 'none', 'aligned', 'pnp')
 VIEWS, LANDMARKS = 64, 32  # places kept: some 300 kB and 100 kB each
@@ -69,7 +69,7 @@ class EdgeEstimator:
         """Return whether the query has moved far enough since the last independent edge."""
         if edge.source is Source.NONE:
             return False
-        base = matrix_of(pair.pose(pair.place)) @ matrix_of(edge.pose)
+        base = matrices(pair.pose(pair.place)) @ matrices(edge.pose)
         last = self._last
         if last is not None and last[0] is pair.source:
             moved = float(np.linalg.norm(base[:3, 3] - last[1]))
@@ -157,7 +157,7 @@ class EdgeEstimator:
         self, pair: MatchedPair, place: int, camera: Camera
     ) -> tuple[Landmarks, float, list[int]]:
         """Return the landmarks of a place, how far from it they serve (m), and its neighbors."""
-        mount, own = matrix_of(np.array(camera.mount)), matrix_of(pair.pose(place))
+        mount, own = matrices(np.array(camera.mount)), matrices(pair.pose(place))
         neighbors, indices, reach = [], [], 0.0
         for index in range(place - NEIGHBORS, place + NEIGHBORS + 1):
             if index == place or not pair.thumbnails.get(index):
@@ -165,7 +165,7 @@ class EdgeEstimator:
             pose, view = pair.pose(index), self._view_of(pair, index, camera)
             if view is None or np.isnan(pose).any():
                 continue
-            motion = inverse(matrix_of(pose) @ mount) @ own @ mount
+            motion = inverse(matrices(pose) @ mount) @ own @ mount
             baseline = float(np.linalg.norm(motion[:3, 3]))
             if baseline > LEAST_BASELINE:
                 neighbors.append((view, motion))
@@ -202,14 +202,14 @@ def _kept(
 def _edge(found: PnpPose, query_camera: Camera, place_camera: Camera) -> Edge:
     """Return the edge between the bases of the cameras."""
     assert found.matrix is not None
-    place_mount = matrix_of(np.array(place_camera.mount))
-    to_base = inverse(matrix_of(np.array(query_camera.mount)))
+    place_mount = matrices(np.array(place_camera.mount))
+    to_base = inverse(matrices(np.array(query_camera.mount)))
     turn = place_mount[:3, :3]
     lever = found.matrix[:3, :3] @ to_base[:3, 3]  # from the query's camera to its base
     change = np.zeros((6, 6))
     change[:3, :3] = change[3:, 3:] = turn
-    change[:3, 3:] = -turn @ cross_matrices(lever[None])[0]
+    change[:3, 3:] = -turn @ cross(lever[None])[0]
     covariance = NOISE**2 * change @ found.covariance @ change.T
     covariance += np.diag([SHIFT**2] * 3 + [TURN**2] * 3)
-    pose = pose_of(place_mount @ found.matrix @ to_base)
+    pose = to_poses(place_mount @ found.matrix @ to_base)
     return Edge(Source.PNP, '', pose, covariance, found.inliers, found.error)

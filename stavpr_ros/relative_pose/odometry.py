@@ -7,9 +7,9 @@ import math
 import numpy as np
 from scipy.interpolate import CubicSpline
 from stavpr_ros.mapping.trajectory import interpolate
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.pair import MatchedPair
-from stavpr_ros.relative_pose.transforms import inverse, matrix_of, pose_of
 
 FARTHEST, STEP = 4.0, 0.05  # offsets that are tried, and between two of them, places
 NEAR = 0.5  # of the least sum: where a parabola is fitted, places
@@ -49,8 +49,8 @@ def align(pair: MatchedPair) -> Edge:
         at = start + offsets + driven[image] - driven[pair.middle]
         total += np.interp(at, grid, smooth[:, column])
     at = start + _least(offsets, total)
-    place = matrix_of(pair.pose(pair.place))
-    pose = pose_of(inverse(place) @ matrix_of(_on_track(pair.poses[known], track[known], at)))
+    place = matrices(pair.pose(pair.place))
+    pose = to_poses(inverse(place) @ matrices(_on_track(pair.poses[known], track[known], at)))
     direction = _direction(pair, place)
     along = max(ALONG * pair.spacing, LEAST_ALONG)
     covariance = np.diag([ACROSS**2] * 3 + [TURN**2] * 3)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from stavpr_ros.mapping.transforms import cross, inverse
 from stavpr_ros.recognition.verification import mutual_matches
 from stavpr_ros.relative_pose.landmarks import Landmarks, RATIO, View
-from stavpr_ros.relative_pose.transforms import cross_matrices, inverse
 
 LEAST_INLIERS = 14  # keypoints of the query; 1,000 pairs of wrong places had 12 at most
 PIXELS = 2.5  # of an inlier, off its landmark
@@ -92,5 +92,5 @@ def _covariance(pose: np.ndarray, points: np.ndarray, focal: float) -> np.ndarra
     projection = focal * np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]])
     turned = projection.transpose(2, 0, 1) @ pose[:3, :3].T
     # a motion of the query by d and its turn by w move a point by w x away - d, reversed
-    jacobian = np.concatenate([-turned, turned @ cross_matrices(away)], axis=2).reshape(-1, 6)
+    jacobian = np.concatenate([-turned, turned @ cross(away)], axis=2).reshape(-1, 6)
     return np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)

@@ -18,9 +18,9 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each
-from stavpr_ros.pose_graph.transforms import inverse, matrices, to_poses
 from stavpr_ros.recognition import Match
 from stavpr_ros.ros.output import image_message, LATCHED, pose_message
 from std_msgs.msg import ColorRGBA, Header

@@ -1,0 +1,41 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Package description for ``colcon build``; the setup.py of stavpr_ros has that for pip."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = 'stavpr_lab'
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Evaluation, baselines and demonstration of stavpr_ros.',
+    license='Apache-2.0',
+    author='The stavpr_ros authors',
+    maintainer='The stavpr_ros maintainers',
+    maintainer_email='maintainers@stavpr-ros.org',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={'': ['py.typed', '*.html', '*.jinja']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'lib/{NAME}', sorted(glob('scripts/*'))),
+    ],
+    python_requires='>=3.11',
+    install_requires=[
+        'jinja2>=3.1',
+        'matplotlib>=3.6',
+        'numba>=0.59',
+        'numpy>=1.26',
+        'opencv-python-headless>=4.6',
+        'rosbags>=0.10',
+        'scikit-learn>=1.4',
+        'scipy>=1.11',
+        'stavpr_ros',
+        'torch>=2.2',
+        'tqdm>=4.66',
+    ],
+    zip_safe=False,
+)

@@ -1,0 +1,398 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 run stavpr_lab demo``: from two traverses to matches, numbers and plots, over ROS."""
+
+import argparse
+from pathlib import Path
+import sys
+import time
+from typing import Any, TYPE_CHECKING
+
+from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.errors import InputError, SettingsError, SourceError, StavprError
+from stavpr_ros.parameters import BY_NAME
+
+if TYPE_CHECKING:
+    from stavpr_lab.demonstration.recordings import LoopTraverse, TraversePair
+    from stavpr_ros.mapping import PlaceMap
+
+EXCLUDE_PLACES, GEOMETRIC_CHECK = 50, 'sift'  # defaults with --loop
+SYNTHETIC = 'synthetic'
+DRIFT = 0.7  # odometry of about 20 m after three laps
+
+DESCRIPTION = """
+Without options: renders two traverses of a synthetic street (the second at dusk in the rain, on
+the other lane, at a varying speed, with a detour that is not in the map), writes two bags, builds
+the map from the first, starts the node, replays the second bag into it over ROS, records the
+matches in a third process, and reports and plots the result. With --map and --query: the same with
+your own folders of images or bags.
+
+With --loop: one traverse that passes places again is replayed into the node in operation
+loop_closure, which compares it with its own past; 'synthetic' is the synthetic street, twice.
+
+With --slam world: three laps on a closed street with a drifting odometry; the node pose_graph
+corrects it by the loop closures of the node. Requires gtsam and evo (the extra slam).
+"""
+
+EPILOG = """
+examples:
+  demo
+  demo --map monday/ --query tuesday/ --truth identity --tolerance 3
+  demo --map monday.bag --query tuesday.bag --topic /camera/image_raw --min-probability 0.8
+  demo --loop synthetic
+  demo --loop round/ --truth closures.png --exclude-places 100
+  demo --slam world --world 3 --drift 0.06 --false-closures 0.3
+
+exit codes: 0 done, 1 something failed (the reason is printed), 2 usage, 130 interrupted
+"""
+
+
+def _parser() -> argparse.ArgumentParser:
+    from stavpr_ros.commands.feature_options import add_feature_options
+
+    parser = make_parser('demo', DESCRIPTION, EPILOG)
+    add = parser.add_argument
+    add('--output', default='demo_output', metavar='FOLDER', help='output folder (%(default)s)')
+    add('--map', metavar='FOLDER|BAG', help='first traverse: the map is built from it')
+    add('--query', metavar='FOLDER|BAG', help='second traverse: it is replayed')
+    add(
+        '--loop', nargs='?', const=SYNTHETIC, metavar='FOLDER|BAG|synthetic',
+        help=f'a traverse that passes places again ({SYNTHETIC})',
+    )  # fmt: skip
+    add('--slam', choices=('world',), help='three laps with a drifting odometry, and a pose graph')
+    slam = parser.add_argument_group('options of --slam')
+    add_slam = slam.add_argument
+    add_slam(
+        '--world', type=int, default=7, metavar='SEED', help='seed of the world (%(default)s)'
+    )
+    add_slam('--draw', type=int, default=0, help='of the errors of the odometry (%(default)s)')
+    add_slam(
+        '--drift', type=float, default=DRIFT, metavar='F',
+        help='factor on the errors of the odometry; 0.06: some 2 m after three laps (%(default)s)',
+    )  # fmt: skip
+    add_slam(
+        '--false-closures', type=float, default=0.0, metavar='P',
+        help='share of loop closures that are made wrong (%(default)g)',
+    )  # fmt: skip
+    add_slam('--coherent', action='store_true', help='they are wrong in runs of 20 that agree')
+    add_slam(
+        '--carried', action='store_true',
+        help='the robot is carried over 60 images of lap 2, which the odometry misses',
+    )  # fmt: skip
+    add_slam(
+        '--sessions', type=int, default=1, choices=(1, 2),
+        help='2: lap 3 is on the next day, its odometry starts anew',
+    )  # fmt: skip
+    add('--topic', help='image topic of the bags, if they have several')
+    add(
+        '--truth', metavar='identity|FILE',
+        help='identity: image i of the query shows place i of the map; with --loop a FILE: pairs '
+        'of images (.csv), or a square array (.npy) or black and white image of loop closures',
+    )  # fmt: skip
+    add('--tolerance', type=int, default=3, help='places that a correct match may be off '
+        '(%(default)s)')  # fmt: skip
+    add('--sequence-length', type=int, default=20, metavar='L', help='images in the window '
+        '(%(default)s)')  # fmt: skip
+    add('--mode', default='robust', choices=('paper', 'robust'), help='of the node (%(default)s)')
+    add(
+        '--min-probability', type=float, default=BY_NAME['min_probability'].default, metavar='P',
+        help='of the node, mode robust: matches have a greater probability (%(default)g)',
+    )  # fmt: skip
+    add(
+        '--threshold', type=float, metavar='DISTANCE',
+        help='of the node, mode paper (estimated from the first traverse)',
+    )  # fmt: skip
+    add(
+        '--exclude-places', type=int, metavar='N',
+        help=f'with --loop: the latest N places are not compared ({EXCLUDE_PLACES})',
+    )  # fmt: skip
+    add(
+        '--geometric-check', choices=('none', 'orb', 'sift'),
+        help=f'with --loop: verification of matches by keypoints ({GEOMETRIC_CHECK})',
+    )  # fmt: skip
+    add_feature_options(parser)
+    return parser
+
+
+def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """Reject options that contradict each other."""
+    _check_limits(parser, arguments)
+    for name, least in (('tolerance', 0), ('exclude_places', 1), ('sequence_length', 2)):
+        value = getattr(arguments, name)
+        if value is not None and value < least:
+            parser.error(f'--{name.replace("_", "-")} {value} must be at least {least}')
+    truth = arguments.truth
+    if arguments.slam is not None:
+        _check_slam(parser, arguments)
+        return
+    if arguments.loop is not None:
+        if arguments.map or arguments.query:
+            parser.error('--loop is one traverse: leave --map and --query out')
+        if truth == 'identity' or (truth and arguments.loop == SYNTHETIC):
+            parser.error(
+                '--loop FOLDER takes a file as --truth; that of the synthetic street is known'
+            )
+        if arguments.mode == 'paper' and arguments.threshold is None:
+            parser.error('--loop in mode paper needs --threshold')
+        return
+    if arguments.exclude_places is not None or arguments.geometric_check is not None:
+        parser.error('--exclude-places and --geometric-check go with --loop')
+    if (arguments.map is None) != (arguments.query is None):
+        parser.error('--map and --query go together')
+    if truth and arguments.map is None:
+        parser.error('--truth goes with --map and --query')
+    if truth not in (None, 'identity'):
+        parser.error(f'--truth {truth}: expected identity; files are for --loop, and for evaluate')
+
+
+def _check_slam(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    if arguments.loop or arguments.map or arguments.query or arguments.truth:
+        parser.error('--slam has its own drive: leave --loop, --map, --query and --truth out')
+    if not 0 <= arguments.false_closures <= 1:
+        parser.error(f'--false-closures {arguments.false_closures} must be 0 to 1')
+    if not 0 < arguments.drift <= 2:
+        parser.error(f'--drift {arguments.drift} must be above 0 and at most 2')
+
+
+def _check_limits(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    least, threshold = arguments.min_probability, arguments.threshold
+    if not 0 < least < 1:
+        parser.error(f'--min-probability {least} must be above 0 and below 1')
+    if threshold is None:
+        return
+    if arguments.mode != 'paper':
+        parser.error('--threshold is of mode paper: give --min-probability in mode robust')
+    if not threshold > 0:
+        parser.error(f'--threshold {threshold} must be above 0')
+
+
+def _print(text: object) -> None:
+    print(text, flush=True)
+
+
+def _skip(error: StavprError) -> None:
+    _print(f'   skipped: {error}')
+
+
+def _require_all(place_map: 'PlaceMap', images: int) -> None:
+    """Reject a ground truth by number where images were skipped."""
+    if len(place_map) != images:
+        raise SourceError(
+            'images were skipped: the ground truth of the others is unknown; repair or remove them'
+        )
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    began = time.monotonic()
+    folder = Path(arguments.output)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SourceError(f'folder {folder} cannot be made: {error}') from error
+    if arguments.slam is not None:
+        _slam(arguments, folder)
+    elif arguments.loop is None:
+        _localization(arguments, folder)
+    else:
+        _loop_closure(arguments, folder)
+    _print(f'   {time.monotonic() - began:.0f} s in all')
+
+
+def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair':
+    from stavpr_lab.demonstration.recordings import own_pair, synthetic_pair
+
+    if not arguments.map:
+        _print('1. Two traverses of a synthetic street')
+        return synthetic_pair(folder)
+    _print(f'1. Your traverses: {arguments.map} is the map, {arguments.query} the query')
+    identity = arguments.truth == 'identity'
+    length = arguments.sequence_length
+    return own_pair(arguments.map, arguments.query, arguments.topic, identity, length)
+
+
+def _limit(arguments: argparse.Namespace, threshold: float | None) -> dict[str, object]:
+    """Return the parameters of the node that decide what is a match."""
+    if arguments.mode == 'robust':
+        return {'mode': 'robust', 'min_probability': arguments.min_probability}
+    return {'mode': 'paper', 'threshold': threshold}
+
+
+def _threshold(place_map: 'PlaceMap', arguments: argparse.Namespace) -> float:
+    """Return the distance below which a window is matched."""
+    from stavpr_ros.recognition.threshold import suggest_threshold
+
+    if arguments.mode == 'robust':
+        return 1 - arguments.min_probability
+    if arguments.threshold is not None:
+        return arguments.threshold
+    try:
+        threshold = suggest_threshold(place_map, progress=True).threshold
+    except InputError as error:
+        raise SettingsError(f'{error}; give --threshold') from error
+    _print(f'   threshold {threshold:.3f}, estimated from the first traverse')
+    return threshold
+
+
+def _localization(arguments: argparse.Namespace, folder: Path) -> None:
+    """Recognize the second traverse on a map of the first."""
+    from stavpr_lab.demonstration.live import run_live
+    from stavpr_lab.demonstration.plots import draw_result
+    from stavpr_lab.evaluation.records import evaluate_records
+    from stavpr_ros.commands.feature_options import make_extractor
+    from stavpr_ros.mapping import save_map
+
+    pair = _traverse_pair(arguments, folder)
+    length, map_path = arguments.sequence_length, folder / 'map.stavpr'
+    _print(f'2. The map of the first traverse: {map_path}')
+    place_map = pair.reference.build_map(make_extractor(arguments), _skip)
+    save_map(place_map, map_path, force=True)
+    threshold = _threshold(place_map, arguments)
+
+    _print('3. The second traverse through the node, over ROS, with a replay and a recorder')
+    query = pair.query.build_map(place_map.extractor(), _skip)
+    if pair.true_places is not None:
+        _require_all(query, len(pair.true_places))
+    parameters = {
+        'map_path': map_path,
+        **_limit(arguments, threshold),
+        'sequence_length': length,
+        'keyframe_change': 0.0,  # every image is evaluated
+    }
+    records, _ = run_live(parameters, pair.query.path, len(query), folder, pair.query.topic)
+    result = evaluate_records(records, length, threshold, pair.true_places, arguments.tolerance)
+    plot = folder / 'demo.png'
+    draw_result(result, query, place_map, threshold, pair.title, plot)
+    _report('4', result.summary(), plot)
+
+
+def _loop_traverse(arguments: argparse.Namespace, folder: Path, exclude: int) -> 'LoopTraverse':
+    from stavpr_lab.demonstration.recordings import own_loop, synthetic_loop
+
+    tolerance = arguments.tolerance
+    if arguments.loop == SYNTHETIC:
+        _print('1. One traverse twice along a synthetic street, then on the other lane and with '
+               'a detour')  # fmt: skip
+        return synthetic_loop(folder, exclude, tolerance)
+    _print(f'1. Your traverse: {arguments.loop}')
+    return own_loop(arguments.loop, arguments.topic, arguments.truth, exclude, tolerance)
+
+
+def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
+    """Find the loop closures of one traverse."""
+    from stavpr_lab.demonstration.live import run_live
+    from stavpr_lab.demonstration.loops import draw_loops, read_result
+    from stavpr_ros.commands.feature_options import make_extractor
+
+    exclude = arguments.exclude_places or EXCLUDE_PLACES
+    length = arguments.sequence_length
+    traverse = _loop_traverse(arguments, folder, exclude)
+    recording = traverse.recording
+    if exclude + length >= traverse.N:
+        raise SettingsError(
+            f'{recording.path} has {traverse.N} images: --exclude-places {exclude} leaves no '
+            f'window of {length}'
+        )
+    extractor = make_extractor(arguments)
+    place_map = recording.build_map(extractor, _skip)
+    if traverse.ground_truth is not None:
+        _require_all(place_map, traverse.N)
+    features = folder / 'features.stavpr'
+    recording.save_feature_settings(extractor, features)
+
+    _print('2. The traverse through the node, over ROS, with a replay and recorders')
+    parameters = {
+        'operation': 'loop_closure',
+        'map_path': features,
+        **_limit(arguments, arguments.threshold),
+        'sequence_length': length,
+        'exclude_places': exclude,
+        'geometric_check': arguments.geometric_check or GEOMETRIC_CHECK,
+    }
+    matches, closures = run_live(
+        parameters, recording.path, len(place_map), folder, recording.topic
+    )
+    result = read_result(matches, closures, traverse.ground_truth, exclude)
+    _report('3', result.summary(), draw_loops(result, place_map, traverse.title, folder))
+
+
+def _slam(arguments: argparse.Namespace, folder: Path) -> None:
+    """Correct the odometry of three laps by loop closures."""
+    from stavpr_lab.demonstration import slam
+    from stavpr_lab.demonstration.live import executable, run_live
+    from stavpr_lab.demonstration.recordings import Recording, TOPIC
+    from stavpr_lab.demonstration.street.laps import CAMERA_IN_BASE, drive_laps
+    from stavpr_ros.commands.feature_options import make_extractor
+    from stavpr_slam.pose_graph.solver import load_gtsam
+    from stavpr_slam.ros.graph_client import fetch_graph
+
+    load_gtsam()
+    _print('1. Three laps of a synthetic street, with a drifting odometry')
+    drive = drive_laps(
+        arguments.world, arguments.draw, arguments.drift, arguments.carried, arguments.sessions
+    )
+    bag, features = folder / 'laps', folder / 'features.stavpr'
+    slam.write_drive(drive, bag)
+    recording = Recording(str(bag), TOPIC)
+    recording.save_feature_settings(make_extractor(arguments), features)
+
+    _print('2. The drive through node and pose_graph, over ROS, with a replay and recorders')
+    topic = 'stavpr/loop_closure'
+    others = {}
+    if arguments.false_closures:
+        topic = 'false_closures/loop_closure'
+        relay = [sys.executable, '-m', 'stavpr_slam.ros.false_closures']
+        relay += ['--share', str(arguments.false_closures), '--seed', str(arguments.world)]
+        others['false_closures'] = relay + ['--coherent'] * arguments.coherent
+    graph = {
+        'maps_folder': folder.absolute(),
+        'loop_closure_topics': [topic],
+    }
+    others['pose_graph'] = [
+        executable('pose_graph', 'stavpr_slam'), '--ros-args',
+        *(word for name, value in graph.items() for word in ('-p', f'{name}:={value}')),
+    ]  # fmt: skip
+    parameters = {
+        'operation': 'loop_closure',
+        'map_path': features,
+        **_limit(arguments, arguments.threshold),
+        'sequence_length': arguments.sequence_length,
+        'keyframe_change': 0.0,
+    }
+    if 'camera_transform' in BY_NAME:
+        parameters['camera_transform'] = ' '.join(f'{value:g}' for value in CAMERA_IN_BASE)
+    result: list[Any] = []
+
+    def fetch(closures: list[dict[str, Any]], environment: dict[str, str]) -> None:
+        domain = int(environment['ROS_DOMAIN_ID'])
+        result.append(fetch_graph(['graph.g2o', 'optimized.tum'], len(closures), domain))
+
+    run_live(
+        parameters, str(bag), len(drive), folder, TOPIC, others,
+        ['--odometry', '--also', slam.CAMERA_INFO, '--timeout', '120'], fetch,
+    )  # fmt: skip
+    values, edges = result[0]
+    found = slam.evaluate_drive(drive, folder / 'optimized.tum', values)
+    _report('3', found.summary(), slam.write_result(found, drive, edges, folder))
+
+
+def _report(number: str, summary: str, plot: Path) -> None:
+    _print(f'\n{number}. Result')
+    for line in summary.splitlines():
+        _print(f'   {line}')
+    _print(f'   plots and records are in {plot.parent}/; start with {plot}')
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command."""
+
+    def work() -> None:
+        parser = _parser()
+        arguments = parser.parse_args(args)
+        _check(parser, arguments)
+        _run(arguments)
+
+    return run_program('demo', work)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,464 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 run stavpr_lab evaluate``: metrics of recognizing one traverse on the map of another."""
+
+import argparse
+from pathlib import Path
+import sys
+import time
+from typing import Any, TYPE_CHECKING
+
+from stavpr_ros.commands.jobs import (
+    add_job_options,
+    Job,
+    job_names,
+    other_arguments,
+    run_jobs,
+)
+from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.errors import SourceError
+from stavpr_ros.output_file import HTML, JSON, NPY, require_replaceable
+from stavpr_ros.parameters import BY_NAME
+
+if TYPE_CHECKING:
+    from stavpr_lab.commands.evaluate_sequences import Sequences
+    from stavpr_lab.evaluation.evaluate import Evaluation
+    from stavpr_lab.evaluation.report import Report
+    from stavpr_ros.pipeline.settings import PipelineSettings
+    from stavpr_ros.recognition import RecognizerSettings
+
+OUTPUT = 'evaluation_output'
+EXCLUDE_PLACES = 50  # as the node's parameter
+
+DESCRIPTION = """
+Recognizes a second traverse on the map of a first one, image by image as the node does, and
+compares the matches with the ground truth: precision and recall, F1, average precision, recall@k,
+recall at 100 % precision, false alarms, calibration; for sequences and for single images. Writes
+JSON, CSV, plots and an HTML page.
+"""
+
+EPILOG = """
+traverses: images, a bag, a saved map, or an array of descriptors that any program computed, .npy
+.npz .csv .mat, or FILE:NAME for one of several: (n, D), one vector an image, or (n, W, D)
+
+ground truth (--truth):
+  identity     image i of the query shows place i of the map (the default); --tolerance is 3 then
+  poses        places within --meters and --degrees of the query's pose
+  FILE         .csv: accepted pairs, query,place, from 0; .npy, .npz: a matrix, queries by places,
+               pairs, or a place a query; an image: white at row i, column j accepts place j for
+               query i; --tolerance is 0 then
+
+another drive (they combine; applied in the order speed, stop, reverse, drop):
+  --remove-from-map 100:150   the map lacks the places 100 to 149: are images of them matched?
+  --mirror                    every image mirrored left-right: no match is right
+  --reverse                   the last image comes first
+  --speed 3, 0.5, varying     images are left out or repeated; varying: 1/2 to 2
+  --stop 60:100               the query stands still at image 60 for 100 images more
+  --drop 0.2                  each image is left out with probability 0.2
+
+examples:
+  evaluate --map summer/ --query winter/
+  evaluate --map route.stavpr --query tuesday.bag --truth pairs.csv --mode paper --json result.json
+  evaluate --map summer/ --query winter/ --crop-map 0.3 --crop-query 0.1 --warp vary
+  evaluate --map monday/ --query tuesday/ --unknown another_town/ --output report/
+  evaluate --map monday/ --query tuesday/ --remove-from-map 40:90 --remove-from-map 200:260
+  evaluate --query loop/ --loop-closure --exclude-places 50 --truth closures.png
+  evaluate --map summer.csv --query netvlad.mat:winter --tolerance 2
+  evaluate --map summer/ --query winter/ --export arrays/
+  evaluate --map summer/ --query drives/*.bag --output reports/ --processes 4
+  evaluate --dataset gardens_point=data/gardens_point --strategy vanilla
+
+exit codes: 0 done, 1 failed (the reason is printed), 2 usage, 130 interrupted
+"""
+
+
+def _parser() -> argparse.ArgumentParser:
+    from stavpr_ros.commands.feature_options import add_feature_options
+
+    parser = make_parser('evaluate', DESCRIPTION, EPILOG)
+    add = parser.add_argument_group('sequences').add_argument
+    add('--map', metavar='FOLDER|BAG|MAP|ARRAY', help='first traverse, see below')
+    query = 'second traverse: the same; several: each is evaluated'
+    add('--query', nargs='+', metavar='FOLDER|BAG|MAP|ARRAY', help=query)
+    add('--dataset', metavar='NAME=FOLDER', help='map, query and ground truth of a known data set')
+    add('--topic', help='image topic of the bags, if they have several')
+    add(
+        '--unknown',
+        metavar='FOLDER|BAG|MAP|ARRAY',
+        help='a traverse of places that are not in the map, for the rate of false alarms',
+    )
+    add('--loop-closure', action='store_true', help="the map is the query's own past: no --map")
+    add(
+        '--exclude-places',
+        type=int,
+        metavar='N',
+        help=f'the latest N images are not part of that map ({EXCLUDE_PLACES})',
+    )
+    late = 'count closures that are published late, too: see the message LoopClosure'
+    add('--late-closures', action='store_true', help=late)
+    odometry = (
+        'poses of the images of the query by odometry, as --query-poses: compared with paths'
+    )
+    add('--odometry', metavar='CSV', help=odometry)
+    for name, side in (('map', 'right'), ('query', 'left')):
+        add(
+            f'--crop-{name}',
+            type=float,
+            default=0.0,
+            metavar='X',
+            help=f'crop this share of the {side} of every image of the {name} (%(default)g)',
+        )
+    _add_drive_options(parser)
+    _add_ground_truth_options(parser)
+    _add_method_options(parser)
+    add = parser.add_argument_group('output').add_argument
+    add('--json', metavar='FILE', help='write the numbers')
+    add('--output', metavar='FOLDER', help=f'write a report ({OUTPUT} without --json)')
+    export = 'write the features of map and query as map.npy and query.npy'
+    add('--export', metavar='FOLDER', help=export)
+    add('--force', action='store_true', help='replace earlier numbers, reports and arrays')
+    add('--window', type=int, metavar='I', help='plot the warping path around query image I')
+    add_job_options(parser)
+    add_feature_options(parser)
+    return parser
+
+
+def _add_drive_options(parser: argparse.ArgumentParser) -> None:
+    from stavpr_lab.evaluation.warp import KINDS
+
+    add = parser.add_argument_group('another drive').add_argument
+    pairs: dict[str, Any] = {'type': _pair, 'action': 'append', 'default': []}
+    removal = 'leave places FIRST .. LAST - 1 out of the map; may be repeated'
+    add('--remove-from-map', metavar='FIRST:LAST', help=removal, **pairs)
+    add('--mirror', action='store_true', help='mirror the images of the query left-right')
+    add('--reverse', action='store_true', help='drive the query in reverse order')
+    speed = 'images of the query per image, or varying'
+    add('--speed', type=_speed, metavar='X', help=speed)
+    stop = 'stand still at image IMAGE of the query for COUNT more; may be repeated'
+    add('--stop', metavar='IMAGE:COUNT', help=stop, **pairs)
+    drop = 'leave each image of the query out with this probability (%(default)g)'
+    add('--drop', type=float, default=0.0, metavar='P', help=drop)
+    seed = 'of the images that are left out (%(default)s)'
+    add('--drop-seed', type=int, default=0, metavar='N', help=seed)
+    add('--warp', choices=KINDS, help='a speed or a stop in the middle, as in the benchmarks')
+
+
+def _pair(text: str) -> tuple[int, int]:
+    numbers = text.split(':')
+    if len(numbers) != 2 or not all(number.isdecimal() for number in numbers):
+        raise argparse.ArgumentTypeError(f'{text!r}: expected two whole numbers, as 60:100')
+    return int(numbers[0]), int(numbers[1])
+
+
+def _speed(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _add_ground_truth_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group('ground truth').add_argument
+    add('--truth', default='identity', metavar='identity|poses|FILE', help='see below')
+    add('--tolerance', type=int, metavar='T', help='places that a correct match may be off')
+    add('--query-poses', metavar='CSV', help='x,y,z[,qx,qy,qz,qw] of every query image')
+    add('--map-poses', metavar='CSV', help='the same of every place (those of the saved map)')
+    add('--meters', type=float, default=5.0, help='with poses: largest distance (%(default)g)')
+    add('--degrees', type=float, help='with poses that have orientations: largest angle (any)')
+
+
+def _add_method_options(parser: argparse.ArgumentParser) -> None:
+    from stavpr_ros.alignment.settings import STRATEGIES
+
+    add = parser.add_argument_group('method').add_argument
+    mode = 'paper: as published; robust: with mitigations of failure modes (%(default)s)'
+    add('--mode', choices=('paper', 'robust'), default='robust', help=mode)
+    least = 'mode robust: matches have a greater probability (%(default)g)'
+    default = BY_NAME['min_probability'].default
+    add('--min-probability', type=float, default=default, metavar='P', help=least)
+    length = 'images in a window (%(default)s)'
+    add('--sequence-length', type=int, default=20, metavar='L', help=length)
+    add('--beta', type=float, default=2.0, help='places per image of a window (%(default)g)')
+    spatial = 'spatial alignment (%(default)s)'
+    add('--strategy', choices=STRATEGIES, default='adaptive', help=spatial)
+    add('--sigma', type=float, default=1.0, help='of the adaptive weight (%(default)g)')
+    add('--xi', type=int, help='restricted alignment: largest shift in strips (none)')
+    add('--vertical', action='store_true', help='align the cells of two strips vertically first')
+    radius = 'other candidates are farther from the match than this (%(default)s)'
+    add('--nms-radius', type=int, default=20, metavar='PLACES', help=radius)
+    add('--backend', choices=('auto', 'cpu', 'cuda'), default='cpu', help='(%(default)s)')
+    budget = 'for an image; a coarse first stage where it takes longer; 0 = exact (%(default)g)'
+    add('--time-budget-ms', type=float, default=0.0, metavar='MS', help=budget)
+    precision = 'of the map (%(default)s)'
+    add('--precision', choices=('float32', 'float16', 'int8'), default='float32', help=precision)
+
+
+def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """Reject options that contradict each other."""
+    loop, dataset = arguments.loop_closure, arguments.dataset is not None
+    if dataset and (arguments.map or arguments.query or arguments.truth != 'identity' or loop):
+        parser.error(
+            '--dataset has map, query and ground truth: leave --map, --query, --truth and '
+            '--loop-closure out'
+        )
+    if dataset and arguments.odometry:
+        parser.error('--odometry: the data set has no poses; give --map and --query')
+    if not dataset and arguments.query is None:
+        parser.error('--query is required')
+    if not dataset and (arguments.map is None) != loop:
+        parser.error('give --map or, for the query on its own past, --loop-closure')
+    if arguments.exclude_places is not None and not loop:
+        parser.error('--exclude-places goes with --loop-closure')
+    if arguments.late_closures and not loop:
+        parser.error('--late-closures goes with --loop-closure')
+    if loop:
+        _check_loop_closure(parser, arguments)
+    if arguments.warp and arguments.speed is not None:
+        parser.error('--warp and --speed: give one of them')
+    if arguments.tolerance is not None and arguments.tolerance < 0:
+        parser.error(f'--tolerance {arguments.tolerance} must be at least 0')
+    of_map = arguments.map_poses and not arguments.odometry
+    if arguments.truth != 'poses' and (arguments.query_poses or of_map):
+        parser.error('--query-poses and --map-poses go with --truth poses (or --odometry)')
+
+
+def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    if arguments.exclude_places is None:
+        arguments.exclude_places = EXCLUDE_PLACES
+    names = ('unknown', 'remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop', 'warp')
+    for name in names:
+        if getattr(arguments, name):
+            parser.error(f'--loop-closure: --{name.replace("_", "-")} needs a --map')
+    if arguments.crop_map or arguments.map_poses:
+        parser.error(
+            '--loop-closure is computed on the query alone: leave --crop-map and --map-poses out'
+        )
+    if arguments.truth == 'identity':
+        parser.error('--loop-closure needs --truth FILE or poses')
+    if arguments.exclude_places < 1:
+        parser.error(f'--exclude-places {arguments.exclude_places} must be at least 1')
+
+
+def node_settings(arguments: argparse.Namespace) -> 'PipelineSettings':
+    """
+    Return the settings of the parsed options as the node has them, without a threshold.
+
+    :raises SettingsError: one is out of its range.
+    """
+    from stavpr_ros.alignment import SequenceSettings, SpatialSettings
+    from stavpr_ros.pipeline.settings import PipelineSettings
+
+    return PipelineSettings(
+        mode=arguments.mode,
+        min_probability=arguments.min_probability,
+        spatial=SpatialSettings(
+            arguments.strategy, arguments.sigma, arguments.xi, arguments.vertical
+        ),
+        sequence=SequenceSettings(arguments.sequence_length, arguments.beta),
+        nms_radius=arguments.nms_radius,
+        time_budget_ms=arguments.time_budget_ms,
+    )
+
+
+def _evaluate(
+    arguments: argparse.Namespace, sequences: 'Sequences', settings: 'RecognizerSettings'
+) -> 'Evaluation':
+    from stavpr_lab.evaluation.evaluate import evaluate_loop_closures, evaluate_on_map
+
+    shown = () if arguments.window is None else (arguments.window,)
+    query, ground_truth = sequences.query.features, sequences.drive.truth
+    if sequences.reference is None:
+        return evaluate_loop_closures(
+            query,
+            ground_truth,
+            settings,
+            arguments.exclude_places,
+            shown,
+            progress=True,
+            odometry=sequences.odometry,
+            late=arguments.late_closures,
+            backend=arguments.backend,
+            precision=arguments.precision,
+        )
+    return evaluate_on_map(
+        sequences.reference,
+        query,
+        ground_truth,
+        settings,
+        sequences.unknown.features if sequences.unknown else None,
+        shown,
+        arguments.backend,
+        arguments.precision,
+        progress=True,
+        odometry=sequences.odometry,
+    )
+
+
+def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dict[str, Any]:
+    """Return everything that decides the numbers."""
+    from stavpr_ros.sources.folder import text_of
+
+    poses = ('query_poses', 'map_poses', 'meters', 'degrees') if sequences.posed else ()
+    names = [
+        *('map', 'query', 'dataset', 'topic', 'unknown', 'loop_closure', 'exclude_places', 'warp'),
+        *('remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
+        *('crop_map', 'crop_query', 'truth', *poses),
+        *('mode', 'min_probability', 'sequence_length', 'beta', 'nms_radius'),
+        *('strategy', 'sigma', 'xi', 'vertical'),
+        *('backend', 'precision', 'time_budget_ms', 'late_closures', 'odometry'),
+    ]
+    settings: dict[str, Any] = {}
+    for name in names:
+        value = getattr(arguments, name)
+        settings[name] = text_of(value) if isinstance(value, str) else value
+    features = sequences.query.settings.to_json()
+    return {**settings, 'tolerance': sequences.tolerance, 'features': features}
+
+
+def _report(arguments: argparse.Namespace) -> 'Report':
+    from stavpr_lab.commands.evaluate_sequences import load_sequences
+    from stavpr_lab.evaluation.extra import import_extra
+    from stavpr_lab.evaluation.report import Report
+
+    began = time.perf_counter()
+    import_extra('sklearn.metrics')  # an error before the work, not after it
+    settings = node_settings(arguments)
+    sequences = load_sequences(arguments)
+    loaded = time.perf_counter()
+    evaluation = _evaluate(arguments, sequences, settings.recognition())
+    ended = time.perf_counter()
+    milliseconds = evaluation.results.seconds * 1e3
+    times = {
+        **sequences.times,
+        'drives_s': loaded - began,
+        'recognition_s': ended - loaded,
+        'recognition_median_ms': float(sorted(milliseconds)[len(milliseconds) // 2]),
+        'total_s': ended - began,
+    }
+    return Report(
+        evaluation=evaluation,
+        query=sequences.query,
+        reference=sequences.reference or sequences.query,
+        title=sequences.title,
+        settings=_settings_json(arguments, sequences),
+        times=times,
+        drive=sequences.drive,
+        default_threshold=settings.applied_threshold,
+        window=arguments.window,
+    )
+
+
+def _print_metrics(report: 'Report') -> None:
+    from stavpr_lab.evaluation.report import METRICS
+
+    print(report.title)
+    print(f'{"":28}{"sequences":>12}{"no ends":>12}{"single":>12}{"no ends":>12}')
+    numbers = [getattr(report.evaluation, name).to_json() for name in METRICS]
+    rows = ('f1', 'threshold', 'average_precision', 'recall_at_1', 'recall_at_5', 'recall_at_10')
+    for row in (*rows, 'recall_at_20', 'recall_at_100_precision'):
+        print(
+            f'{row.replace("_", " "):28}' + ''.join(f'{number[row]:12.4f}' for number in numbers)
+        )
+    alarms = [report.evaluation.false_alarm_rate(kind) for kind in ('sequence', 'single')]
+    if alarms[0] is not None:
+        print(f'{"false alarm rate":28}{alarms[0]:12.4f}{"":12}{alarms[1]:12.4f}')
+    decision, calibration = report.decision(), report.evaluation.calibration
+    print(
+        f'matched, {decision["rule"]}: {decision["matched"]} of {decision["images"]} images, '
+        f'{decision["wrongly_matched"]} of them wrongly'
+    )
+    for stretch in report.unseen():
+        print(
+            f'without places {stretch["first"]} .. {stretch["last"] - 1}: {stretch["matched"]} of '
+            f'{stretch["images"]} unseen images matched'
+        )
+    if calibration is not None:
+        print(
+            f'declared probability: expected calibration error {calibration.expected_error:.4f}, '
+            f'recall at 100 precision {calibration.recall_at_full_precision:.4f}'
+        )
+    print(
+        f'{report.times["recognition_median_ms"]:.2f} ms an image for recognition (median), '
+        f'{report.times["total_s"]:.1f} s in all'
+    )
+
+
+def _export(report: 'Report', folder: Path, force: bool) -> None:
+    from stavpr_ros.features.descriptors import write_descriptors
+
+    traverses = {'query': report.query}
+    if report.reference is not report.query:
+        traverses['map'] = report.reference
+    for name, place_map in traverses.items():
+        write_descriptors(place_map.features, folder / f'{name}.npy', force)
+    print(f'arrays: {folder}')
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from stavpr_lab.evaluation.extra import import_extra
+    from stavpr_lab.evaluation.report import chosen_window
+    from stavpr_lab.evaluation.report_files import PAGE, write_folder, write_json
+
+    folder = arguments.output or (None if arguments.json else OUTPUT)
+    if arguments.json:
+        require_replaceable(arguments.json, JSON, arguments.force)
+    if folder:
+        import_extra('jinja2')
+        if Path(folder).is_file():
+            raise SourceError(f'{folder} is a file: --output takes a folder')
+        if Path(folder).is_dir():
+            require_replaceable(Path(folder) / PAGE, HTML, arguments.force)
+    if arguments.export:
+        Path(arguments.export).mkdir(parents=True, exist_ok=True)
+        for name in ('map', 'query'):
+            require_replaceable(Path(arguments.export) / f'{name}.npy', NPY, arguments.force)
+    report = _report(arguments)
+    chosen_window(report.evaluation, arguments.window)  # an invalid image fails before writing
+    _print_metrics(report)
+    if arguments.export:
+        _export(report, Path(arguments.export), arguments.force)
+    if arguments.json:
+        write_json(report, Path(arguments.json), arguments.force)
+        print(f'numbers: {arguments.json}')
+    if folder:
+        print(f'report: {write_folder(report, Path(folder), arguments.force)}')
+
+
+def _run_each(
+    parser: argparse.ArgumentParser, arguments: argparse.Namespace, args: list[str]
+) -> int:
+    """Evaluate each query: a report and the numbers in a folder of its name; the exit code."""
+    for option in ('json', 'export', 'window', 'dataset', 'query_poses'):
+        if getattr(arguments, option) is not None:
+            parser.error(f'--{option.replace("_", "-")} goes with one --query')
+    folder, others = Path(arguments.output or OUTPUT), other_arguments(args, '--query')
+    jobs = []
+    for name, query in zip(job_names(arguments.query), arguments.query, strict=True):
+        own = folder / name
+        written = ('--output', str(own), '--json', f'{own}.json')
+        is_new = not (own.exists() or Path(f'{own}.json').exists())
+        jobs.append(Job(name, 'evaluate', ('--query', query, *written, *others), is_new))
+    folder.mkdir(parents=True, exist_ok=True)
+    return run_jobs(jobs, arguments.processes, arguments.ray)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command."""
+
+    def work() -> int | None:
+        parser = _parser()
+        # None = not given: a saved map decides these then
+        given = argparse.Namespace(features=None, strips=None, seed=None)
+        arguments = parser.parse_args(args, given)
+        if arguments.query is not None and len(arguments.query) > 1:
+            return _run_each(parser, arguments, sys.argv[1:] if args is None else args)
+        arguments.query = arguments.query[0] if arguments.query else None
+        _check(parser, arguments)
+        _run(arguments)
+        return None
+
+    return run_program('evaluate', work)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,328 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The inputs of the command ``evaluate``: folders, bags, saved maps, data sets, ground truth."""
+
+import argparse
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+import time
+
+import numpy as np
+from stavpr_lab.evaluation.drive import Drive, DriveChanges
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_lab.evaluation.ground_truth_files import read_poses
+from stavpr_lab.evaluation.paper.datasets import open_dataset
+from stavpr_lab.evaluation.warp import (
+    cropped,
+    FrameSource,
+    mirrored,
+    select_places,
+    warp_changes,
+)
+from stavpr_ros.commands.feature_options import (
+    kind_options,
+    make_extractor,
+    require_descriptors_alone,
+)
+from stavpr_ros.devices import choose_device
+from stavpr_ros.errors import SettingsError, SourceError
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.features.descriptors import (
+    is_descriptors,
+    read_descriptors,
+    require_comparable,
+)
+from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap
+from stavpr_ros.sources import open_source
+from stavpr_ros.sources.bag_file import is_bag
+from stavpr_ros.sources.folder import text_of
+
+IDENTITY_TOLERANCE = 3  # places; a file of accepted pairs includes its tolerance
+DEFAULTS = {'features': 'gradient', 'seed': 0}
+
+
+@dataclass(frozen=True)
+class Sequences:
+    """
+    The inputs of an evaluation.
+
+    :param reference: the map; None for loop closures.
+    :param query: the query, with the changes that the options name.
+    :param unknown: a traverse through places that are not in the map, if there is one.
+    :param drive: these changes, and the ground truth of the query's images.
+    :param tolerance: places.
+    :param posed: the ground truth comes from poses.
+    :param title: names of the inputs, a line.
+    :param times: of the extraction of features, milliseconds an image.
+    :param odometry: poses of the query's images by odometry, (N, 7); None = unknown.
+    """
+
+    reference: PlaceMap | None
+    query: PlaceMap
+    unknown: PlaceMap | None
+    drive: Drive
+    tolerance: int
+    posed: bool
+    title: str
+    times: dict[str, float] = field(default_factory=dict)
+    odometry: np.ndarray | None = None
+
+
+def load_sequences(arguments: argparse.Namespace) -> Sequences:
+    """
+    Open the inputs that the parsed options name and extract their features.
+
+    :raises StavprError: one cannot be read, or they do not fit together.
+    """
+    loader = _Loader(arguments)
+    if arguments.dataset is not None:
+        sequences = _of_dataset(arguments, loader)
+    else:
+        # saved maps first: they decide the features of the others
+        paths = {'map': arguments.map, 'query': arguments.query, 'unknown': arguments.unknown}
+        opened = {
+            name: loader.load(name, path)
+            for name, path in sorted(paths.items(), key=_decides_features)
+            if path is not None
+        }
+        sequences = _of_paths(arguments, opened, loader.times)
+    return _changed(sequences, arguments)
+
+
+def is_saved_map(path: str | None) -> bool:
+    """Return whether a path is a map file, by its content; False for an unreadable path."""
+    return path is not None and Path(path).is_file() and is_map(path)
+
+
+def _decides_features(item: tuple[str, str | None]) -> int:
+    """Order saved maps first, then descriptors."""
+    return 0 if is_saved_map(item[1]) else 1 if is_descriptors(item[1]) else 2
+
+
+class _Loader:
+    """Extracts the same features of all inputs: those of the first saved map, or the options'."""
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self._arguments = arguments
+        self._extractor: FeatureExtractor | None = None
+        self._saved: PlaceMap | None = None
+        self.times: dict[str, float] = {}
+
+    def load(self, name: str, path: str) -> PlaceMap:
+        """Open a folder, a bag, a saved map or descriptors."""
+        if is_saved_map(path) or is_descriptors(path):
+            crop = 'crop_map' if name == 'map' else 'crop_query'
+            unusable = (crop, 'mirror') if name == 'query' else (crop,)
+            for option in unusable:
+                if getattr(self._arguments, option):
+                    raise SettingsError(
+                        f'--{option.replace("_", "-")}: {path} is a saved map or an array, which '
+                        'has no images'
+                    )
+            return self._read(path) if is_descriptors(path) else self._load_map(path)
+        if Path(path).suffix == '.stavpr':
+            return load_map(path)  # raises the reason why it is none
+        source = open_source(path, self._arguments.topic if is_bag(Path(path)) else None)
+        return self.extract(name, source)
+
+    def extract(self, name: str, source: FrameSource) -> PlaceMap:
+        """Extract the features of a source, cropped and mirrored as the options want it."""
+        given, extractor = self._arguments, self._chosen()
+        # unknown places are cropped as the query is
+        source = cropped(
+            source, *((0, given.crop_map) if name == 'map' else (given.crop_query, 0))
+        )
+        if name == 'query' and given.mirror:
+            source = mirrored(source)
+        began = time.perf_counter()
+        extracted = build_map(source, extractor)
+        milliseconds = (time.perf_counter() - began) * 1e3
+        self.times[f'describing_{name}_ms_per_image'] = milliseconds / len(extracted)
+        return extracted
+
+    def _read(self, path: str) -> PlaceMap:
+        """Read descriptors; those of the map and the query must be comparable."""
+        require_descriptors_alone(self._arguments, path)
+        source = self._arguments.descriptors_source
+        first = self._saved
+        if source is None and first is not None and first.settings.kind == 'descriptors':
+            source = first.settings.backbone.source
+        features = read_descriptors(path, source or '')
+        if first is not None:
+            require_comparable(features, first.settings, first.dimension)
+        found = descriptor_map(features)
+        self._saved = first or found
+        return found
+
+    def _load_map(self, path: str) -> PlaceMap:
+        """Load a saved map, and refuse options that contradict its features."""
+        found = load_map(path)
+        given = self._arguments
+        first = self._extractor if self._saved is None else self._saved
+        if first is not None:
+            found.features.require_same_settings(first.settings, 'the first sequence')
+            return found
+        for name, requested, present in (
+            ('features', given.features, found.settings.kind),
+            ('strips', given.strips, found.settings.strips),
+        ):
+            if requested is not None and requested != present:
+                raise SettingsError(
+                    f'--{name} {requested}: the map {path} was made with {present}; leave it out'
+                )
+        model = f'--{found.settings.kind}-model'  # a map does not state where it is
+        options = {'--projection': given.projection, '--seed': given.seed, **kind_options(given)}
+        for option, value in options.items():
+            if value is not None and option not in (
+                model,
+                '--torchscript-allow',
+                '--descriptors-source',
+            ):
+                raise SettingsError(f'{option}: the map {path} has its own or none; leave it out')
+        self._saved = found
+        return found
+
+    def _chosen(self) -> FeatureExtractor:
+        if self._extractor is None:
+            given = self._arguments
+            if self._saved is not None:
+                model = getattr(given, f'{self._saved.settings.kind}_model', None)
+                self._extractor = self._saved.extractor(
+                    choose_device(given.device), model or '', bool(given.torchscript_allow)
+                )
+            else:
+                options = argparse.Namespace(**vars(given))
+                for name, default in DEFAULTS.items():
+                    if getattr(options, name) is None:
+                        setattr(options, name, default)
+                self._extractor = make_extractor(options)
+        return self._extractor
+
+
+def _of_dataset(arguments: argparse.Namespace, loader: _Loader) -> Sequences:
+    name, separator, root = arguments.dataset.partition('=')
+    if not separator:
+        raise SettingsError(f'--dataset {arguments.dataset}: expected NAME=FOLDER')
+    found = open_dataset(name, root, arguments.tolerance)
+    return Sequences(
+        reference=loader.extract('map', found.map),
+        query=loader.extract('query', found.query),
+        unknown=loader.load('unknown', arguments.unknown) if arguments.unknown else None,
+        drive=DriveChanges().apply(found.ground_truth),
+        tolerance=found.tolerance,
+        posed=False,
+        title=name.replace('_', ' '),
+        times=loader.times,
+    )
+
+
+def _of_paths(
+    arguments: argparse.Namespace, opened: dict[str, PlaceMap], times: dict[str, float]
+) -> Sequences:
+    reference, query = opened.get('map'), opened['query']
+    tolerance = arguments.tolerance
+    if tolerance is None:
+        tolerance = IDENTITY_TOLERANCE if arguments.truth == 'identity' else 0
+    ground_truth = _ground_truth(arguments, query, reference or query, tolerance)
+    if reference is None:
+        # places are ``exclude_places`` images before the query and earlier
+        ground_truth = ground_truth.loop_closures(arguments.exclude_places - 1)
+        title = f'{_name(arguments.query)}: loop closures'
+    else:
+        title = f'{_name(arguments.query)} on the map {_name(arguments.map)}'
+    posed = arguments.truth == 'poses'
+    unknown = opened.get('unknown')
+    drive = DriveChanges().apply(ground_truth)
+    odometry = None
+    if arguments.odometry is not None:
+        odometry = _poses(arguments.odometry, query, 'query', None)
+        if reference is not None:
+            reference = replace(
+                reference, poses=_poses(arguments.map_poses, reference, 'map', None)
+            )
+    return Sequences(reference, query, unknown, drive, tolerance, posed, title, times, odometry)
+
+
+def _name(path: str) -> str:
+    return text_of(Path(path).resolve().name)
+
+
+def _ground_truth(
+    arguments: argparse.Namespace, query: PlaceMap, reference: PlaceMap, tolerance: int
+) -> GroundTruth:
+    N, n = len(query), len(reference)
+    if arguments.truth == 'identity':
+        return GroundTruth.identity(N, n, tolerance)
+    if arguments.truth != 'poses':
+        return GroundTruth.from_file(arguments.truth, N, n, tolerance)
+    same = reference is query
+    queries = _poses(arguments.query_poses, query, 'query', arguments.degrees)
+    path = arguments.query_poses if same else arguments.map_poses
+    places = _poses(path, reference, 'map', arguments.degrees)
+    found = GroundTruth.from_poses(queries, places, arguments.meters, arguments.degrees)
+    return found.widened(tolerance)
+
+
+def _poses(path: str | None, place_map: PlaceMap, name: str, degrees: float | None) -> np.ndarray:
+    """Return the poses of an input, from a file or from the saved map."""
+    if path is None:
+        if place_map.poses is None or not place_map.has_poses:
+            raise SettingsError(f'the {name} has no poses: give --{name}-poses')
+        return place_map.poses
+    poses, oriented = read_poses(Path(path))
+    if len(poses) != len(place_map):
+        raise SourceError(
+            f'{path} has {len(poses)} poses for {len(place_map)} images: give one each'
+        )
+    if degrees is not None and not oriented:
+        raise SourceError(f'{path} has no orientations: leave --degrees out')
+    return poses
+
+
+def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
+    """Drive the query as the options want it, on a map without the places that they remove."""
+    query, reference = sequences.query, sequences.reference
+    if arguments.warp is None:
+        warp = DriveChanges(speed=1.0 if arguments.speed is None else arguments.speed)
+    else:
+        warp = warp_changes(len(query), arguments.warp)
+    changes = replace(
+        warp,
+        removed=tuple(arguments.remove_from_map),
+        mirror=arguments.mirror,
+        reverse=arguments.reverse,
+        drop=arguments.drop,
+        seed=arguments.drop_seed,
+        stops=(*warp.stops, *arguments.stop),
+    )
+    if changes == DriveChanges(seed=changes.seed):
+        return sequences
+    drive = changes.apply(sequences.drive.recorded)
+    if reference is not None and changes.removed:
+        reference = select_places(reference, drive.places)
+    title = f'{sequences.title}, {_description(arguments)}'
+    query = select_places(query, drive.images)
+    odometry = sequences.odometry
+    if odometry is not None:
+        odometry = odometry[drive.images]
+    return replace(
+        sequences,
+        reference=reference,
+        query=query,
+        drive=drive,
+        title=title,
+        odometry=odometry,
+    )
+
+
+def _description(arguments: argparse.Namespace) -> str:
+    """Return the changes of the drive as text of the title."""
+    parts = [f'without places {a} .. {b - 1}' for a, b in arguments.remove_from_map]
+    parts += [name for name in ('mirror', 'reverse') if getattr(arguments, name)]
+    if arguments.warp or arguments.speed is not None:
+        speed = arguments.warp or arguments.speed
+        parts.append(f'speed {speed if isinstance(speed, str) else format(speed, "g")}')
+    if arguments.drop:
+        parts.append(f'drop {arguments.drop:g}')
+    parts += [f'stop {image}:{count}' for image, count in arguments.stop]
+    return ', '.join(parts)

@@ -1,0 +1,292 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 run stavpr_lab experiments``: the paper's tables, computed and published."""
+
+import argparse
+import json
+from pathlib import Path
+import sys
+from typing import Any, TYPE_CHECKING
+
+from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.errors import SettingsError, SourceError
+from stavpr_ros.output_file import JSON, require_replaceable, write_output
+
+if TYPE_CHECKING:
+    from stavpr_lab.evaluation.metrics import Metrics
+    from stavpr_lab.evaluation.paper.datasets import Dataset
+    from stavpr_lab.evaluation.paper.experiments import BaselineInputs, Configuration
+
+EMPTY = '-'
+
+DESCRIPTION = """
+Runs one of the paper's experiments on several data sets with several kinds of features and prints
+the table beside the published numbers (F1; the paper has no others).
+"""
+
+EPILOG = """
+experiments:
+  paper        SeqSLAM, NetVLAD, SAES, no alignment, VGG fc6, SSM-VPR, STA-VPR, STA-VPR with GRP
+               and RA, on all data sets; below the table, why an entry is -
+  ablation     no alignment, only spatial, only temporal, both
+  strategies   sliding window, vanilla DTW, adaptive DTW
+  fast         random projection (GRP) and restricted alignment (RA), off and on
+  robust_options  the paper, mode robust, and robust without each of its options
+  sweep        one of l, beta, xi, sigma, W (--parameter), all others at their defaults
+
+data sets: nordland gardens_point gardens_point_night ua berlin_a100; synth_ before a name crops
+the images as synth-Nord
+
+examples:
+  experiments paper --data folder_of_all --datasets nordland synth_nordland gardens_point
+  experiments strategies --datasets gardens_point=data/gp --features onnx --onnx-model m.onnx \\
+      --onnx-layer x
+  experiments paper --data all --features onnx --onnx-model m.onnx --onnx-layer x \\
+      --ssm-layers y x --descriptors netvlad=arrays/netvlad
+  experiments sweep --parameter sigma --values 0 0.5 1 2 --data all
+
+exit codes: 0 done, 1 failed (the reason is printed), 2 usage, 130 interrupted
+"""
+
+
+def _parser() -> argparse.ArgumentParser:
+    from stavpr_lab.evaluation.paper.experiments import PRESETS, SWEEPS
+    from stavpr_ros.commands.feature_options import add_feature_options
+
+    parser = make_parser('experiments', DESCRIPTION, EPILOG)
+    parser.add_argument('experiment', choices=(*PRESETS, 'sweep'), help='see below')
+    parser.add_argument('--data', metavar='FOLDER', help='the folder that holds the data sets')
+    parser.add_argument(
+        '--datasets',
+        nargs='+',
+        metavar='NAME[=FOLDER]',
+        help='data sets to run (those of the paper in --data)',
+    )
+    parser.add_argument(
+        '--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)'
+    )
+    parser.add_argument('--parameter', choices=tuple(SWEEPS), help='of sweep (l)')
+    parser.add_argument(
+        '--values', nargs='+', type=float, default=(), metavar='X', help='of sweep'
+    )
+    parser.add_argument(
+        '--descriptors',
+        action='append',
+        default=[],
+        metavar='COLUMN=FOLDER',
+        help='of paper: arrays FOLDER/DATASET/map.npy and query.npy (or .npz .csv .mat) for the '
+        'column netvlad, saes or vgg_fc6; may be repeated',
+    )
+    parser.add_argument(
+        '--ssm-layers',
+        nargs=2,
+        metavar=('FIRST', 'SECOND'),
+        help='of paper: two layers of the network of --features for SSM-VPR, the coarser first',
+    )
+    parser.add_argument('--json', metavar='FILE', help='write all numbers')
+    parser.add_argument('--force', action='store_true', help='replace an existing FILE')
+    add_feature_options(parser)
+    return parser
+
+
+def _columns(arguments: argparse.Namespace) -> 'tuple[Configuration, ...]':
+    from stavpr_lab.evaluation.paper.experiments import PRESETS, sweep_configurations
+
+    if arguments.experiment == 'sweep':
+        return sweep_configurations(arguments.parameter or 'l', arguments.values)
+    if arguments.values or arguments.parameter:
+        raise SettingsError('--parameter and --values go with the experiment sweep')
+    return PRESETS[arguments.experiment]
+
+
+def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset | SourceError]':
+    """Open the requested data sets, or all; of one that is not found, return why."""
+    from stavpr_lab.evaluation.paper.datasets import open_dataset
+    from stavpr_lab.evaluation.paper.published import F1
+
+    found: dict[str, Dataset | SourceError] = {}
+    if arguments.datasets:
+        for entry in arguments.datasets:
+            name, _, folder = entry.partition('=')
+            if not (folder or arguments.data):
+                raise SettingsError(f'data set {name}: give NAME=FOLDER, or --data')
+            found[name] = open_dataset(name, folder or arguments.data)
+        return found
+    if not arguments.data:
+        raise SettingsError('give --data FOLDER, or --datasets NAME=FOLDER')
+    for name in F1:
+        try:
+            found[name] = open_dataset(name, arguments.data)
+        except SourceError as error:
+            found[name] = error
+    if all(isinstance(each, SourceError) for each in found.values()):
+        raise SourceError(f'none of the data sets {", ".join(F1)} is in {arguments.data}')
+    return found
+
+
+def _check_features(options: argparse.Namespace) -> None:
+    """Reject options of features that the experiment sets itself."""
+    if options.strips is not None or options.projection is not None or options.seed:
+        raise SettingsError(
+            '--strips, --projection, --seed: the experiment sets them; leave them out'
+        )
+
+
+def _check_baselines(options: argparse.Namespace) -> None:
+    from stavpr_lab.evaluation.paper.experiments import PRESETS
+
+    if (options.descriptors or options.ssm_layers) and options.experiment != 'paper':
+        raise SettingsError('--descriptors and --ssm-layers go with the experiment paper')
+    if options.ssm_layers and options.features not in ('onnx', 'torchscript'):
+        raise SettingsError('--ssm-layers: give --features onnx or torchscript')
+    known = [row.name for row in PRESETS['paper'] if row.baseline == 'descriptors']
+    for entry in options.descriptors:
+        column, _, folder = entry.partition('=')
+        if column not in known or not folder or not Path(folder).is_dir():
+            raise SettingsError(
+                f'--descriptors {entry}: expected {" or ".join(known)}, = and a folder'
+            )
+
+
+def _inputs(options: argparse.Namespace, dataset: str) -> 'BaselineInputs':
+    """Return the inputs of the baselines on a data set; its descriptors may be missing."""
+    from stavpr_lab.evaluation.paper.experiments import BaselineInputs
+    from stavpr_ros.features.descriptors import is_descriptors
+
+    arrays: dict[str, tuple[str, str]] = {}
+    for entry in options.descriptors:
+        column, _, folder = entry.partition('=')
+        both = [
+            [str(path) for path in sorted(Path(folder, dataset).glob(f'{name}.*'))]
+            for name in ('map', 'query')
+        ]
+        places, queries = ([path for path in paths if is_descriptors(path)] for paths in both)
+        if places and queries:
+            arrays[column] = places[0], queries[0]
+    return BaselineInputs(arrays, tuple(options.ssm_layers) if options.ssm_layers else None)
+
+
+def _run_row(
+    dataset: 'Dataset',
+    options: argparse.Namespace,
+    columns: 'tuple[Configuration, ...]',
+    name: str,
+) -> 'dict[str, Metrics | None]':
+    """Run all columns of a row; None where the data set is too short for one."""
+    from stavpr_lab.evaluation.paper.experiments import DatasetExperiment
+    from stavpr_ros.commands.feature_options import make_extractor
+    from stavpr_ros.devices import choose_device
+    from tqdm import tqdm
+
+    features = make_extractor(options).settings
+    device = choose_device(options.device)
+    inputs = _inputs(options, name)
+    experiment = DatasetExperiment(
+        dataset, features.kind, features.backbone, options.mode, device, inputs
+    )
+    found: dict[str, Metrics | None] = {}
+    title = f'{name}, {features.kind}'
+    for column in tqdm(columns, desc=title, unit='column', disable=None):
+        too_short = len(dataset.query) < column.sequence.length
+        found[column.name] = None if too_short else experiment.evaluate(column)
+    return found
+
+
+def _reason(name: str, dataset: 'Dataset', column: 'Configuration') -> str:
+    """Return why a data set has no number in a column."""
+    if len(dataset.query) < column.sequence.length:
+        return f'its {len(dataset.query)} images are fewer than a window has'
+    if column.baseline == 'ssm_vpr':
+        return 'give --features onnx or torchscript and --ssm-layers'
+    way = {
+        'saes': 'from any program: SAES is a metric trained on SPED, without public weights',
+        'netvlad': 'evaluate --export writes them, with --features netvlad',
+        'vgg_fc6': 'evaluate --export writes them, with --features vgg16_fc6',
+    }[column.name]
+    return (
+        f'give --descriptors {column.name}=FOLDER with FOLDER/{name}/map.npy and query.npy; {way}'
+    )
+
+
+def _published(
+    dataset: str, columns: 'tuple[Configuration, ...]'
+) -> dict[str, list[float | None]]:
+    """Return the published F1 of the columns, by backbone; None where the paper has none."""
+    from stavpr_lab.evaluation.paper.published import DENSENET, published_f1, VGG
+
+    rows = {
+        backbone: [published_f1(dataset, backbone, column.name) for column in columns]
+        for backbone in (DENSENET, VGG)
+    }
+    return {
+        backbone: row for backbone, row in rows.items() if any(value is not None for value in row)
+    }
+
+
+def _table(rows: list[list[str]]) -> str:
+    """Format a table: text left-aligned, numbers right-aligned, a rule below the head."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = [
+        '  '.join(
+            cell.ljust(width) if i < 2 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+    return '\n'.join([lines[0], '-' * len(lines[0]), *lines[1:]])
+
+
+def _number(value: float | None) -> str:
+    return EMPTY if value is None else f'{value:.3f}'
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from stavpr_lab.evaluation.extra import import_extra
+    from stavpr_lab.evaluation.report import jsonable
+
+    import_extra('sklearn.metrics')
+    if arguments.json:
+        require_replaceable(arguments.json, JSON, arguments.force)
+    _check_features(arguments)
+    _check_baselines(arguments)
+    columns, datasets = _columns(arguments), _datasets(arguments)
+    rows = [['data set', 'features', *(column.title for column in columns)]]
+    results: list[dict[str, Any]] = []
+    blanks: dict[str, list[str]] = {}  # data sets and columns, by reason
+    for name, dataset in datasets.items():
+        metrics: dict[str, Metrics | None] = {}
+        if isinstance(dataset, SourceError):
+            metrics = dict.fromkeys(column.name for column in columns)
+            blanks[f'no data: {dataset}'] = [name]
+        else:
+            metrics = _run_row(dataset, arguments, columns, name)
+            for column in columns:
+                if metrics[column.name] is None:
+                    reason = _reason(name, dataset, column)
+                    blanks.setdefault(reason, []).append(f'{name}, {column.title}')
+        numbers = {
+            key: None if found is None else found.to_json() for key, found in metrics.items()
+        }
+        cells = [None if row is None else row['f1'] for row in numbers.values()]
+        rows.append([name, arguments.features, *map(_number, cells)])
+        results.append({'dataset': name, 'features': arguments.features, 'results': numbers})
+        for backbone, published in _published(name, columns).items():
+            rows.append(['', f'published, {backbone}', *map(_number, published)])
+            named = dict(zip([column.name for column in columns], published, strict=True))
+            results.append({'dataset': name, 'published': backbone, 'f1': named})
+    print(f'{arguments.experiment}, mode {arguments.mode}: f1')
+    print(_table(rows))
+    for reason, where in blanks.items():
+        print(f'{EMPTY} {"; ".join(where)}: {reason}')
+    if arguments.json:
+        text = json.dumps(jsonable(results), indent=2) + '\n'
+        write_output(arguments.json, text, JSON, arguments.force)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command."""
+    return run_program('experiments', lambda: _run(_parser().parse_args(args)))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

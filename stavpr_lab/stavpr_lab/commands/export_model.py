@@ -1,0 +1,180 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``ros2 run stavpr_lab export_model``: any network to one ONNX file of vectors and maps."""
+
+import argparse
+import hashlib
+import json
+from pathlib import Path
+import sys
+from typing import Any, TYPE_CHECKING
+
+from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.output_file import atomic_output, ONNX, require_replaceable
+
+if TYPE_CHECKING:
+    from stavpr_lab.features.export import Exported, Outputs
+
+LICENSES = ('LICEN', 'COPYING')  # in American and British spelling
+
+DESCRIPTION = """
+Makes one ONNX file, with the outputs `global` (a vector an image) and `map`, of a network: of an
+entry of a torch.hub repository, a TorchScript file or an ONNX file. The file is compared with the
+original on random images. build_map and the node take it as features onnx.
+"""
+
+EPILOG = """
+A repository is a program of somebody else, which runs with all your rights, here and only here,
+and only with --allow-foreign-code; so is a TorchScript file. Its own downloads (weights, other
+repositories) are not pinned by --commit.
+
+examples:
+  export_model --repository gmberton/MegaLoc --commit SHA --entry get_trained_model --size 322 \\
+      --map-module backbone --allow-foreign-code --output megaloc.onnx
+  export_model --repository facebookresearch/dinov2 --commit SHA --entry dinov2_vits14_reg \\
+      --map-module norm --prefix-tokens 5 --size 224 --allow-foreign-code --output dinov2.onnx
+  export_model --onnx net.onnx --vector pooled --map conv5 --output named.onnx
+
+docs/features.md has recipes. exit codes: 0 done, 1 failed (the reason is printed), 2 usage
+"""
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = make_parser('export_model', DESCRIPTION, EPILOG)
+    add = parser.add_argument_group('network').add_argument
+    add('--repository', metavar='OWNER/NAME|FOLDER', help='with a hubconf.py')
+    add('--commit', default='', metavar='SHA', help='of a repository on GitHub, 40 digits')
+    add('--entry', metavar='NAME', help='function in hubconf.py')
+    add(
+        '--argument',
+        action='append',
+        default=[],
+        metavar='NAME=JSON',
+        help='of the entry, such as fc_output_dim=512 or backbone=\'"ResNet18"\'; may be repeated',
+    )
+    add('--torchscript', metavar='FILE', help='a TorchScript file instead')
+    add('--onnx', metavar='FILE', help='an ONNX file instead')
+    add('--allow-foreign-code', action='store_true', help='run the repository or TorchScript file')
+    add = parser.add_argument_group('outputs').add_argument
+    add('--size', type=int, default=224, help='side of the images in pixels (%(default)s)')
+    vector = "which output of the network is the vector: number or key, '' for none (0)"
+    add('--vector', metavar='OUTPUT', help=vector)
+    add('--map-module', default='', metavar='PATH', help='module whose output is the map')
+    maps = 'which of its outputs, or of the network, is the map or the tokens (0 with a module)'
+    add('--map', metavar='OUTPUT', help=maps)
+    prefix = 'leading tokens that are no patches: class token, registers (%(default)s)'
+    add('--prefix-tokens', type=int, default=1, metavar='N', help=prefix)
+    add('--output', required=True, metavar='FILE', help='the ONNX file to write')
+    add('--force', action='store_true', help='replace an existing file')
+    return parser
+
+
+def _outputs(arguments: argparse.Namespace) -> 'Outputs':
+    from stavpr_lab.features.export import Outputs
+
+    vector = arguments.vector
+    if vector is None:
+        vector = '' if arguments.onnx else '0'
+    maps = arguments.map
+    if maps is None:
+        maps = '0' if arguments.map_module else ''
+    return Outputs(vector, arguments.map_module, maps, arguments.prefix_tokens)
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    sources = [name for name in ('repository', 'torchscript', 'onnx') if getattr(arguments, name)]
+    if len(sources) != 1:
+        raise SettingsError('give one of --repository, --torchscript and --onnx')
+    if (sources[0] == 'repository') != bool(arguments.entry):
+        raise SettingsError('--repository and --entry go together')
+    if sources[0] != 'onnx' and not arguments.allow_foreign_code:
+        raise SettingsError(
+            f'--{sources[0]} {getattr(arguments, sources[0])} is a program, which would run with '
+            'all your rights: give --allow-foreign-code if you trust its source'
+        )
+    if arguments.onnx and arguments.map_module:
+        raise SettingsError('--map-module: in an ONNX file name a tensor by --map')
+    if arguments.size < 8 or arguments.size > 4096:
+        raise SettingsError(f'--size {arguments.size} must be 8 to 4096 pixels')
+    require_replaceable(arguments.output, ONNX, arguments.force)
+
+
+def _arguments(texts: list[str]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for text in texts:
+        name, separator, value = text.partition('=')
+        try:
+            found[name] = json.loads(value)
+        except ValueError as error:
+            raise SettingsError(f'--argument {text}: {value!r} is no JSON ({error})') from error
+        if not separator or not name.isidentifier():
+            raise SettingsError(f'--argument {text}: expected NAME=JSON')
+    return found
+
+
+def _export(arguments: argparse.Namespace) -> 'Exported':
+    from stavpr_lab.features import export
+    from stavpr_ros.features.weights import open_model
+    import torch
+
+    torch.backends.mha.set_fastpath_enabled(False)  # its operator is not in the ONNX standard
+    outputs = _outputs(arguments)
+    if arguments.onnx:
+        with open_model(Path(arguments.onnx)) as file:
+            return export.export_onnx(file.read(), outputs, arguments.size)
+    if arguments.torchscript:
+        network = export.load_torchscript(Path(arguments.torchscript))
+    else:
+        given = _arguments(arguments.argument)
+        network = export.load_hub(arguments.repository, arguments.commit, arguments.entry, given)
+        print(f'license of {arguments.repository}: {_license(arguments)}')
+    return export.export_network(network, outputs, arguments.size)
+
+
+def _license(arguments: argparse.Namespace) -> str:
+    """Return the first lines of the repository's license, or that there is none."""
+    import torch
+
+    folder = Path(arguments.repository)
+    if not folder.is_dir():
+        name = f'{arguments.repository.replace("/", "_")}_{arguments.commit}'
+        folder = Path(torch.hub.get_dir()) / name
+    for path in sorted(folder.glob('*')) if folder.is_dir() else ():
+        if path.name.upper().startswith(LICENSES) and path.is_file():
+            lines = [line.strip() for line in path.read_text(errors='replace').splitlines()]
+            return ', '.join([line for line in lines if line][:2])[:120]
+    return 'none was found: without one, its weights may not be used'
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command."""
+
+    def work() -> None:
+        arguments = _parser().parse_args(args)
+        _check(arguments)
+        exported = _export(arguments)
+        with atomic_output(arguments.output, ONNX, arguments.force) as file:
+            file.write(exported.content)
+        for name, shape in exported.shapes.items():
+            print(f'output {name}: {shape}')
+        print(
+            f'verified on random images: largest difference {exported.difference:.1e} of the '
+            f'largest value; {"batches" if exported.batch else "one image at a time"}'
+        )
+        digest = hashlib.sha256(exported.content).hexdigest()
+        size = len(exported.content) / 1e6
+        print(f'{arguments.output}: {size:.1f} MB, sha256 {digest}')
+        layer = 'global' if 'global' in exported.shapes else 'map'
+        print(
+            f'use: --features onnx --onnx-model {arguments.output} --onnx-layer {layer} '
+            f'--onnx-size {arguments.size}'
+        )
+        if len(exported.shapes) > 1:
+            print('or, strips and a vector: --onnx-layer map --onnx-vector global')
+
+    return run_program('export_model', work)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,183 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Runs the node, a replay and recorders as processes of their own: recognition as on a robot."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, ExitStack
+from functools import partial
+import json
+import math
+import os
+from pathlib import Path
+import random
+import signal
+import subprocess
+import time
+from typing import Any
+
+from ament_index_python.packages import get_package_prefix, PackageNotFoundError
+from stavpr_ros.errors import StavprError, UnavailableError
+
+START_TIMEOUT = 180.0  # seconds for the node to load the map and to compile
+END_TIMEOUT = 20.0  # seconds for a process to end, or for the last record
+POLL_SECONDS = 0.05
+REFUSED = 'cannot configure: '  # in the log of the node
+
+Process = subprocess.Popen[bytes]
+Records = list[dict[str, Any]]
+
+
+def executable(name: str, package: str = 'stavpr_ros') -> str:
+    """
+    Return the file that ``ros2 run PACKAGE NAME`` runs.
+
+    :raises UnavailableError: the package is not installed, or its environment is not sourced.
+    """
+    try:
+        return str(Path(get_package_prefix(package)) / 'lib' / package / name)
+    except PackageNotFoundError as error:
+        raise UnavailableError(
+            f'the package {package} is not found: build it with colcon and '
+            'source install/setup.bash'
+        ) from error
+
+
+def private_domain() -> dict[str, str]:
+    """Return an environment with a ROS domain of its own, unless the user has chosen one."""
+    environment = dict(os.environ)
+    environment.setdefault('ROS_DOMAIN_ID', str(random.randrange(1, 100)))
+    environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    return environment
+
+
+def run_live(
+    node_parameters: dict[str, Any],
+    query: str,
+    images: int,
+    folder: Path,
+    topic: str | None = None,
+    others: Mapping[str, list[str]] | None = None,
+    replay_options: Sequence[str] = (),
+    at_end: Callable[[Records, dict[str, str]], None] = lambda closures, environment: None,
+) -> tuple[Records, Records]:
+    """
+    Replay a query losslessly into a node and return what was recorded.
+
+    :param node_parameters: of the node, name to value.
+    :param query: the bag or folder of images to replay.
+    :param images: number of its images.
+    :param folder: for the logs, ``matches.jsonl``, and in operation loop_closure
+        ``loop_closures.jsonl``.
+    :param topic: image topic of the bag; None = its only one.
+    :param others: commands of further processes by their names.
+    :param replay_options: further options of the command ``replay``.
+    :param at_end: called with the loop closures and the environment, while everything still runs.
+    :returns: one match per image, and the loop closures; see the command ``record``.
+    :raises StavprError: a process failed; names its log.
+    """
+    environment = private_domain()
+    parameters = [f'{name}:={value}' for name, value in node_parameters.items()]
+    node = [executable('node'), '--ros-args', *(word for p in parameters for word in ('-p', p))]
+    replay = [executable('replay'), query, '--lossless', '--wait', '120']
+    replay += [] if topic is None else ['--topic', topic]
+    replay += replay_options
+    record = [executable('record'), '--output']
+    matches, closures = folder / 'matches.jsonl', folder / 'loop_closures.jsonl'
+    recorders = {'record': [*record, str(matches)]}
+    if node_parameters.get('operation') == 'loop_closure':
+        recorders['record_loop_closures'] = [*record, str(closures), '--loop-closures']
+    for file in (matches, closures):
+        file.unlink(missing_ok=True)
+
+    def complete() -> bool:
+        """Return whether all images have a match, and accepted ones their loop closure."""
+        found = _records(matches)
+        accepted = sum(match['status'] == 'MATCH' for match in found)
+        enough = len(recorders) == 1 or len(_records(closures)) >= accepted
+        return len(found) >= images and enough
+
+    with ExitStack() as stack:
+        processes: dict[str, Process] = {}
+        for name, command in {'node': node, **(others or {}), **recorders}.items():
+            running = _running(command, folder / f'{name}.log', environment)
+            processes[name] = stack.enter_context(running)
+
+        def wait_until(done: Callable[[], bool], seconds: float, event: str) -> None:
+            _wait_until(done, processes, folder, seconds, event)
+
+        for name in recorders:
+            log = folder / f'{name}.log'
+            wait_until(partial(_is_recording, log), START_TIMEOUT, 'the node')
+        with _running(replay, None, environment) as player:
+            wait_until(lambda: player.poll() is not None, math.inf, 'the end of the replay')
+        if player.returncode != 0:
+            raise StavprError(f'the replay ended with {player.returncode}, see {folder}/node.log')
+        wait_until(complete, END_TIMEOUT, 'the last record')
+        at_end(_records(closures), environment)
+    found = _records(matches)
+    if len(found) != images:
+        raise StavprError(f'{len(found)} matches of {images} images, see the logs in {folder}')
+    return found, _records(closures)
+
+
+@contextmanager
+def _running(
+    command: list[str], log: Path | None, environment: dict[str, str]
+) -> Iterator[Process]:
+    """Run a process, its output in a file or shown; interrupt it at the end, or kill it."""
+    if log is None:
+        process = subprocess.Popen(command, env=environment)
+    else:
+        with log.open('w') as output:
+            process = subprocess.Popen(
+                command, env=environment, stdout=output, stderr=subprocess.STDOUT
+            )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        try:
+            process.wait(END_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _wait_until(
+    done: Callable[[], bool],
+    processes: dict[str, Process],
+    folder: Path,
+    seconds: float,
+    event: str,
+) -> None:
+    """Wait for an event while the processes run."""
+    end = time.monotonic() + seconds
+    while not done():
+        for name, process in processes.items():
+            if process.poll() is not None:
+                raise StavprError(
+                    f'{name} ended with {process.returncode}, see {folder / name}.log'
+                )
+        if reason := _refusal(folder / 'node.log'):
+            raise StavprError(f'the node cannot start: {reason}')
+        if time.monotonic() > end:
+            raise StavprError(f'{event} did not come in {seconds:g} s, see the logs in {folder}')
+        time.sleep(POLL_SECONDS)
+
+
+def _refusal(log: Path) -> str:
+    """Return why the node, which then waits for another try, could not be configured; or ''."""
+    _, _, rest = log.read_text().partition(REFUSED)
+    return rest.partition('\n')[0] if '\n' in rest else ''
+
+
+def _is_recording(log: Path) -> bool:
+    """Return whether a recorder has logged that it misses no more messages."""
+    return any(line.startswith('recording') for line in log.read_text().splitlines())
+
+
+def _records(path: Path) -> Records:
+    """Return the records in a file; a line that is still being written is left out."""
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    return [json.loads(line) for line in lines if line.endswith('\n')]

@@ -1,0 +1,205 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The result of a loop-closure demonstration, and its plot: the traverse against its own past."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_lab.evaluation.plots import (
+    BRIGHT,
+    color_bar,
+    draw_pairs,
+    INK,
+    legend_above,
+    MatchPair,
+    MEANING,
+    Outcome,
+    page,
+    QUIET,
+    SCALE,
+    TRUTH,
+)
+from stavpr_lab.evaluation.records import IN_WINDOW
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import SubFigure
+
+SHOWN = 8  # pairs of images
+LARGEST = 4000  # images of a traverse whose distances are drawn
+
+
+@dataclass(frozen=True)
+class LoopResult:
+    """
+    The loop closures of N images, in numbers of images.
+
+    :param closures: (query, place) of each, shape (C, 2).
+    :param distances: of each, shape (C,).
+    :param pairs: (later, earlier) images aligned by a closure, each once, shape (M, 2).
+    :param ground_truth: None = unknown.
+    :param exclude: latest places that an image was not compared with.
+    :param skipped: images too similar to the last keyframe.
+    """
+
+    N: int
+    closures: np.ndarray
+    distances: np.ndarray
+    pairs: np.ndarray
+    ground_truth: GroundTruth | None
+    exclude: int
+    skipped: int
+
+    def are_correct(self, pairs: np.ndarray) -> np.ndarray | None:
+        """Return which pairs of images (M, 2) are correct, shape (M,), bool; None = unknown."""
+        if self.ground_truth is None:
+            return None
+        return np.isin(pairs[:, 0] * self.N + pairs[:, 1], self.ground_truth.keys)
+
+    def summary(self) -> str:
+        """Return the result in words, a line each."""
+        C = len(self.closures)
+        line = f'{C} loop closures in {self.N} images ({self.skipped} too similar to the last)'
+        right = self.are_correct(self.closures)
+        if self.ground_truth is None or right is None:
+            return line
+        correct = np.count_nonzero(right)
+        precision = f', precision {correct / C:.3f}' if C else ''
+        seen = self.ground_truth.has_match
+        aligned = self.pairs[self.are_correct(self.pairs)]
+        closed = len(np.unique(aligned[:, 0]))
+        recall = f', recall {closed / seen.sum():.3f}' if seen.any() else ''
+        return (
+            f'{line}\n'
+            f'{correct} of {C} loop closures are correct{precision}\n'
+            f'{closed} of {np.count_nonzero(seen)} images of places passed before are in a '
+            f'correct pair{recall}'
+        )
+
+
+def read_result(
+    matches: list[dict[str, Any]],
+    closures: list[dict[str, Any]],
+    ground_truth: GroundTruth | None,
+    exclude: int,
+) -> LoopResult:
+    """
+    Combine the recorded matches and loop closures of a traverse.
+
+    :param matches: one an image, of the command ``record``; their status decides which images
+        are places.
+    :param closures: of ``record --loop-closures``.
+    """
+    in_window = [i for i, match in enumerate(matches) if match['status'] in IN_WINDOW]
+    images = np.array(in_window, np.int64)
+    ends = [[closure['query_index'], closure['place_index']] for closure in closures]
+    pairs = [[pair[0], pair[2]] for closure in closures for pair in closure['pairs']]
+    return LoopResult(
+        len(matches),
+        images[np.array(ends, np.int64).reshape(-1, 2)],
+        np.array([closure['distance'] for closure in closures], float),
+        images[np.unique(np.array(pairs, np.int64).reshape(-1, 2), axis=0)],
+        ground_truth,
+        exclude,
+        sum(match['status'] == 'SKIPPED' for match in matches),
+    )
+
+
+def choose_closures(count: int, correct: np.ndarray | None) -> list[int]:
+    """
+    Choose closures to show: up to a quarter wrong ones, the others evenly over the traverse.
+
+    :param correct: shape (count,), bool; None = unknown.
+    """
+    good = np.arange(count) if correct is None else np.flatnonzero(correct)
+    bad = np.setdiff1d(np.arange(count), good)
+    chosen: set[int] = set()
+    for indices, most in ((bad, SHOWN if not len(good) else SHOWN // 4), (good, SHOWN)):
+        room = min(most, SHOWN - len(chosen), len(indices))
+        if room:
+            chosen |= set(indices[np.linspace(0, len(indices) - 1, room).astype(int)].tolist())
+    return sorted(chosen)
+
+
+def _pairs(result: LoopResult, place_map: PlaceMap) -> list[MatchPair]:
+    correct = result.are_correct(result.closures)
+    pairs: list[MatchPair] = []
+    for i in choose_closures(len(result.closures), correct):
+        outcome: Outcome = 'match' if correct is None else 'right' if correct[i] else 'wrong'
+        query, place = map(int, result.closures[i])
+        image = place_map.thumbnail(query)
+        if image is None:
+            raise InputError('the map of the traverse has no thumbnails')
+        caption = f'image {query}: image {place}, distance {result.distances[i]:.2f}'
+        pairs.append(MatchPair(image, place_map.thumbnail(place), caption, outcome))
+    return pairs
+
+
+def _compared_distances(result: LoopResult, place_map: PlaceMap) -> np.ndarray | None:
+    """Return the distances of every image to those it is compared with, NaN elsewhere, (N, N)."""
+    if result.N > LARGEST:
+        return None
+    recognizer = PlaceRecognizer(place_map, RecognizerSettings(threshold=1.0))
+    index = np.arange(result.N)
+    compared = index[:, None] - index >= result.exclude
+    return np.where(compared, recognizer.distances(place_map.features), np.nan)
+
+
+def _draw_traverse(
+    figure: 'SubFigure', axes: 'Axes', result: LoopResult, distances: np.ndarray | None
+) -> None:
+    """Draw the compared pairs, the ground truth, and the aligned pairs."""
+    N = result.N
+    if distances is not None:
+        low, high = np.nanquantile(distances, [0.002, 0.995])
+        scale: dict[str, Any] = {'cmap': SCALE, 'vmin': low, 'vmax': max(high, low + 1e-6)}
+        color_bar(figure, axes.imshow(distances, aspect='auto', **scale), axes)
+    size = float(np.clip(900 / N, 2.5, 5.0))
+    dots: dict[str, Any] = {'marker': '.', 'linestyle': 'none', 'mew': 0}
+    if result.ground_truth is not None:
+        later, earlier = result.ground_truth.pairs.T
+        style: dict[str, Any] = {'color': TRUTH, 'ms': size * 2.4, 'alpha': 0.4}
+        axes.plot(earlier, later, label='passed before', **style, **dots)
+    correct = result.are_correct(result.pairs)
+    if correct is None:
+        masks = {'match': np.ones(len(result.pairs), bool)}
+    else:
+        masks = {'right': correct, 'wrong': ~correct}
+    for outcome, mask in masks.items():
+        if mask.any():
+            later, earlier = result.pairs[mask].T
+            label = MEANING[outcome].replace('match', 'aligned')
+            axes.plot(earlier, later, color=BRIGHT[outcome], ms=size, label=label, **dots)
+    note = 'not compared:\nlater, or too recent'
+    axes.text(N * 0.97, N * 0.04, note, ha='right', va='top', color=QUIET)
+    axes.set(xlabel='earlier image', ylabel='later image')
+    axes.set(xlim=(-0.5, N - 0.5), ylim=(N - 0.5, -0.5))
+    for handle in legend_above(axes, 3).get_lines():
+        handle.set(markersize=10, alpha=1)
+
+
+def draw_loops(result: LoopResult, place_map: PlaceMap, title: str, folder: Path) -> Path:
+    """
+    Draw the page ``loop.png``: the traverse against its own past, and closures.
+
+    :param place_map: a map of all images, with thumbnails.
+    :returns: its path.
+    """
+    path = folder / 'loop.png'
+    text = result.summary()
+    head = 0.4 + 0.17 * len(text.splitlines())
+    with page(path, 12.5, 5.9 + head) as figure:
+        parts = figure.add_gridspec(2, 2, height_ratios=(head, 5.9), width_ratios=(1, 1.1))
+        top = figure.add_subfigure(parts[0, :])
+        top.text(0.012, 0.96, title, fontsize=15, weight='bold', va='top', color=INK)
+        top.text(0.012, 0.54, text, fontsize=10.5, va='top', color=QUIET)
+        left = figure.add_subfigure(parts[1, 0])
+        _draw_traverse(left, left.add_subplot(), result, _compared_distances(result, place_map))
+        draw_pairs(figure.add_subfigure(parts[1, 1]), _pairs(result, place_map), 2)
+    return path

@@ -1,0 +1,175 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a localization demonstration: images, the distance matrix, distances over time."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from stavpr_lab.evaluation.plots import (
+    COLORS,
+    draw_matrix,
+    draw_pairs,
+    GRID,
+    INK,
+    legend_above,
+    MatchPair,
+    MEANING,
+    Outcome,
+    page,
+    PAPER,
+    QUIET,
+    THRESHOLD,
+)
+from stavpr_lab.evaluation.records import TraverseEvaluation
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import SubFigure
+
+SHOWN = 6  # pairs of images: two rows of three
+
+
+def draw_result(
+    result: TraverseEvaluation,
+    query: PlaceMap,
+    place_map: PlaceMap,
+    threshold: float,
+    title: str,
+    path: Path,
+) -> None:
+    """
+    Draw the page of a result.
+
+    :param query: a map of the query, with thumbnails.
+    """
+    recognizer = PlaceRecognizer(place_map, RecognizerSettings(threshold=1.0))
+    outcomes = outcomes_of(result)
+    pairs = [_pair(result, i, outcomes[i], query, place_map) for i in choose_images(outcomes)]
+    demo_sheet(path, pairs, recognizer.distances(query.features), result, threshold, title)
+
+
+def outcomes_of(result: TraverseEvaluation) -> list[Outcome]:
+    """Return one outcome for each image."""
+    if result.true_places is None or result.correct is None:
+        return ['match' if accepted else 'no match' for accepted in result.accepted]
+    outcomes: list[Outcome] = []
+    for accepted, correct, place in zip(
+        result.accepted, result.correct, result.true_places, strict=True
+    ):
+        rejected: Outcome = 'unseen' if place < 0 else 'no match'
+        outcomes.append(('right' if correct else 'wrong') if accepted else rejected)
+    return outcomes
+
+
+def choose_images(outcomes: list[Outcome]) -> list[int]:
+    """Choose one image of each outcome, and others of the most frequent, far from each other."""
+    chosen: list[int] = []
+    for outcome in dict.fromkeys(outcomes):
+        same = [i for i, other in enumerate(outcomes) if other == outcome]
+        chosen.append(same[len(same) // 2])
+    common = max(set(outcomes), key=outcomes.count)
+    candidates = np.array([i for i, other in enumerate(outcomes) if other == common])
+    while len(chosen) < min(SHOWN, len(outcomes)) and len(candidates):
+        others = np.array([0, len(outcomes), *chosen])
+        gaps = np.abs(candidates[:, None] - others).min(axis=1)
+        chosen.append(int(candidates[gaps.argmax()]))
+    return sorted(set(chosen))[:SHOWN]
+
+
+def _pair(
+    result: TraverseEvaluation,
+    image: int,
+    outcome: Outcome,
+    query: PlaceMap,
+    place_map: PlaceMap,
+) -> MatchPair:
+    left = query.thumbnail(image)
+    if left is None:
+        raise InputError('the map of the query has no thumbnails')
+    place, distance = int(result.matched[image]), result.matches.distances[image]
+    match = f'place {place}' if place >= 0 else 'no match'
+    found = f'{match}, distance {distance:.3f}' if np.isfinite(distance) else 'no window'
+    right = place_map.thumbnail(place) if place >= 0 else None
+    return MatchPair(left, right, f'image {image}: {found}', outcome)
+
+
+def demo_sheet(
+    path: Path,
+    pairs: Sequence[MatchPair],
+    distances: np.ndarray,
+    result: TraverseEvaluation,
+    threshold: float,
+    title: str,
+) -> None:
+    """
+    Draw one page: pairs above, the matrix and the distance over time below.
+
+    :param distances: every query to every place, shape (N, n).
+    """
+    above, below = 0.5 + 1.52 * max(1, -(-len(pairs) // 3)), 4.2
+    with page(path, 11, 0.75 + above + below) as figure:
+        parts = figure.add_gridspec(
+            3, 2, height_ratios=(0.75, above, below), width_ratios=(1, 1.18)
+        )
+        top = figure.add_subfigure(parts[0, :])
+        top.text(0.012, 0.66, title, fontsize=15, weight='bold', va='center', color=INK)
+        top.text(0.012, 0.2, result.headline, fontsize=10.5, va='center', color=QUIET)
+        draw_pairs(figure.add_subfigure(parts[1, :]), pairs, 3)
+        _draw_matrix(figure.add_subfigure(parts[2, 0]), distances, result)
+        _draw_time(figure.add_subfigure(parts[2, 1]).add_subplot(), result, threshold)
+
+
+def _draw_matrix(figure: 'SubFigure', distances: np.ndarray, result: TraverseEvaluation) -> None:
+    """Draw a matrix with a row a query and a column a place, the true and the matched places."""
+    axes, truth, correct = figure.add_subplot(), result.true_places, result.correct
+    pairs = np.stack([np.arange(len(distances)), result.matched], axis=1)
+    if truth is None or correct is None:
+        matches = {'match': pairs[result.accepted]}
+        draw_matrix(figure, axes, distances, distances.shape, None, '', matches)
+        return
+    away = np.abs(np.arange(distances.shape[1]) - truth[:, None])
+    cells = (truth >= 0)[:, None] & (away <= result.tolerance)
+    matches = {'right': pairs[correct], 'wrong': pairs[result.accepted & ~correct]}
+    label = f'true place ± {result.tolerance}'
+    draw_matrix(figure, axes, distances, distances.shape, cells, label, matches)
+    for start, stop in _runs(truth < 0):
+        axes.axhspan(start - 0.5, stop - 0.5, color=PAPER, alpha=0.32, lw=0)
+        if stop - start > len(truth) / 25:
+            at = distances.shape[1] * 0.02, (start + stop - 1) / 2
+            axes.text(*at, 'not in the map', va='center', color=INK, fontsize=9.5)
+
+
+def _draw_time(axes: 'Axes', result: TraverseEvaluation, threshold: float) -> None:
+    """Draw the distance of each query's best match as a dot in the color of its outcome."""
+    distances, kinds = result.matches.distances, np.array(outcomes_of(result))
+    index = np.arange(len(distances))
+    axes.plot(index, distances, color=GRID, lw=1.0, zorder=1)
+    for outcome, color in COLORS.items():
+        mask = kinds == outcome
+        if mask.any():
+            style: dict[str, Any] = {'color': color, 'ms': 6, 'mew': 0, 'label': MEANING[outcome]}
+            axes.plot(index[mask], distances[mask], '.', zorder=2, **style)
+    name = f'threshold {threshold:.3g}'
+    axes.axhline(threshold, color=THRESHOLD, lw=1.3, ls=(0, (5, 3)), label=name, zorder=1.5)
+    truth = np.zeros(len(index)) if result.true_places is None else result.true_places
+    for number, (start, stop) in enumerate(_runs(truth < 0)):
+        name = '' if number else 'not in the map'
+        axes.axvspan(start - 0.5, stop - 0.5, color='#e9e9e4', lw=0, zorder=0, label=name)
+    axes.set(
+        xlabel='query image',
+        ylabel='distance of the best match',
+        xlim=(-1, max(1, len(distances))),
+    )
+    axes.grid(axis='y', color=GRID, lw=0.7)
+    legend_above(axes, 3)
+
+
+def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """Return the runs of True as (first, one past the last)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -1,0 +1,215 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The SLAM demonstration: the bag of a drive of laps, and the errors and plot of the result."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.typesys import get_typestore, Stores
+from stavpr_lab.demonstration.bag_writer import write_bag
+from stavpr_lab.demonstration.recordings import remove_earlier_bag, TOPIC
+from stavpr_lab.demonstration.street.laps import intrinsics, LapDrive
+from stavpr_lab.demonstration.street.traverses import SIZE
+from stavpr_lab.evaluation.plots import INK, page, QUIET
+from stavpr_ros.errors import UnavailableError
+from stavpr_ros.mapping.trajectory import SECOND
+from stavpr_ros.output_file import JSON, write_output
+from stavpr_ros.sources.frame import ImageRecord, MessageRecord
+from stavpr_slam.pose_graph.files import TUM, tum_text
+from stavpr_slam.pose_graph.transforms import planar_poses
+from tqdm import tqdm
+
+ODOMETRY, CAMERA_INFO = '/odom', '/camera_info'  # beside the topic of the node's images, /image
+RPE_METERS = 50.0
+
+
+def write_drive(drive: LapDrive, bag: Path) -> None:
+    """
+    Write the images, the intrinsics and the odometry of a drive into a bag.
+
+    :raises SourceError: it cannot be written.
+    """
+    remove_earlier_bag(bag)
+    kinds = {ODOMETRY: 'nav_msgs/msg/Odometry', CAMERA_INFO: 'sensor_msgs/msg/CameraInfo'}
+    write_bag(bag, TOPIC, _records(drive), others=kinds)
+
+
+def _records(drive: LapDrive) -> Iterator[ImageRecord | MessageRecord]:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = store.types
+    poses = planar_poses(drive.odometry)
+    K = intrinsics()
+    P = np.column_stack([K, np.zeros(3)])
+    for i in tqdm(range(len(drive)), desc='three laps', unit='image', disable=None):
+        stamp = int(drive.stamps[i])
+        time = types['builtin_interfaces/msg/Time'](stamp // SECOND, stamp % SECOND)
+        numbers = dict(zip('xyzw', poses[i, 3:].tolist(), strict=True))
+        pose = types['geometry_msgs/msg/Pose'](
+            types['geometry_msgs/msg/Point'](*poses[i, :3].tolist()),
+            types['geometry_msgs/msg/Quaternion'](**numbers),
+        )
+        zero = types['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
+        header = types['std_msgs/msg/Header']
+        odometry = types['nav_msgs/msg/Odometry'](
+            header(time, 'odom'), 'base_link',
+            types['geometry_msgs/msg/PoseWithCovariance'](pose, np.zeros(36)),
+            types['geometry_msgs/msg/TwistWithCovariance'](
+                types['geometry_msgs/msg/Twist'](zero, zero), np.zeros(36)
+            ),
+        )  # fmt: skip
+        region = types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)
+        info = types['sensor_msgs/msg/CameraInfo'](
+            header(time, 'camera'), SIZE[1], SIZE[0], 'plumb_bob', np.zeros(5), K.ravel(),
+            np.eye(3).ravel(), P.ravel(), 0, 0, region,
+        )  # fmt: skip
+        for topic, message in ((ODOMETRY, odometry), (CAMERA_INFO, info)):
+            content = bytes(store.serialize_cdr(message, message.__msgtype__))
+            yield MessageRecord(stamp, topic, content)
+        yield ImageRecord.of_image(drive.frame(i).image, stamp, frame_id='camera')
+
+
+@dataclass(frozen=True, eq=False)
+class SlamResult:
+    """
+    The corrected trajectory of a drive, and its errors.
+
+    :param poses: corrected, aligned with the truth, shape (n, 7); ``before``: the odometry.
+    :param truth: at the same stamps, shape (n, 7).
+    :param in_map: the corrected trajectory as published, shape (n, 7).
+    :param numbers: what the file ``slam.json`` has.
+    """
+
+    poses: np.ndarray
+    before: np.ndarray
+    truth: np.ndarray
+    in_map: np.ndarray
+    numbers: dict[str, Any]
+
+    def summary(self) -> str:
+        """Return the result in words, a line each."""
+        n = self.numbers
+        return (
+            f'{n["closures"]} loop closures, {n["rejected"]} of them rejected, '
+            f'{n["sessions"]} sessions\n'
+            f'absolute trajectory error {n["ate_before"]:.2f} m -> {n["ate_after"]:.2f} m '
+            f'(ratio {n["ate_ratio"]:.3f})\n'
+            f'relative error over {RPE_METERS:g} m: {n["rpe_before"]:.2f} m -> '
+            f'{n["rpe_after"]:.2f} m'
+        )
+
+
+def evaluate_drive(drive: LapDrive, trajectory: Path, values: dict[str, str]) -> SlamResult:
+    """
+    Compare a corrected trajectory with the truth.
+
+    :param trajectory: a file in the TUM format.
+    :param values: diagnostics of the pose graph.
+    :raises UnavailableError: evo is not installed.
+    """
+    rows = [line.split() for line in trajectory.read_text().splitlines() if line[:1] != '#']
+    stamps = np.array([int(row[0].replace('.', '')) for row in rows])
+    found = np.array([row[1:] for row in rows], float)
+    at = np.searchsorted(drive.stamps, stamps).clip(max=len(drive) - 1)
+    truth, before = planar_poses(drive.truth)[at], planar_poses(drive.odometry)[at]
+    (ate_before, rpe_before, moved_before), (ate_after, rpe_after, moved) = (
+        trajectory_errors(stamps, poses, truth) for poses in (before, found)
+    )
+    numbers = {
+        'ate_before': ate_before,
+        'ate_after': ate_after,
+        'ate_ratio': ate_after / ate_before,
+        'rpe_before': rpe_before,
+        'rpe_after': rpe_after,
+        'images': len(drive),
+        'nodes': len(rows),
+        'closures': int(values['accepted_closures']) + int(values['rejected_closures']),
+        'accepted': int(values['accepted_closures']),
+        'rejected': int(values['rejected_closures']),
+        'sessions': int(values['sessions']),
+        'odometry_error_factor': float(values['odometry_error_factor']),
+    }
+    return SlamResult(moved, moved_before, truth, found, numbers)
+
+
+def trajectory_errors(
+    stamps: np.ndarray, poses: np.ndarray, truth: np.ndarray
+) -> tuple[float, float, np.ndarray]:
+    """
+    Return the absolute and the relative error of a trajectory by evo, and the aligned poses.
+
+    :param stamps: ns, shape (n,).
+    :param poses, truth: shape (n, 7).
+    :returns: rms of positions after alignment, m; rms over :data:`RPE_METERS`, m; poses (n, 7).
+    :raises UnavailableError: evo is not installed.
+    """
+    try:
+        from evo.core import metrics
+        from evo.core.trajectory import PoseTrajectory3D
+    except ImportError as error:
+        raise UnavailableError(
+            'the errors of trajectories require evo: pip install evo (the extra slam)'
+        ) from error
+    seconds = (stamps - stamps[0]) / SECOND
+    reference, estimate = (
+        PoseTrajectory3D(each[:, :3].copy(), each[:, [6, 3, 4, 5]].copy(), seconds)
+        for each in (truth, poses)
+    )
+    estimate.align(reference)
+    absolute = metrics.APE(metrics.PoseRelation.translation_part)
+    absolute.process_data((reference, estimate))
+    relative = metrics.RPE(
+        metrics.PoseRelation.translation_part, RPE_METERS, metrics.Unit.meters, all_pairs=True
+    )
+    relative.process_data((reference, estimate))
+    moved = np.column_stack(
+        [estimate.positions_xyz, estimate.orientations_quat_wxyz[:, [1, 2, 3, 0]]]
+    )
+    errors = [
+        float(each.get_statistic(metrics.StatisticsType.rmse)) for each in (absolute, relative)
+    ]
+    return errors[0], errors[1], moved
+
+
+def write_result(
+    result: SlamResult, drive: LapDrive, edges: list[np.ndarray], folder: Path
+) -> Path:
+    """
+    Write ``slam.json``, the trajectories in the TUM format, and the plot; return its path.
+
+    :param edges: ends of the accepted and of the rejected edges in the map, each (m, 2, 3).
+    """
+    text = json.dumps(result.numbers, indent=2) + '\n'
+    write_output(folder / 'slam.json', text, JSON, True)
+    for name, poses in (('truth', drive.truth), ('odometry', drive.odometry)):
+        write_output(
+            folder / f'{name}.tum', tum_text(drive.stamps, planar_poses(poses)), TUM, True
+        )
+    plot = folder / 'slam.png'
+    with page(plot, 12.5, 6.6) as figure:
+        parts = figure.add_gridspec(2, 1, height_ratios=(1.1, 5.5))
+        top, below = figure.add_subfigure(parts[0]), figure.add_subfigure(parts[1])
+        top.text(0.012, 0.96, 'Three laps of a synthetic street', fontsize=15, va='top',
+                 weight='bold', color=INK)  # fmt: skip
+        top.text(0.012, 0.6, result.summary(), fontsize=10.5, va='top', color=QUIET)
+        left, right = below.subplots(1, 2)
+        style: dict[str, Any] = {'lw': 1.0}
+        left.plot(*result.truth[:, :2].T, color='black', label='truth', lw=2.2, alpha=0.5)
+        left.plot(*result.before[:, :2].T, color='#c44', label='odometry', **style)
+        left.plot(*result.poses[:, :2].T, color='#07a', label='optimized', **style)
+        right.plot(*result.in_map[:, :2].T, color='#07a', **style)
+        colors = (('#2a2', 'accepted'), ('#d33', 'rejected'))
+        for ends, (color, name) in zip(edges, colors, strict=True):
+            for k, (a, b) in enumerate(ends[:, :, :2]):
+                label = f'{len(ends)} {name}' if k == 0 else None
+                right.plot(*zip(a, b, strict=True), color=color, lw=0.7, alpha=0.6, label=label)
+        left.set_title('aligned with the truth')
+        right.set_title('loop closures')
+        for axes in (left, right):
+            axes.set_aspect('equal', adjustable='datalim')
+            axes.set(xlabel='x in m', ylabel='y in m')
+            axes.legend(loc='upper right')
+    return plot

@@ -1,0 +1,185 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A recorded query driven differently: faster, with stops, dropped images, backward, off the map.
+
+Nothing here touches images or features: a :class:`Drive` is the indices of the images that are
+shown and of the places that the map keeps, and their ground truth.
+"""
+
+from dataclasses import dataclass, replace
+from fractions import Fraction
+import math
+
+import numpy as np
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_ros.errors import SettingsError
+
+VARYING = 'varying'
+SPEEDS = 0.01, 100.0  # slowest and fastest, places per image
+PERIOD = 60  # images of one period of the varying speed: 1, 2, 1, 1/2, 1
+UNSEEN_DISTANCE = 5  # places from the map within which a removed place may look like a mapped one
+
+
+def speed_indices(n: int, speed: float) -> np.ndarray:
+    """
+    Return the images of a drive at a constant speed: floor(speed * i), as long as it is below n.
+
+    :param n: images of the recorded query.
+    :param speed: recorded images per shown image; below 1, images are repeated. It counts as a
+        fraction, so that ten images at 0.7 are exactly seven.
+    :returns: shape (N,), int64, ascending.
+    """
+    ratio = Fraction(speed).limit_denominator(1000)
+    count = math.ceil(n / ratio)
+    return np.arange(count, dtype=np.int64) * ratio.numerator // ratio.denominator
+
+
+def varying_indices(n: int) -> np.ndarray:
+    """Return the images of a drive at speed 2 ** sin(2 pi i / 60) at image i, from 1/2 to 2."""
+    positions = [0.0]
+    while positions[-1] < n:
+        phase = 2 * math.pi * (len(positions) - 1) / PERIOD
+        positions.append(positions[-1] + 2 ** math.sin(phase))
+    return np.floor(positions[:-1]).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class DriveChanges:
+    """
+    How a query is driven; they apply in the order speed, stops, reverse, drop.
+
+    :param removed: stretches (first, last) of the map, first .. last - 1, that it is made without.
+    :param mirror: images are mirrored left-right and thus show no place of the map.
+    :param reverse: the last image comes first.
+    :param drop: probability with which each image is left out.
+    :param seed: of the images that are left out.
+    :param stops: (image, count): at this image of the recorded query, it is repeated count times.
+    :param speed: recorded images per shown image, or ``varying``.
+    :raises SettingsError: a value is out of its range.
+    """
+
+    removed: tuple[tuple[int, int], ...] = ()
+    mirror: bool = False
+    reverse: bool = False
+    drop: float = 0.0
+    seed: int = 0
+    stops: tuple[tuple[int, int], ...] = ()
+    speed: float | str = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.drop < 1:
+            raise SettingsError(f'drop = {self.drop}: expected a probability from 0 to below 1')
+        if self.seed < 0:
+            raise SettingsError(f'seed = {self.seed} of the dropped images must be at least 0')
+        for image, count in self.stops:
+            if count < 1:
+                raise SettingsError(f'stop {image}:{count}: expected at least one image more')
+        if isinstance(self.speed, str):
+            if self.speed != VARYING:
+                raise SettingsError(f'speed {self.speed!r}: expected a number or {VARYING}')
+        elif not SPEEDS[0] <= self.speed <= SPEEDS[1]:
+            raise SettingsError(
+                f'speed {self.speed:g}: expected {SPEEDS[0]:g} .. {SPEEDS[1]:g} images '
+                'of the query per image'
+            )
+
+    def images(self, n: int) -> np.ndarray:
+        """
+        Return the images that are shown, of n recorded ones, shape (N,), int64.
+
+        :raises SettingsError: a stop at an image that there is not, or no image is left.
+        """
+        if isinstance(self.speed, str):
+            images = varying_indices(n)
+        else:
+            images = speed_indices(n, self.speed)
+        for at, count in self.stops:
+            if not 0 <= at < n:
+                raise SettingsError(f'stop {at}:{count}: the query has the images 0 .. {n - 1}')
+            position = int(np.argmin(np.abs(images - at)))  # at high speed, the nearest one
+            images = np.insert(images, position, np.full(count, images[position]))
+        if self.reverse:
+            images = images[::-1].copy()  # torch indexes with no negative strides
+        if self.drop:
+            images = images[np.random.default_rng(self.seed).random(len(images)) >= self.drop]
+        if not len(images):
+            raise SettingsError(f'drop = {self.drop} leaves none of {n} images')
+        return images
+
+    def places(self, n: int) -> np.ndarray:
+        """
+        Return the places that the map keeps, of n recorded ones, ascending, int64.
+
+        :raises SettingsError: stretches outside the map, that overlap, or that leave no place.
+        """
+        kept = np.ones(n, bool)
+        for first, last in self.removed:
+            if not 0 <= first < last <= n:
+                raise SettingsError(
+                    f'removed places {first}:{last}: expected 0 <= FIRST < LAST <= {n}, the '
+                    'number of places of the map'
+                )
+            if not kept[first:last].all():
+                raise SettingsError(f'removed places {first}:{last} overlap with others')
+            kept[first:last] = False
+        if not kept.any():
+            raise SettingsError(f'all {n} places of the map are removed: leave some')
+        return np.flatnonzero(kept)
+
+    def apply(self, ground_truth: GroundTruth) -> 'Drive':
+        """
+        Return the drive of a query.
+
+        :param ground_truth: of the query and the map as they were recorded, of any origin.
+        :raises SettingsError: a change that does not fit the query or the map.
+        """
+        images, places = self.images(ground_truth.N), self.places(ground_truth.n)
+        recorded = ground_truth.select(images)
+        truth = recorded.on_places(places)
+        if self.mirror:
+            truth = replace(truth, keys=truth.keys[:0])
+        return Drive(images, places, truth, recorded, self.removed)
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """
+    A query of N images on a map of n places, changed from what was recorded.
+
+    :param images: the recorded image that each one is, shape (N,), int64.
+    :param places: the recorded place that each place of the map is, ascending, shape (n,), int64.
+    :param truth: of the images, in places of this map (which are numbered without gaps).
+    :param recorded: of the images, in places of the recorded map.
+    :param removed: stretches (first, last) of the recorded map that this one lacks.
+    """
+
+    images: np.ndarray
+    places: np.ndarray
+    truth: GroundTruth
+    recorded: GroundTruth
+    removed: tuple[tuple[int, int], ...] = ()
+
+    def unseen(self) -> list[np.ndarray]:
+        """
+        Return the images whose place was removed, for each removed stretch, shape (N,), bool.
+
+        The place of an image is the middle of its run of correct places. Only images without any
+        correct place in the map count, whose place is more than ``UNSEEN_DISTANCE`` places from
+        each one that the map keeps. An image of several places counts for the first of them.
+        """
+        truth = self.recorded
+        queries, places = truth.pairs.T
+        breaks = np.flatnonzero((np.diff(places) != 1) | (np.diff(queries) != 0)) + 1
+        firsts = np.concatenate([[0], breaks]) if len(places) else breaks
+        lasts = np.append(firsts[1:], len(places)) - 1 if len(places) else breaks
+        run_query, middle = queries[firsts], (places[firsts] + places[lasts]) // 2
+        at = np.searchsorted(self.places, middle)
+        before = self.places[np.maximum(at - 1, 0)]
+        after = self.places[np.minimum(at, len(self.places) - 1)]
+        distance = np.minimum(np.abs(middle - before), np.abs(middle - after))
+        near = np.bincount(run_query[distance <= UNSEEN_DISTANCE], minlength=truth.N) > 0
+        near |= truth.on_places(self.places).has_match
+        place = np.full(truth.N, -1)
+        place[run_query[::-1]] = middle[::-1]  # the first run comes last and stays
+        return [(place >= first) & (place < last) & ~near for first, last in self.removed]

@@ -1,0 +1,372 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Evaluation of a traverse, recognized image by image as in the node.
+
+Every image has two results: the nearest place to the image alone, and the place that the window
+around it was matched with. The rows of distances are not kept: memory does not limit the length.
+"""
+
+from collections import deque
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+import time
+
+import numpy as np
+from stavpr_lab.evaluation.calibration import calibrate, Calibration
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_lab.evaluation.metrics import (
+    evaluate_ranking,
+    image_matches,
+    Metrics,
+    Ranking,
+    RANKS,
+    smallest_indices,
+)
+from stavpr_ros.errors import InputError
+from stavpr_ros.features import LocalFeatures
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.loop_closer import LoopCloser
+from tqdm import tqdm
+
+MARGIN = 8  # places beside the path of a window whose distances are kept
+MATRIX_SIDE = 900  # cells along a side of the reduced distance matrix
+WINDOWS = 1500  # windows whose distances are kept, spread over the traverse
+
+
+@dataclass(frozen=True)
+class WindowDistances:
+    """
+    The distances of one window to the stretch of the map that it was matched with.
+
+    :param image: the window's middle image, which the window is the match of.
+    :param newest: its last image.
+    :param first: first place of the stretch.
+    :param distances: shape (l, k), float32, NaN where there was no place yet.
+    :param path: position in the window, place; shape (m, 2).
+    """
+
+    image: int
+    newest: int
+    first: int
+    distances: np.ndarray
+    path: np.ndarray
+
+
+@dataclass(frozen=True)
+class ReducedDistances:
+    """
+    Distances of all images to all places; each cell is the smallest distance of a block.
+
+    :param values: shape (rows, columns), float32; NaN where there was nothing to compare with.
+    :param block: images a row, places a column.
+    """
+
+    values: np.ndarray
+    block: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class TraverseResults:
+    """
+    The matches of the N images of a traverse.
+
+    :param sequence: of the windows, each for its middle image; the first and last images take
+        theirs from the paths of the outermost windows.
+    :param single: of each image alone.
+    :param seconds: to match each image, features excluded, shape (N,).
+    :param windows: distances of some windows.
+    :param distances: of all images.
+    :param accepted: of the windows' matches, those that the recognizer accepts, shape (N,), bool.
+    :param probabilities: declared for them, shape (N,); NaN = not declared.
+    """
+
+    sequence: Ranking
+    single: Ranking
+    seconds: np.ndarray
+    windows: tuple[WindowDistances, ...] = field(repr=False)
+    distances: ReducedDistances = field(repr=False)
+    accepted: np.ndarray = field(repr=False)
+    probabilities: np.ndarray = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """
+    Metrics of a traverse.
+
+    :param sequence_length: images in a window, l.
+    :param sequence_without_ends, single_without_ends: of the images in :attr:`centered`.
+    :param unknown: results of a traverse of places that are not in the map, if there was one.
+    """
+
+    results: TraverseResults
+    ground_truth: GroundTruth
+    sequence_length: int
+    sequence: Metrics
+    sequence_without_ends: Metrics
+    single: Metrics
+    single_without_ends: Metrics
+    unknown: TraverseResults | None = None
+
+    @property
+    def centered(self) -> slice:
+        """Return the images that have a window centered on them."""
+        return centered_images(len(self.results.single), self.sequence_length)
+
+    def false_alarm_rate(self, kind: str) -> float | None:
+        """
+        Return the share of unknown images that are accepted; None without any.
+
+        :param kind: ``sequence`` or ``single``; at the threshold of its best F1.
+        """
+        if self.unknown is None:
+            return None
+        metrics: Metrics = getattr(self, kind)
+        scores = getattr(self.unknown, kind).scores
+        return int(np.count_nonzero(scores < metrics.best.threshold)) / len(scores)
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """Return how far the declared probabilities hold; None without any."""
+        correct = self.ground_truth.accepts(self.results.sequence.best)
+        return calibrate(self.results.probabilities, correct, self.ground_truth.has_match)
+
+
+def centered_images(count: int, length: int) -> slice:
+    """
+    Return the images that have a window centered on them: all but the first and last l / 2.
+
+    :param count: number of images N.
+    :param length: images in a window, l.
+    :raises InputError: there is not even one window.
+    """
+    if count < length:
+        raise InputError(f'{count} query images: expected at least l = {length}, one window')
+    middle = (length - 1) // 2
+    return slice(middle, count - (length - 1 - middle))
+
+
+def recognize_all(recognizer: PlaceRecognizer, features: LocalFeatures) -> list[Match]:
+    """
+    Recognize every image of a sequence, starting with an empty window.
+
+    :param features: of N images.
+    :returns: N matches, one an image.
+    """
+    recognizer.reset()
+    return [recognizer.update(features[i : i + 1]) for i in range(len(features))]
+
+
+def recognize_traverse(
+    online: PlaceRecognizer | LoopCloser,
+    features: LocalFeatures,
+    places: int,
+    settings: RecognizerSettings,
+    shown: Collection[int] = (),
+    progress: str = '',
+    odometry: np.ndarray | None = None,
+    late: bool = False,
+) -> TraverseResults:
+    """
+    Match every image of a traverse.
+
+    :param online: with an empty window.
+    :param features: of N images.
+    :param places: largest number of places n that a row of distances may have.
+    :param settings: those of ``online``.
+    :param shown: images whose windows' distances are kept in any case.
+    :param progress: label of the progress bar; none without.
+    :param odometry: poses of the images, (N, 7), NaN = unknown; None = of all.
+    :param late: late matches count for the images that had none.
+    """
+    count, ranks = len(features), max(RANKS)
+    length = settings.sequence.length
+    middle = (length - 1) // 2
+    single = Ranking(np.full((count, ranks), -1, np.int64), np.full(count, np.inf))
+    candidates = np.full((count, ranks), -1, np.int64)
+    matches: list[Match] = []
+    seconds = np.empty(count)
+    rows: deque[np.ndarray] = deque(maxlen=length)
+    reduced = _BlockMinimum(count, places)
+    windows: list[WindowDistances] = []
+    every = -(-count // WINDOWS)
+    for i in tqdm(range(count), desc=progress, unit='image', disable=None if progress else True):
+        began = time.perf_counter()
+        pose = None if odometry is None or np.isnan(odometry[i]).any() else odometry[i]
+        match = online.update(features[i : i + 1], pose=pose)
+        seconds[i] = time.perf_counter() - began
+        matches.append(match)
+        row = np.array(online.newest_row())  # a copy: the recognizer overwrites it
+        rows.append(row)
+        reduced.add(i, row)
+        nearest = smallest_indices(row, ranks)
+        if len(nearest):
+            single.places[i, : len(nearest)], single.scores[i] = nearest, row[nearest[0]]
+        if match.sequence is not None:
+            image = i - (length - 1) + middle
+            found = np.asarray(online.candidates(ranks)[0])
+            candidates[image, : len(found)] = found
+            if i % every == 0 or image in shown:
+                windows.append(_window_distances(image, i, length, rows, match.path))
+    matched = image_matches(matches, length, late)
+    ranked = np.stack([_ranked(*pair) for pair in zip(matched.places, candidates, strict=True)])
+    sequence = Ranking(ranked, matched.distances)
+    return TraverseResults(
+        sequence,
+        single,
+        seconds,
+        tuple(windows),
+        reduced.result(),
+        matched.accepted,
+        matched.probabilities,
+    )
+
+
+def evaluate_on_map(
+    place_map: PlaceMap,
+    query: LocalFeatures,
+    ground_truth: GroundTruth,
+    settings: RecognizerSettings,
+    unknown: LocalFeatures | None = None,
+    shown: Collection[int] = (),
+    backend: str = 'cpu',
+    precision: str = 'float32',
+    progress: bool = False,
+    odometry: np.ndarray | None = None,
+) -> Evaluation:
+    """
+    Recognize a traverse on a map and compute its metrics.
+
+    :param query: features of N images.
+    :param ground_truth: of the same images.
+    :param settings: of the recognizer; only what it accepts depends on its threshold.
+    :param unknown: features of a traverse through places that are not in the map.
+    :param shown: images whose windows' distances are kept in any case.
+    :param backend, precision: see :class:`stavpr_ros.recognition.PlaceRecognizer`.
+    :param odometry: poses of the query's images, (N, 7), compared with those of the places.
+    :raises InputError: fewer images than one window, or ground truth of another length.
+    """
+
+    def results(
+        features: LocalFeatures, label: str, poses: np.ndarray | None = None
+    ) -> TraverseResults:
+        # a new recognizer for each: mode robust keeps statistics of the images so far
+        one = PlaceRecognizer(place_map, settings, backend, precision)
+        bar = label if progress else ''
+        return recognize_traverse(one, features, len(place_map), settings, shown, bar, poses)
+
+    centered_images(len(query), settings.sequence.length)
+    known = results(query, 'recognizing', odometry)
+    elsewhere = None if unknown is None else results(unknown, 'false alarms')
+    return evaluate_traverse(known, ground_truth, settings.sequence.length, elsewhere)
+
+
+def evaluate_loop_closures(
+    query: LocalFeatures,
+    ground_truth: GroundTruth,
+    settings: RecognizerSettings,
+    exclude_places: int,
+    shown: Collection[int] = (),
+    progress: bool = False,
+    odometry: np.ndarray | None = None,
+    late: bool = False,
+    backend: str = 'cpu',
+    precision: str = 'float32',
+) -> Evaluation:
+    """
+    Recognize a traverse on its own past and compute its metrics.
+
+    :param ground_truth: of the same images: the earlier images that are correct.
+    :param exclude_places: the latest images that are not part of the map.
+    :param late: late matches count for the images that had none.
+    :param backend, precision: see :class:`stavpr_ros.recognition.loop_closer.LoopCloser`.
+
+    The others are as in :func:`evaluate_on_map`.
+    """
+    centered_images(len(query), settings.sequence.length)
+    closer = LoopCloser(
+        settings, exclude_places, query.settings, backend=backend, precision=precision
+    )
+    label = 'closing loops' if progress else ''
+    results = recognize_traverse(closer, query, len(query), settings, shown, label, odometry, late)
+    return evaluate_traverse(results, ground_truth, settings.sequence.length)
+
+
+def evaluate_traverse(
+    results: TraverseResults,
+    ground_truth: GroundTruth,
+    length: int,
+    unknown: TraverseResults | None = None,
+) -> Evaluation:
+    """
+    Compute the metrics of a traverse, with and without its first and last images.
+
+    :param ground_truth: of the same N images.
+    :param length: images in a window, l.
+    :raises InputError: fewer images than one window, or ground truth of another length.
+    """
+    count = len(results.single)
+    if count != ground_truth.N:
+        raise InputError(
+            f'ground truth of {ground_truth.N} images for {count} images: expected a row each'
+        )
+    centered = centered_images(count, length)
+    return Evaluation(
+        results,
+        ground_truth,
+        length,
+        sequence=evaluate_ranking(results.sequence, ground_truth),
+        sequence_without_ends=evaluate_ranking(results.sequence, ground_truth, centered),
+        single=evaluate_ranking(results.single, ground_truth),
+        single_without_ends=evaluate_ranking(results.single, ground_truth, centered),
+        unknown=unknown,
+    )
+
+
+def _ranked(place: int, candidates: np.ndarray) -> np.ndarray:
+    """Return the matched place followed by the other candidates, shape (K,); -1 = no further."""
+    others = candidates[(candidates != place) & (candidates >= 0)]
+    ranked = np.full(len(candidates), -1, np.int64)
+    ranked[0] = place
+    ranked[1 : 1 + len(others)] = others[: len(candidates) - 1]
+    return ranked
+
+
+def _window_distances(
+    image: int, newest: int, length: int, rows: Sequence[np.ndarray], path: np.ndarray
+) -> WindowDistances:
+    """Cut a window's rows of distances to the surroundings of its path."""
+    low, high = int(path[:, 1].min()), int(path[:, 1].max())
+    first = max(0, low - MARGIN)
+    width = high + MARGIN + 1 - first
+    distances = np.full((length, width), np.nan, np.float32)
+    for line, row in zip(distances[length - len(rows) :], rows, strict=True):
+        part = row[first : first + width]
+        line[: len(part)] = part
+    distances[~np.isfinite(distances)] = np.nan
+    width = int(np.argwhere(np.isfinite(distances))[:, 1].max()) + 1  # the map may end before
+    return WindowDistances(image, newest, first, distances[:, :width], path)
+
+
+class _BlockMinimum:
+    """Reduces rows of distances to the smallest one of each block."""
+
+    def __init__(self, count: int, places: int) -> None:
+        self._block = (-(-count // MATRIX_SIDE), -(-max(1, places) // MATRIX_SIDE))
+        self._columns = np.arange(0, max(1, places), self._block[1])
+        shape = -(-count // self._block[0]), len(self._columns)
+        self._values = np.full(shape, np.inf, np.float32)
+
+    def add(self, image: int, row: np.ndarray) -> None:
+        if not len(row):
+            return
+        columns = self._columns[: np.searchsorted(self._columns, len(row))]
+        line = self._values[image // self._block[0], : len(columns)]
+        np.minimum(line, np.fmin.reduceat(row, columns), out=line)
+
+    def result(self) -> ReducedDistances:
+        values = np.where(np.isfinite(self._values), self._values, np.nan).astype(np.float32)
+        return ReducedDistances(values, self._block)

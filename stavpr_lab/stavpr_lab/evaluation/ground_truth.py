@@ -1,0 +1,265 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Ground truth: which places of the map are correct for each query image."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from stavpr_lab.evaluation.ground_truth_files import read_pairs
+from stavpr_ros.errors import InputError
+
+CHUNK = 1_000_000  # pairs of poses compared at a time
+LISTED = 10  # images that an error names
+
+
+@dataclass(frozen=True, eq=False)
+class GroundTruth:
+    """
+    The accepted places of each query; made by one of the constructors.
+
+    Tolerances are part of it: every place that counts as correct is an accepted one.
+
+    :param N: number of query images.
+    :param n: number of places of the map.
+    :param keys: query * n + place of each accepted pair, sorted, each once, shape (M,), int64.
+    """
+
+    N: int
+    n: int
+    keys: np.ndarray
+
+    @classmethod
+    def from_pairs(
+        cls, queries: np.ndarray, places: np.ndarray, N: int, n: int, tolerance: int = 0
+    ) -> Self:
+        """
+        Accept the given pairs.
+
+        :param queries: shape (M,), integers 0 .. N - 1, in any order.
+        :param places: shape (M,), integers 0 .. n - 1.
+        :param tolerance: places before and after an accepted one that are accepted as well.
+        :raises InputError: a pair outside N queries and n places.
+        """
+        queries, places = np.asarray(queries, np.int64), np.asarray(places, np.int64)
+        if N < 1 or n < 1:
+            raise InputError(
+                f'ground truth of {N} queries in {n} places: expected at least one of each'
+            )
+        outside = (queries < 0) | (queries >= N) | (places < 0) | (places >= n)
+        if outside.any():
+            first = int(np.argmax(outside))
+            raise InputError(
+                f'ground truth pairs query {queries[first]} with place {places[first]}: expected '
+                f'queries 0 .. {N - 1} and places 0 .. {n - 1}; is it that of other images, or '
+                'counted from 1?'
+            )
+        return cls(N, n, np.unique(queries * n + places)).widened(tolerance)
+
+    @classmethod
+    def identity(cls, N: int, n: int, tolerance: int = 0) -> Self:
+        """
+        Accept the same index: image i of both traverses shows the same place.
+
+        :raises InputError: N and n differ.
+        """
+        if n != N:
+            raise InputError(
+                f'{N} query images and {n} places: the same index is the ground truth only of '
+                'equally many; give a file of accepted pairs'
+            )
+        return cls.from_pairs(np.arange(N), np.arange(n), N, n, tolerance)
+
+    @classmethod
+    def from_file(cls, path: str | Path, N: int, n: int, tolerance: int = 0) -> Self:
+        """
+        Read accepted pairs; queries and places are counted from 0.
+
+        * Text (.csv, .tsv, .txt): a line a pair, query and place, with or without a header. A
+          single column holds the place of query 0, 1, 2 and so on. A place of -1 = not in the map.
+        * Array (.npy, .npz with one array or one called ``truth``): shape (N, n), 0 or 1; else
+          shape (M, 2), pairs; or shape (N,), the place of each query, -1 = none.
+        * Black and white image, N high and n wide: white at row i, column j accepts place j for
+          query i. For loop closures, where both are one traverse, see :meth:`loop_closures`.
+
+        :raises SourceError: the file cannot be read, or holds objects (pickles).
+        :raises InputError: it is that of other images: wrong size, or indices outside.
+        """
+        queries, places = read_pairs(Path(path), N, n)
+        try:
+            return cls.from_pairs(queries, places, N, n, tolerance)
+        except InputError as error:
+            raise InputError(f'{path}: {error}') from error
+
+    @classmethod
+    def from_poses(
+        cls, queries: np.ndarray, places: np.ndarray, meters: float, degrees: float | None = None
+    ) -> Self:
+        """
+        Accept places that are near and have a similar orientation.
+
+        :param queries: x y z (meters), quaternion x y z w of each query, shape (N, 7).
+        :param places: of each place, shape (n, 7); a row of NaN = unknown, never accepted.
+        :param meters: largest distance, >= 0.
+        :param degrees: largest angle between the two orientations, >= 0; None = any.
+        :raises InputError: a query without a pose, no place with one, or values that are no poses.
+        """
+        query, place = _checked_poses(queries, 'query'), _checked_poses(places, 'map')
+        unknown = np.flatnonzero(np.isnan(query[:, 0]))
+        if len(unknown):
+            listed = ', '.join(map(str, unknown[:LISTED])) + (
+                ' ...' if len(unknown) > LISTED else ''
+            )
+            raise InputError(
+                f'{len(unknown)} of {len(query)} query images have no pose ({listed}): give poses '
+                'of all, or leave these images out'
+            )
+        if not meters >= 0 or (degrees is not None and not degrees >= 0):
+            raise InputError(f'{meters} meters and {degrees} degrees: expected numbers >= 0')
+        pairs = []
+        step = max(1, CHUNK // len(place))
+        for first in range(0, len(query), step):
+            part = query[first : first + step]
+            near = np.linalg.norm(part[:, None, :3] - place[None, :, :3], axis=2) <= meters
+            found = np.argwhere(near)
+            if degrees is not None:
+                # a quaternion and its negative are the same rotation: the angle is 2 acos |<p, q>|
+                cosines = np.abs(np.sum(part[found[:, 0], 3:] * place[found[:, 1], 3:], axis=1))
+                angles = 2 * np.degrees(np.arccos(np.minimum(cosines, 1)))
+                found = found[angles <= degrees + 1e-5]  # acos is inexact near 1
+            pairs.append(found + np.array([first, 0]))
+        accepted = np.concatenate(pairs)
+        return cls.from_pairs(accepted[:, 0], accepted[:, 1], len(query), len(place))
+
+    @property
+    def pairs(self) -> np.ndarray:
+        """Return the sorted accepted pairs of query and place, shape (M, 2), int64."""
+        return np.stack([self.keys // self.n, self.keys % self.n], axis=1)
+
+    @cached_property
+    def has_match(self) -> np.ndarray:
+        """Whether a query has an accepted place, shape (N,), bool."""
+        return self._counts > 0
+
+    @cached_property
+    def middles(self) -> np.ndarray:
+        """Return the middle one of each query's accepted places, shape (N,), int64; -1 = none."""
+        found = np.full(self.N, -1, np.int64)
+        ends = np.cumsum(self._counts)
+        at = (2 * ends - self._counts - 1) // 2
+        found[self.has_match] = self.keys[at[self.has_match]] % self.n
+        return found
+
+    @cached_property
+    def _counts(self) -> np.ndarray:
+        return np.bincount(self.keys // self.n, minlength=self.N)
+
+    def accepted(self, query: int) -> np.ndarray:
+        """Return the accepted places of one query, sorted, shape (k,), int64."""
+        first, end = np.searchsorted(self.keys, [query * self.n, (query + 1) * self.n])
+        return self.keys[first:end] % self.n
+
+    def matrix(self) -> np.ndarray:
+        """Return the accepted pairs as a matrix, shape (N, n), bool: a byte a pair."""
+        matrix = np.zeros(self.N * self.n, bool)
+        matrix[self.keys] = True
+        return matrix.reshape(self.N, self.n)
+
+    def accepts(self, places: np.ndarray) -> np.ndarray:
+        """
+        Return which places are correct.
+
+        :param places: the place of each query, shape (N,), or several, shape (N, k); integers,
+            -1 = none, which is never correct.
+        :returns: bool, of the same shape.
+        :raises InputError: a place that the map does not have.
+        """
+        places = np.asarray(places)
+        if places.size and not (places.min() >= -1 and places.max() < self.n):
+            raise InputError(
+                f'places {places.min()} .. {places.max()}: expected 0 .. {self.n - 1}, -1 = none'
+            )
+        if not self.keys.size:
+            return np.zeros(places.shape, bool)
+        queries = np.arange(self.N).reshape(-1, *[1] * (places.ndim - 1))
+        wanted = queries * self.n + places
+        at = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
+        return (self.keys[at] == wanted) & (places >= 0)
+
+    def widened(self, tolerance: int) -> Self:
+        """
+        Accept ``tolerance`` places before and after each accepted one as well.
+
+        :raises InputError: no whole number >= 0.
+        """
+        if not tolerance >= 0 or not float(tolerance).is_integer():
+            raise InputError(f'tolerance {tolerance}: expected a whole number of places >= 0')
+        if tolerance == 0:
+            return self
+        queries, places = self.pairs.T
+        around = places[:, None] + np.arange(-int(tolerance), int(tolerance) + 1)
+        inside = (around >= 0) & (around < self.n)
+        keys = (queries[:, None] * self.n + around)[inside]
+        return type(self)(self.N, self.n, np.unique(keys))
+
+    def select(self, indices: np.ndarray) -> Self:
+        """
+        Return the ground truth of some of the queries.
+
+        :param indices: query of each row of the result, shape (K,), in any order, repeated or not.
+        """
+        counts = self._counts[indices]
+        firsts = np.searchsorted(self.keys, indices.astype(np.int64) * self.n)
+        # position of each pair in keys: that of its query's first pair, plus its rank in the query
+        at = np.repeat(firsts - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+        rows = np.repeat(np.arange(len(indices)), counts)
+        return type(self)(len(indices), self.n, rows * self.n + self.keys[at] % self.n)
+
+    def on_places(self, places: np.ndarray) -> Self:
+        """
+        Return the ground truth on a map that keeps only some of the places.
+
+        :param places: those that are kept, ascending, shape (k,); they become 0 .. k - 1.
+        """
+        number = np.full(self.n, -1, np.int64)
+        number[places] = np.arange(len(places))
+        queries, found = self.keys // self.n, number[self.keys % self.n]
+        kept = found >= 0
+        return type(self)(self.N, len(places), queries[kept] * len(places) + found[kept])
+
+    def loop_closures(self, exclude: int = 0) -> Self:
+        """
+        Return the ground truth of one traverse on its own past: the later image is the query.
+
+        Either triangle of a square matrix may hold the pairs, the lower one (row = query, as
+        RTAB-Map writes it), the upper one or both.
+
+        :param exclude: the latest images before the query that are not part of the map.
+        :raises InputError: N and n differ.
+        """
+        if self.n != self.N:
+            raise InputError(
+                f'{self.N} queries, {self.n} places: loop closures need one traverse, as many of '
+                'both'
+            )
+        pairs = self.pairs
+        later, earlier = pairs.max(axis=1), pairs.min(axis=1)
+        past = later - earlier > exclude
+        return type(self)(self.N, self.n, np.unique(later[past] * self.n + earlier[past]))
+
+
+def _checked_poses(poses: np.ndarray, name: str) -> np.ndarray:
+    """Return poses with quaternions of norm 1; unknown poses stay rows of NaN."""
+    poses = np.array(poses, np.float64)
+    if poses.ndim != 2 or poses.shape[1] != 7 or not len(poses):
+        raise InputError(f'{name} poses have shape {poses.shape}: expected (images, 7)')
+    known = ~np.isnan(poses).all(axis=1)
+    lengths = np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+    if not np.isfinite(poses[known]).all() or not lengths.all():
+        raise InputError(f'{name} poses: expected finite numbers and quaternions other than 0')
+    if not known.any():
+        raise InputError(f'{name} poses: none of {len(poses)} is known; give others')
+    poses[:, 3:] /= lengths
+    return poses

@@ -1,0 +1,241 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Files of ground truth: text, arrays, black and white images, poses."""
+
+import csv
+from pathlib import Path
+import re
+import zipfile
+
+import cv2
+import numpy as np
+from stavpr_ros.errors import InputError, SourceError
+from stavpr_ros.regular_file import require_regular
+from stavpr_ros.sources.folder import SUFFIXES
+
+TEXT, ARRAYS = ('.csv', '.tsv', '.txt'), ('.npy', '.npz')
+NAME = 'truth'  # of the array to read from an .npz with several
+QUERY_WORDS = ('query', 'live', 'current')
+PLACE_WORDS = ('place', 'ref', 'map', 'database', 'historical')
+BLACK, WHITE = 32, 223  # gray levels; between them an image is not black and white
+
+Pairs = tuple[np.ndarray, np.ndarray]
+
+
+def read_pairs(path: Path, N: int, n: int) -> Pairs:
+    """
+    Read accepted pairs; see :meth:`stavpr_lab.evaluation.ground_truth.GroundTruth.from_file`.
+
+    :returns: queries and places, shape (M,), int64; those of text and pairs may exceed N and n.
+    :raises SourceError: the file cannot be read.
+    :raises InputError: its size is not that of N queries and n places, or it accepts nothing.
+    """
+    suffix = path.suffix.lower()
+    if suffix in TEXT:
+        queries, places = _from_text(path, N)
+    elif suffix in ARRAYS:
+        queries, places = _from_array(_load(path), path, N, n)
+    elif suffix in SUFFIXES:
+        queries, places = _from_image(path, N, n)
+    else:
+        raise SourceError(
+            f'ground truth {path}: expected text ({" ".join(TEXT)}), an array '
+            f'({" ".join(ARRAYS)}) or a black and white image (.png .bmp ...)'
+        )
+    if not queries.size:
+        raise InputError(f'ground truth {path} accepts no pair: is it the right file?')
+    return queries, places
+
+
+def read_poses(path: Path) -> tuple[np.ndarray, bool]:
+    """
+    Read poses as ``build_map --poses`` takes them: x,y,z or x,y,z,qx,qy,qz,qw a line, meters.
+
+    :returns: shape (images, 7), float64, and whether the file has orientations.
+    :raises SourceError: the file cannot be read.
+    """
+    try:
+        require_regular(path)
+        with path.open(newline='') as file:
+            lines = [row for row in csv.reader(file) if row and row[0][:1] != '#']
+            rows = [[float(value) for value in row] for row in lines]
+    except (OSError, ValueError) as error:
+        raise SourceError(f'poses {path} cannot be read: {error}') from error
+    if {len(row) for row in rows} not in ({3}, {7}):
+        raise SourceError(f'poses {path}: expected 3 or 7 numbers on every line')
+    poses = np.array(rows)
+    if not np.isfinite(poses).all():
+        raise SourceError(f'poses {path}: expected finite numbers')
+    oriented = poses.shape[1] == 7
+    if not oriented:
+        poses = np.hstack([poses, np.tile([0.0, 0.0, 0.0, 1.0], (len(poses), 1))])
+    return poses, oriented
+
+
+# ------------------------------------------------------------------------------------------ text
+
+
+def _cells(line: str) -> list[str]:
+    separator = r'[,;\t]' if re.search(r'[,;\t]', line) else r'\s+'
+    return [cell.strip().strip('"') for cell in re.split(separator, line.strip())]
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _columns(names: list[str] | None, width: int, path: Path) -> tuple[int | None, int]:
+    """Return the columns of query and place; None = the query is the line's number."""
+    if names is not None:
+        found = []
+        for words in (QUERY_WORDS, PLACE_WORDS):
+            columns = [
+                i for i, name in enumerate(names) if any(word in name.casefold() for word in words)
+            ]
+            found.append(columns[0] if len(columns) == 1 else None)
+        query, place = found
+        if place is not None and query != place:
+            return query, place
+    if width == 1:
+        return None, 0
+    if width == 2:
+        return 0, 1
+    raise SourceError(
+        f'ground truth {path} has {width} columns: expected two, query and place, or a header '
+        'with these names'
+    )
+
+
+def _from_text(path: Path, N: int) -> Pairs:
+    try:
+        require_regular(path)
+        lines = path.read_text(encoding='utf-8-sig').splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f'ground truth {path} cannot be read: {error}') from error
+    rows = [
+        (number, _cells(line))
+        for number, line in enumerate(lines, 1)
+        if line.strip() and line.lstrip()[0] != '#'
+    ]
+    names = None
+    if rows and not all(_is_number(cell) for cell in rows[0][1]):
+        names = rows.pop(0)[1]
+    if not rows:
+        raise SourceError(f'ground truth {path} holds no line of numbers: expected query,place')
+    query_column, place_column = _columns(names, len(rows[0][1]), path)
+    if query_column is None and len(rows) != N:
+        raise InputError(
+            f'ground truth {path} has a place for {len(rows)} queries, but there are {N}'
+        )
+    queries, places = [], []
+    for index, (number, cells) in enumerate(rows):
+        place = _whole(cells, place_column, number, path)
+        if place == -1:  # not in the map
+            continue
+        queries.append(
+            index if query_column is None else _whole(cells, query_column, number, path)
+        )
+        places.append(place)
+    return np.array(queries, np.int64), np.array(places, np.int64)
+
+
+def _whole(cells: list[str], column: int, number: int, path: Path) -> int:
+    try:
+        value = float(cells[column])
+        if value.is_integer():
+            return int(value)
+    except (ValueError, IndexError):
+        pass
+    raise SourceError(
+        f'ground truth {path}, line {number}: {",".join(cells)!r} has no whole number in column '
+        f'{column + 1}'
+    )
+
+
+# ------------------------------------------------------------------------------------------ arrays
+
+
+def _load(path: Path) -> np.ndarray:
+    try:
+        require_regular(path)
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return loaded
+        with loaded:
+            names = loaded.files
+            if len(names) == 1 or NAME in names:
+                return loaded[names[0] if len(names) == 1 else NAME]
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        if 'pickle' in str(error):
+            raise SourceError(
+                f'ground truth {path} holds Python objects, which are stored as a pickle, and '
+                'reading a pickle runs whatever program is in it: save it as an array of numbers, '
+                'or as text, query,place a line'
+            ) from error
+        raise SourceError(f'ground truth {path} cannot be read: {error}') from error
+    raise SourceError(
+        f'ground truth {path} holds {", ".join(names)}: expected one array, or one called {NAME}'
+    )
+
+
+def _from_array(array: np.ndarray, path: Path, N: int, n: int) -> Pairs:
+    if array.dtype.kind not in 'buif' or not np.isfinite(array).all():
+        raise InputError(f'ground truth {path} is {array.dtype}: expected finite numbers')
+    if array.shape == (N, n):
+        if not np.isin(array, (0, 1, array.max(initial=1))).all():
+            raise InputError(
+                f'ground truth {path} holds other values than 0 and one more: expected 1 where a '
+                'place is correct; is it a matrix of distances?'
+            )
+        queries, places = np.nonzero(array)
+        return queries, places
+    whole = array.astype(np.int64)
+    if array.dtype.kind == 'b' or not (whole == array).all():
+        raise InputError(_wrong_shape(array.shape, path, N, n))
+    if array.ndim == 2 and array.shape[1] == 2:
+        listed = whole[whole[:, 1] != -1]
+        return listed[:, 0], listed[:, 1]
+    if array.shape == (N,):
+        queries = np.nonzero(whole != -1)[0]
+        return queries, whole[queries]
+    raise InputError(_wrong_shape(array.shape, path, N, n))
+
+
+def _wrong_shape(shape: tuple[int, ...], path: Path, N: int, n: int) -> str:
+    hint = '; it seems to be transposed: rows are queries' if shape == (n, N) and n != N else ''
+    return (
+        f'ground truth {path} has shape {shape}: expected ({N}, {n}) for {N} queries and {n} '
+        f'places, pairs (M, 2), or a place a query ({N},){hint}'
+    )
+
+
+# ------------------------------------------------------------------------------------------ images
+
+
+def _from_image(path: Path, N: int, n: int) -> Pairs:
+    try:
+        content = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise SourceError(f'ground truth {path} cannot be read: {error}') from error
+    image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
+    if image is None:
+        raise SourceError(f'ground truth {path} is no image that can be decoded')
+    if image.shape != (N, n):
+        raise InputError(
+            f'ground truth {path} is {image.shape[0]} high and {image.shape[1]} wide: expected '
+            f'{N} rows, one a query, and {n} columns, one a place'
+        )
+    if image.max() == 1:  # a mask
+        image = image * np.uint8(255)
+    gray = np.count_nonzero((image > BLACK) & (image < WHITE))
+    if gray:
+        raise InputError(
+            f'ground truth {path} has {gray} gray pixels: expected white where a place is '
+            'correct, black elsewhere'
+        )
+    queries, places = np.nonzero(image >= WHITE)
+    return queries, places

@@ -1,0 +1,342 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Precision, recall, F1 and the numbers derived from them.
+
+Counts, F1 and recall follow section 6 of the method: a query that is rejected although its place
+is in the map is a false negative. Average precision is scikit-learn's, which counts only rejected
+*correct* matches as false negatives; its F1 and recall at 100 % precision are given beside ours.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from stavpr_lab.evaluation.extra import import_extra
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_ros.alignment import aligned_index
+from stavpr_ros.errors import InputError
+from stavpr_ros.recognition import Match
+
+RANKS = (1, 5, 10, 20)  # k of recall@k
+
+
+@dataclass(frozen=True)
+class ConfusionCounts:
+    """
+    Counts at one threshold.
+
+    :param threshold: a match is accepted if its distance is below.
+    :param true_positives: accepted and correct.
+    :param false_positives: accepted and wrong.
+    :param false_negatives: rejected although the place is in the map.
+    """
+
+    threshold: float
+    true_positives: int
+    false_positives: int
+    false_negatives: int
+
+    @property
+    def accepted(self) -> int:
+        """Return the number of accepted matches."""
+        return self.true_positives + self.false_positives
+
+    @property
+    def precision(self) -> float:
+        """TP / (TP + FP); 1 when nothing is accepted."""
+        return self.true_positives / self.accepted if self.accepted else 1.0
+
+    @property
+    def recall(self) -> float:
+        """TP / (TP + FN); 0 when there is neither."""
+        relevant = self.true_positives + self.false_negatives
+        return self.true_positives / relevant if relevant else 0.0
+
+    @property
+    def f1(self) -> float:
+        """2 TP / (2 TP + FP + FN); 0 when there is nothing to count."""
+        total = 2 * self.true_positives + self.false_positives + self.false_negatives
+        return 2 * self.true_positives / total if total else 0.0
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """
+    The best places for each of N queries and the distance of the first one.
+
+    :param places: shape (N, K), int64, best first; -1 = no further place.
+    :param scores: distance of the first place, shape (N,), float64; +inf = no match.
+    """
+
+    places: np.ndarray
+    scores: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    @property
+    def best(self) -> np.ndarray:
+        """Return the first place of each query, shape (N,); -1 = none."""
+        return self.places[:, 0]
+
+
+@dataclass(frozen=True)
+class ImageMatches:
+    """
+    The matched place of each of N query images.
+
+    :param places: shape (N,), int64; -1 = none.
+    :param distances: shape (N,), float64; +inf = none.
+    :param accepted: whether the recognizer matched the window, shape (N,), bool.
+    :param probabilities: that the match is right, shape (N,), float64; NaN = not declared.
+    """
+
+    places: np.ndarray
+    distances: np.ndarray
+    accepted: np.ndarray
+    probabilities: np.ndarray
+
+    @classmethod
+    def none(cls, count: int) -> Self:
+        """Return the matches of images without any."""
+        return cls(
+            np.full(count, -1, np.int64),
+            np.full(count, np.inf),
+            np.zeros(count, bool),
+            np.full(count, np.nan),
+        )
+
+    def within(self, true_places: np.ndarray, tolerance: int) -> np.ndarray:
+        """
+        Return which places are at most ``tolerance`` off, shape (N,), bool.
+
+        :param true_places: shape (N,); -1 = not in the map.
+        """
+        true_places = np.asarray(true_places)
+        known = (self.places >= 0) & (true_places >= 0)
+        return known & (np.abs(self.places - true_places) <= tolerance)
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """
+    Metrics of the matches of some queries.
+
+    :param queries: number of queries.
+    :param with_match: how many of them have a place in the map.
+    :param best: counts at the threshold with the best F1.
+    :param average_precision: scikit-learn's ``average_precision_score``.
+    :param recall_at: share of the queries with a place in the map that have a correct one among
+        the first k; by k.
+    :param recall_at_full_precision: largest recall with precision 1.
+    :param sklearn_f1: best F1 of scikit-learn's curve.
+    :param sklearn_recall_at_full_precision: largest recall with precision 1 of that curve.
+    :param curve: threshold, precision and recall, from rejecting all matches to accepting all,
+        shape (T, 3).
+    """
+
+    queries: int
+    with_match: int
+    best: ConfusionCounts
+    average_precision: float
+    recall_at: dict[int, float]
+    recall_at_full_precision: float
+    sklearn_f1: float
+    sklearn_recall_at_full_precision: float
+    curve: np.ndarray
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the numbers, without the curve, for a JSON file."""
+        return {
+            'f1': self.best.f1,
+            'threshold': self.best.threshold,
+            'precision': self.best.precision,
+            'recall': self.best.recall,
+            'average_precision': self.average_precision,
+            **{f'recall_at_{k}': value for k, value in self.recall_at.items()},
+            'recall_at_100_precision': self.recall_at_full_precision,
+            'true_positives': self.best.true_positives,
+            'false_positives': self.best.false_positives,
+            'false_negatives': self.best.false_negatives,
+            'queries': self.queries,
+            'queries_with_match': self.with_match,
+            'scikit_learn': {
+                'f1': self.sklearn_f1,
+                'recall_at_100_precision': self.sklearn_recall_at_full_precision,
+            },
+        }
+
+
+def counts_at(
+    threshold: float,
+    distances: np.ndarray,
+    correct: np.ndarray,
+    has_match: np.ndarray | None = None,
+) -> ConfusionCounts:
+    """
+    Count at one threshold.
+
+    :param distances: of each query's match, shape (N,); +inf or NaN = no match.
+    :param correct: the match is within the tolerance of the ground truth, shape (N,), bool.
+    :param has_match: the query's place is in the map, shape (N,), bool; None = all are.
+    """
+    return _counts(np.array([threshold]), distances, correct, has_match)[0]
+
+
+def accepted_counts(
+    accepted: np.ndarray, correct: np.ndarray, has_match: np.ndarray
+) -> ConfusionCounts:
+    """
+    Count accepted matches, whatever they were accepted by; the threshold is NaN.
+
+    :param accepted: shape (N,), bool; the others are as in :func:`counts_at`.
+    """
+    return ConfusionCounts(
+        float('nan'),
+        int(np.count_nonzero(accepted & correct)),
+        int(np.count_nonzero(accepted & ~correct)),
+        int(np.count_nonzero(~accepted & has_match)),
+    )
+
+
+def sweep(
+    distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None
+) -> list[ConfusionCounts]:
+    """
+    Count at every threshold that changes the counts, from rejecting all to accepting all.
+
+    The parameters are those of :func:`counts_at`.
+    """
+    finite = np.unique(distances[np.isfinite(distances)])
+    thresholds = (
+        np.append(finite, np.nextafter(finite[-1], np.inf)) if finite.size else np.zeros(1)
+    )
+    return _counts(thresholds, distances, correct, has_match)
+
+
+def best_f1(
+    distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None
+) -> ConfusionCounts:
+    """Return the counts of the threshold with the best F1, the lowest on a tie."""
+    return max(sweep(distances, correct, has_match), key=lambda counts: counts.f1)
+
+
+def _counts(
+    thresholds: np.ndarray,
+    distances: np.ndarray,
+    correct: np.ndarray,
+    has_match: np.ndarray | None,
+) -> list[ConfusionCounts]:
+    order = np.argsort(distances)  # NaN last, as +inf
+    accepted = np.searchsorted(distances[order], thresholds)  # below, not at the threshold
+    true_positives = np.append(0, np.cumsum(correct[order]))[accepted]
+    relevant = np.ones_like(correct) if has_match is None else has_match
+    in_map = np.append(0, np.cumsum(relevant[order]))
+    false_negatives = in_map[-1] - in_map[accepted]
+    columns = (thresholds, true_positives, accepted - true_positives, false_negatives)
+    return [
+        ConfusionCounts(*row) for row in zip(*(column.tolist() for column in columns), strict=True)
+    ]
+
+
+def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> ImageMatches:
+    """
+    Assign the matches of windows to images: each to the image in the middle of its window.
+
+    Images before the middle of the first matched window or after that of the last one take their
+    place from that window's warping path, with its distance.
+
+    :param matches: one an image, in order: that of the window that ends with the image.
+    :param length: images in a window, l.
+    :param late: images whose window was not matched take their late match, where they have one.
+    """
+    found = ImageMatches.none(len(matches))
+    middle = (length - 1) // 2
+    ends = [end for end, match in enumerate(matches) if match.sequence is not None]
+
+    def assign(end: int, position: int, place: int) -> None:
+        image = end - (length - 1) + position
+        if image >= 0:
+            match = matches[end].at(position)
+            found.places[image], found.distances[image] = place, match.score
+            found.accepted[image], found.probabilities[image] = match.accepted, match.probability
+
+    for end in ends:
+        assign(end, middle, matches[end].sequence.middle)  # type: ignore[union-attr]
+    if ends:
+        for position in range(middle):
+            assign(ends[0], position, aligned_index(matches[ends[0]].path, position))
+        for position in range(middle + 1, length):
+            assign(ends[-1], position, aligned_index(matches[ends[-1]].path, position))
+    for end, match in enumerate(matches if late else ()):
+        if match.late is not None and match.late.sequence is not None:
+            image = end - (length - 1)
+            found.places[image], found.distances[image] = match.late.place_index, match.late.score
+            found.accepted[image], found.probabilities[image] = True, match.late.probability
+    return found
+
+
+def evaluate_ranking(
+    ranking: Ranking, ground_truth: GroundTruth, images: slice = slice(None)
+) -> Metrics:
+    """
+    Compare ranked places with the ground truth.
+
+    :param images: the queries that count; all by default.
+    :raises InputError: no queries are left.
+    :raises UnavailableError: scikit-learn is not installed.
+    """
+    correct = ground_truth.accepts(ranking.places)[images]
+    has_match = ground_truth.has_match[images]
+    scores = ranking.scores[images]
+    if not len(scores):
+        raise InputError(f'{images} of {len(ranking)} queries leaves no queries to evaluate')
+    counts = sweep(scores, correct[:, 0], has_match)
+    average_precision, sklearn_f1, sklearn_recall = _sklearn_metrics(scores, correct[:, 0])
+    return Metrics(
+        queries=len(scores),
+        with_match=int(np.count_nonzero(has_match)),
+        best=max(counts, key=lambda each: each.f1),
+        average_precision=average_precision,
+        recall_at={k: _recall_at(k, correct, has_match) for k in RANKS},
+        recall_at_full_precision=max(each.recall for each in counts if each.precision == 1),
+        sklearn_f1=sklearn_f1,
+        sklearn_recall_at_full_precision=sklearn_recall,
+        curve=np.array([(each.threshold, each.precision, each.recall) for each in counts]),
+    )
+
+
+def smallest_indices(row: np.ndarray, k: int) -> np.ndarray:
+    """
+    Return the indices of the k smallest finite values, smallest first, the lowest index on a tie.
+
+    :param row: shape (n,); +inf and NaN are left out.
+    :returns: shape (<= k,), int64.
+    """
+    usable = np.flatnonzero(np.isfinite(row))
+    if len(usable) > k:
+        limit = np.partition(row[usable], k - 1)[k - 1]
+        usable = usable[row[usable] <= limit]
+    return usable[np.argsort(row[usable], kind='stable')][:k]
+
+
+def _recall_at(k: int, correct: np.ndarray, has_match: np.ndarray) -> float:
+    """Return the share of queries with a place in the map; NaN where none has one."""
+    found = correct[has_match, :k].any(axis=1)
+    return float(np.mean(found)) if has_match.any() else float('nan')
+
+
+def _sklearn_metrics(scores: np.ndarray, correct: np.ndarray) -> tuple[float, float, float]:
+    """Return average precision, best F1 and recall at 100 % precision, as scikit-learn counts."""
+    metrics = import_extra('sklearn.metrics')
+    if not correct.any():
+        return 0.0, 0.0, 0.0
+    finite = np.isfinite(scores)
+    # scikit-learn takes finite values only: queries without a match come last
+    confidence = -np.where(finite, scores, scores[finite].max(initial=0.0) + 1)
+    precision, recall, _ = metrics.precision_recall_curve(correct, confidence)
+    average = metrics.average_precision_score(correct, confidence)
+    f1 = 2 * precision * recall / np.maximum(precision + recall, np.finfo(float).tiny)
+    return float(average), float(f1.max()), float(recall[precision == 1].max())

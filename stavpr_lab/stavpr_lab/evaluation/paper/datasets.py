@@ -1,0 +1,208 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's data sets on disk: the folders of map and query, and their ground truth."""
+
+from dataclasses import dataclass
+from pathlib import Path
+import re
+
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_lab.evaluation.ground_truth_files import ARRAYS, TEXT
+from stavpr_lab.evaluation.warp import cropped, FrameSource
+from stavpr_ros.errors import SettingsError, SourceError
+from stavpr_ros.sources.folder import FolderSource, SUFFIXES
+
+SYNTH = 'synth_'  # before a name: the same with both traverses cropped
+CROP_MAP, CROP_QUERY = 0.3, 0.1  # right of every map image, left of every query image (synth-Nord)
+GROUND_TRUTHS = ('groundtruth', 'gt', 'truth', 'groundtruthnew')
+HOLDERS = ('images', 'data', 'datasets', 'test')  # folders that only hold others
+# Parts of folder names besides the traverse: sizes, rates, kinds of files.
+NOISE = re.compile(r'\d+x\d+|\dfps|images|image|imgs|frames|gr[ae]yscale|jpg|png|test')
+
+
+@dataclass(frozen=True)
+class Layout:
+    """
+    Names of a data set's folders, compared without case, punctuation and ``NOISE``.
+
+    :param folders: names, or their first parts, of the data set's folder.
+    :param map_names: names of the folder of the map.
+    :param query_names: names of that of the query.
+    :param tolerance: the paper's, places.
+    :param paired: the same index is the ground truth where both have equally many images; else a
+        file is needed.
+    """
+
+    folders: tuple[str, ...]
+    map_names: tuple[str, ...]
+    query_names: tuple[str, ...]
+    tolerance: int
+    paired: bool = True
+
+
+GARDENS = ('gardenspoint', 'gardenpoint', 'gardens', 'garden', 'gpw', 'gp')
+LAYOUTS = {
+    'nordland': Layout(('nordland',), ('summer',), ('winter',), 3),
+    'gardens_point': Layout(GARDENS, ('dayleft',), ('dayright',), 2),
+    'gardens_point_night': Layout(GARDENS, ('dayleft',), ('nightright',), 2),
+    'ua': Layout(('ua', 'uacampus', 'uadataset'), ('day',), ('evening',), 3),
+    'berlin_a100': Layout(
+        ('berlina100', 'a100'), ('reference', 'ref', '2'), ('live', 'query', '1'), 2, paired=False
+    ),
+}
+NAMES = (*LAYOUTS, *(SYNTH + name for name in LAYOUTS))
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """
+    Two traverses of one route.
+
+    :param map: images of the map, in the order of the route.
+    :param query: images of the query.
+    :param ground_truth: of the query's images, tolerance included.
+    :param tolerance: the paper's or the requested one, places.
+    """
+
+    map: FrameSource
+    query: FrameSource
+    ground_truth: GroundTruth
+    tolerance: int
+
+
+def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> Dataset:
+    """
+    Find a data set on disk.
+
+    :param name: one of ``NAMES``; ``synth_`` before a name crops both traverses as synth-Nord.
+    :param root: its own folder, or one that holds it.
+    :param tolerance: places; None = the paper's.
+    :raises SettingsError: an unknown name.
+    :raises SourceError: it is not found; names the folders that were searched.
+    """
+    if name not in NAMES:
+        raise SettingsError(f'data set {name!r} is unknown: take one of {", ".join(NAMES)}')
+    layout = LAYOUTS[name.removeprefix(SYNTH)]
+    folder, map_folder, query_folder = _find(name, layout, Path(root))
+    places: FrameSource = FolderSource(map_folder)
+    query: FrameSource = FolderSource(query_folder)
+    tolerance = layout.tolerance if tolerance is None else tolerance
+    if layout.paired and len(query) == len(places):
+        ground_truth = GroundTruth.identity(len(query), len(places), tolerance)
+    else:
+        file = _ground_truth_file(name, folder, len(query), len(places))
+        ground_truth = GroundTruth.from_file(file, len(query), len(places), tolerance)
+    if name.startswith(SYNTH):
+        places, query = cropped(places, 0, CROP_MAP), cropped(query, CROP_QUERY, 0)
+    return Dataset(places, query, ground_truth, tolerance)
+
+
+def _letters(name: str) -> str:
+    return re.sub(r'[^a-z0-9]', '', name.casefold())
+
+
+def _plain(name: str) -> str:
+    # noise before punctuation: 64x32-1fps
+    return _letters(NOISE.sub('', name.casefold()))
+
+
+def _is_called(name: str, layout: Layout) -> bool:
+    plain = _plain(name)
+    # short names must be equal: too many others begin with them
+    return any(
+        plain == folder or (len(folder) > 3 and plain.startswith(folder))
+        for folder in layout.folders
+    )
+
+
+def _traverse_name(name: str, layout: Layout) -> str:
+    """Return the traverse in a folder's name: ``winter`` of ``nordland_winter_images``."""
+    plain = _plain(name)
+    for folder in sorted(layout.folders, key=len, reverse=True):
+        if plain.startswith(folder):
+            return plain.removeprefix(folder)
+    return plain
+
+
+def _folders(path: Path) -> list[Path]:
+    try:
+        return sorted(child for child in path.iterdir() if child.is_dir() and child.name[0] != '.')
+    except OSError as error:
+        raise SourceError(
+            f'{path} cannot be listed: {error.strerror}; name the folder of the data'
+        ) from error
+
+
+def _holders(paths: list[Path]) -> list[Path]:
+    return [child for path in paths for child in _folders(path) if _letters(child.name) in HOLDERS]
+
+
+def _find(name: str, layout: Layout, root: Path) -> tuple[Path, Path, Path]:
+    """Return the folders of data set, map and query, those nearest to the root first."""
+    inside = _holders([root])
+    own = [
+        child
+        for path in (root, *inside)
+        for child in _folders(path)
+        if _is_called(child.name, layout)
+    ]
+    searched: list[Path] = []
+    for level in ([root], inside, own, _holders(own)):
+        searched += [path for path in level if path not in searched]
+        hits = [(path, *found) for path in level if (found := _traverses(path, layout))]
+        if len(hits) > 1:
+            several = ', '.join(str(path) for path, *_ in hits)
+            raise SourceError(
+                f'data set {name} exists more than once: {several}; name one of these folders'
+            )
+        if hits:
+            return hits[0]
+    seen = ', '.join(folder.name for path in searched for folder in _folders(path)) or 'no folder'
+    raise SourceError(
+        f'data set {name} is not in {root}: searched {", ".join(map(str, searched))} for the map, '
+        f'a folder called {_or(layout.map_names)}, and the query, {_or(layout.query_names)}, and '
+        f'found {seen}; rename them, or give map and query by their paths'
+    )
+
+
+def _traverses(path: Path, layout: Layout) -> tuple[Path, Path] | None:
+    traverses = []
+    for names in (layout.map_names, layout.query_names):
+        found = [
+            folder for folder in _folders(path) if _traverse_name(folder.name, layout) in names
+        ]
+        if not found:
+            return None
+        if len(found) > 1:
+            several = ', '.join(folder.name for folder in found)
+            raise SourceError(
+                f'{path} holds several folders for one traverse: {several}; leave one of them'
+            )
+        traverses.append(found[0])
+    return traverses[0], traverses[1]
+
+
+def _ground_truth_file(name: str, folder: Path, queries: int, places: int) -> Path:
+    files = [
+        file
+        for file in sorted(folder.iterdir())
+        if _letters(file.stem) in GROUND_TRUTHS and file.is_file()
+    ]
+    for suffixes in (TEXT, ARRAYS, tuple(SUFFIXES)):  # text first: the least ambiguous
+        found = [file for file in files if file.suffix.lower() in suffixes]
+        if len(found) > 1:
+            several = ', '.join(file.name for file in found)
+            raise SourceError(
+                f'data set {name} in {folder} has several ground truths: {several}; leave one'
+            )
+        if found:
+            return found[0]
+    raise SourceError(
+        f'data set {name} in {folder} has {queries} query images for {places} places and no '
+        f'ground truth: searched for a file called {_or(GROUND_TRUTHS)}, text, array or image, '
+        'such as GroundTruth.csv, a line query,place'
+    )
+
+
+def _or(names: tuple[str, ...]) -> str:
+    return ' or '.join(repr(name) for name in names)

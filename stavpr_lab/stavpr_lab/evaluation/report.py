@@ -1,0 +1,181 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""An evaluation and its surroundings: the numbers of a report, and the examples that it shows."""
+
+from dataclasses import dataclass
+from functools import cached_property
+import math
+from typing import Any
+
+import numpy as np
+from stavpr_lab.evaluation.drive import Drive
+from stavpr_lab.evaluation.evaluate import Evaluation, WindowDistances
+from stavpr_lab.evaluation.metrics import accepted_counts, ConfusionCounts
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.mapping import PlaceMap
+
+METRICS = ('sequence', 'sequence_without_ends', 'single', 'single_without_ends')
+
+
+@dataclass(frozen=True)
+class Report:
+    """
+    An evaluation with the images and settings that it was made from.
+
+    :param query: the query's places, with thumbnails if the report is to show them.
+    :param reference: the map; the query itself for loop closures.
+    :param title: names of both, a line.
+    :param settings: of the run: everything that decides the numbers.
+    :param times: of the run, by name; seconds, or milliseconds where the name has them.
+    :param drive: how the query was driven and what the map lacks.
+    :param default_threshold: the mode's own, with which the recognizer ran; None = it has none.
+    :param window: query image whose window is plotted; None = the worst mistake.
+    """
+
+    evaluation: Evaluation
+    query: PlaceMap
+    reference: PlaceMap
+    title: str
+    settings: dict[str, Any]
+    times: dict[str, float]
+    drive: Drive
+    default_threshold: float | None = None
+    window: int | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all numbers for a JSON file; undefined ones are None."""
+        evaluation = self.evaluation
+        numbers: dict[str, Any] = {name: getattr(evaluation, name).to_json() for name in METRICS}
+        numbers['recommended_threshold'] = evaluation.sequence.best.threshold
+        if self.default_threshold is not None:
+            numbers['default_threshold'] = self._at_default()
+        numbers['decision'] = self.decision()
+        numbers['unseen'] = self.unseen()
+        calibration = evaluation.calibration
+        numbers['calibration'] = None if calibration is None else calibration.to_json()
+        if evaluation.unknown is not None:
+            for kind in ('sequence', 'single'):
+                numbers[kind]['false_alarm_rate'] = evaluation.false_alarm_rate(kind)
+            numbers['false_alarm_rate'] = evaluation.false_alarm_rate('sequence')
+            numbers['unknown_images'] = len(evaluation.unknown.single)
+        numbers |= {'images': len(self.query), 'places': len(self.reference)}
+        numbers['map_id'] = self.reference.map_id
+        numbers |= {'settings': self.settings, 'times': self.times}
+        return jsonable(numbers)
+
+    @cached_property
+    def accepted(self) -> np.ndarray:
+        """
+        Return which matches a robot would get, shape (N,), bool.
+
+        Those that the recognizer accepts by default; in mode paper, which has no default, those
+        below the threshold of the best F1.
+        """
+        results = self.evaluation.results
+        if self.default_threshold is None:
+            return results.sequence.scores < self.evaluation.sequence.best.threshold
+        return results.accepted
+
+    @cached_property
+    def counts(self) -> ConfusionCounts:
+        """Return the counts of :attr:`accepted`."""
+        truth = self.evaluation.ground_truth
+        correct = truth.accepts(self.evaluation.results.sequence.best)
+        return accepted_counts(self.accepted, correct, truth.has_match)
+
+    def decision(self) -> dict[str, Any]:
+        """Return how many images are matched, and how many of them wrongly."""
+        counts = self.counts
+        return {
+            'rule': 'best F1' if self.default_threshold is None else 'default',
+            'images': len(self.accepted),
+            'matched': counts.accepted,
+            'wrongly_matched': counts.false_positives,
+            'precision': counts.precision,
+            'recall': counts.recall,
+        }
+
+    def unseen(self) -> list[dict[str, int]]:
+        """Return, for each stretch removed from the map, its unseen images and those matched."""
+        return [
+            {
+                'first': first,
+                'last': last,
+                'images': int(np.count_nonzero(mask)),
+                'matched': int(np.count_nonzero(mask & self.accepted)),
+            }
+            for (first, last), mask in zip(self.drive.removed, self.drive.unseen(), strict=True)
+        ]
+
+    def _at_default(self) -> dict[str, Any]:
+        counts, unknown = self.counts, self.evaluation.unknown
+        numbers: dict[str, Any] = {'threshold': self.default_threshold}
+        numbers |= {'precision': counts.precision, 'recall': counts.recall, 'f1': counts.f1}
+        if unknown is not None:
+            numbers['false_alarm_rate'] = float(np.mean(unknown.accepted))
+        return numbers
+
+
+def jsonable(value: Any) -> Any:
+    """Replace NaN and infinities, which JSON lacks, by None, and NumPy's numbers by Python's."""
+    if isinstance(value, dict):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [jsonable(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def accepted_matches(evaluation: Evaluation) -> dict[str, np.ndarray]:
+    """
+    Return the windows' matches that are accepted at the threshold of the best F1.
+
+    :returns: image and place, shape (count, 2), of the ``right`` and of the ``wrong`` ones.
+    """
+    matches = evaluation.results.sequence
+    accepted = matches.scores < evaluation.sequence.best.threshold
+    correct = evaluation.ground_truth.accepts(matches.best)
+    pairs = np.stack([np.arange(len(matches)), matches.best], axis=1)
+    return {'right': pairs[accepted & correct], 'wrong': pairs[accepted & ~correct]}
+
+
+def worst_mistakes(evaluation: Evaluation, count: int) -> list[int]:
+    """
+    Choose wrong matches: those a window off or more first, then by distance, half a window apart.
+
+    :returns: up to ``count`` images, the worst first.
+    """
+    matches, true = evaluation.results.sequence, evaluation.ground_truth.middles
+    wrong = ~evaluation.ground_truth.accepts(matches.best) & np.isfinite(matches.scores)
+    near = (true >= 0) & (np.abs(matches.best - true) < evaluation.sequence_length)
+    apart = evaluation.sequence_length // 2
+    chosen: list[int] = []
+    for image in np.lexsort((matches.scores, near)).tolist():
+        if wrong[image] and all(abs(image - other) > apart for other in chosen):
+            chosen.append(image)
+            if len(chosen) == count:
+                break
+    return chosen
+
+
+def chosen_window(evaluation: Evaluation, image: int | None) -> WindowDistances | None:
+    """
+    Return the window around an image, by default that of the worst mistake or the middle one.
+
+    :raises SettingsError: no window is centered on that image.
+    """
+    windows = evaluation.results.windows
+    if image is not None:
+        for window in windows:
+            if window.image == image:
+                return window
+        raise SettingsError(
+            f'no window is centered on image {image}: choose one of '
+            f'{evaluation.centered.start} .. {evaluation.centered.stop - 1}'
+        )
+    if not windows:
+        return None
+    mistakes = worst_mistakes(evaluation, 1)
+    wanted = mistakes[0] if mistakes else windows[len(windows) // 2].image
+    return min(windows, key=lambda window: abs(window.image - wanted))

@@ -1,0 +1,183 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The files of a report: JSON, CSV, plots and the page."""
+
+from collections.abc import Iterable
+import csv
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+from stavpr_lab.evaluation import plots
+from stavpr_lab.evaluation.evaluate import Evaluation
+from stavpr_lab.evaluation.plots import Box
+from stavpr_lab.evaluation.report import (
+    accepted_matches,
+    chosen_window,
+    METRICS,
+    Report,
+    worst_mistakes,
+)
+from stavpr_lab.evaluation.report_page import html_page
+from stavpr_ros.errors import SourceError
+from stavpr_ros.output_file import csv_kind, HTML, JSON, require_replaceable, write_output
+
+PAGE = 'report.html'
+MISTAKES = 9  # on the page
+
+
+def write_json(report: Report, path: Path, force: bool = False) -> None:
+    """
+    Write the numbers.
+
+    :param force: replace an existing file of numbers.
+    :raises OutputError: the file cannot be written.
+    """
+    text = json.dumps(report.to_json(), indent=2, allow_nan=False)
+    write_output(path, text + '\n', JSON, force)
+
+
+def write_folder(report: Report, folder: Path, force: bool = False) -> Path:
+    """
+    Write the numbers, the matches, the curves, the plots and the page.
+
+    :param force: replace an earlier report.
+    :returns: the page.
+    :raises SourceError: the folder cannot be made.
+    :raises OutputError: a file cannot be written, or must not be replaced.
+    :raises UnavailableError: jinja2 is not installed.
+    """
+    page = folder / PAGE
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SourceError(f'the report cannot be written into {folder}: {error}') from error
+    require_replaceable(page, HTML, force)  # the page stands for its report
+    _write_matches(report, folder / 'answers.csv')
+    _write_curves(report.evaluation, folder / 'curves.csv')
+    boxes = _draw(report, folder)
+    embedded = {
+        'precision_recall': folder / 'precision_recall.png',
+        'distances': folder / 'distances.png',
+        'matrix': folder / 'similarity_matrix.png',
+        'drive': folder / 'drive.png',
+    }
+    if report.evaluation.calibration is not None:
+        embedded['calibration'] = folder / 'calibration.png'
+    contents = {name: path.read_bytes() for name, path in embedded.items()}
+    mistakes = worst_mistakes(report.evaluation, MISTAKES)
+    write_output(page, html_page(report, mistakes, contents, boxes), HTML, force)
+    write_json(report, folder / 'results.json', force=True)
+    return page
+
+
+def _write_matches(report: Report, path: Path) -> None:
+    results, truth = report.evaluation.results, report.evaluation.ground_truth
+    sequence, single = results.sequence, results.single
+    columns = {
+        'image': range(len(report.query)),
+        'identifier': report.query.ids,
+        'in_map': truth.has_match.astype(int).tolist(),
+        'true_place': truth.middles.tolist(),
+        'sequence_place': sequence.best.tolist(),
+        'sequence_distance': sequence.scores.tolist(),
+        'sequence_right': truth.accepts(sequence.best).astype(int).tolist(),
+        'single_place': single.best.tolist(),
+        'single_distance': single.scores.tolist(),
+        'single_right': truth.accepts(single.best).astype(int).tolist(),
+        'accepted': report.accepted.astype(int).tolist(),
+        'probability': results.probabilities.tolist(),
+        'recorded_image': report.drive.images.tolist(),
+    }
+    _write_csv(path, list(columns), zip(*columns.values(), strict=True))
+
+
+def _write_curves(evaluation: Evaluation, path: Path) -> None:
+    points = [
+        [name, *point] for name in METRICS for point in getattr(evaluation, name).curve.tolist()
+    ]
+    _write_csv(path, ['answers', 'threshold', 'precision', 'recall'], points)
+
+
+def _write_csv(path: Path, columns: list[str], rows: Iterable[Iterable[object]]) -> None:
+    text = io.StringIO(newline='')
+    writer = csv.writer(text)
+    writer.writerow(columns)
+    writer.writerows(rows)
+    write_output(path, text.getvalue(), csv_kind(columns), force=True)
+
+
+def _draw(report: Report, folder: Path) -> dict[str, Box]:
+    """
+    Draw the curves, the distances, the drive, the calibration and one window.
+
+    :returns: where the axes of ``curves`` and ``matrix`` are in their plots.
+    """
+    evaluation = report.evaluation
+    boxes = {
+        'curves': _draw_curves(evaluation, folder / 'precision_recall.png'),
+        'matrix': _draw_matrix(evaluation, folder / 'similarity_matrix.png'),
+    }
+    _draw_distances(evaluation, folder / 'distances.png')
+    _draw_drive(report, folder / 'drive.png')
+    if evaluation.calibration is not None:
+        plots.reliability(folder / 'calibration.png', evaluation.calibration)
+    window = chosen_window(evaluation, report.window)
+    if window is not None:
+        local = window.path - [0, window.first]
+        path = folder / f'window_{window.image}.png'
+        plots.warping_path(path, window.distances, local, window.first)
+    return boxes
+
+
+def _draw_curves(evaluation: Evaluation, path: Path) -> Box:
+    kinds = {
+        'sequences': (plots.SEQUENCE, evaluation.sequence),
+        'sequences, without the ends': (plots.SEQUENCE_INNER, evaluation.sequence_without_ends),
+        'single images': (plots.SINGLE, evaluation.single),
+    }
+    curves = {
+        name: (
+            color,
+            metrics.curve[:, 2],
+            metrics.curve[:, 1],
+            (metrics.best.recall, metrics.best.precision),
+        )
+        for name, (color, metrics) in kinds.items()
+    }
+    return plots.precision_recall(path, curves)
+
+
+def _draw_distances(evaluation: Evaluation, path: Path) -> None:
+    matches = evaluation.results.sequence
+    correct = evaluation.ground_truth.accepts(matches.best)
+    groups = {
+        'correct': (plots.COLORS['right'], matches.scores[correct]),
+        'wrong': (plots.COLORS['wrong'], matches.scores[~correct]),
+    }
+    if evaluation.unknown is not None:
+        groups['unknown places'] = (plots.UNKNOWN, evaluation.unknown.sequence.scores)
+    plots.distance_histogram(path, groups, evaluation.sequence.best.threshold)
+
+
+def _draw_drive(report: Report, path: Path) -> None:
+    truth, places = report.evaluation.ground_truth, report.evaluation.results.sequence.best
+    unseen = np.any([np.zeros(truth.N, bool), *report.drive.unseen()], axis=0)
+    outcomes = np.where(
+        report.accepted,
+        np.where(truth.accepts(places), 'right', 'wrong'),
+        np.where(truth.has_match, 'no match', 'unseen'),
+    )
+    plots.drive(path, truth.pairs, truth.n, places, outcomes, unseen)
+
+
+def _draw_matrix(evaluation: Evaluation, path: Path) -> Box:
+    reduced, truth = evaluation.results.distances, evaluation.ground_truth
+    true_blocks = np.zeros(reduced.values.shape, bool)
+    rows, columns = (truth.pairs // reduced.block).T
+    true_blocks[rows, columns] = True
+    shape = truth.N, truth.n
+    return plots.reduced_matrix(
+        path, reduced.values, shape, true_blocks, accepted_matches(evaluation)
+    )

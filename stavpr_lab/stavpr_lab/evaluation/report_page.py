@@ -1,0 +1,217 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The HTML page of a report: one file that needs no server, no network and no other file."""
+
+import base64
+from collections.abc import Mapping
+from importlib import resources
+import json
+from typing import Any
+
+import cv2
+import numpy as np
+from stavpr_lab.evaluation.drive import UNSEEN_DISTANCE
+from stavpr_lab.evaluation.evaluate import Evaluation, WindowDistances
+from stavpr_lab.evaluation.extra import import_extra
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_lab.evaluation.metrics import RANKS
+from stavpr_lab.evaluation.plots import Box, COLORS, SEQUENCE
+from stavpr_lab.evaluation.report import jsonable, METRICS, Report
+from stavpr_ros.mapping import PlaceMap
+
+TEMPLATE = 'report.html.jinja'
+VIEWS = 240  # windows that can be looked at: more would make a large file
+POINTS = 400  # of a curve
+WIDTH, LARGE = 160, 4000  # of an image, pixels; bytes from which one is made smaller
+
+# rows of the table: keys of Metrics.to_json
+NUMBERS = {
+    'F1': 'f1',
+    'threshold of the best F1': 'threshold',
+    'precision there': 'precision',
+    'recall there': 'recall',
+    'average precision': 'average_precision',
+    **{f'recall@{k}': f'recall_at_{k}' for k in RANKS},
+    'recall at 100 % precision': 'recall_at_100_precision',
+}
+CARDS = ('recall@1', 'average precision', 'recall at 100 % precision')
+
+
+def html_page(
+    report: Report, mistakes: list[int], plots: Mapping[str, bytes], boxes: Mapping[str, Box]
+) -> str:
+    """
+    Return the page.
+
+    :param mistakes: images whose wrong matches are shown, the worst first.
+    :param plots: PNG files ``precision_recall``, ``distances``, ``matrix``, ``drive`` and, where
+        probabilities are declared, ``calibration``.
+    :param boxes: where the axes of ``curves`` and ``matrix`` are.
+    :raises UnavailableError: jinja2 is not installed.
+    """
+    jinja2 = import_extra('jinja2')
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.policies['json.dumps_kwargs'] = {'separators': (',', ':')}
+    template = resources.files('stavpr_lab.evaluation').joinpath(TEMPLATE).read_text('utf-8')
+    evaluation = report.evaluation
+    unknown = evaluation.unknown is not None
+    kinds = ('sequence', 'single')
+    return environment.from_string(template).render(
+        title=report.title,
+        images=len(report.query),
+        best=evaluation.sequence.best,
+        single=evaluation.single.best,
+        false_alarms={kind: evaluation.false_alarm_rate(kind) for kind in kinds}
+        if unknown
+        else None,
+        colors={'right': COLORS['right'], 'wrong': COLORS['wrong'], 'sequence': SEQUENCE},
+        cards=_cards(evaluation),
+        decision=report.decision(),
+        unseen=report.unseen(),
+        unseen_distance=UNSEEN_DISTANCE,
+        calibration=evaluation.calibration and evaluation.calibration.to_json(),
+        plots={name: _data_url(content, 'png') for name, content in plots.items()},
+        infinite=_infinite(evaluation),
+        mistakes=[_mistake(report, image) for image in mistakes],
+        rows=_rows(evaluation),
+        settings={name: _text(value) for name, value in report.settings.items()},
+        times={name: f'{value:.3g}' for name, value in report.times.items()},
+        data=jsonable({**_data(report, mistakes), 'boxes': boxes}),
+    )
+
+
+def _data_url(content: bytes, kind: str) -> str:
+    return f'data:image/{kind};base64,{base64.b64encode(content).decode()}'
+
+
+def _text(value: Any) -> str:
+    return '–' if value is None else value if isinstance(value, str) else json.dumps(value)
+
+
+def _cards(evaluation: Evaluation) -> list[dict[str, Any]]:
+    kinds = ('sequence', 'single')
+    sequence, single = (getattr(evaluation, kind).to_json() for kind in kinds)
+    cards = [('F1 of sequences', sequence['f1'], single['f1'], SEQUENCE)]
+    cards += [(name, sequence[NUMBERS[name]], single[NUMBERS[name]], SEQUENCE) for name in CARDS]
+    if evaluation.unknown is not None:
+        rate, single_rate = (evaluation.false_alarm_rate(kind) for kind in kinds)
+        cards.append(('false alarms', rate, single_rate, COLORS['wrong']))
+    return [dict(zip(('name', 'value', 'single', 'color'), card, strict=True)) for card in cards]
+
+
+def _infinite(evaluation: Evaluation) -> dict[str, int]:
+    """Count the matches without a distance, which the histogram lacks."""
+    scores = evaluation.results.sequence.scores
+    correct = evaluation.ground_truth.accepts(evaluation.results.sequence.best)
+    groups = {'correct matches': scores[correct], 'wrong matches': scores[~correct]}
+    if evaluation.unknown is not None:
+        groups['images of unknown places'] = evaluation.unknown.sequence.scores
+    return {name: int(np.count_nonzero(~np.isfinite(values))) for name, values in groups.items()}
+
+
+def _rows(evaluation: Evaluation) -> dict[str, list[str]]:
+    """Return the table of all numbers: a row a number, a column a kind of metrics."""
+    columns = [getattr(evaluation, name).to_json() for name in METRICS]
+    rows = {name: [f'{column[key]:.4f}' for column in columns] for name, key in NUMBERS.items()}
+    rows['scikit-learn’s F1'] = [f'{column["scikit_learn"]["f1"]:.4f}' for column in columns]
+    if evaluation.unknown is not None:
+        rates = [f'{evaluation.false_alarm_rate(kind):.4f}' for kind in ('sequence', 'single')]
+        rows['false alarms'] = [rates[0], '', rates[1], '']
+    rows['queries'] = [str(column['queries']) for column in columns]
+    rows['with a place in the map'] = [str(column['queries_with_match']) for column in columns]
+    return rows
+
+
+def _mistake(report: Report, image: int) -> dict[str, Any]:
+    matches = report.evaluation.results.sequence
+    place, true = int(matches.best[image]), int(report.evaluation.ground_truth.middles[image])
+    images = [
+        {'name': f'image {image}', 'url': _image(report.query, image)},
+        {'name': f'place {place}', 'url': _image(report.reference, place)},
+        {
+            'name': f'place {true}' if true >= 0 else 'not in the map',
+            'url': _image(report.reference, true),
+        },
+    ]
+    accepted = matches.scores[image] < report.evaluation.sequence.best.threshold
+    status = 'accepted' if accepted else 'rejected, correctly'
+    off = f', {abs(place - true)} places off' if true >= 0 else ''
+    return {'images': images, 'caption': f'distance {matches.scores[image]:.4f}, {status}{off}'}
+
+
+def _image(place_map: PlaceMap, place: int) -> str:
+    """Return a small image of a place as a data URL; empty where there is none."""
+    if place < 0 or not place_map.thumbnails:
+        return ''
+    content = place_map.thumbnails[place]
+    image = place_map.thumbnail(place) if len(content) > LARGE else None
+    if image is not None and image.shape[1] > WIDTH:
+        size = (WIDTH, max(1, round(image.shape[0] * WIDTH / image.shape[1])))
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)[:, :, ::-1]
+        content = cv2.imencode('.jpg', small, [cv2.IMWRITE_JPEG_QUALITY, 75])[1].tobytes()
+    return _data_url(content, 'jpeg')
+
+
+def _data(report: Report, mistakes: list[int]) -> dict[str, Any]:
+    """Return the data of the page's script."""
+    evaluation = report.evaluation
+    windows = evaluation.results.windows
+    kept = set(
+        np.linspace(0, len(windows) - 1, min(VIEWS, len(windows))).round().astype(int).tolist()
+    )
+    shown = [window for i, window in enumerate(windows) if i in kept or window.image in mistakes]
+    views = [_view(evaluation, window) for window in shown]
+    places = {view[name] for view in views for name in ('place', 'true')}
+    curves = {'sequences': evaluation.sequence.curve, 'single images': evaluation.single.curve}
+    return {
+        'images': len(report.query),
+        'views': views,
+        'start': mistakes[0] if mistakes else len(report.query) // 2,
+        'queries': {window.image: _image(report.query, window.image) for window in shown},
+        'places': {place: _image(report.reference, place) for place in sorted(places)},
+        'curves': {name: _points(curve) for name, curve in curves.items()},
+    }
+
+
+def _points(curve: np.ndarray) -> list[list[float]]:
+    """Return some points of a curve: the first, the last, some between."""
+    kept = np.unique(np.linspace(0, len(curve) - 1, min(len(curve), POINTS)).round().astype(int))
+    return np.round(curve[kept], 6).tolist()
+
+
+def _view(evaluation: Evaluation, window: WindowDistances) -> dict[str, Any]:
+    """Return a window for the script; its distances as bytes: 0 near, 254 far, 255 none."""
+    matches, truth = evaluation.results.sequence, evaluation.ground_truth
+    rows, columns = window.distances.shape
+    low, high = np.nanmin(window.distances), np.nanmax(window.distances)
+    share = (window.distances - low) / max(float(high - low), 1e-9)
+    cells = np.where(np.isnan(share), 255, np.round(np.nan_to_num(share) * 254)).astype(np.uint8)
+    place, score = int(matches.best[window.image]), float(matches.scores[window.image])
+    return {
+        'image': window.image,
+        'newest': window.newest,
+        'first': window.first,
+        'rows': rows,
+        'columns': columns,
+        'cells': base64.b64encode(cells.tobytes()).decode(),
+        'path': window.path.tolist(),
+        'truth': _true_stretches(truth, window),
+        'place': place,
+        'single': int(evaluation.results.single.best[window.image]),
+        'true': int(truth.middles[window.image]),
+        'right': bool(place in truth.accepted(window.image)),
+        'accepted': score < evaluation.sequence.best.threshold,
+        'score': score,
+    }
+
+
+def _true_stretches(truth: GroundTruth, window: WindowDistances) -> list[list[int]]:
+    """Return the true places of a window: position, first and last place of each stretch."""
+    rows, columns = window.distances.shape
+    stretches: list[list[int]] = []
+    for row in range(rows):
+        places = truth.accepted(window.newest - rows + 1 + row)
+        places = places[(places >= window.first) & (places < window.first + columns)]
+        parts = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)
+        stretches += [[row, int(part[0]), int(part[-1])] for part in parts if len(part)]
+    return stretches

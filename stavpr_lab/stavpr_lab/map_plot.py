@@ -1,0 +1,98 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``map info --plot``: the route with its poses, thumbnails, and the map compared with itself."""
+
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from stavpr_lab.evaluation.plots import color_bar, page, QUIET, SCALE
+from stavpr_ros.mapping import PlaceMap, select_places
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.robust import evenly
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+COMPARED = 500  # places of the matrix, at most
+SHOWN = 8  # thumbnails
+
+
+def plot_map(place_map: PlaceMap, path: Path) -> None:
+    """Draw an opened map to a PNG file; of a long map, some places evenly."""
+    with page(path, 13, 7.4) as figure:
+        halves: Any = figure.subfigures(1, 2, width_ratios=(1, 1.2))
+        left, right = halves
+        if place_map.has_poses:
+            top, bottom = left.subfigures(2, 1, height_ratios=(1.3, 1))
+            _draw_route(top.subplots(), place_map)
+            _draw_thumbnails(bottom, place_map, 4)
+        else:
+            _draw_thumbnails(left, place_map, 2)
+        _draw_matrix(right, right.subplots(), place_map)
+
+
+def _runs(place_map: PlaceMap) -> list[tuple[str, np.ndarray]]:
+    """Return name and places of each session."""
+    index = place_map.session_index
+    if index is None:
+        return [('', np.arange(len(place_map)))]
+    return [
+        (session.id, np.flatnonzero(index == number))
+        for number, session in enumerate(place_map.sessions)
+    ]
+
+
+def _draw_route(axes: 'Axes', place_map: PlaceMap) -> None:
+    axes.set_title('route, seen from above', fontsize=10.5, loc='left')
+    assert place_map.poses is not None
+    for name, places in _runs(place_map):
+        x, y = place_map.poses[places, :2].T
+        (line,) = axes.plot(x, y, '.-', ms=3, lw=1, label=name)
+        known = np.flatnonzero(np.isfinite(x))
+        if not len(known):
+            continue
+        axes.plot(x[known[0]], y[known[0]], 'o', ms=7, mfc='white', color=line.get_color())
+        for place in known[evenly(len(known), 6)[1:]].tolist():
+            at = (float(x[place]), float(y[place]))
+            axes.annotate(str(places[place]), at, fontsize=8.5, color=QUIET)
+    axes.set_aspect('equal', adjustable='datalim')
+    axes.set(xlabel='x in m; circle: first place, numbers: places', ylabel='y in m')
+    if place_map.sessions:
+        axes.legend(loc='best')
+
+
+def _draw_thumbnails(figure: 'SubFigure', place_map: PlaceMap, columns: int) -> None:
+    places = evenly(len(place_map), SHOWN).tolist()
+    grid = figure.subplots(SHOWN // columns, columns, squeeze=False)
+    for axes in grid.flat:
+        axes.set_axis_off()
+    for axes, place in zip(grid.flat, places, strict=False):
+        image = place_map.thumbnail(place)
+        axes.set_title(f'place {place}', fontsize=9.5, color=QUIET)
+        if image is None:
+            axes.text(0.5, 0.5, 'no thumbnail', ha='center', va='center', color=QUIET)
+        else:
+            axes.imshow(image, interpolation='lanczos')
+
+
+def _draw_matrix(figure: 'Figure | SubFigure', axes: 'Axes', place_map: PlaceMap) -> None:
+    """Draw the distances of places to each other, as mode robust compares images."""
+    n, places = len(place_map), evenly(len(place_map), COMPARED)
+    some = select_places(place_map, places)
+    distances = PlaceRecognizer(some, RecognizerSettings(0.5, mode='robust')).distances(
+        some.features
+    )
+    extent = (-0.5, n - 0.5, n - 0.5, -0.5)
+    away = distances[~np.eye(len(some), dtype=bool)]
+    low, high = np.quantile(away, [0.002, 0.995]) if away.size else (0.0, 1.0)
+    image = axes.imshow(distances, extent=extent, cmap=SCALE, vmin=low, vmax=max(high, low + 1e-6))
+    for _, session in _runs(place_map)[1:]:
+        if len(session):
+            axes.axhline(session[0] - 0.5, color='#ff5440', lw=1)
+            axes.axvline(session[0] - 0.5, color='#ff5440', lw=1)
+    borders = '; red: borders of sessions' if len(place_map.sessions) > 1 else ''
+    axes.set_title(f'distance of places to each other{borders}', fontsize=10.5, loc='left')
+    axes.set(xlabel='place', ylabel='place')
+    color_bar(figure, image, axes)

@@ -1,0 +1,29 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Package description for ``colcon build``; the setup.py of stavpr_ros has that for pip."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = 'stavpr_slam'
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='SLAM with the loop closures of stavpr_ros: pose graph and bridges.',
+    license='Apache-2.0',
+    author='The stavpr_ros authors',
+    maintainer='The stavpr_ros maintainers',
+    maintainer_email='maintainers@stavpr-ros.org',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={'': ['py.typed', '*.html', '*.jinja']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'lib/{NAME}', sorted(glob('scripts/*'))),
+    ],
+    python_requires='>=3.11',
+    install_requires=['gtsam>=4.2', 'numpy>=1.26', 'scipy>=1.11', 'stavpr_ros'],
+    zip_safe=False,
+)

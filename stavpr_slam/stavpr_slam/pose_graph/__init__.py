@@ -1,0 +1,22 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Loop closures and odometry become one trajectory: a pose graph, solved with GTSAM."""
+
+from stavpr_slam.pose_graph.alignment import align_maps
+from stavpr_slam.pose_graph.closures import Closure
+from stavpr_slam.pose_graph.consistency import ConsistencySettings
+from stavpr_slam.pose_graph.graph import GraphEdge, GraphSettings, PoseGraph
+from stavpr_slam.pose_graph.odometry import ChainSettings, OdometryNoise
+from stavpr_slam.pose_graph.offline import optimize
+
+__all__ = [
+    'ChainSettings',
+    'Closure',
+    'ConsistencySettings',
+    'GraphEdge',
+    'GraphSettings',
+    'OdometryNoise',
+    'PoseGraph',
+    'align_maps',
+    'optimize',
+]

@@ -1,0 +1,89 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Pose graphs as text: g2o, and trajectories in the format of the TUM benchmark."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.mapping.trajectory import SECOND
+from stavpr_ros.mapping.transforms import inverse, to_poses
+from stavpr_ros.output_file import FileKind, Force, write_output
+from stavpr_slam.pose_graph.graph import PoseGraph
+
+TUM_HEADER = '# timestamp tx ty tz qx qy qz qw\n'
+TUM = FileKind('trajectory', lambda head: head.startswith(TUM_HEADER.encode()))
+G2O = FileKind('g2o file', lambda head: head.startswith((b'VERTEX_SE3:QUAT', b'# g2o')))
+
+
+def tum_text(stamps: np.ndarray, poses: np.ndarray) -> str:
+    """
+    Return a trajectory in the TUM format.
+
+    :param stamps: ns, shape (N,); poses of NaN are left out.
+    :param poses: shape (N, 7).
+    """
+    lines = [
+        f'{stamp // SECOND}.{stamp % SECOND:09d} ' + ' '.join(f'{value:.9g}' for value in pose)
+        for stamp, pose in zip(stamps.tolist(), poses, strict=True)
+        if np.isfinite(pose).all()
+    ]
+    return TUM_HEADER + '\n'.join(lines) + '\n'
+
+
+def g2o_text(graph: PoseGraph) -> str:
+    """Return the nodes as solved, the odometry and the accepted closures in the g2o format."""
+    count = len(graph.solved)
+    lines = ['# g2o: accepted closures only']
+    poses = to_poses(graph.solved)
+    lines += [f'VERTEX_SE3:QUAT {i} {_numbers(pose)}' for i, pose in enumerate(poses)]
+    T, previous = graph.chain.transforms, graph.chain.previous
+    travelled, noise = graph.chain.travelled, graph.noise
+    for node in range(count):
+        before = int(previous[node])
+        if before < 0:
+            continue
+        step = max(float(travelled[node] - travelled[before]), 0.05)
+        variance = np.repeat([noise.rotation**2 * step, noise.translation**2 * step], 3)
+        lines.append(_edge(before, node, inverse(T[before]) @ T[node], np.diag(variance)))
+    for edge in graph.used.values():
+        lines.append(_edge(edge.place, edge.query, edge.transform, edge.covariance))
+    return '\n'.join(lines) + '\n'
+
+
+def _edge(start: int, end: int, transform: np.ndarray, covariance: np.ndarray) -> str:
+    """Return an edge; g2o has the translation first, and half the rotation as a quaternion's."""
+    order = [3, 4, 5, 0, 1, 2]
+    information = np.linalg.inv(covariance)[np.ix_(order, order)]
+    half = np.diag([1, 1, 1, 2, 2, 2])
+    upper = (half @ information @ half)[np.triu_indices(6)]
+    return f'EDGE_SE3:QUAT {start} {end} {_numbers(to_poses(transform))} {_numbers(upper)}'
+
+
+def _numbers(values: np.ndarray) -> str:
+    return ' '.join(f'{value:.9g}' for value in values)
+
+
+def save_graph(graph: PoseGraph, path: str, force: Force = False) -> int:
+    """
+    Write the graph, ``.g2o``, or its trajectory, ``.tum``; return the number of nodes.
+
+    :raises SettingsError: another suffix.
+    :raises OutputError: it cannot be written, or exists.
+    """
+    suffix = Path(path).suffix
+    kinds: dict[str, tuple[FileKind, Callable[[], str]]] = {
+        '.g2o': (G2O, lambda: g2o_text(graph)),
+        '.tum': (TUM, lambda: _trajectory(graph)),
+    }
+    if suffix not in kinds:
+        raise SettingsError(f'{path}: expected a name that ends in .g2o or .tum')
+    kind, text = kinds[suffix]
+    write_output(path, text(), kind, force)
+    return len(graph.solved)
+
+
+def _trajectory(graph: PoseGraph) -> str:
+    stamps, _, corrected = graph.chain.trajectory(graph.solved)
+    return tum_text(stamps, to_poses(corrected))

@@ -1,0 +1,63 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Angles, covariances, logarithms and adjoints of rigid transforms, many at once."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from stavpr_ros.mapping.transforms import cross
+
+
+def angles(transforms: np.ndarray) -> np.ndarray:
+    """Return the angles of rotation of transforms (..., 4, 4), radians."""
+    trace = np.trace(transforms[..., :3, :3], axis1=-2, axis2=-1)
+    result: np.ndarray = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    return result
+
+
+def planar_poses(poses: np.ndarray) -> np.ndarray:
+    """Return planar poses (N, 3), x y and yaw in radians, as poses (N, 7)."""
+    result = np.zeros((len(poses), 7))
+    result[:, :2] = poses[:, :2]
+    result[:, 5], result[:, 6] = np.sin(poses[:, 2] / 2), np.cos(poses[:, 2] / 2)
+    return result
+
+
+def body_covariance(covariance: np.ndarray, transform: np.ndarray) -> np.ndarray:
+    """
+    Return the covariance of a pose in the axes of its own frame, rotation first.
+
+    :param covariance: as in ``geometry_msgs/PoseWithCovariance``: x y z and rotations about the
+        fixed axes of the parent frame, shape (6, 6).
+    :param transform: the pose, shape (4, 4).
+    :returns: that of ``Z Exp([rotation, translation])``, as GTSAM has it, shape (6, 6).
+    """
+    turn = transform[:3, :3].T
+    change = np.zeros((6, 6))
+    change[:3, 3:] = change[3:, :3] = turn
+    result: np.ndarray = change @ covariance @ change.T
+    return result
+
+
+def logarithms(motions: np.ndarray) -> np.ndarray:
+    """
+    Return the logarithms of motions (n, 4, 4), rotation first, shape (n, 6).
+
+    A turn about any one point is exact (Sola et al., *A micro Lie theory for state estimation in
+    robotics*, 2018, equations 174 and 179).
+    """
+    turn = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
+    half = np.maximum(np.linalg.norm(turn, axis=1), 1e-4) / 2
+    hat, shift = cross(turn), motions[:, :3, 3, None]
+    once = hat @ shift
+    rest = (1 - half / np.tan(half)) / (4 * half**2)
+    moved = shift - once / 2 + rest[:, None, None] * (hat @ once)
+    return np.concatenate([turn, moved[:, :, 0]], axis=1)
+
+
+def adjoints(motions: np.ndarray) -> np.ndarray:
+    """Return the adjoints of motions (n, 4, 4), rotation first, shape (n, 6, 6)."""
+    R = motions[:, :3, :3]
+    result = np.zeros((len(motions), 6, 6))
+    result[:, :3, :3] = result[:, 3:, 3:] = R
+    result[:, 3:, :3] = cross(motions[:, :3, 3]) @ R
+    return result

@@ -1,0 +1,232 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What all bridges have in common: parameters, loop closures in, counts, diagnostics."""
+
+from collections import Counter
+import importlib
+import math
+from typing import Any, ClassVar
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from stavpr_msgs.msg import LoopClosure
+from stavpr_ros.errors import InputError, SettingsError, UnavailableError
+from stavpr_ros.ros.diagnostics import one_status
+from stavpr_ros.ros.output import nanoseconds
+from stavpr_ros.ros.subscriptions import odometry_pose
+from stavpr_slam.pose_graph import Closure
+from stavpr_slam.pose_graph.foreign import ForeignKeyframes, keyframe_edge, KeyframeEdge
+from stavpr_slam.ros.graph_messages import closure_of, pose_array
+
+CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+PERIOD = 1.0  # seconds between two diagnostics
+MAX_PENDING = 1000  # closures that wait for keyframes
+REMEDIES = {
+    'without_relative_pose': 'the closures are of appearance alone: set camera_info and odom of '
+    'the recognition node',
+    'no_keyframe': 'no keyframe near the stamps of the images: is it the same clock and odometry?',
+    'on_a_map': 'the places are of a map, not of this drive: use operation loop_closure',
+    'not_on_a_map': 'the places are of this drive: use operation localization, a map with poses',
+    'not_pnp': 'the closures are not by PnP: set camera_info of the recognition node',
+}
+
+
+def interfaces(package: str, source: str, kind: str = 'msg') -> Any:
+    """
+    Import the interfaces of another package.
+
+    :param source: where the package is from.
+    :param kind: 'msg' or 'srv'.
+    :raises UnavailableError: it is not installed.
+    """
+    try:
+        return importlib.import_module(f'{package}.{kind}')
+    except ImportError as error:
+        raise UnavailableError(
+            f'this bridge requires the package {package} ({source}): install or build it, and '
+            'source its workspace before the bridge is started'
+        ) from error
+
+
+class Bridge(Node):
+    """
+    Passes loop closures of ``stavpr/loop_closure`` on; a subclass has its target.
+
+    :raises UnavailableError: the messages of the target are not installed.
+    :raises SettingsError: an invalid parameter.
+    """
+
+    NAME: ClassVar[str]
+    PARAMETERS: ClassVar[dict[str, tuple[Any, str]]]
+
+    def __init__(self) -> None:
+        super().__init__(f'{self.NAME}_bridge')
+        self.given = {
+            name: self.declare_parameter(name, default).value
+            for name, (default, _) in self.PARAMETERS.items()
+        }
+        self.counts: Counter[str] = Counter()
+        self.create_subscription(LoopClosure, 'stavpr/loop_closure', self._on_closure, CLOSURE_QOS)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(PERIOD, self.on_timer, clock=steady)
+
+    def seconds(self, name: str) -> float:
+        """
+        Return a parameter.
+
+        :raises SettingsError: it is not a number above 0.
+        """
+        value = self.given[name]
+        if not (math.isfinite(value) and value > 0):
+            raise SettingsError(f'{name} = {value}: expected a number of seconds above 0')
+        return float(value)
+
+    def take(self, message: LoopClosure) -> str:
+        """Pass a closure on; return why it is not, empty = it is, or waits."""
+        raise NotImplementedError
+
+    def _on_closure(self, message: LoopClosure) -> None:
+        self.counts['closures'] += 1
+        try:
+            cause = self.take(message)
+        except InputError as error:
+            cause = 'invalid'
+            self.get_logger().warning(f'closure rejected: {error}', throttle_duration_sec=10.0)
+        if cause:
+            self.counts[cause] += 1
+
+    def on_timer(self) -> None:
+        """Publish the diagnostics."""
+        counts = self.counts
+        level, text = DiagnosticStatus.OK, f'{counts["sent"]} closures sent'
+        causes = [(counts[cause], cause) for cause in REMEDIES if counts[cause]]
+        if not counts['closures']:
+            level = DiagnosticStatus.WARN
+            text = f'no closures on {self.resolve_topic_name("stavpr/loop_closure")}: remap it'
+        elif not counts['sent'] and causes:
+            level, text = DiagnosticStatus.WARN, REMEDIES[max(causes)[1]]
+        self._diagnostics.publish(one_status(self, 'bridge', level, text, counts))
+
+
+class EdgeBridge(Bridge):
+    """Passes loop closures on as edges between the keyframes of the target."""
+
+    PARAMETERS: ClassVar[dict[str, tuple[Any, str]]] = {
+        'max_keyframe_gap': (2.0, 'seconds between an image and its keyframe at most, above 0'),
+        'independent_only': (
+            True,
+            'only edges whose errors do not correlate with those of the edge before',
+        ),
+        'pnp_only': (False, 'only edges by PnP, none that are aligned by odometry'),
+    }
+    ROBOTS: ClassVar[dict[str, tuple[Any, str]]] = {
+        'robot_id': (0, 'number of this robot in the target'),
+        'place_robot_id': (
+            -1,
+            'number of the robot that recorded the map, for operation localization; -1 = the '
+            'places are of this drive',
+        ),
+    }
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._pending: list[tuple[LoopClosure, Closure]] = []
+        self._sent: set[tuple[int, int]] = set()
+        self.robot = int(self.given.get('robot_id', 0))
+        other = int(self.given.get('place_robot_id', -1))
+        self.place_robot = self.robot if other < 0 else other
+        gap = self.seconds('max_keyframe_gap')
+        self.keyframes = {robot: ForeignKeyframes(gap) for robot in (self.robot, self.place_robot)}
+        topics = {self.place_robot: 'place_odom', self.robot: 'odom'}
+        for robot, topic in topics.items():
+            self.create_subscription(
+                Odometry,
+                topic,
+                lambda message, robot=robot: self._on_odometry(message, robot),
+                ODOMETRY_QOS,
+            )
+
+    def send(self, edge: KeyframeEdge, message: LoopClosure) -> None:
+        """Pass an edge on."""
+        raise NotImplementedError
+
+    def ready(self) -> bool:
+        """Return whether the target takes edges; they wait until it does."""
+        return True
+
+    def on_keyframe(self, robot: int, stamp: int, number: int) -> None:
+        """Note a keyframe of the target, and send the closures that waited for it."""
+        if robot in self.keyframes and stamp > 0:
+            self.keyframes[robot].add(stamp, number)
+            self._send_pending()
+
+    def on_timer(self) -> None:
+        """Send what waited for the target, and publish the diagnostics."""
+        self._send_pending()
+        self.counts['waiting'] = len(self._pending)
+        self.counts['keyframes'] = sum(len(each) for each in self.keyframes.values())
+        super().on_timer()
+
+    def _on_odometry(self, message: Odometry, robot: int) -> None:
+        try:
+            self.keyframes[robot].add_odometry(
+                nanoseconds(message.header.stamp), odometry_pose(message)
+            )
+        except InputError as error:
+            self.counts['invalid_odometry'] += 1
+            self.get_logger().warning(f'odometry rejected: {error}', throttle_duration_sec=10.0)
+
+    def take(self, message: LoopClosure) -> str:
+        """Let an edge wait for its keyframes."""
+        relative = message.relative_pose
+        if message.query_index < 0 and self.place_robot == self.robot:
+            return 'on_a_map'
+        if message.query_index >= 0 and self.place_robot != self.robot:
+            return 'not_on_a_map'
+        closure = closure_of(message, appearance=False)
+        if closure is None:
+            return 'without_relative_pose'
+        if self.given['pnp_only'] and relative.source != relative.PNP:
+            return 'not_pnp'
+        if self.given['independent_only'] and not relative.is_independent:
+            return 'not_independent'
+        self._pending.append((message, closure.checked()))
+        if len(self._pending) > MAX_PENDING:
+            del self._pending[0]
+            self.counts['no_keyframe'] += 1
+        self._send_pending()
+        return ''
+
+    def _send_pending(self) -> None:
+        """Send the edges whose keyframes are known; those of later stamps wait."""
+        queries, places = self.keyframes[self.robot], self.keyframes[self.place_robot]
+        if not self.ready():
+            return
+        waiting = []
+        for message, closure in self._pending:
+            if closure.query_stamp > queries.newest or not len(places):
+                waiting.append((message, closure))
+                continue
+            known = message.has_poses
+            query = queries.near(
+                closure.query_stamp, pose_array(message.query_pose) if known else None
+            )
+            place = places.near(
+                closure.place_stamp, pose_array(message.place_pose) if known else None
+            )
+            if query is None or place is None:
+                self.counts['no_keyframe'] += 1
+            elif (place[0], query[0]) in self._sent or (
+                place[0] == query[0] and self.place_robot == self.robot
+            ):
+                self.counts['same_keyframes'] += 1
+            else:
+                self._sent.add((place[0], query[0]))
+                self.send(keyframe_edge(closure, place, query), message)
+                self.counts['sent'] += 1
+        self._pending = waiting

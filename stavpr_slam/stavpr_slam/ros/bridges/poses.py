@@ -1,0 +1,91 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Poses on a map, for filters and priors: ``geometry_msgs/PoseWithCovarianceStamped``."""
+
+from typing import Any, ClassVar
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
+from stavpr_msgs.msg import LoopClosure
+from stavpr_ros.mapping.trajectory import checked_pose, SECOND
+from stavpr_ros.mapping.transforms import matrices, to_poses
+from stavpr_ros.ros.output import nanoseconds, pose_message
+from stavpr_slam.ros.bridges.bridge import Bridge
+from stavpr_slam.ros.graph_messages import closure_of, pose_array
+
+
+class PoseBridge(Bridge):
+    """
+    Publishes the pose of the query in the frame of the map, by the place and the relative pose.
+
+    The covariance is that of the relative pose; the poses of the map count as exact.
+    """
+
+    TOPIC: ClassVar[str]
+    PARAMETERS: ClassVar[dict[str, tuple[Any, str]]] = {
+        'pnp_only': (False, 'only poses by PnP, none that are aligned by odometry'),
+    }
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._publisher = self.create_publisher(PoseWithCovarianceStamped, self.TOPIC, 10)
+
+    def frame(self, message: LoopClosure) -> str:
+        """Return the frame_id of the pose."""
+        return str(message.pose_frame)
+
+    def wanted(self, message: LoopClosure) -> str:
+        """Return why a pose is left out, empty = it is not."""
+        return '' if message.relative_pose.is_independent else 'not_independent'
+
+    def take(self, message: LoopClosure) -> str:
+        """Publish the pose of a closure on a map."""
+        relative = message.relative_pose
+        if message.query_index >= 0 or not message.has_poses:
+            return 'not_on_a_map'
+        closure = closure_of(message, appearance=False)
+        if closure is None:
+            return 'without_relative_pose'
+        if self.given['pnp_only'] and relative.source != relative.PNP:
+            return 'not_pnp'
+        closure = closure.checked()
+        if cause := self.wanted(message):
+            return cause
+        place = matrices(checked_pose(pose_array(message.place_pose)))
+        turn = np.kron(np.eye(2), place[:3, :3])
+        result = PoseWithCovarianceStamped()
+        result.header.stamp, result.header.frame_id = relative.query_stamp, self.frame(message)
+        result.pose.pose = pose_message(to_poses(place @ matrices(closure.pose)))
+        result.pose.covariance = (turn @ closure.covariance @ turn.T).ravel()
+        self._publisher.publish(result)
+        self.counts['sent'] += 1
+        return ''
+
+
+class RobotLocalizationBridge(PoseBridge):
+    """
+    Publishes ``~/pose`` for a ``poseN`` of robot_localization, once per relocalization.
+
+    Errors of successive poses correlate, and a filter that fuses each of them becomes too certain.
+    """
+
+    NAME, TOPIC = 'robot_localization', '~/pose'
+    PARAMETERS: ClassVar[dict[str, tuple[Any, str]]] = {
+        **PoseBridge.PARAMETERS,
+        'relocalization_gap': (
+            10.0,
+            'seconds without a match on the map after which the next one is published, above 0',
+        ),
+    }
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._gap = round(self.seconds('relocalization_gap') * SECOND)
+        self._last = -self._gap - 1
+
+    def wanted(self, message: LoopClosure) -> str:
+        """Leave out all but the first closure after a gap."""
+        stamp = nanoseconds(message.relative_pose.query_stamp)
+        lost = not 0 <= stamp - self._last <= self._gap
+        self._last = stamp
+        return '' if lost else 'not_relocalized'
