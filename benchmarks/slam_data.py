@@ -19,7 +19,7 @@ import numpy as np
 from results import environment, RESULTS, ROOT, table
 from slam import ate, DRIFTS
 from slam_pairs import recognize, with_edges
-from stavpr_lab.demonstration.street.laps import drifted, LapDrive, RingWorld
+from stavpr_lab.demonstration.street.laps import LapDrive, RingWorld
 from stavpr_lab.demonstration.street.traverses import LENGTH
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.plots import page
@@ -27,6 +27,7 @@ from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.sources import open_source
 from stavpr_slam.pose_graph import optimize
 from stavpr_slam.pose_graph.transforms import planar_poses
+from stavpr_slam.simulated_odometry import drifted
 from tqdm import tqdm
 
 HALLWAY_LENGTH = 40.0  # meters of a lap; those of Gardens Point get that of the street

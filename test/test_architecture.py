@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The order of the package: imports between folders, cycles, and the files on an image's way."""
+"""The order of the packages and their folders, cycles, and the files on an image's way."""
 
 import ast
 from pathlib import Path
@@ -11,7 +11,14 @@ from pipelines import message, process, recorded, SECOND
 import pytest
 import stavpr_ros
 
-PACKAGE = Path(__file__).resolve().parents[1] / 'stavpr_ros'
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / 'stavpr_ros'
+PACKAGES = ('stavpr_msgs', 'stavpr_ros', 'stavpr_slam', 'stavpr_lab')
+"""Each may import those before it."""
+FOLDERS = {name: ROOT / name / name for name in PACKAGES[2:]} | {'stavpr_ros': PACKAGE}
+TESTS = {name: ROOT / name / 'test' for name in PACKAGES[2:]} | {'stavpr_ros': ROOT / 'test'}
+NEED_SLAM = {'demonstration/slam.py', 'demonstration/street/laps.py'}
+"""Modules of stavpr_lab that need stavpr_slam, imported within functions only."""
 ROS = {'rclpy', 'ament_index_python', 'stavpr_msgs', 'rcl_interfaces', 'builtin_interfaces'}
 ROS |= {
     f'{name}_msgs'
@@ -29,12 +36,9 @@ MAY_IMPORT = {
     'recognition': {'alignment', 'features', 'mapping'},
     'fleet': {'alignment', 'features', 'mapping', 'recognition'},
     'relative_pose': {'alignment', 'features', 'mapping', 'recognition'},
-    'pipeline': {'fleet', *CORE[:6]},
-    'pose_graph': {'mapping'},
-    'evaluation': set(CORE[:5]),
-    'demonstration': {'evaluation', 'pose_graph', *CORE},
-    'ros': {'pose_graph', *CORE},
-    'commands': {'ros', 'demonstration', 'evaluation', 'pose_graph', 'fleet', *CORE},
+    'pipeline': set(CORE[:6]),
+    'ros': set(CORE),
+    'commands': {'ros', *CORE},
 }
 # On an image's way as well, but not traced: compiled code does not report its calls, and these
 # files of the node run before and after the pipeline, in the executor's and the worker's thread.
@@ -49,17 +53,17 @@ MOST_FILES = 20
 
 
 MODULES = {
-    '.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts).removesuffix(
-        '.__init__'
-    ): path
-    for path in sorted(PACKAGE.rglob('*.py'))
+    '.'.join(path.relative_to(folder.parent).with_suffix('').parts).removesuffix('.__init__'): path
+    for folder in FOLDERS.values()
+    for path in sorted(folder.rglob('*.py'))
 }
 
 
-def imported_modules(path: Path) -> set[str]:
+def imported_modules(path: Path, at_top: bool = False) -> set[str]:
     """Modules that a file imports, at its top or in a function."""
     modules = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    tree = ast.parse(path.read_text())
+    for node in tree.body if at_top else ast.walk(tree):
         if isinstance(node, ast.Import):
             modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -77,6 +81,27 @@ def on_a_cycle(arrows: dict[str, set[str]]) -> list[str]:
         if kept == left:
             return sorted(left)
         left = kept
+
+
+@pytest.mark.parametrize('package', FOLDERS)
+def test_package_and_its_tests_import_only_those_below_it(package):
+    above = PACKAGES[PACKAGES.index(package) + 1 :]
+    for folder in (FOLDERS[package], TESTS[package]):
+        files = sorted(folder.rglob('*.py'))
+        assert files
+        for path in files:
+            found = {module.split('.')[0] for module in imported_modules(path)}
+            assert not found & set(above), f'{path} imports {found & set(above)}'
+
+
+def test_slam_is_optional_for_the_laboratory():
+    folder = FOLDERS['stavpr_lab']
+    optional = {'.'.join(('stavpr_lab', *Path(name[:-3]).parts)) for name in NEED_SLAM}
+    for path in folder.rglob('*.py'):
+        if path.relative_to(folder).as_posix() not in NEED_SLAM:
+            modules = imported_modules(path, at_top=True)
+            assert not modules & optional, path
+            assert not {module for module in modules if module.startswith('stavpr_slam')}, path
 
 
 @pytest.mark.parametrize('folder', list(MAY_IMPORT))

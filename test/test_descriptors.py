@@ -9,7 +9,8 @@ from evaluation_commands import runner, write_images
 import numpy as np
 import pytest
 from scipy.io import savemat
-from stavpr_ros.commands import build_map, evaluate
+from stavpr_lab.commands import evaluate
+from stavpr_ros.commands import build_map
 from stavpr_ros.errors import FeatureMismatchError, SourceError, UnavailableError
 from stavpr_ros.features import descriptors
 from stavpr_ros.features.descriptors import (

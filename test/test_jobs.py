@@ -7,10 +7,11 @@ from pathlib import Path
 import subprocess
 import sys
 
-from conftest import route_images
 import cv2
+from fixtures import route_images
 import pytest
-from stavpr_ros.commands import build_map, evaluate, jobs
+from stavpr_lab.commands import evaluate
+from stavpr_ros.commands import build_map, jobs
 from stavpr_ros.commands.jobs import Job, job_names, other_arguments, run_jobs
 from stavpr_ros.errors import SettingsError
 

@@ -317,7 +317,7 @@ def test_discarded_places_stay_in_their_journal(start, small_map, route, target,
 FULL = """
 import resource, signal, sys
 from pipelines import process, settings_of
-from conftest import route_images
+from fixtures import route_images
 from stavpr_ros.mapping.journal import recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.pipeline import Pipeline

@@ -16,8 +16,8 @@ import sys
 from types import ModuleType, SimpleNamespace
 
 from ament_index_python.packages import get_package_share_directory
-from conftest import route_images
 import cv2
+from fixtures import route_images
 from processes import environment, executable
 import pytest
 from stavpr_ros.parameters import BY_NAME

@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 from unittest.mock import patch
 
-from conftest import route_images
+from fixtures import route_images
 from map_examples import example_map
 from map_files import parts_of, tensor, version2
 import numpy as np

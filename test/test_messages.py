@@ -7,7 +7,7 @@ from dataclasses import replace
 import math
 
 from builtin_interfaces.msg import Time
-from conftest import route_images
+from fixtures import route_images
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Operation loop_closure over ROS: a synthetic loop with odometry."""
 
-from conftest import route_images
+from fixtures import route_images
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 import pytest

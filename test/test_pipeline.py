@@ -5,8 +5,8 @@
 from dataclasses import replace
 import itertools
 
-from conftest import route_images
 import cv2
+from fixtures import route_images
 import numpy as np
 from pipelines import (
     at,

@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from conftest import route_images
+from fixtures import route_images
 import numpy as np
 import pytest
 from stavpr_lab.evaluation.evaluate import recognize_all

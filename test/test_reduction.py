@@ -5,7 +5,8 @@
 import cv2
 import numpy as np
 import pytest
-from stavpr_ros.commands import build_map, evaluate
+from stavpr_lab.commands import evaluate
+from stavpr_ros.commands import build_map
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor

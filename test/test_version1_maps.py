@@ -14,8 +14,8 @@ are the random ones of conftest.py, whose files are equal to the bit on every ma
 import json
 from pathlib import Path
 
-from conftest import route_images
 import cv2
+from fixtures import route_images
 import numpy as np
 import pytest
 from stavpr_ros.alignment import SequenceSettings

@@ -31,6 +31,7 @@ from stavpr_lab.demonstration.street.traverses import (
     World,
 )
 from stavpr_ros.sources.frame import Frame
+from stavpr_slam.simulated_odometry import drifted, relative_poses
 
 OTHER_LIGHT = replace(
     GOOD_LIGHT, sun=0.25, sun_azimuth=250.0, sun_elevation=20.0, clouds=0.7, ambient=0.55,
@@ -43,15 +44,6 @@ CARRIED = slice(480, 540)  # images left out where the robot is carried, on lap 
 NEXT_DAY = 86_400 * 10**9
 CAMERA_IN_BASE = np.array([0.0, 0.0, EYE, -0.5, 0.5, -0.5, 0.5])
 """Pose of the camera's optical frame in the base's, x y z and quaternion x y z w."""
-
-# Odometry at drift 1: deviation of the scale of a step, per step; of the heading, per square root
-# of a meter; bias of the heading, per meter; bias of the scale.
-SCALE_NOISE, HEADING_NOISE, HEADING_BIAS, SCALE_BIAS = (
-    0.02,
-    np.radians(0.5),
-    np.radians(0.02),
-    0.01,
-)
 
 
 @dataclass(frozen=True)
@@ -225,37 +217,5 @@ def drive_laps(
     odometry = drifted(truth, moved, np.random.default_rng([seed, draw]), drift)
     for number in range(1, sessions):
         own = session == number
-        odometry[own] = _relative(odometry[own][0], odometry[own])
+        odometry[own] = relative_poses(odometry[own][0], odometry[own])
     return LapDrive(truth, odometry, stamps + session * NEXT_DAY, laps, images, session)
-
-
-def drifted(
-    truth: np.ndarray, moved: np.ndarray, dice: np.random.Generator, drift: float
-) -> np.ndarray:
-    """
-    Return what an odometry with errors makes of true poses.
-
-    :param truth: shape (N, 3).
-    :param moved: whether the odometry noticed the motion before each image, shape (N,).
-    :returns: shape (N, 3); the first is 0, 0, 0.
-    """
-    signs = dice.choice([-1, 1], 2)
-    result = np.zeros_like(truth)
-    for i in range(1, len(truth)):
-        step = _relative(truth[i - 1], truth[i : i + 1])[0] * moved[i]
-        length = float(np.hypot(*step[:2]))
-        scale = 1 + drift * (signs[0] * SCALE_BIAS + SCALE_NOISE * dice.normal())
-        turn = HEADING_NOISE * np.sqrt(length) * dice.normal() + signs[1] * HEADING_BIAS * length
-        yaw = result[i - 1, 2]
-        c, s = np.cos(yaw), np.sin(yaw)
-        result[i, :2] = result[i - 1, :2] + scale * (np.array([[c, -s], [s, c]]) @ step[:2])
-        result[i, 2] = yaw + step[2] + drift * turn
-    return result
-
-
-def _relative(origin: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Return planar poses (N, 3) in the frame of one, shape (3,)."""
-    c, s = np.cos(origin[2]), np.sin(origin[2])
-    return np.column_stack(
-        [(poses[:, :2] - origin[:2]) @ np.array([[c, -s], [s, c]]), poses[:, 2] - origin[2]]
-    )

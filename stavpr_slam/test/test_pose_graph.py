@@ -8,13 +8,13 @@ import sys
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from stavpr_lab.demonstration.street.laps import drifted
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import align_maps, Closure, optimize, PoseGraph
 from stavpr_slam.pose_graph.consistency import largest_consistent
 from stavpr_slam.pose_graph.files import save_graph
 from stavpr_slam.pose_graph.transforms import body_covariance, planar_poses
+from stavpr_slam.simulated_odometry import drifted
 
 SECOND = 10**9
 LAP = 100  # images of 2 m

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stavpr_lab.demonstration.street.laps import drifted
 from stavpr_slam.pose_graph import optimize
 from stavpr_slam.pose_graph.consistency import LIMIT
 from stavpr_slam.pose_graph.cycles import Cycles
@@ -14,6 +13,7 @@ from stavpr_slam.pose_graph.false_places import FalsePlaces
 from stavpr_slam.pose_graph.odometry import OdometryNoise
 from stavpr_slam.pose_graph.refutation import Refutation
 from stavpr_slam.pose_graph.transforms import planar_poses
+from stavpr_slam.simulated_odometry import drifted
 from test_pose_graph import circle, closure, error, solve
 from test_pose_graph_cycles import drive, LAP, laps, measured, PLANE
 

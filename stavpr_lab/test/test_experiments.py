@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's experiments: configurations, published numbers, and the command."""
 
-from conftest import route_images
 from evaluation_commands import read_json, runner, write_images
+from fixtures import route_images
 import numpy as np
 import pytest
 from stavpr_lab.commands import experiments

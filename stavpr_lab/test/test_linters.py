@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 NOT_OURS = {'build', 'install', 'log'}
 HEADER = ['# Copyright 2026 The stavpr_ros authors', '# SPDX-License-Identifier: Apache-2.0']
 # The rules that ament_pep257 ignores in ROS 2 Jazzy; it checks all others of pydocstyle.

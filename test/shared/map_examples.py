@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from unittest.mock import patch
 
-from conftest import route_images
+from fixtures import route_images
 import numpy as np
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.gradient import GradientSettings
@@ -14,7 +14,7 @@ from stavpr_ros.mapping import build_map, PlaceMap, save_map, Session
 from stavpr_ros.recognition import held_map
 from stavpr_ros.sources.frame import Frame
 
-VERSION1 = Path(__file__).parent / 'data' / 'version1'
+VERSION1 = Path(__file__).parents[1] / 'data' / 'version1'
 PLACES = 24
 
 

@@ -10,13 +10,16 @@ import sys
 
 from ament_index_python.packages import get_package_prefix
 from domain import DOMAIN
+from stavpr_ros.commands.stavpr import PACKAGES
 
 TIMEOUT = 60.0  # seconds until an expected event counts as missing
 SECOND = 10**9
 
 
 def executable(name: str) -> str:
-    return str(Path(get_package_prefix('stavpr_ros')) / 'lib' / 'stavpr_ros' / name)
+    """Return the file that ``ros2 run`` runs."""
+    package = PACKAGES.get(name, 'stavpr_ros')
+    return str(Path(get_package_prefix(package)) / 'lib' / package / name)
 
 
 def environment() -> dict[str, str]:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import os
 import re
 
-from conftest import route_images
 import cv2
 from evaluation_commands import read_json, runner, write_images
+from fixtures import route_images
 import numpy as np
 import pytest
 from stavpr_lab.commands import evaluate

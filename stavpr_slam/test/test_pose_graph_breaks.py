@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stavpr_lab.demonstration.street import laps
 from stavpr_ros.mapping.transforms import inverse
+from stavpr_slam import simulated_odometry
 from stavpr_slam.pose_graph import PoseGraph
 from stavpr_slam.pose_graph.odometry import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.refutation import Refutation
@@ -44,8 +44,8 @@ def test_ways_of_chain_far_from_origin_are_integrals(node):
 
 def test_optimize_heading_with_bias_rejects_no_closure(monkeypatch):
     """A constant bias of the heading turns the laps against each other."""
-    monkeypatch.setattr(laps, 'HEADING_BIAS', 0.0008)
-    monkeypatch.setattr(laps, 'HEADING_NOISE', 0.003)
+    monkeypatch.setattr(simulated_odometry, 'HEADING_BIAS', 0.0008)
+    monkeypatch.setattr(simulated_odometry, 'HEADING_NOISE', 0.003)
     truth = circle(3)
     # clusters end with a lap, and fewer than three closures are none
     known = [q for q in range(LAP, 3 * LAP) if q % LAP < 95]

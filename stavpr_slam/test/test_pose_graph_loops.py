@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 import pytest
-from stavpr_lab.demonstration.street.laps import drifted
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import Closure, PoseGraph
 from stavpr_slam.pose_graph.acceptance import Acceptance, LEAST_CLUSTERS, SCALES
 from stavpr_slam.pose_graph.cycles import Cycles
 from stavpr_slam.pose_graph.odometry import OdometryNoise
 from stavpr_slam.pose_graph.transforms import planar_poses
+from stavpr_slam.simulated_odometry import drifted
 from test_pose_graph import circle, error, LAP, SECOND, solve
 
 WIDE = np.diag([0.5, 1.25, 1.25, 0.05, 0.05, 0.05]) ** 2

@@ -16,7 +16,7 @@ import zipfile
 import pytest
 import setup_venv
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 GROUPS = ('torch', 'cuda', *(f'locked/{name}' for name in ('base', *setup_venv.LOCKED_EXTRAS)))
 LOCKED = setup_venv.LOCKED_EXTRAS
 EXACT = re.compile(r'^([\w.-]+)(?:\[\w+\])?==([\w.]+)', re.MULTILINE)

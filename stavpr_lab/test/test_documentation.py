@@ -8,14 +8,14 @@ from pathlib import Path
 import re
 import shlex
 
-from conftest import route_images
 from evaluation_commands import write_images
+from fixtures import route_images
 import pytest
 from stavpr_ros.commands import stavpr
 from stavpr_ros.parameters import PARAMETERS
 from stavpr_slam.ros.bridges.bridge import EdgeBridge
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').glob('*.md'))]
 README_LINES = 180
 NAMES = {row.name for row in PARAMETERS}

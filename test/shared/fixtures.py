@@ -1,0 +1,197 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Fixtures: the folder of real data, synthetic images and maps."""
+
+from collections import OrderedDict
+import os
+from pathlib import Path
+
+from domain import DOMAIN
+from hypothesis import settings
+import numpy as np
+import pytest
+from stavpr_ros.threads import wait_passively
+
+wait_passively()  # torch and numba are not imported yet
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+# of the processes that tests start: the domain, and the modules of this folder
+os.environ['ROS_DOMAIN_ID'] = str(DOMAIN)
+os.environ['PYTHONPATH'] = os.pathsep.join(
+    [str(Path(__file__).parent), *filter(None, [os.environ.get('PYTHONPATH')])]
+)
+# No deadline: a shared machine may be slow. Examples are random everywhere but in CI, where a
+# failure must be reproducible.
+settings.register_profile('stavpr', deadline=None, derandomize='CI' in os.environ)
+settings.load_profile('stavpr')
+
+
+@pytest.fixture(scope='session')
+def data_folder() -> Path:
+    """Return the folder of real images and bags: STAVPR_DATA, or the one beside the checkout."""
+    default = Path(__file__).resolve().parents[3] / 'shared' / 'data'
+    folder = Path(os.environ.get('STAVPR_DATA', default))
+    if not folder.is_dir():
+        pytest.skip('no data folder')
+    return folder
+
+
+@pytest.fixture(scope='session', autouse=True)
+def user_data(tmp_path_factory):
+    """Keep the user's own folder of maps out of the tests, also of their processes."""
+    os.environ['XDG_DATA_HOME'] = str(tmp_path_factory.mktemp('data'))
+
+
+def route_images(count: int, seed: int = 0, size: tuple[int, int] = (96, 128)) -> list[np.ndarray]:
+    """Return views of one long random texture, each a step further along it, RGB uint8."""
+    rng = np.random.default_rng(seed)
+    step, (height, width) = 24, size
+    coarse = rng.integers(0, 256, (height // 8, (count * step + width) // 8 + 1, 3), np.uint8)
+    texture = np.kron(coarse, np.ones((8, 8, 1), np.uint8))
+    return [np.ascontiguousarray(texture[:, i * step : i * step + width]) for i in range(count)]
+
+
+@pytest.fixture(scope='session')
+def route() -> list[np.ndarray]:
+    """Sixty views of a synthetic route."""
+    return route_images(60)
+
+
+@pytest.fixture(scope='session')
+def small_map(route):
+    """Return a map of the synthetic route, with all optional parts of a map."""
+    from stavpr_ros.features import FeatureExtractor
+    from stavpr_ros.mapping import build_map
+    from stavpr_ros.sources.frame import Frame
+
+    frames = [Frame(image, (i + 1) * 10**9, f'place {i}') for i, image in enumerate(route)]
+    poses = np.zeros((len(route), 7))
+    poses[:, 0], poses[:, 6] = np.arange(len(route)), 1
+    return build_map(frames, FeatureExtractor(projection=64), poses, progress=False)
+
+
+@pytest.fixture(scope='module')
+def one_thread():
+    """Limit the threads: waiting ones spin, 100 ms an image on a busy machine."""
+    from stavpr_ros.threads import limit_threads
+
+    limit_threads(1)
+    yield
+    limit_threads(0)
+
+
+@pytest.fixture(scope='module')
+def cuda_runtime():
+    """Return the CUDA runtime; skip where there is no device."""
+    from stavpr_ros.alignment.cuda.compilation import runtime
+    from stavpr_ros.errors import UnavailableError
+
+    try:
+        return runtime()
+    except UnavailableError as error:
+        pytest.skip(f'{error}; the same test runs in the simulator')
+
+
+@pytest.fixture
+def context():
+    """Yield an initialized ROS context."""
+    import rclpy
+
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    yield context
+    rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture(scope='module')
+def robot():
+    """Yield a robot with a camera: a ROS node beside the tested one."""
+    from robot import Robot
+
+    robot = Robot()
+    yield robot
+    robot.close()
+
+
+@pytest.fixture(scope='module')
+def map_file(small_map, tmp_path_factory) -> str:
+    """Save that map in a file."""
+    from stavpr_ros.mapping import save_map
+
+    path = tmp_path_factory.mktemp('map') / 'route.stavpr'
+    save_map(small_map, path)
+    return str(path)
+
+
+@pytest.fixture
+def start(robot, map_file, tmp_path_factory):
+    """Start a node in this process that localizes on the map; it ends with the test."""
+    from robot import NodeThread
+
+    started = []
+
+    def start(*arguments, wait=True, **parameters):
+        robot.forget()
+        files = {'map_path': map_file, 'maps_folder': str(tmp_path_factory.getbasetemp())}
+        started.append(NodeThread(arguments, files | parameters))
+        if wait:
+            robot.wait_for_node()
+        return started[-1].node
+
+    yield start
+    for each in started:
+        each.end()
+    robot.wait_for_nobody()
+
+
+@pytest.fixture
+def squeezenet_settings(data_folder):
+    """Return the settings of the data folder's network, layer fire6/concat, 13 x 13 x 384."""
+    pytest.importorskip('onnxruntime', reason='the extra onnx is not installed')
+    from stavpr_ros.features.registry import settings_class
+
+    return settings_class('onnx')(
+        model=str(data_folder / 'squeezenet1_1_imagenet' / 'squeezenet_fp16.onnx'),
+        layer='fire6/concat_1',
+        channels='bgr',
+        scale=1.0,
+        mean=(104, 117, 123),
+        std=(1, 1, 1),
+    )
+
+
+@pytest.fixture(scope='session')
+def densenet_parameters():
+    """Random parameters of DenseNet161, equal to the bit on every machine."""
+    from checkpoints import random_parameters
+    import networks
+
+    return random_parameters(networks.densenet161_shapes())
+
+
+@pytest.fixture(scope='session')
+def densenet_file(densenet_parameters, tmp_path_factory) -> Path:
+    """Their checkpoint as published: of Python 2, old names, a prefix, tensors of a GPU."""
+    from checkpoints import places365_file
+
+    path = tmp_path_factory.mktemp('weights') / 'densenet161_places365.pth.tar'
+    path.write_bytes(places365_file(densenet_parameters))
+    return path
+
+
+@pytest.fixture(scope='session')
+def vgg_parameters():
+    """Random parameters of VGG16, equal to the bit on every machine."""
+    from checkpoints import random_parameters
+    import networks
+
+    return random_parameters(networks.vgg16_shapes())
+
+
+@pytest.fixture(scope='session')
+def vgg_file(vgg_parameters, tmp_path_factory) -> Path:
+    """Their checkpoint, of Python 2 as the published one."""
+    from checkpoints import OldPickle
+
+    path = tmp_path_factory.mktemp('weights') / 'vgg16.pth'
+    path.write_bytes(OldPickle().file(OrderedDict(vgg_parameters)))
+    return path
