@@ -15,6 +15,7 @@ WORKDIR /ros_ws
 # Only the manifests and requirements: this layer stays cached while the sources change.
 COPY package.xml src/stavpr_ros/
 COPY stavpr_msgs/package.xml src/stavpr_ros/stavpr_msgs/
+COPY stavpr_slam/package.xml src/stavpr_ros/stavpr_slam/
 COPY requirements/robot.txt src/stavpr_ros/requirements/
 
 # Versions are those of the distribution, which changes them for security fixes only.
@@ -22,7 +23,7 @@ COPY requirements/robot.txt src/stavpr_ros/requirements/
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3-pip python3-venv \
     && rosdep update --rosdistro "$ROS_DISTRO" \
-    && rosdep install --from-paths src/stavpr_ros src/stavpr_ros/stavpr_msgs --ignore-src -y \
+    && rosdep install --from-paths src/stavpr_ros src/stavpr_ros/stavpr_{msgs,slam} --ignore-src -y \
     && rm -rf /var/lib/apt/lists/*
 
 # What apt has no package for: a virtual environment that sees the system's packages.
@@ -38,6 +39,6 @@ USER 1000:1000
 FROM development AS runtime
 COPY --chown=1000:1000 . src/stavpr_ros
 RUN . "/opt/ros/$ROS_DISTRO/setup.bash" \
-    && python3 -m colcon build --base-paths src/stavpr_ros src/stavpr_ros/stavpr_msgs
+    && python3 -m colcon build --base-paths src/stavpr_ros src/stavpr_ros/stavpr_{msgs,slam}
 ENTRYPOINT ["/bin/bash", "-c", ". /ros_ws/install/setup.bash && exec \"$@\"", "--"]
 CMD ["ros2", "run", "stavpr_ros", "node"]

@@ -6,7 +6,7 @@ from pathlib import Path
 import sys
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT / folder) for folder in ('.', 'stavpr_slam', 'stavpr_lab')]
 
 project = 'stavpr_ros'
 author = 'The stavpr_ros authors'

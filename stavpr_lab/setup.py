@@ -37,5 +37,10 @@ setup(
         'torch>=2.2',
         'tqdm>=4.66',
     ],
+    extras_require={
+        'faiss': ['faiss-cpu>=1.8'],
+        'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
+        'slam': ['evo>=1.31', 'stavpr_slam'],
+    },
     zip_safe=False,
 )

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the package installs, the dependencies it declares, and the command ``stavpr``."""
+"""What each package installs, the dependencies it declares, and the command ``stavpr``."""
 
 import ast
 import os
@@ -10,15 +10,20 @@ import shutil
 import subprocess
 import sys
 from xml.etree import ElementTree
+import zipfile
 
 from interface_packages import INTERFACES
 import pytest
 import setuptools
 import stavpr_ros
-from stavpr_ros.commands import stavpr
+from stavpr_ros import plugins
+from stavpr_ros.commands import COMMANDS, stavpr
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGE = ROOT / 'stavpr_ros'
+PACKAGES = {
+    'stavpr_ros': ROOT, 'stavpr_slam': ROOT / 'stavpr_slam', 'stavpr_lab': ROOT / 'stavpr_lab'
+}  # fmt: skip
+EXTRAS = ('onnx', 'hdf5', 'faiss', 'fleet', 'ray', 'slam')
 
 # Import name: distribution on PyPI, where they differ.
 DISTRIBUTIONS = {
@@ -48,22 +53,18 @@ NO_ROSDEP_KEY = {
     *('h5py', 'ray', 'rosbags', 'torch'),
 }
 ROS = re.compile(r'\w+_(msgs|srvs|interfaces)|rclpy|launch|launch_ros|ament_index_python|tf2_ros')
-PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules of another name
+ROS_PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules of another name
+
+each_package = pytest.mark.parametrize('package', PACKAGES)
 
 
-@pytest.fixture(scope='module')
-def setup_arguments() -> dict:
+def setup_arguments(package: str, monkeypatch) -> dict:
     """Return what setup.py passes to setuptools."""
     passed: dict = {}
-    original, setuptools.setup = setuptools.setup, passed.update
-    folder = Path.cwd()
-    os.chdir(ROOT)
-    try:
-        source = (ROOT / 'setup.py').read_text(encoding='utf-8')
-        exec(compile(source, 'setup.py', 'exec'), {'__name__': 'setup'})
-    finally:
-        os.chdir(folder)
-        setuptools.setup = original
+    monkeypatch.setattr(setuptools, 'setup', passed.update)
+    monkeypatch.chdir(PACKAGES[package])
+    source = Path('setup.py').read_text(encoding='utf-8')
+    exec(compile(source, 'setup.py', 'exec'), {'__name__': 'setup'})
     return passed
 
 
@@ -88,7 +89,7 @@ def imported(folder: Path) -> set[str]:
                 names.add((node.module or '').partition('.')[0])
             elif isinstance(node, ast.Call):
                 names |= literal_import(node)
-    return names - set(sys.stdlib_module_names) - {'stavpr_ros', 'numba_cuda', 'cuda'}
+    return names - set(sys.stdlib_module_names) - {'numba_cuda', 'cuda'}
 
 
 def distribution_names(requirements: list[str]) -> set[str]:
@@ -99,52 +100,75 @@ def manifest(path: Path) -> ElementTree.Element:
     return ElementTree.parse(path / 'package.xml').getroot()
 
 
-def declared(*tags: str) -> set[str]:
-    return {element.text for tag in tags for element in manifest(ROOT).findall(tag)}
+def declared(package: str, *tags: str) -> set[str]:
+    root = manifest(PACKAGES[package])
+    return {element.text for tag in tags for element in root.findall(tag)}
+
+
+def imports_of(package: str) -> set[str]:
+    """Return what a package imports besides itself."""
+    return imported(PACKAGES[package] / package) - {package}
 
 
 # Dependencies
 
 
-def test_every_imported_distribution_is_required(setup_arguments):
-    required = distribution_names(setup_arguments['install_requires'])
-    for extra in ('onnx', 'hdf5', 'faiss', 'fleet', 'ray', 'slam'):
-        required |= distribution_names(setup_arguments['extras_require'][extra])
-    needed = {name for name in imported(PACKAGE) if not ROS.fullmatch(name)}
+@each_package
+def test_every_imported_distribution_is_required(package, monkeypatch):
+    arguments = setup_arguments(package, monkeypatch)
+    required = distribution_names(arguments['install_requires'])
+    for extra in EXTRAS:
+        required |= distribution_names(arguments.get('extras_require', {}).get(extra, []))
+    needed = {name for name in imports_of(package) if not ROS.fullmatch(name)} - {'stavpr_slam'}
     assert needed  # the search works
     assert {DISTRIBUTIONS.get(name, name).lower() for name in needed} - required == set()
 
 
-def test_every_imported_ros_package_is_dependency():
-    run = {name for folder in ('stavpr_ros', 'launch') for name in imported(ROOT / folder)}
-    needed = {PACKAGES.get(name, name) for name in run if ROS.fullmatch(name)}
-    assert 'rclpy' in needed
-    assert needed - declared('exec_depend', 'depend') == set()
-    tests = {name for name in imported(ROOT / 'test') if ROS.fullmatch(name)}
+@each_package
+def test_every_imported_ros_package_is_dependency(package):
+    folder = PACKAGES[package]
+    run = imports_of(package) | imported(folder / 'launch')
+    needed = {ROS_PACKAGES.get(name, name) for name in run if ROS.fullmatch(name)}
+    assert needed - declared(package, 'exec_depend', 'depend') == set()
+    tests = {name for name in imported(folder / 'test') if ROS.fullmatch(name)}
     tests -= INTERFACES.keys()  # built by the tests
-    assert tests - declared('exec_depend', 'depend', 'test_depend') == set()
+    assert tests - declared(package, 'exec_depend', 'depend', 'test_depend') == set()
 
 
-def test_every_other_import_has_rosdep_key_or_explanation():
-    needed = {name for name in imported(PACKAGE) if not ROS.fullmatch(name)}
+@each_package
+def test_every_other_import_has_rosdep_key_or_explanation(package):
+    needed = {name for name in imports_of(package) if not ROS.fullmatch(name)}
+    needed -= PACKAGES.keys()
     assert needed - set(ROSDEP_KEYS) - NO_ROSDEP_KEY == set()
     keys = {ROSDEP_KEYS[name] for name in needed & set(ROSDEP_KEYS)}
-    assert keys - declared('exec_depend') == set()
-    text = (ROOT / 'package.xml').read_text(encoding='utf-8')
-    assert [name for name in NO_ROSDEP_KEY if f'      {name} ' not in text] == []
+    assert keys - declared(package, 'exec_depend') == set()
+    text = (PACKAGES[package] / 'package.xml').read_text(encoding='utf-8')
+    assert [name for name in NO_ROSDEP_KEY & needed if f'      {name} ' not in text] == []
+
+
+def test_dependencies_between_packages_are_declared():
+    for package in ('stavpr_slam', 'stavpr_lab'):
+        assert 'stavpr_ros' in declared(package, 'exec_depend')
+    for package in PACKAGES:
+        tags = ('exec_depend', 'depend', 'test_depend')
+        assert 'stavpr_lab' not in declared(package, *tags)
+        if package != 'stavpr_lab':
+            assert 'stavpr_slam' not in declared(package, *tags)
 
 
 # Versions and licenses
 
 
-def test_versions_agree(setup_arguments):
-    versions = [manifest(ROOT / folder).findtext('version') for folder in ('.', 'stavpr_msgs')]
+def test_versions_agree(monkeypatch):
+    folders = [*PACKAGES.values(), ROOT / 'stavpr_msgs']
+    versions = [manifest(folder).findtext('version') for folder in folders]
     citation = (ROOT / 'CITATION.cff').read_text(encoding='utf-8')
     versions.append(re.search(r'^version: (.+)$', citation, re.MULTILINE).group(1))
-    assert {*versions, setup_arguments['version']} == {stavpr_ros.__version__}
+    versions += [setup_arguments(package, monkeypatch)['version'] for package in PACKAGES]
+    assert set(versions) == {stavpr_ros.__version__}
 
 
-@pytest.mark.parametrize('folder', ['.', 'stavpr_msgs'])
+@pytest.mark.parametrize('folder', ['.', 'stavpr_msgs', 'stavpr_slam', 'stavpr_lab'])
 def test_license_file_is_there(folder):
     element = manifest(ROOT / folder).find('license')
     text = (ROOT / folder / element.get('file')).read_text(encoding='utf-8')
@@ -157,53 +181,113 @@ def test_license_file_is_there(folder):
 
 
 @pytest.fixture(scope='module')
-def installed(tmp_path_factory) -> Path:
-    """Install a copy of the sources as colcon does, and return the prefix."""
-    source, prefix = (tmp_path_factory.mktemp(name) for name in ('source', 'prefix'))
-    for name in ('stavpr_ros', 'scripts', 'resource', 'config', 'launch'):
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns('__pycache__'))
-    for name in ('setup.py', 'setup.cfg', 'package.xml'):
-        shutil.copy(ROOT / name, source)
-    command = [sys.executable, '-W', 'ignore', 'setup.py', '--quiet', 'install']
-    command += ['--prefix', str(prefix), '--single-version-externally-managed']
-    command += ['--record', str(source / 'install.log')]
-    done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
+def sources(tmp_path_factory) -> Path:
+    """Copy the repository as far as the packages are made of it."""
+    root = tmp_path_factory.mktemp('sources') / 'stavpr_ros'
+    unwanted = ('.*', '__pycache__', 'build', 'install', 'log', 'docs', 'test', 'benchmarks')
+    shutil.copytree(ROOT, root, ignore=shutil.ignore_patterns(*unwanted))
+    return root
+
+
+def run_setup(folder: Path, *arguments: str) -> None:
+    command = [sys.executable, '-W', 'ignore', 'setup.py', '--quiet', *arguments]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    return prefix
+
+
+@pytest.fixture(scope='module')
+def installed(sources, tmp_path_factory) -> dict[str, Path]:
+    """Install each package as colcon does, and return their prefixes."""
+    prefixes = {}
+    for package, folder in PACKAGES.items():
+        prefixes[package] = prefix = tmp_path_factory.mktemp(package)
+        run_setup(
+            sources / folder.relative_to(ROOT), 'install', '--prefix', str(prefix),
+            '--single-version-externally-managed', '--record', str(prefix / 'install.log'),
+        )  # fmt: skip
+    return prefixes
+
+
+def modules_in(prefix: Path) -> set[str]:
+    """Return the files of Python packages below a prefix, relative to site-packages."""
+    site = next(prefix.glob('**/*-packages'))
+    return {str(path.relative_to(site)) for path in site.rglob('*.py')}
+
+
+def test_no_module_is_in_two_packages(installed):
+    found = [modules_in(prefix) for prefix in installed.values()]
+    assert all(found)
+    assert sum(map(len, found)) == len(set().union(*found))
+    for package, prefix in installed.items():
+        assert {name.partition('/')[0] for name in modules_in(prefix)} == {package}
 
 
 def test_install_puts_one_command_on_path(installed):
-    assert [path.name for path in installed.glob('**/bin/*')] == ['stavpr']
+    found = [path.name for prefix in installed.values() for path in prefix.glob('**/bin/*')]
+    assert found == ['stavpr']
 
 
-def test_install_keeps_names_of_ros2_run(installed):
-    scripts = next(installed.glob('**/lib/stavpr_ros'))
-    assert {path.name for path in scripts.iterdir()} == set(stavpr.COMMANDS)
-    for path in scripts.iterdir():
-        text = path.read_text(encoding='utf-8')
-        assert os.access(path, os.X_OK)
+@each_package
+def test_install_keeps_names_of_ros2_run(installed, package):
+    scripts = next(installed[package].glob(f'**/lib/{package}'))
+    own = {name for name, owner in stavpr.PACKAGES.items() if owner == package}
+    if package == 'stavpr_ros':
+        own = set(COMMANDS)
+        for name, owner in stavpr.PACKAGES.items():
+            done = subprocess.run(
+                [sys.executable, scripts / name, '-x'], capture_output=True, text=True, check=False
+            )
+            assert done.returncode == 1
+            assert f'ros2 run {owner} {name} -x' in done.stderr
+    others = set(stavpr.PACKAGES) - own if package == 'stavpr_ros' else set()
+    assert {path.name for path in scripts.iterdir()} == own | others
+    for name in own:
+        text = (scripts / name).read_text(encoding='utf-8')
+        assert os.access(scripts / name, os.X_OK)
         assert text.startswith('#!/usr/bin/env python3\n')
-        assert f'from stavpr_ros.commands.{path.name} import main\n' in text
-        assert (PACKAGE / 'commands' / f'{path.name}.py').is_file()
+        assert f'from {package}.commands.{name} import main\n' in text
+        assert (PACKAGES[package] / package / 'commands' / f'{name}.py').is_file()
 
 
-def test_install_registers_package(installed):
-    share = next(installed.glob('**/share'))
-    assert (share / 'ament_index/resource_index/packages/stavpr_ros').is_file()
-    assert (share / 'stavpr_ros/package.xml').is_file()
+@each_package
+def test_install_registers_package(installed, package):
+    share = next(installed[package].glob('**/share'))
+    assert (share / 'ament_index/resource_index/packages' / package).is_file()
+    assert (share / package / 'package.xml').is_file()
+
+
+def test_install_contains_launch_files(installed):
+    share = next(installed['stavpr_ros'].glob('**/share'))
     launch = {path.name for path in (share / 'stavpr_ros/launch').iterdir()}
     assert {path.name for path in (ROOT / 'launch').glob('*.launch.py')} <= launch
 
 
-def test_install_contains_every_file_of_package(installed):
-    package = next(installed.glob('**/*-packages/stavpr_ros'))
+@each_package
+def test_install_contains_every_file_of_package(installed, package):
+    target = next(installed[package].glob(f'**/*-packages/{package}'))
+    source = PACKAGES[package] / package
     wanted = {
-        path.relative_to(PACKAGE)
-        for path in PACKAGE.rglob('*')
+        path.relative_to(source)
+        for path in source.rglob('*')
         if path.is_file() and '__pycache__' not in path.parts
     }
     assert Path('py.typed') in wanted
-    assert [str(path) for path in wanted if not (package / path).is_file()] == []
+    assert [str(path) for path in wanted if not (target / path).is_file()] == []
+
+
+def test_wheel_has_all_python_packages_and_entry_points(sources, installed, tmp_path):
+    """``pip install .`` gives ``stavpr evaluate``, without an order of builds as colcon has."""
+    run_setup(sources, 'bdist_wheel', '--dist-dir', str(tmp_path))
+    (wheel,) = tmp_path.glob('*.whl')
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+        (file,) = (name for name in names if name.endswith('entry_points.txt'))
+        entries = archive.read(file).decode()
+    assert set().union(*map(modules_in, installed.values())) <= names
+    for package in ('stavpr_slam', 'stavpr_lab'):
+        table = (PACKAGES[package] / 'setup.cfg').read_text(encoding='utf-8')
+        for line in re.findall(r'^    (\w+ = .*)$', table, re.MULTILINE):
+            assert line in entries
 
 
 # The command `stavpr`
@@ -212,8 +296,16 @@ def test_install_contains_every_file_of_package(installed):
 def test_stavpr_lists_every_command(capsys):
     assert stavpr.main(['--help']) == 0
     text = capsys.readouterr().out
-    assert [name for name in stavpr.COMMANDS if f'  {name} ' not in text] == []
+    assert [name for name in COMMANDS if f'  {name} ' not in text] == []
     assert stavpr.main([]) == 2
+
+
+def test_stavpr_without_a_package_names_it(monkeypatch, capsys):
+    monkeypatch.setattr(plugins, 'load', lambda group: {})
+    assert stavpr.main(['evaluate']) == 2
+    assert 'in the package stavpr_lab' in capsys.readouterr().err
+    assert stavpr.main(['evaluat']) == 2
+    assert 'choose from build_map' in capsys.readouterr().err
 
 
 def test_stavpr_passes_arguments_and_exit_code(monkeypatch):
@@ -227,7 +319,7 @@ def test_stavpr_passes_arguments_and_exit_code(monkeypatch):
 
 def test_stavpr_without_ros_names_missing_modules(monkeypatch, capsys):
     monkeypatch.setattr(stavpr.importlib.util, 'find_spec', lambda _: None)
-    for name in ('node', 'replay', 'record', 'demo'):
+    for name in ('node', 'replay', 'record'):
         assert stavpr.main([name]) == 2
         assert re.search(r'rclpy.*setup\.bash', capsys.readouterr().err, re.DOTALL)
 

@@ -16,12 +16,12 @@ from fixtures import route_images
 import numpy as np
 from processes import DOMAIN, executable, Process, TIMEOUT
 import pytest
+from stavpr_lab.commands import demo
 from stavpr_lab.demonstration.bag_writer import write_bag
 from stavpr_lab.demonstration.loops import read_result
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.records import evaluate_records
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure, PlaceMatch
-from stavpr_lab.commands import demo
 from stavpr_ros.commands import build_map, node, record, replay, stavpr
 from stavpr_ros.commands.record import loop_closure_record, match_record
 from stavpr_ros.mapping import load_map

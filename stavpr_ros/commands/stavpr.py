@@ -27,7 +27,8 @@ def all_commands() -> dict[str, Command]:
     """Return the commands of this package and of all others that are installed."""
     found = dict(COMMANDS)
     for table in plugins.load(plugins.COMMANDS).values():
-        found = table | found
+        for name, command in table.items():
+            found.setdefault(name, command)
     return found
 
 

@@ -1,0 +1,74 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Entry points of other packages: commands, stores, and one that cannot be imported."""
+
+import pytest
+from stavpr_ros import plugins
+from stavpr_ros.commands import stavpr
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.mapping.stores import is_address, store_of
+
+MODULE = """
+from stavpr_ros.commands import Command
+from stavpr_ros.mapping.stores import Store
+
+COMMANDS = {'hello': Command('plugged', 'greet'), 'node': Command('plugged', 'not this one')}
+STORE = Store(open_map=lambda address: address, upload=lambda *_: None)
+main = lambda arguments: len(arguments)
+"""
+ENTRY_POINTS = """
+[stavpr.commands]
+plugged = plugged:COMMANDS
+broken = plugged:MISSING
+
+[stavpr.stores]
+drawer = plugged:STORE
+faiss = plugged:STORE
+"""
+
+
+@pytest.fixture
+def plugged(tmp_path, monkeypatch):
+    """Install a package with entry points."""
+    (tmp_path / 'plugged.py').write_text(MODULE)
+    info = tmp_path / 'plugged-1.0.dist-info'
+    info.mkdir()
+    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: plugged\nVersion: 1.0\n')
+    (info / 'entry_points.txt').write_text(ENTRY_POINTS)
+    monkeypatch.syspath_prepend(tmp_path)
+    plugins.load.cache_clear()
+    yield
+    plugins.load.cache_clear()
+
+
+def test_command_of_another_package_runs(plugged, capsys):
+    assert stavpr.main(['hello', 'a', 'b']) == 2
+    stavpr.main(['--help'])
+    assert 'greet' in capsys.readouterr().out
+
+
+def test_command_of_this_package_is_not_replaced(plugged):
+    assert stavpr.all_commands()['node'].module == 'stavpr_ros.commands.node'
+
+
+def test_broken_plugin_is_named_and_skipped(plugged, caplog):
+    assert 'plugged' in plugins.load(plugins.COMMANDS)
+    assert 'broken' not in plugins.load(plugins.COMMANDS)
+    assert 'plug-in broken of plugged (plugged:MISSING): AttributeError' in caplog.text
+
+
+def test_store_of_another_package_opens_its_scheme(plugged):
+    assert is_address('drawer:socks')
+    assert store_of('drawer:socks').open_map('drawer:socks') == 'drawer:socks'
+
+
+def test_built_in_scheme_is_not_replaced(plugged):
+    from stavpr_ros.fleet.addresses import STORE
+
+    assert store_of('faiss:file') is STORE
+
+
+def test_unknown_scheme_lists_known_ones():
+    assert not is_address('drawer:socks')
+    with pytest.raises(SettingsError, match=r'drawer:socks is no address.*faiss:, qdrant:'):
+        store_of('drawer:socks')
