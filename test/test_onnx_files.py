@@ -11,7 +11,12 @@ from evaluation_commands import runner, write_images
 import numpy as np
 import pytest
 from stavpr_ros.commands import build_map
-from stavpr_ros.errors import SettingsError, UnavailableError
+from stavpr_ros.errors import (
+    FeatureMismatchError,
+    ImageError,
+    SettingsError,
+    UnavailableError,
+)
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class, settings_class
 import torch
@@ -56,6 +61,49 @@ def single(made):
 MEAN_OF_ALL = helper.make_node('ReduceMean', ['y'], ['z'], keepdims=0)
 ARGMAX = helper.make_node('ArgMax', ['y'], ['z'], axis=1)
 RESHAPE = helper.make_node('Reshape', ['y', 's'], ['z'])
+
+
+def test_input_of_the_network_by_hand(saved):
+    """Sums over 64 equal pixels; blue first, mean and std by channel; two images."""
+    image = np.full((64, 64, 3), (100, 2, 1), np.uint8)
+    settings = settings_class('onnx')(
+        model=str(saved(w=np.ones((1, 3, 8, 8), np.float32))),
+        size=64, layer='y', channels='bgr', scale=1.0, mean=(0, 0, 20), std=(1, 1, 2),
+    )  # fmt: skip
+    maps = backbone_class('onnx')(settings).feature_maps([image, 2 * image])
+    assert maps.shape == (2, 1, 8, 8)
+    assert (maps[0] == 64 * (1 + 2 + (100 - 20) / 2)).all()
+    assert (maps[1] == 64 * (2 + 4 + (200 - 20) / 2)).all()
+
+
+def test_features_that_are_not_finite_are_rejected(saved):
+    """Sums of 192 values are out of range where all are bright; or always."""
+    path = saved(w=np.ones((1, 3, 8, 8), np.float32))
+    made = extractor(path, mean=(0, 0, 0), std=(1, 1, 1), scale=1e34)
+    with pytest.raises(ImageError, match='not finite'):
+        made.extract([np.full((16, 16, 3), 255, np.uint8)])
+    with pytest.raises(SettingsError, match='test image are not finite'):
+        extractor(path, scale=1e36)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error', 'named'),
+    [
+        ({'layer': 'fire'}, SettingsError, r"no layer 'fire'.*y"),
+        ({'channels': 'hsv'}, SettingsError, 'must be'),
+        ({'sha256': '0' * 64}, FeatureMismatchError, 'sha256'),
+        ({'vector': 'y'}, SettingsError, 'is what the strips are made of'),
+    ],
+)
+def test_wrong_settings_are_rejected_by_name(saved, changes, error, named):
+    with pytest.raises(error, match=named):
+        extractor(saved(), **changes)
+
+
+def test_other_file_is_rejected(tmp_path):
+    (tmp_path / 'broken.onnx').write_bytes(b'no model')
+    with pytest.raises(UnavailableError, match='no usable ONNX model'):
+        extractor(tmp_path / 'broken.onnx')
 
 
 @pytest.mark.parametrize('batch', ['b', 1, 4])
