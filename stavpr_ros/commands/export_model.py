@@ -79,30 +79,26 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _check(arguments: argparse.Namespace) -> None:
+def _export(arguments: argparse.Namespace) -> 'Exported':
     if not arguments.allow_foreign_code:
         raise SettingsError(
             f'--repository {arguments.repository} is a program, which would run with all your '
             'rights: give --allow-foreign-code if you trust its source'
         )
-    if arguments.size < 8 or arguments.size > 4096:
+    if not 8 <= arguments.size <= 4096:
         raise SettingsError(f'--size {arguments.size} must be 8 to 4096 pixels')
     require_replaceable(arguments.output, ONNX, arguments.force)
-
-
-def _export(arguments: argparse.Namespace) -> 'Exported':
-    from stavpr_ros.features import export
+    from stavpr_ros.features.export import Chosen, export_network, load_hub
     import torch
 
     torch.backends.mha.set_fastpath_enabled(False)  # its operator is not in the ONNX standard
-    module, maps = arguments.map_module, arguments.map
+    given, module, maps = dict(arguments.argument), arguments.map_module, arguments.map
     if maps is None:
         maps = '0' if module else ''
-    outputs = export.Outputs(arguments.vector, module, maps, arguments.prefix_tokens)
-    given = dict(arguments.argument)
-    network = export.load_hub(arguments.repository, arguments.commit, arguments.entry, given)
+    network = load_hub(arguments.repository, arguments.commit, arguments.entry, given)
     print(f'license of {arguments.repository}: {_license(arguments)}')
-    return export.export_network(network, outputs, arguments.size)
+    chosen = Chosen(network, arguments.vector, module, maps, arguments.prefix_tokens)
+    return export_network(chosen, arguments.size)
 
 
 def _license(arguments: argparse.Namespace) -> str:
@@ -125,7 +121,6 @@ def main(args: list[str] | None = None) -> int:
 
     def work() -> None:
         arguments = _parser().parse_args(args)
-        _check(arguments)
         exported = _export(arguments)
         with atomic_output(arguments.output, ONNX, arguments.force) as file:
             file.write(exported.content)

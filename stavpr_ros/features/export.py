@@ -31,27 +31,6 @@ CHECKED = 3  # random images that the file is verified on
 
 
 @dataclass(frozen=True)
-class Outputs:
-    """
-    What of a network becomes the outputs of the file.
-
-    :param vector: number or key of the network's output (n, D); '' = no output ``global``.
-    :param module: path of the module whose output is the map; '' = the network's own output.
-    :param map: number or key of the output that is the map, or tokens; '' = no output ``map``.
-    :param prefix_tokens: leading tokens that are no patches.
-    """
-
-    vector: str = '0'
-    module: str = ''
-    map: str = ''
-    prefix_tokens: int = 1
-
-    def __post_init__(self) -> None:
-        if not self.vector and not self.map:
-            raise SettingsError('neither a vector nor a map is chosen: name one of the outputs')
-
-
-@dataclass(frozen=True)
 class Exported:
     """
     An ONNX file that was verified against the original.
@@ -105,54 +84,73 @@ def load_hub(repository: str, commit: str, entry: str, arguments: Mapping[str, A
 
 
 class Chosen(nn.Module):
-    """The chosen outputs of a network, in the order vector, map."""
+    """
+    The chosen outputs of a network: what becomes the outputs of the file.
 
-    def __init__(self, network: nn.Module, outputs: Outputs) -> None:
+    :param vector: number or key of the network's output (n, D); '' = no output ``global``.
+    :param module: path of the module whose output is the map; '' = the network's own output.
+    :param map: number or key of the output that is the map, or tokens; '' = no output ``map``.
+    :param prefix_tokens: leading tokens that are no patches.
+    :raises SettingsError: neither is chosen, or there is no such module.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        vector: str = '0',
+        module: str = '',
+        map: str = '',  # noqa: A002
+        prefix_tokens: int = 1,
+    ) -> None:
         super().__init__()
-        self.network, self._outputs = network.eval().float(), outputs
+        if not vector and not map:
+            raise SettingsError('neither a vector nor a map is chosen: name one of the outputs')
+        self.names = [name for name, kept in ((GLOBAL, vector), (MAP, map)) if kept]
+        self.network = network.eval().float()
+        self._vector, self._module, self._map, self._prefix = vector, module, map, prefix_tokens
         self._kept: list[Any] = []
-        if outputs.map and outputs.module:
+        if map and module:
             try:
-                module = network.get_submodule(outputs.module)
+                inner = network.get_submodule(module)
             except AttributeError as error:
                 names = [name for name, _ in network.named_modules() if name]
                 raise SettingsError(
-                    f'the network has no module {outputs.module!r}: its modules are '
+                    f'the network has no module {module!r}: its modules are '
                     f'{", ".join(names[:60])}'
                 ) from error
-            module.register_forward_hook(lambda *call: self._kept.append(call[-1]))
+            inner.register_forward_hook(lambda *call: self._kept.append(call[-1]))
 
     def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """
-        Return the chosen outputs of images (n, 3, size, size).
+        Return the vectors (n, D) and the maps (n, C, H, W) of images (n, 3, size, size).
 
         :raises SettingsError: the network has no such outputs, or of another shape.
         """
-        chosen, found = self._outputs, []
+        found = []
         self._kept.clear()
         returned = self.network(images)
-        if chosen.vector:
-            vector = one_of(returned, chosen.vector, 'the network')
+        if self._vector:
+            vector = one_of(returned, self._vector, 'the network')
             if not isinstance(vector, torch.Tensor) or vector.ndim != 2:
                 shape = getattr(vector, 'shape', type(vector).__name__)
                 raise SettingsError(
-                    f'output {chosen.vector!r} of the network is {shape}: expected a vector (n, D)'
+                    f'output {self._vector!r} of the network is {shape}: expected a vector (n, D)'
                 )
             found.append(vector)
-        if chosen.map:
-            if chosen.module and not self._kept:
-                raise SettingsError(f'module {chosen.module!r} is not called by the network')
-            owner = self._kept[-1] if chosen.module else returned
-            output = one_of(owner, chosen.map, chosen.module or 'the network')
-            name = f'module {chosen.module!r}' if chosen.module else f'output {chosen.map!r}'
-            maps = as_maps(output, len(images), chosen.prefix_tokens, name)
+        if self._map:
+            if self._module and not self._kept:
+                raise SettingsError(f'module {self._module!r} is not called by the network')
+            owner = self._kept[-1] if self._module else returned
+            output = one_of(owner, self._map, self._module or 'the network')
+            name = f'module {self._module!r}' if self._module else f'output {self._map!r}'
+            maps = as_maps(output, len(images), self._prefix, name)
             if maps.ndim != 4:
                 raise SettingsError(f'{name} returns vectors {tuple(maps.shape)}: expected a map')
             found.append(maps)
         return tuple(found)
 
 
-def export_network(network: nn.Module, outputs: Outputs, size: int) -> Exported:
+def export_network(chosen: Chosen, size: int) -> Exported:
     """
     Record a network as an ONNX file, and verify it on random images.
 
@@ -163,31 +161,28 @@ def export_network(network: nn.Module, outputs: Outputs, size: int) -> Exported:
     :raises SettingsError: the network has no such outputs.
     :raises UnavailableError: it cannot be recorded, or the file computes something else.
     """
-    weights = sum(value.nbytes for value in network.state_dict().values())
+    weights = sum(value.nbytes for value in chosen.state_dict().values())
     if weights >= LARGEST:
         raise UnavailableError(
             f'the network has {weights / 1e9:.1f} GB of weights, more than an ONNX file holds '
             '(2 GiB): compute its descriptors with its own program, and give those'
         )
-    generator = torch.Generator().manual_seed(0)
-    images = torch.randn(CHECKED, 3, size, size, generator=generator)
-    chosen = Chosen(network, outputs)
+    images = torch.randn(CHECKED, 3, size, size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         singles = [chosen(image[None]) for image in images]
-        references = [torch.cat(parts).numpy() for parts in zip(*singles, strict=True)]
-    names = [name for name, kept in ((GLOBAL, outputs.vector), (MAP, outputs.map)) if kept]
+    references = [torch.cat(parts).numpy() for parts in zip(*singles, strict=True)]
     if not all(np.isfinite(reference).all() for reference in references):
         raise UnavailableError('the network returns NaN or infinite numbers for random images')
     reasons = []
     for batch, step in ((2, CHECKED), (1, 1)):  # recorded with two images; else with one
         try:
-            content = _recorded(chosen, images[:batch], names, alone=step == 1)
+            content = _recorded(chosen, images[:batch], alone=step == 1)
             difference = _difference(content, images.numpy(), references, step)
         except Exception as error:  # of the network, the recorder and the runtime
             reasons.append(last_line(error))
             continue
         if difference <= TOLERANCE:
-            shapes = {n: (1, *r.shape[1:]) for n, r in zip(names, references, strict=True)}
+            shapes = {n: (1, *r.shape[1:]) for n, r in zip(chosen.names, references, strict=True)}
             return Exported(content, shapes, difference, step > 1)
         reasons.append(f'its outputs differ by {difference:.2g}')
     raise UnavailableError(
@@ -196,8 +191,9 @@ def export_network(network: nn.Module, outputs: Outputs, size: int) -> Exported:
     )
 
 
-def _recorded(chosen: Chosen, images: torch.Tensor, names: list[str], alone: bool) -> bytes:
+def _recorded(chosen: Chosen, images: torch.Tensor, alone: bool) -> bytes:
     onnx, _ = import_onnx()
+    batched = {name: {0: 'batch'} for name in ('image', *chosen.names)}
     with (
         tempfile.TemporaryDirectory() as folder,
         warnings.catch_warnings(),
@@ -211,8 +207,8 @@ def _recorded(chosen: Chosen, images: torch.Tensor, names: list[str], alone: boo
             (images,),
             path,
             input_names=['image'],
-            output_names=names,
-            dynamic_axes=None if alone else {name: {0: 'batch'} for name in ('image', *names)},
+            output_names=chosen.names,
+            dynamic_axes=None if alone else batched,
             opset_version=OPSET,
             dynamo=False,
         )
