@@ -15,11 +15,13 @@ from stavpr_ros.features.paper_networks import (
     DenseNet161,
     DenseNet161Places365,
     VGG16,
+    VGG16Fc6,
     VGG16Pool4,
 )
 from stavpr_ros.features.registry import backbone_class, settings_class
 from stavpr_ros.features.weights import load_parameters
 import torch
+from torch import nn
 
 
 @pytest.mark.parametrize(
@@ -106,6 +108,19 @@ def test_vgg16_equals_second_implementation(vgg_file, vgg_parameters):
     }
     assert ours.shape == (3, 512, 4, 4)
     assert_same(ours, networks.vgg16_pool4(doubles, standardized(images, 64)))
+
+
+def test_vgg16_fc6_by_hand():
+    """Maps of other sizes are averaged to 7 x 7, flattened channel by channel; then ReLU."""
+    network = nn.Module()
+    network.features = nn.Identity()
+    network.classifier = nn.Sequential(nn.Linear(2 * 49, 4), nn.ReLU(), nn.Dropout())
+    maps = torch.rand(3, 2, 14, 14)
+    found = VGG16Fc6.up_to_layer(network)(maps.to(memory_format=torch.channels_last))
+    weight, bias = network.classifier[0].weight, network.classifier[0].bias
+    means = maps.reshape(3, 2, 7, 2, 7, 2).mean(dim=(3, 5)).reshape(3, 98)
+    torch.testing.assert_close(found, torch.relu(means @ weight.T + bias))
+    assert VGG16Fc6.published.name == 'vgg16-397923af.pth'
 
 
 @pytest.fixture(scope='module')
