@@ -5,6 +5,7 @@
 import json
 import sys
 
+from checkpoints import Hostile
 from evaluation_commands import runner, write_images
 import numpy as np
 import pytest
@@ -80,22 +81,12 @@ def test_read_descriptors_of_strips_keeps_their_order(tmp_path, kind):
     assert float(features.weights[2, 4]) == pytest.approx(share, abs=1e-6)
 
 
-class Harmful:
-    """Writes a file when it is unpickled."""
-
-    def __init__(self, path):
-        self.path = str(path)
-
-    def __reduce__(self):
-        return (open, (self.path, 'w'))
-
-
 @pytest.mark.parametrize(
     ('name', 'words'),
     [('a.npy', 'cannot be read'), ('a.npz', 'numbers are none'), ('a.npz:a', 'numbers are none')],
 )
 def test_read_descriptors_executes_nothing(tmp_path, name, words):
-    harmful = np.array([Harmful(tmp_path / 'trap')], object)
+    harmful = np.array([Hostile(str(tmp_path / 'trap'))], object)
     np.save(tmp_path / 'a.npy', harmful, allow_pickle=True)
     np.savez(tmp_path / 'a.npz', a=harmful)
     with pytest.raises(SourceError, match=words):

@@ -197,6 +197,7 @@ def test_backend_summary_names_device_of_each_stage(
     why = {'cuda': ' (CUDA is available)', 'cpu': ' (no device)'}[available] * (backend == 'auto')
     settings = PipelineSettings(mode=mode, backend=backend)
     extraction, distances, sequences = stages
+    assert settings.extraction_device == ('cpu' if extraction == 'cpu' else backend)
     assert settings.backend_summary(operation) == (
         f'backend {backend}{why}: extraction on {extraction}, image distances on {distances} '
         f'(float32), sequences on {sequences}'

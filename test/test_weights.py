@@ -10,7 +10,7 @@ from pathlib import Path
 import pickle
 import threading
 
-from checkpoints import Call, Global, OldPickle
+from checkpoints import Call, Global, Hostile, OldPickle
 import numpy as np
 import pytest
 from stavpr_ros.errors import FeatureMismatchError, UnavailableError
@@ -276,14 +276,6 @@ def test_read_checkpoint_of_every_format(tmp_path, content):
     parameters = read(tmp_path, content)
     assert list(parameters) == ['a.weight']
     assert torch.equal(parameters['a.weight'], WEIGHT)
-
-
-class Hostile:
-    def __init__(self, path: str) -> None:
-        self.path = path
-
-    def __reduce__(self):
-        return (open, (self.path, 'w'))
 
 
 @pytest.mark.filterwarnings('ignore:Detected pickle protocol')

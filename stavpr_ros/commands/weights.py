@@ -6,12 +6,7 @@ import sys
 
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features.registry import (
-    backbone_class,
-    kinds,
-    PublishedSettings,
-    settings_class,
-)
+from stavpr_ros.features.registry import backbone_class, kinds, PublishedSettings, settings_class
 
 EPILOG = """
 Nothing else in this package goes online. The file is downloaded over https, compared with its
