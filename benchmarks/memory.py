@@ -24,6 +24,7 @@ from unittest.mock import patch
 import numpy as np
 
 if TYPE_CHECKING:
+    from stavpr_ros.features.registry import Kind
     from stavpr_ros.pipeline import Pipeline
     import torch
 
@@ -121,13 +122,18 @@ def measure_memory(operation: str, mode: str, precision: str, n: int = 0, d: int
     return Memory(operation, mode, precision, n, d, item * n * d * STRIPS, int(done.stdout))
 
 
+def _kind() -> 'Kind':
+    from stavpr_ros.features.registry import Kind
+
+    return Kind(SyntheticSettings, f'{__name__}:Synthetic')
+
+
 def _save_map(path: Path, n: int, d: int) -> None:
     """Write a map of synthetic places."""
     from dataclasses import replace
 
     from data import make_features
     from stavpr_ros.features import FeatureSettings
-    from stavpr_ros.features.registry import KINDS
     from stavpr_ros.mapping import PlaceMap, save_map
 
     features = make_features(n, d, STRIPS, 'cpu', seed=0)
@@ -135,7 +141,7 @@ def _save_map(path: Path, n: int, d: int) -> None:
         features, settings=FeatureSettings('synthetic', SyntheticSettings(d)), cells=(1, 1)
     )
     place_map = PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
-    with patch.dict(KINDS, synthetic=(SyntheticSettings, 'synthetic:Synthetic')):
+    with patch.dict('stavpr_ros.features.registry.KINDS', synthetic=_kind()):
         save_map(place_map, path)
 
 
@@ -173,12 +179,11 @@ def run_pipeline(
 
 def main(arguments: list[str]) -> None:
     """Print by how many bytes the resident set of this process grows with a pipeline."""
-    from stavpr_ros.features.registry import KINDS
+    from stavpr_ros.features import registry
     from stavpr_ros.threads import wait_passively
 
     wait_passively()
-    KINDS['synthetic'] = (SyntheticSettings, 'synthetic:Synthetic')
-    sys.modules['stavpr_ros.features.synthetic'] = sys.modules[__name__]
+    registry.KINDS['synthetic'] = _kind()
     operation, mode, precision, n, d, folder = arguments
     run = (operation, mode, precision)
     run_pipeline(*run, SMALL, int(d), Path(folder))

@@ -4,12 +4,14 @@
 The parameters of the node: one table for validation, launch arguments and documentation.
 
 ``python3 tools/parameter_files.py``, in a checkout, writes ``config/stavpr.yaml`` and
-``docs/parameters.md``. Launch files read this table, so it imports nothing but the standard
-library.
+``docs/parameters.md``. Launch files read this table: it imports the standard library and the
+table of the kinds of features, which loads as quickly.
 """
 
 from dataclasses import dataclass
 from typing import Any, Literal
+
+from stavpr_ros.features.registry import kinds
 
 WHEN = {
     'live': 'at any time',
@@ -100,15 +102,7 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'features',
             'gradient',
             'Kind of the features of a map that is recorded without map_path.',
-            choices=(
-                'gradient',
-                'onnx',
-                'torchscript',
-                'densenet161_places365',
-                'vgg16',
-                'vgg16_fc6',
-                'netvlad',
-            ),
+            choices=kinds(from_images=True),
         ),
         NodeParameter(
             'exclude_places',
@@ -298,13 +292,6 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             '',
             'File of the network, for features of a network. For a map also a folder with it; '
             'empty: the folder $STAVPR_MODELS, by default ~/.local/share/stavpr_ros/models.',
-        ),
-        NodeParameter(
-            'allow_torchscript',
-            False,
-            'Permit features torchscript to run their file: it is a program, and may read and '
-            'write files.',
-            when='start',
         ),
         NodeParameter(
             'max_places',

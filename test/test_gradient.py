@@ -174,9 +174,10 @@ def test_gradient_error_in_thread_is_raised(route):
         Gradient(GradientSettings()).feature_maps(images)
 
 
-def test_gradient_on_other_device_uses_torch(route):
+def test_gradient_on_other_device_uses_torch(route, monkeypatch):
     """On torch's device without numbers, as there may be no other."""
-    maps = Gradient(GradientSettings(cell=7, orientations=5), 'meta').feature_maps(route[:3])
+    monkeypatch.setattr('stavpr_ros.features.gradient.choose_device', lambda name: 'meta')
+    maps = Gradient(GradientSettings(cell=7, orientations=5)).feature_maps(route[:3])
     assert maps.shape == (3, 5, 31, 31)
     assert maps.device.type == 'meta'
 

@@ -5,6 +5,7 @@
 import hashlib
 import os
 from pathlib import Path
+import pickle
 import shutil
 import subprocess
 
@@ -40,16 +41,13 @@ def resident(process: Process) -> int:
 
 
 def network_map(content: bytes, sha256: str, **values) -> bytes:
-    """Return a map of features of a TorchScript file, with correct hashes."""
+    """Return a map of features of a network, with correct hashes."""
     manifest, tensors = parts_of(content)
     del manifest['parts']
     manifest['settings'] |= {
-        'kind': 'torchscript',
-        'backbone': {
-            'size': 32, 'resize': 'area', 'layer': '', 'channels': 'rgb', 'scale': 1.0,
-            'mean': [0, 0, 0], 'std': [1, 1, 1], 'sha256': sha256,
-        } | values,
-    }  # fmt: skip
+        'kind': 'vgg16',
+        'backbone': {'size': 32, 'resize': 'area', 'sha256': sha256} | values,
+    }
     manifest['cells'] = None
     return version2(manifest, tensors)
 
@@ -67,8 +65,8 @@ def test_running_node_refuses_hostile_files_and_goes_on(nodes, robot, route, map
     with (maps / 'sparse').open('wb') as file:
         file.write(content[:8000])
         file.truncate(8 * 2**30)
-    program = models / 'network.pt'
-    program.write_bytes(b'PK\x03\x04 a TorchScript program')
+    program = models / 'network.pth'
+    program.write_bytes(pickle.dumps(print))
     sha256 = hashlib.sha256(program.read_bytes()).hexdigest()
     for name, other in (
         ('program', network_map(content, sha256)),
@@ -85,7 +83,7 @@ def test_running_node_refuses_hostile_files_and_goes_on(nodes, robot, route, map
         ('pipe', 'it is a pipe, expected a regular file'),
         ('zero', 'is no file in the maps folder'),
         ('sparse', 'a sparse file'),
-        ('program', 'allow_torchscript'),
+        ('program', 'cannot be read as a file of weights'),
         ('unnamed', 'lack the sha256 of the model'),
         ('download', "unknown 'model'"),
         ('located', "unknown 'model'"),

@@ -147,8 +147,8 @@ def test_node_at_invalid_transitions_rejects_them(robot, node, map_file):
 
 def with_missing_model(whole: PlaceMap) -> PlaceMap:
     """Return a map whose network has no file."""
-    network = settings_class('torchscript')(model='', sha256='0' * 64)
-    settings = dataclasses.replace(whole.settings, kind='torchscript', backbone=network)
+    network = settings_class('onnx')(model='', layer='y', sha256='0' * 64)
+    settings = dataclasses.replace(whole.settings, kind='onnx', backbone=network)
     return dataclasses.replace(
         whole, features=dataclasses.replace(whole.features, settings=settings)
     )

@@ -335,9 +335,9 @@ def _backbone(name, value):
 def _network(**values):
     def change(manifest):
         manifest['settings'] |= {
-            'kind': 'torchscript',
+            'kind': 'onnx',
             'backbone': {
-                'size': 32, 'resize': 'area', 'layer': '', 'channels': 'rgb', 'scale': 1.0,
+                'size': 32, 'resize': 'area', 'layer': 'y', 'channels': 'rgb', 'scale': 1.0,
                 'mean': [0, 0, 0], 'std': [1, 1, 1], 'sha256': '0' * 64,
             } | values,
         }  # fmt: skip
@@ -413,7 +413,7 @@ HAND_MADE = [
     ({}, _backbone('orientations', 2**31), 'orientations'),
     ({}, _backbone('model', '/dev/zero'), "unknown 'model'"),
     ({}, _network(model='/dev/zero'), "unknown 'model'"),
-    ({}, _network(allow=True), "unknown 'allow'"),
+    ({}, _setting('kind', 'torchscript'), 'export the network to an ONNX file'),
     ({}, _network(sha256=''), 'lack the sha256 of the model'),
     ({}, _network(sha256='abc'), '64 digits'),
     ({}, _network(scale=float('inf')), 'no number'),
@@ -504,15 +504,14 @@ def test_hand_made_file_of_version1_is_rejected_by_name(tmp_path, change, text):
 
 
 def test_version1_map_that_grants_itself_a_model_does_not(tmp_path):
-    """Its location and permissions are dropped, and one without the model's hash is rejected."""
-    manifest, arrays = members_of((VERSION1 / 'torchscript.stavpr').read_bytes())
+    """Its location is dropped, and one without the model's hash is rejected."""
+    manifest, arrays = members_of((VERSION1 / 'onnx.stavpr').read_bytes())
     record = json.loads(manifest['settings'])
-    record['backbone'] |= {'model': '/dev/zero', 'allow': True}
+    record['backbone']['model'] = '/dev/zero'
     manifest['settings'] = json.dumps(record)
     path = tmp_path / 'old.stavpr'
     path.write_bytes(version1(manifest, arrays))
-    backbone = load_map(path).settings.backbone
-    assert (backbone.model, backbone.allow) == ('', False)
+    assert load_map(path).settings.backbone.model == ''
     record['backbone']['sha256'] = ''
     manifest['settings'] = json.dumps(record)
     path.write_bytes(version1(manifest, arrays))

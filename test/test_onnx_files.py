@@ -1,15 +1,26 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""ONNX files as other programs write them: batches, inputs, layers, several files."""
+"""ONNX files as other programs write them: batches, inputs, layers, several files, devices."""
 
+from pathlib import Path
+import re
+from types import SimpleNamespace
+
+import cv2
 from evaluation_commands import runner, write_images
 import numpy as np
 import pytest
 from stavpr_ros.commands import build_map
-from stavpr_ros.errors import SettingsError, UnavailableError
+from stavpr_ros.errors import (
+    FeatureMismatchError,
+    ImageError,
+    SettingsError,
+    UnavailableError,
+)
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.features.registry import settings_class
+from stavpr_ros.features.registry import backbone_class, settings_class
 import torch
+from torch import nn
 
 onnx = pytest.importorskip('onnx', reason='the extra onnx is not installed')
 helper, FLOAT = onnx.helper, onnx.TensorProto.FLOAT
@@ -47,8 +58,51 @@ def single(made):
     return torch.cat([made.extract([image]).strips for image in IMAGES], dim=1)
 
 
-def reshape(*shape):
-    return helper.make_node('Reshape', ['y', 's'], ['z']), np.array(shape, np.int64)
+MEAN_OF_ALL = helper.make_node('ReduceMean', ['y'], ['z'], keepdims=0)
+ARGMAX = helper.make_node('ArgMax', ['y'], ['z'], axis=1)
+RESHAPE = helper.make_node('Reshape', ['y', 's'], ['z'])
+
+
+def test_input_of_the_network_by_hand(saved):
+    """Sums over 64 equal pixels; blue first, mean and std by channel; two images."""
+    image = np.full((64, 64, 3), (100, 2, 1), np.uint8)
+    settings = settings_class('onnx')(
+        model=str(saved(w=np.ones((1, 3, 8, 8), np.float32))),
+        size=64, layer='y', channels='bgr', scale=1.0, mean=(0, 0, 20), std=(1, 1, 2),
+    )  # fmt: skip
+    maps = backbone_class('onnx')(settings).feature_maps([image, 2 * image])
+    assert maps.shape == (2, 1, 8, 8)
+    assert (maps[0] == 64 * (1 + 2 + (100 - 20) / 2)).all()
+    assert (maps[1] == 64 * (2 + 4 + (200 - 20) / 2)).all()
+
+
+def test_features_that_are_not_finite_are_rejected(saved):
+    """Sums of 192 values are out of range where all are bright; or always."""
+    path = saved(w=np.ones((1, 3, 8, 8), np.float32))
+    made = extractor(path, mean=(0, 0, 0), std=(1, 1, 1), scale=1e34)
+    with pytest.raises(ImageError, match='not finite'):
+        made.extract([np.full((16, 16, 3), 255, np.uint8)])
+    with pytest.raises(SettingsError, match='test image are not finite'):
+        extractor(path, scale=1e36)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error', 'named'),
+    [
+        ({'layer': 'fire'}, SettingsError, r"no layer 'fire'.*y"),
+        ({'channels': 'hsv'}, SettingsError, 'must be'),
+        ({'sha256': '0' * 64}, FeatureMismatchError, 'sha256'),
+    ],
+)
+def test_wrong_settings_are_rejected_by_name(saved, changes, error, named):
+    with pytest.raises(error, match=named):
+        extractor(saved(), **changes)
+
+
+def test_other_file_is_rejected(tmp_path):
+    (tmp_path / 'broken.onnx').write_bytes(b'no model')
+    with pytest.raises(UnavailableError, match='no usable ONNX model'):
+        extractor(tmp_path / 'broken.onnx')
 
 
 @pytest.mark.parametrize('batch', ['b', 1, 4])
@@ -57,25 +111,34 @@ def test_batch_of_convolutions_may_be_stated(saved, batch):
     torch.testing.assert_close(made.extract(IMAGES).strips, single(made))
 
 
-@pytest.mark.parametrize('shape', [(1, -1), (1, 512)])
-def test_network_for_one_image_is_run_image_by_image(saved, shape):
-    node, s = reshape(*shape)
-    made = extractor(saved(node, shape=(1, 3, 64, 64), s=s), 'z')
-    features = made.extract(IMAGES).strips
-    assert features.shape == (1, 4, 512)
-    assert torch.equal(features, single(made))
+MEAN = helper.make_node('ReduceMean', ['y'], ['m'], axes=[0, 2, 3], keepdims=1)
 
 
-def test_network_whose_images_influence_each_other_is_run_image_by_image(saved):
-    mean = helper.make_node('ReduceMean', ['y'], ['m'], axes=[0, 2, 3], keepdims=1)
-    made = extractor(saved(mean, helper.make_node('Sub', ['y', 'm'], ['z'])), 'z')
+@pytest.mark.parametrize(
+    ('nodes', 'batch', 'shape'),
+    [
+        ([RESHAPE], 1, (1, -1)),
+        ([RESHAPE], 1, (1, 512)),
+        ([MEAN, helper.make_node('Sub', ['y', 'm'], ['z'])], 'b', ()),
+    ],
+    ids=['to any row', 'to one row', 'images influence each other'],
+)
+def test_network_for_one_image_is_run_image_by_image(saved, nodes, batch, shape):
+    made = extractor(saved(*nodes, shape=(batch, 3, 64, 64), s=np.array(shape, np.int64)), 'z')
     assert torch.equal(made.extract(IMAGES).strips, single(made))
 
 
-def test_network_for_four_images_is_rejected_before_any_image(saved):
-    node, s = reshape(4, 512)
-    with pytest.raises(SettingsError, match=r'rejects images of size 64.*Reshape'):
-        extractor(saved(node, shape=(4, 3, 64, 64), s=s), 'z')
+def test_nodes_after_the_layer_are_not_computed(saved):
+    """The reshaping fits images of 64 pixels only; a branch needs a tensor from outside it."""
+    inner = helper.make_node('Identity', ['y'], ['v'])
+    value = helper.make_tensor_value_info('v', FLOAT, None)
+    branch = helper.make_graph([inner], 'branch', [], [value])
+    either = helper.make_node('If', ['c'], ['w2'], then_branch=branch, else_branch=branch)
+    path = saved(RESHAPE, either, shape=('b', 3, 'h', 'w'), s=np.array((1, 512)), c=np.array(True))
+    whole = extractor(path, 'y', 128).extract(IMAGES).strips
+    assert torch.equal(extractor(path, 'w2', 128).extract(IMAGES).strips, whole)
+    with pytest.raises(SettingsError, match='Reshape'):
+        extractor(path, 'z', 128)
 
 
 @pytest.mark.parametrize(
@@ -95,18 +158,18 @@ def test_other_inputs_are_rejected_by_name(saved, changes, named):
         extractor(saved(**changes))
 
 
-def test_layers_that_are_not_one_row_an_image_are_rejected_by_name(saved):
-    mean = helper.make_node('ReduceMean', ['y'], ['z'], keepdims=0)
-    with pytest.raises(SettingsError, match=r"layer 'z' .* returns \(\) for 1 images"):
-        extractor(saved(mean), 'z')
-    node, s = reshape(-1)
-    with pytest.raises(SettingsError, match=r'returns \(512,\) for 1 images'):
-        extractor(saved(node, s=s), 'z')
-    index = helper.make_node('ArgMax', ['y'], ['z'], axis=1)
-    with pytest.raises(SettingsError, match="layer 'z' is int64, expected float numbers"):
-        extractor(saved(index), 'z')
-    with pytest.raises(SettingsError, match="no layer '': its layers are y"):
-        extractor(saved(), '')
+@pytest.mark.parametrize(
+    ('node', 'layer', 'named'),
+    [
+        (RESHAPE, 'z', r'rejects images of size 64.*Reshape'),
+        (MEAN_OF_ALL, 'z', r'returns \(\) for 1 image'),
+        (ARGMAX, 'z', 'is int64, expected float numbers'),
+        (RESHAPE, '', "no layer '': its layers are y, z"),
+    ],
+)
+def test_layers_that_are_not_one_row_an_image_are_rejected_by_name(saved, node, layer, named):
+    with pytest.raises(SettingsError, match=named):
+        extractor(saved(node, s=np.array((4, 512))), layer).extract(IMAGES)
 
 
 def test_weights_in_another_file_are_rejected_with_the_remedy(saved, tmp_path):
@@ -129,3 +192,122 @@ def test_build_map_with_a_network_anywhere_suggests_a_threshold(
     )
     assert code == 0, errors
     assert 'suggested threshold for mode paper' in output
+
+
+# ------------------------------------------------ networks of torch, as the documentation has it
+
+
+class Network(nn.Module):
+    """Patches of 32 pixels; returns a vector, the class token, and the map of the patches."""
+
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(0)
+        self.patches, self.norm = nn.Conv2d(3, 6, 32, stride=32), nn.LayerNorm(6)
+
+    def forward(self, x):
+        maps = self.patches(x)
+        tokens = torch.cat([maps.mean((2, 3))[:, None], maps.flatten(2).transpose(1, 2)], 1)
+        return self.norm(tokens)[:, 0], maps
+
+
+@pytest.mark.filterwarnings('ignore::DeprecationWarning', 'ignore:no signature found')
+@pytest.mark.parametrize('half', [False, True])
+def test_network_of_torch_is_exported_as_documented(tmp_path, monkeypatch, half):
+    """Outputs, an inner layer and tokens of a TorchScript file, in float32 and float16."""
+    page = Path(__file__).parents[1] / 'docs' / 'features.md'
+    code = re.search('```python\n(.*?)```', page.read_text(), re.DOTALL)[1]
+    if half:
+        code = code.replace('.eval()', '.eval().half()').replace('224)', '224).half()')
+    network = Network().eval()
+    monkeypatch.chdir(tmp_path)
+    torch.jit.save(torch.jit.trace(network, torch.rand(1, 3, 224, 224)), 'net.pt')
+    exec(code)
+    plain = {'size': 224, 'mean': (0, 0, 0), 'std': (1, 1, 1)}
+    squares = [cv2.resize(image, (224, 224)) for image in IMAGES]
+    batch = torch.from_numpy(np.stack(squares) / 255).permute(0, 3, 1, 2).float()
+    with torch.no_grad():
+        vector, maps = network(batch)
+        tokens = network.norm(maps.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+    for layer, expected in (
+        ('vector', vector),
+        ('map', maps),
+        ('/norm/LayerNormalization_output_0', tokens),
+    ):
+        settings = settings_class('onnx')(model='net.onnx', layer=layer, **plain)
+        found = backbone_class('onnx')(settings).feature_maps(IMAGES)
+        tolerance = 2e-2 if half else 1e-5
+        torch.testing.assert_close(found, expected, atol=tolerance, rtol=tolerance)
+
+
+# ------------------------------------------------ devices
+
+CUDA, TENSORRT, CPU = (f'{name}ExecutionProvider' for name in ('CUDA', 'Tensorrt', 'CPU'))
+
+
+@pytest.fixture
+def providers(monkeypatch):
+    """
+    Return a function that replaces the providers that onnxruntime offers and can load.
+
+    It returns a list, to which a session adds its own.
+    """
+
+    def replace(offered, loaded):
+        used = []
+
+        def session(content, options, providers):
+            used.extend(name for name in providers if name in (*loaded, CPU))
+            return SimpleNamespace(
+                get_providers=lambda: used,
+                get_inputs=lambda: [SimpleNamespace(type='tensor(float)')],
+            )
+
+        runtime = SimpleNamespace(
+            get_available_providers=lambda: [*offered, CPU],
+            SessionOptions=SimpleNamespace,
+            InferenceSession=session,
+        )
+        module = 'stavpr_ros.features.onnx'
+        monkeypatch.setattr(f'{module}.import_onnx', lambda: (onnx, runtime))
+        monkeypatch.setattr(f'{module}.choose_device', lambda name: name.replace('auto', 'cuda'))
+        return used
+
+    return replace
+
+
+@pytest.mark.parametrize(
+    ('device', 'offered', 'chosen'),
+    [
+        ('cuda', (TENSORRT, CUDA), CUDA),
+        ('auto', (TENSORRT, CUDA), CUDA),
+        ('cuda', (TENSORRT,), TENSORRT),
+        ('cpu', (TENSORRT, CUDA), CPU),
+    ],
+)
+def test_network_runs_on_the_provider_of_its_device(saved, providers, device, offered, chosen):
+    used = providers(offered, offered)
+    settings = settings_class('onnx')(model=str(saved()), layer='y', size=64)
+    backbone_class('onnx')(settings, device)
+    assert used[0] == chosen
+
+
+@pytest.mark.parametrize('offered', [(), (CUDA,)], ids=['not installed', 'not loaded'])
+def test_network_without_provider_of_the_gpu(saved, providers, caplog, offered):
+    """An error if the GPU was requested; auto takes the CPU with a warning."""
+    providers(offered, ())
+    settings = settings_class('onnx')(model=str(saved()), layer='y', size=64)
+    with pytest.raises(UnavailableError, match=r"device 'cuda'.*onnxruntime-gpu.*'cpu' or 'auto'"):
+        backbone_class('onnx')(settings, 'cuda')
+    backbone_class('onnx')(settings, 'auto')
+    assert 'onnxruntime-gpu' in caplog.text
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason='no CUDA device')
+def test_network_on_gpu_equals_cpu(saved):
+    settings = settings_class('onnx')(model=str(saved()), layer='y', size=64)
+    on_gpu, on_cpu = (
+        backbone_class('onnx')(settings, device).feature_maps(IMAGES).cpu()
+        for device in ('auto', 'cpu')
+    )
+    torch.testing.assert_close(on_gpu, on_cpu, atol=1e-2, rtol=1e-2)

@@ -10,7 +10,7 @@ import pytest
 from stavpr_ros.alignment.settings import STRATEGIES
 from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import MapFileError, SettingsError
-from stavpr_ros.features.registry import KINDS
+from stavpr_ros.features.registry import kinds
 from stavpr_ros.parameters import BASIC, BY_NAME, GROUPS, PARAMETERS
 from stavpr_ros.pipeline import (
     node_settings,
@@ -53,7 +53,7 @@ def test_choices_are_those_of_library():
     library = {
         'operation': OPERATIONS,
         'mode': MODES,
-        'features': tuple(kind for kind in KINDS if kind != 'descriptors'),
+        'features': kinds(from_images=True),
         'geometric_check': ('none', *METHODS),
         'relative_pose': EDGE_METHODS,
         'backend': BACKENDS,
@@ -197,6 +197,7 @@ def test_backend_summary_names_device_of_each_stage(
     why = {'cuda': ' (CUDA is available)', 'cpu': ' (no device)'}[available] * (backend == 'auto')
     settings = PipelineSettings(mode=mode, backend=backend)
     extraction, distances, sequences = stages
+    assert settings.extraction_device == ('cpu' if extraction == 'cpu' else backend)
     assert settings.backend_summary(operation) == (
         f'backend {backend}{why}: extraction on {extraction}, image distances on {distances} '
         f'(float32), sequences on {sequences}'

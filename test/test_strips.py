@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Vertical strips, their norms, and the distances between them, against the oracle."""
 
-import re
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -136,30 +134,29 @@ def test_holistic_distances_equal_oracle(seed, W, n, zeros):
 @pytest.mark.parametrize(
     ('query', 'reference', 'named'),
     [
-        ((7, 5), (7, 3, 6), '(7, 5)'),
-        ((6, 5), (7, 3, 5), '(6, 5)'),
-        ((7, 5, 1), (7, 3, 5), '(7, 5, 1)'),
-        ((7, 5), (7, 5), '(7, 5)'),
+        ((7, 5), (7, 3, 6), r'\(7, 5\)'),
+        ((6, 5), (7, 3, 5), r'\(6, 5\)'),
+        ((7, 5, 1), (7, 3, 5), r'\(7, 5, 1\)'),
+        ((7, 5), (7, 5), r'\(7, 5\)'),
     ],
 )
 def test_distances_of_other_shapes_are_rejected(query, reference, named):
     query, reference = torch.zeros(query), torch.zeros(reference)
-    with pytest.raises(InputError, match=re.escape(named)):
+    with pytest.raises(InputError, match=named):
         strip_distances(query, reference)
-    with pytest.raises(InputError, match=re.escape(named)):
+    with pytest.raises(InputError, match=named):
         holistic_distances(query, query[:, 0], reference, reference.sum(-1))
 
 
-def test_holistic_distances_of_other_weights_are_rejected():
+@pytest.mark.parametrize(('first', 'second', 'named'), [(6, 3, r'\(6,\)'), (7, 4, r'\(7, 4\)')])
+def test_holistic_distances_of_other_weights_are_rejected(first, second, named):
     strips, reference = torch.zeros(7, 5), torch.zeros(7, 3, 5)
-    with pytest.raises(InputError, match=r'\(6,\)'):
-        holistic_distances(strips, torch.zeros(6), reference, torch.zeros(7, 3))
-    with pytest.raises(InputError, match=r'\(7, 4\)'):
-        holistic_distances(strips, torch.zeros(7), reference, torch.zeros(7, 4))
+    with pytest.raises(InputError, match=named):
+        holistic_distances(strips, torch.zeros(first), reference, torch.zeros(7, second))
 
 
-def test_strip_distances_of_other_dtype_are_rejected():
-    query, reference = torch.zeros(7, 5), torch.zeros(7, 3, 5)
-    for pair in ((query.double(), reference), (query, reference.double())):
-        with pytest.raises(InputError, match='float64'):
-            strip_distances(*pair)
+@pytest.mark.parametrize('types', [('float64', 'float32'), ('float32', 'float64')])
+def test_strip_distances_of_other_dtype_are_rejected(types):
+    query, reference = (getattr(torch, name) for name in types)
+    with pytest.raises(InputError, match='float64'):
+        strip_distances(torch.zeros(7, 5, dtype=query), torch.zeros(7, 3, 5, dtype=reference))

@@ -295,52 +295,13 @@ def test_extractor_of_vector_and_strips_equals_both_alone(network, route):
     assert LocalFeatures.concatenate([both, bare]).vectors is None
 
 
-class Pair(torch.nn.Module):
-    """Returns a map and its mean over all cells, both times a factor."""
-
-    def __init__(self):
-        super().__init__()
-        self.conv = torch.nn.Conv2d(3, 5, 8, 8)
-        self.factor = torch.nn.Parameter(torch.ones(()))
-
-    def forward(self, x):
-        maps = self.conv(x)
-        return maps, self.factor * maps.mean((2, 3))
-
-
-def pair(tmp_path, vector, **changes):
-    torch.manual_seed(0)
-    network = Pair()
-    for name, value in changes.items():
-        getattr(network, name).data.fill_(value)
-    path = tmp_path / 'pair.pt'
-    torch.jit.trace(network.eval(), torch.zeros(1, 3, 64, 64)).save(str(path))
-    settings = settings_class('torchscript')(model=str(path), size=64, allow=True, vector=vector)
-    return network, FeatureExtractor('torchscript', settings)
-
-
-def test_torchscript_extractor_of_two_outputs_has_strips_and_vector(tmp_path, route):
-    _, made = pair(tmp_path, '1')
-    features = made.extract(route[:2])
-    assert features.strips.shape == (7, 2, 5 * 8)
-    assert features.vectors.shape == (2, 5)
-    torch.testing.assert_close(features.vectors.norm(dim=1), torch.ones(2))
-    assert pair(tmp_path, '')[1].extract(route[:2]).vectors is None
-
-
-def test_unusable_vectors_are_rejected_before_any_image(network, tmp_path):
+def test_unusable_vectors_are_rejected_before_any_image(network):
     with pytest.raises(SettingsError, match="vector = 'map' is what the strips are made of"):
         extractor(network, 'map', vector='map')
     with pytest.raises(SettingsError, match=r"no layer 'local'.*its layers are conv, map"):
         extractor(network, 'map', vector='local')
     with pytest.raises(SettingsError, match=r"'conv'.*\(1, 16, 8, 8\).*expected one vector"):
         extractor(network, 'map', vector='conv')
-    with pytest.raises(SettingsError, match="vector = '0'"):
-        pair(tmp_path, '0')
-    with pytest.raises(SettingsError, match="no output '2'"):
-        pair(tmp_path, '2')
-    with pytest.raises(SettingsError, match='not finite'):
-        pair(tmp_path, '1', factor=math.nan)
 
 
 def test_query_without_vector_on_map_with_vectors_is_rejected(network, route):

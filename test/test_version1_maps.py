@@ -7,7 +7,7 @@ The files in ``data/version1`` were written by commit eb40c94, before most names
 ``build_map`` on the eight images ``route_images(8)`` of conftest.py, and with an extractor of the
 kind, settings, strips and projection of the table ``MAPS`` below. ``gradient_projected`` has
 stamps, identifiers, poses (x = i, that of place 3 unknown) and thumbnails 48 pixels wide.
-``tiny.onnx`` and ``tiny.pt`` are one convolution and a ReLU; the weights of the paper's networks
+``tiny.onnx`` is one convolution and a ReLU; the weights of the paper's networks
 are the random ones of conftest.py, whose files are equal to the bit on every machine.
 """
 
@@ -19,8 +19,7 @@ from fixtures import route_images
 import numpy as np
 import pytest
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.features import KINDS
-from stavpr_ros.features.registry import settings_class
+from stavpr_ros.features.registry import kinds, settings_class
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 import torch
@@ -52,14 +51,6 @@ MAPS = {
         4,
         None,
     ),
-    'torchscript': (
-        'torchscript',
-        IMAGENET
-        | {'layer': 'relu', 'channels': 'rgb', 'size': 32, 'half': True}
-        | {'model': 'tiny.pt', 'resize': 'area', 'sha256': '5994cbbd120ebce2'},
-        4,
-        None,
-    ),
     'densenet161_places365': (
         'densenet161_places365',
         {'half': False, 'model': 'densenet161_places365.pth.tar', 'resize': 'bilinear'}
@@ -80,16 +71,15 @@ MAPS = {
 @pytest.fixture
 def model(request, name):
     """Return the file of the map's network: stored beside the map, or made again."""
-    stored = {'onnx': 'tiny.onnx', 'torchscript': 'tiny.pt'}
-    if name in stored:
-        return str(FOLDER / stored[name])
+    if name == 'onnx':
+        return str(FOLDER / 'tiny.onnx')
     made = {'densenet161_places365': 'densenet_file', 'vgg16': 'vgg_file'}
     return str(request.getfixturevalue(made[name])) if name in made else ''
 
 
 def test_version1_maps_cover_every_kind():
     assert {path.stem for path in FOLDER.glob('*.stavpr')} == MAPS.keys()
-    assert {kind for kind, *_ in MAPS.values()} <= KINDS.keys()
+    assert {kind for kind, *_ in MAPS.values()} <= set(kinds())
 
 
 @pytest.mark.parametrize('name', MAPS)
@@ -100,7 +90,7 @@ def test_version1_map_loads_with_its_settings(name, tmp_path):
     read = json.loads(place_map.settings.to_json())
     if 'sha256' in backbone:
         read['backbone']['sha256'] = read['backbone']['sha256'][:16]
-    forgotten = {'model': '', 'half': False, 'allow': False}  # nothing that a map may state
+    forgotten = {'model': '', 'half': False}  # nothing that a map may state
     before = getattr(settings_class(kind), 'BEFORE', {})  # settings that there were none of
     forgotten = {key: v for key, v in forgotten.items() if key in read['backbone']}
     expected = before | backbone | forgotten
@@ -114,14 +104,13 @@ def test_version1_map_loads_with_its_settings(name, tmp_path):
     assert torch.equal(again.features.strips, place_map.features.strips)
 
 
-@pytest.mark.filterwarnings('ignore:.torch.jit:DeprecationWarning')
 @pytest.mark.parametrize('name', MAPS)
 def test_version1_map_recognizes_its_images(name, model):
     """Features extracted now are those of the map, and a window of three finds its places."""
     if name == 'onnx':
         pytest.importorskip('onnxruntime', reason='the extra onnx is not installed')
     place_map = load_map(FOLDER / f'{name}.stavpr')
-    query = place_map.extractor(model=model, allow_torchscript=True).extract(route_images(PLACES))
+    query = place_map.extractor(model=model).extract(route_images(PLACES))
     torch.testing.assert_close(query.strips, place_map.features.strips, rtol=0, atol=1e-5)
     torch.testing.assert_close(query.weights, place_map.features.weights, rtol=0, atol=1e-5)
     settings = RecognizerSettings(0.5, sequence=SequenceSettings(3), mode='paper')

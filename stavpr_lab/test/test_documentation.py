@@ -34,7 +34,8 @@ def workspace(tmp_path_factory) -> Path:
 
 
 def code_blocks(page: Path, language: str = '') -> list[str]:
-    return re.findall(rf'^```{language}\n(.*?)^```', page.read_text(), re.M | re.S)
+    blocks = re.findall(r'^```(\w*)\n(.*?)^```$', page.read_text(), re.M | re.S)
+    return [code for found, code in blocks if found == language]
 
 
 def documented_commands() -> list[list[str]]:

@@ -301,7 +301,6 @@ def _report(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
             place_map,
             progress=True,
             model=getattr(arguments, f'{kind}_model', None) or '',
-            allow_torchscript=arguments.torchscript_allow or False,
         )
     except InputError as error:
         print(f'no threshold is suggested for mode paper: {error}')

@@ -6,9 +6,9 @@ import argparse
 import dataclasses
 from typing import Any, TYPE_CHECKING
 
-from stavpr_ros.devices import choose_device, DEVICES
+from stavpr_ros.devices import DEVICES
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features.registry import KINDS, settings_class
+from stavpr_ros.features.registry import kinds, settings_class
 
 if TYPE_CHECKING:
     from stavpr_ros.features import FeatureExtractor
@@ -47,7 +47,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--features``, the general options and ``--KIND-NAME`` for each setting of a kind."""
     add = parser.add_argument_group('features').add_argument
     kind_help = 'kind of features (%(default)s)'
-    add('--features', choices=list(KINDS), default='gradient', help=kind_help)
+    add('--features', choices=kinds(), default='gradient', help=kind_help)
     strips = 'vertical strips of an image (7; 1 if the features are one vector)'
     add('--strips', type=int, metavar='W', help=strips)
     projection = 'each strip to D dimensions by a random projection; build_map: pca:D, by the '
@@ -55,7 +55,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     add('--projection', type=_projection, metavar='[pca:]D', help=projection)
     add('--seed', type=int, default=0, help='of the random projection (%(default)s)')
     add('--device', default='auto', choices=DEVICES, help='where features are computed')
-    for kind in KINDS:
+    for kind in kinds():
         group = parser.add_argument_group(f'features {kind}')
         for row in dataclasses.fields(settings_class(kind)):
             required = row.default is dataclasses.MISSING
@@ -89,7 +89,7 @@ def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':
         arguments.strips,
         arguments.projection,
         arguments.seed,
-        choose_device(arguments.device),
+        arguments.device,
     )
 
 
@@ -112,7 +112,7 @@ def kind_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the values of the options ``--KIND-NAME``, by option; None = not given."""
     return {
         _option(kind, row.name): getattr(arguments, f'{kind}_{row.name}')
-        for kind in KINDS
+        for kind in kinds()
         for row in dataclasses.fields(settings_class(kind))
     }
 
@@ -132,7 +132,7 @@ def _backbone_settings(arguments: argparse.Namespace) -> Any:
     own = {_option(kind, row.name) for row in rows}
     for option, value in kind_options(arguments).items():
         if value is not None and option not in own:
-            other = next(other for other in KINDS if option.startswith(f'--{other}-'))
+            other = next(other for other in kinds() if option.startswith(f'--{other}-'))
             raise SettingsError(
                 f'{option} was given with --features {kind}: give --features {other}'
             )

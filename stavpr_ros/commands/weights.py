@@ -6,7 +6,7 @@ import sys
 
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features.registry import backbone_class, KINDS, PublishedSettings
+from stavpr_ros.features.registry import backbone_class, kinds, PublishedSettings, settings_class
 
 EPILOG = """
 Nothing else in this package goes online. The file is downloaded over https, compared with its
@@ -21,8 +21,8 @@ def main(args: list[str] | None = None) -> int:
 
     def work() -> None:
         parser = make_parser('weights', 'Download the published weights of a network.', EPILOG)
-        kinds = [kind for kind, (settings, _) in KINDS.items() if settings is PublishedSettings]
-        parser.add_argument('features', choices=kinds, help='kind of features')
+        published = [kind for kind in kinds() if settings_class(kind) is PublishedSettings]
+        parser.add_argument('features', choices=published, help='kind of features')
         parser.add_argument(
             '--sha256', default='', help='hash of the file, 64 digits; known for vgg16'
         )

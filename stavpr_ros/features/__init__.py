@@ -12,10 +12,9 @@ from typing import Any, TYPE_CHECKING
 if TYPE_CHECKING:
     from stavpr_ros.features.extractor import FeatureExtractor, FeatureSettings, LocalFeatures
     from stavpr_ros.features.projection import Projection
-    from stavpr_ros.features.registry import KINDS
 
-__all__ = ['KINDS', 'FeatureExtractor', 'FeatureSettings', 'LocalFeatures', 'Projection']
-_MODULES = {'KINDS': 'registry', 'Projection': 'projection'}
+__all__ = ['FeatureExtractor', 'FeatureSettings', 'LocalFeatures', 'Projection']
+_MODULES = {'Projection': 'projection'}
 
 
 def __getattr__(name: str) -> Any:

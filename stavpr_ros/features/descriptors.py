@@ -7,7 +7,7 @@ An array has the shape (n, D), one vector an image, or (n, W, D), W local featur
 right. Nothing in a file is executed: no pickles, no MATLAB objects.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 import re
@@ -37,10 +37,6 @@ class Descriptors:
             'images: give those of map and query both (evaluate --map FILE --query FILE), or make '
             'the map with the network itself'
         )
-
-    def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
-        """See :class:`stavpr_ros.features.registry.Backbone`."""
-        raise NotImplementedError
 
 
 def is_descriptors(path: str | None) -> bool:

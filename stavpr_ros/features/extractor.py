@@ -127,14 +127,15 @@ class FeatureExtractor:
 
     A network is tried on one image first, so that unusable ones fail before any work.
 
-    :param kind: name in :data:`stavpr_ros.features.registry.KINDS`.
+    :param kind: one of :func:`stavpr_ros.features.registry.kinds`.
     :param backbone: settings of that kind; None for its defaults.
     :param strips: number of vertical strips W; None = 7, or 1 if an image has one vector.
     :param projection: number of dimensions of a new Gaussian projection, a :class:`Projection`,
         or None.
     :param seed: of a new projection.
-    :param device: ``cpu`` or ``cuda``.
+    :param device: ``cpu``, ``cuda`` or ``auto``: ``cuda`` where it is available.
     :raises SettingsError: the network's output cannot be used.
+    :raises UnavailableError: the device or the network's file is not there.
     """
 
     def __init__(
@@ -177,24 +178,24 @@ class FeatureExtractor:
         settings: FeatureSettings,
         projection: Projection | None,
         device: str = 'cpu',
-        **changes: Any,
+        model: str = '',
     ) -> 'FeatureExtractor':
         """
         Make the extractor with the settings of a map.
 
-        :param changes: settings of the backbone to replace: ``model``, the file of the model or a
-            folder with it, see :func:`stavpr_ros.features.weights.find_model`; ``allow``.
-        :raises FeatureMismatchError: the projection or a change gives other features.
+        :param model: file of the network or a folder with it, for kinds that have one, see
+            :func:`stavpr_ros.features.weights.find_model`; '' = as the settings state.
+        :raises FeatureMismatchError: the projection or the model gives other features.
         :raises UnavailableError: the model is not found.
         """
-        known = {field.name for field in dataclasses.fields(settings.backbone)}
-        changes = {name: value for name, value in changes.items() if value and name in known}
-        if 'model' in known and settings.backbone.sha256:
-            from stavpr_ros.features.weights import find_model
+        backbone = settings.backbone
+        if isinstance(backbone, NetworkSettings):
+            model = model or backbone.model
+            if backbone.sha256:
+                from stavpr_ros.features.weights import find_model
 
-            stated = changes.get('model', settings.backbone.model)
-            changes['model'] = str(find_model(settings.backbone.sha256, stated))
-        backbone = dataclasses.replace(settings.backbone, **changes)
+                model = str(find_model(backbone.sha256, model))
+            backbone = dataclasses.replace(backbone, model=model)
         extractor = cls(settings.kind, backbone, settings.strips, projection, device=device)
         if extractor.settings != settings:
             raise FeatureMismatchError(

@@ -24,6 +24,7 @@ import math
 import cv2
 import numpy as np
 from stavpr_ros.compilation import kernel
+from stavpr_ros.devices import choose_device
 from stavpr_ros.features.extractor import resize_square
 from stavpr_ros.features.registry import GradientSettings
 import torch
@@ -53,7 +54,7 @@ class Gradient:
 
     def __init__(self, settings: GradientSettings, device: str = 'cpu') -> None:
         self.settings = settings
-        self._device = torch.device(device)
+        self._device = torch.device(choose_device(device))
         self._shape = settings.orientations, settings.cells, settings.cells
 
     def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:

@@ -3,18 +3,19 @@
 """
 Features of any network in an ONNX file, the output of a named inner layer.
 
-Requires the extra ``onnx`` (packages onnx and onnxruntime). The file is data: weights and
-operators of the ONNX standard; nothing in it is executed as Python.
+Requires the extra ``onnx`` (packages onnx and onnxruntime; onnxruntime-gpu for a GPU). The file is
+data: weights and operators of the ONNX standard; nothing in it is executed as Python.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+import logging
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-from stavpr_lab.features.export import BATCH, TOLERANCE
+from stavpr_ros.devices import choose_device
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.extractor import resize_square, TEST_SIDE
 from stavpr_ros.features.outputs import as_maps, as_vectors
@@ -23,9 +24,19 @@ from stavpr_ros.features.weights import read_model
 import torch
 
 FLOAT, FLOAT16 = 1, 10  # as ONNX numbers them
+BATCH = 'stavpr_batch'  # property of a file: '1' = the images of a batch influence each other
+TOLERANCE = 1e-3  # largest difference between computations of one network, over the largest value
+ON_GPU = ('CUDAExecutionProvider', 'TensorrtExecutionProvider')  # the first that is offered
+ON_CPU = 'CPUExecutionProvider'
+_log = logging.getLogger(__name__)
 
 
-def _import_extra() -> tuple[ModuleType, ModuleType]:
+def import_onnx() -> tuple[ModuleType, ModuleType]:
+    """
+    Return the modules onnx and onnxruntime.
+
+    :raises UnavailableError: they are not installed.
+    """
     try:
         import onnx
         import onnxruntime
@@ -38,37 +49,60 @@ def _import_extra() -> tuple[ModuleType, ModuleType]:
 
 
 class Onnx:
-    """Feature maps, or vectors, of one layer of a network, float32."""
+    """
+    Feature maps, or vectors, of one layer of a network, float32.
+
+    :param device: ``cuda`` computes with onnxruntime's provider of CUDA or TensorRT; ``auto`` logs
+        whether it takes one of them, where torch has a GPU.
+    :raises UnavailableError: the packages are not installed, the file cannot be read or run, or
+        device ``cuda`` has no provider.
+    :raises SettingsError: the file has another input, or no such layer.
+    """
 
     def __init__(self, settings: OnnxSettings, device: str = 'cpu') -> None:
-        onnx, onnxruntime = _import_extra()
+        onnx, onnxruntime = import_onnx()
         file, digest = read_model(Path(settings.model), required=settings.sha256)
         with file:
             content = file.read()
         self.settings = replace(settings, sha256=digest)
-        self._device = torch.device(device)
+        self._device = torch.device(choose_device(device))
         self._layers = [settings.layer, *([settings.vector] if settings.vector else [])]
         model = self._with_outputs(onnx, content)
         properties = {row.key: row.value for row in model.metadata_props}
         # whether images go through the network alone; None = not known yet
         self._one_by_one = True if properties.get(BATCH) == '1' else None
-        providers = ['CPUExecutionProvider']
-        on_gpu = self._device.type == 'cuda'
-        if on_gpu and 'CUDAExecutionProvider' in onnxruntime.get_available_providers():
-            providers.insert(0, 'CUDAExecutionProvider')
+        offered = onnxruntime.get_available_providers()
+        gpu = [name for name in ON_GPU if name in offered][: self._device.type == 'cuda']
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         options.log_severity_level = 4  # errors are raised
         try:
             self._session = onnxruntime.InferenceSession(
-                model.SerializeToString(), options, providers=providers
+                model.SerializeToString(), options, providers=[*gpu, ON_CPU]
             )
         except Exception as error:  # onnxruntime has exception types of its own
             raise UnavailableError(
                 f'{settings.model} cannot be run by onnxruntime: {error}'
             ) from error
+        if self._device.type == 'cuda':
+            self._check_provider(device)
         self._input = self._session.get_inputs()[0]
         self._dtype = np.float16 if self._input.type == 'tensor(float16)' else np.float32
+
+    def _check_provider(self, device: str) -> None:
+        """Reject a session on the CPU if ``cuda`` was requested; else log where it computes."""
+        chosen = self._session.get_providers()[0]  # onnxruntime leaves out what it cannot load
+        if chosen in ON_GPU:
+            _log.info('features onnx: %s', chosen)
+            return
+        reason = (
+            "onnxruntime computes features 'onnx' on the CPU: its providers of CUDA and TensorRT "
+            'are not installed or cannot be loaded; pip install onnxruntime-gpu instead of '
+            'onnxruntime'
+        )
+        if device == 'cuda':
+            raise UnavailableError(f"device 'cuda': {reason}, or take 'cpu' or 'auto'")
+        _log.warning('device auto: %s', reason)
 
     def _with_outputs(self, onnx: ModuleType, content: bytes):  # type: ignore[no-untyped-def]
         """Return the model with the layers as its only outputs and a variable batch size."""
@@ -92,6 +126,7 @@ class Onnx:
             raise SettingsError(f'{name} has {len(inputs)} inputs: expected one, the image')
         self._require_images(inputs[0])
         inputs[0].type.tensor_type.shape.dim[0].dim_param = 'batch'
+        _prune(model.graph, self._layers)
         del model.graph.output[:]
         del model.graph.value_info[:]  # it may fix the batch size
         for layer in self._layers:
@@ -199,3 +234,20 @@ class Onnx:
         values: np.ndarray = resized.astype(np.float32) * settings.scale
         mean, std = (np.array(numbers, np.float32) for numbers in (settings.mean, settings.std))
         return ((values - mean) / std).transpose(2, 0, 1)
+
+
+def _prune(graph: Any, layers: list[str]) -> None:
+    """Remove the nodes that layers do not depend on: onnxruntime would compute them as well."""
+    needed, kept = set(layers), []
+    for node in reversed(graph.node):
+        if needed.intersection(node.output):
+            needed |= _inputs(node)
+            kept.append(node)
+    del graph.node[:]
+    graph.node.extend(reversed(kept))
+
+
+def _inputs(node: Any) -> set[str]:
+    """Return the names that a node takes, also those within its branches and loops."""
+    graphs = [attribute.g for attribute in node.attribute if attribute.HasField('g')]
+    return set(node.input).union(*(_inputs(inner) for graph in graphs for inner in graph.node))

@@ -63,7 +63,7 @@ def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> torch.Te
             f'expected those of a square; prefix_tokens = {T - largest**2} leaves {largest} x '
             f'{largest}'
         )
-    return output[:, prefix_tokens:].mT.reshape(n, C, side, side)
+    return output[:, prefix_tokens:].transpose(1, 2).reshape(n, C, side, side)
 
 
 def as_vectors(output: Any, images: int, name: str) -> torch.Tensor:

@@ -18,6 +18,7 @@ import re
 from typing import ClassVar
 
 import numpy as np
+from stavpr_ros.devices import choose_device
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features.preprocessing import BatchMaker
 from stavpr_ros.features.registry import PublishedSettings
@@ -58,7 +59,7 @@ class PublishedNetwork:
     whole_network: ClassVar[type[nn.Module]]
 
     def __init__(self, settings: PublishedSettings, device: str = 'cpu') -> None:
-        self._device = torch.device(device)
+        self._device = torch.device(choose_device(device))
         path = published_path(settings.model, self.published)
         file, digest = read_model(path, expected_hash(path, self.published), settings.sha256)
         with file:

@@ -18,7 +18,6 @@ class BatchMaker:
     :param resize: method, see :func:`stavpr_ros.features.extractor.resize_square`.
     :param mean: of each channel, in the order of the network's input.
     :param std: likewise.
-    :param bgr: the network's input is blue, green, red.
     :param dtype: of the batch, float32 or float16.
     """
 
@@ -31,9 +30,8 @@ class BatchMaker:
         scale: float = 1 / 255,
         mean: Sequence[float] = IMAGENET_MEAN,
         std: Sequence[float] = IMAGENET_STD,
-        bgr: bool = False,
     ) -> None:
-        self._size, self._resize, self._bgr = size, resize, bgr
+        self._size, self._resize = size, resize
         self._device, self._dtype = device, dtype
         deviation = torch.tensor(std, dtype=torch.float64)
         factor, shift = scale / deviation, -torch.tensor(mean, dtype=torch.float64) / deviation
@@ -50,6 +48,4 @@ class BatchMaker:
         squares = np.stack([resize_square(image, self._size, self._resize) for image in images])
         # one byte a value is copied to the device
         pixels = torch.from_numpy(squares).to(self._device).permute(0, 3, 1, 2)
-        if self._bgr:
-            pixels = pixels.flip(1)
         return torch.addcmul(self._shift, pixels.float(), self._factor).to(self._dtype)

@@ -151,37 +151,10 @@ class OnnxSettings(NetworkSettings):
             )
         if self.prefix_tokens < 0:
             raise SettingsError(f'prefix_tokens = {self.prefix_tokens} must be at least 0')
-        if self.vector and self.vector == self._strips_of:
+        if self.vector and self.vector == self.layer:
             raise SettingsError(
                 f'vector = {self.vector!r} is what the strips are made of: leave it out'
             )
-
-    @property
-    def _strips_of(self) -> str:
-        return self.layer
-
-
-@dataclass(frozen=True, kw_only=True)
-class TorchScriptSettings(OnnxSettings):
-    """Settings of the TorchScript features: those of ONNX, and the precision."""
-
-    BEFORE: ClassVar[dict[str, Any]] = {**OnnxSettings.BEFORE, 'output': '0'}
-
-    model: str = setting(help='the TorchScript file', identity=False)
-    layer: str = setting(
-        '',
-        help='module to use the output of, such as features.23: maps (n, C, H, W), tokens '
-        "(n, T, C) or vectors (n, D); empty: the network's output",
-    )
-    output: str = setting('0', help='which one of several outputs: its number, or its key')
-    half: bool = setting(False, help=_HALF_HELP, identity=False)
-    allow: bool = setting(
-        False, help='permit to run this file: TorchScript is a program', identity=False
-    )
-
-    @property
-    def _strips_of(self) -> str:
-        return self.output
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,16 +191,34 @@ class DescriptorSettings:
     source: str = setting('', help='what computed the descriptors, such as netvlad')
 
 
-# Settings and class of each kind, the class as MODULE:NAME in this package, imported on use.
-KINDS: dict[str, tuple[type, str]] = {
-    'gradient': (GradientSettings, 'gradient:Gradient'),
-    'onnx': (OnnxSettings, 'onnx:Onnx'),
-    'torchscript': (TorchScriptSettings, 'torchscript:TorchScript'),
-    'densenet161_places365': (PublishedSettings, 'paper_networks:DenseNet161Places365'),
-    'vgg16': (PublishedSettings, 'paper_networks:VGG16Pool4'),
-    'vgg16_fc6': (PublishedSettings, 'paper_networks:VGG16Fc6'),
-    'netvlad': (NetVladSettings, 'netvlad:NetVlad'),
-    'descriptors': (DescriptorSettings, 'descriptors:Descriptors'),
+@dataclass(frozen=True)
+class Kind:
+    """
+    A kind of features.
+
+    :param settings: the frozen dataclass of its settings.
+    :param backbone: its class, a :class:`Backbone`, as ``package.module:Class``; imported on use.
+    :param from_images: False for features that a node cannot extract.
+    """
+
+    settings: Any
+    backbone: str
+    from_images: bool = True
+
+
+_FEATURES = 'stavpr_ros.features'
+KINDS = {
+    'gradient': Kind(GradientSettings, f'{_FEATURES}.gradient:Gradient'),
+    'onnx': Kind(OnnxSettings, f'{_FEATURES}.onnx:Onnx'),
+    'densenet161_places365': Kind(
+        PublishedSettings, f'{_FEATURES}.paper_networks:DenseNet161Places365'
+    ),
+    'vgg16': Kind(PublishedSettings, f'{_FEATURES}.paper_networks:VGG16Pool4'),
+    'vgg16_fc6': Kind(PublishedSettings, f'{_FEATURES}.paper_networks:VGG16Fc6'),
+    'netvlad': Kind(NetVladSettings, f'{_FEATURES}.netvlad:NetVlad'),
+    'descriptors': Kind(
+        DescriptorSettings, f'{_FEATURES}.descriptors:Descriptors', from_images=False
+    ),
 }
 
 
@@ -235,7 +226,8 @@ class Backbone(Protocol):
     """
     Images to feature maps.
 
-    The class of a kind is called with the kind's settings and the device (``cpu``, ``cuda``).
+    The class of a kind is called with the kind's settings and the device: ``cpu``, ``cuda``, or
+    ``auto``, which is ``cuda`` where it is available.
     """
 
     settings: Any
@@ -255,15 +247,29 @@ class Backbone(Protocol):
         ...
 
 
+def kinds(*, from_images: bool = False) -> tuple[str, ...]:
+    """
+    Return the names of the kinds.
+
+    :param from_images: only those that are extracted from images.
+    """
+    return tuple(name for name, kind in KINDS.items() if kind.from_images or not from_images)
+
+
 def settings_class(kind: str) -> Any:
     """
     Return the frozen dataclass of a kind's settings.
 
     :raises SettingsError: no such kind.
     """
+    if kind == 'torchscript':
+        raise SettingsError(
+            "features 'torchscript' were removed: export the network to an ONNX file "
+            '(docs/features.md) and take features onnx; build a map with it again'
+        )
     if kind not in KINDS:
-        raise SettingsError(f'features {kind!r} are unknown: take one of {", ".join(KINDS)}')
-    return KINDS[kind][0]
+        raise SettingsError(f'features {kind!r} are unknown: take one of {", ".join(kinds())}')
+    return KINDS[kind].settings
 
 
 def backbone_class(kind: str) -> Any:
@@ -273,8 +279,8 @@ def backbone_class(kind: str) -> Any:
     :raises SettingsError: no such kind.
     """
     settings_class(kind)
-    module, name = KINDS[kind][1].split(':')
-    return getattr(importlib.import_module(f'stavpr_ros.features.{module}'), name)
+    module, name = KINDS[kind].backbone.split(':')
+    return getattr(importlib.import_module(module), name)
 
 
 def settings_from_json(kind: str, text: str, model: str = '') -> Any:

@@ -159,20 +159,15 @@ class PlaceMap:
         """Return the session that a place is of, None without sessions."""
         return None if self.session_index is None else self.sessions[self.session_index[place]]
 
-    def extractor(
-        self, device: str = 'cpu', model: str = '', allow_torchscript: bool = False
-    ) -> FeatureExtractor:
+    def extractor(self, device: str = 'cpu', model: str = '') -> FeatureExtractor:
         """
         Make the extractor for queries, with the settings of this map.
 
         :param model: the network's file, or a folder with it; '' = in the models folder.
-        :param allow_torchscript: permit to run a network that is a TorchScript program.
         :raises FeatureMismatchError: the file is not the map's.
         :raises UnavailableError: the file is not there.
         """
-        return FeatureExtractor.from_settings(
-            self.settings, self.projection, device, model=model, allow=allow_torchscript
-        )
+        return FeatureExtractor.from_settings(self.settings, self.projection, device, model)
 
     def thumbnail(self, place: int) -> np.ndarray | None:
         """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None."""

@@ -3,7 +3,7 @@
 """Settings of the pipeline and of the node, built from the values of the parameters."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 import os
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,6 @@ class PipelineSettings:
     precision: str = 'float32'
     time_budget_ms: float = 0.0
     model_path: str = ''
-    allow_torchscript: bool = False
     features: str = 'gradient'
     feature_settings: str = ''
     exclude_places: int = 50
@@ -177,9 +176,12 @@ class PipelineSettings:
         backbone = settings_from_json(
             self.features, self.feature_settings or '{}', self.model_path
         )
-        if self.features == 'torchscript':
-            backbone = replace(backbone, allow=self.allow_torchscript)
-        return FeatureExtractor(self.features, backbone, device=choose_backend(self.backend))
+        return FeatureExtractor(self.features, backbone, device=self.extraction_device)
+
+    @property
+    def extraction_device(self) -> str:
+        """Return the requested device of the features; that of ``auto`` is the backend's."""
+        return 'cpu' if choose_backend(self.backend) == 'cpu' else self.backend
 
 
 @dataclass(frozen=True, kw_only=True)

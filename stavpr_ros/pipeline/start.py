@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import MapFileError, SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, open_map, PlaceMap, verify_map
@@ -51,9 +50,7 @@ def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
         remedy = f'name one of its maps: {maps}' if maps else 'build a map of its images'
         raise MapFileError(f'{path} is a folder, not a map: {remedy} (build_map makes map files)')
     place_map = store_of(path).open_map(path) if is_address(path) else open_map(path)
-    extractor = place_map.extractor(
-        choose_backend(settings.backend), settings.model_path, settings.allow_torchscript
-    )
+    extractor = place_map.extractor(settings.extraction_device, settings.model_path)
     return LoadedMap(path, place_map, extractor)
 
 

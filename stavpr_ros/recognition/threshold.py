@@ -56,7 +56,6 @@ def suggest_threshold(
     windows: int = 24,
     progress: bool = False,
     model: str = '',
-    allow_torchscript: bool = False,
 ) -> ThresholdSuggestion:
     """
     Ask how near the map's places come to *other* places of it when they look different.
@@ -68,7 +67,7 @@ def suggest_threshold(
 
     :param settings: of the recognizer; its threshold is not used.
     :param windows: how many windows are tried.
-    :param model, allow_torchscript: of the network, see :meth:`PlaceMap.extractor`.
+    :param model: file of the network, see :meth:`PlaceMap.extractor`.
     :raises InputError: the map has no thumbnails, or is too short to have an elsewhere.
     """
     settings = settings or RecognizerSettings(threshold=1.0)
@@ -81,7 +80,7 @@ def suggest_threshold(
     if not place_map.thumbnails:
         raise InputError('the map was built without thumbnails: a threshold cannot be tried on it')
     recognizer = PlaceRecognizer(place_map, settings)
-    extractor = place_map.extractor(model=model, allow_torchscript=allow_torchscript)
+    extractor = place_map.extractor(model=model)
     rng = np.random.default_rng(0)
     elsewhere = []
     starts = np.unique(np.linspace(0, n - l, min(windows, n - l + 1)).astype(int))

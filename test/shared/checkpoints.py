@@ -3,15 +3,14 @@
 """Checkpoints for the tests: random parameters, in the formats of Python 2 and torch 0.3."""
 
 from collections import OrderedDict
+from dataclasses import dataclass
 import struct
 
 import numpy as np
 import torch
 
-MAGIC, PROTOCOL = (
-    0x1950A86A20F9469CFC6C,
-    1001,
-)  # the first two numbers in every file of before torch 1.6
+# The first two numbers in every file from before torch 1.6.
+MAGIC, PROTOCOL = 0x1950A86A20F9469CFC6C, 1001
 
 
 def random_parameters(
@@ -108,14 +107,26 @@ class OldPickle:
         return self._emit(Global('torch._utils', '_rebuild_tensor')) + view + b'R'
 
 
+@dataclass
 class Global:
-    def __init__(self, module: str, name: str) -> None:
-        self.module, self.name = module, name
+    module: str
+    name: str
 
 
+@dataclass
 class Call:
-    def __init__(self, function: Global, arguments: tuple[object, ...]) -> None:
-        self.function, self.arguments = function, arguments
+    function: Global
+    arguments: tuple[object, ...]
+
+
+@dataclass
+class Hostile:
+    """Writes a file when it is unpickled."""
+
+    path: str
+
+    def __reduce__(self):
+        return (open, (self.path, 'w'))
 
 
 def places365_file(parameters: dict[str, torch.Tensor]) -> bytes:

@@ -24,7 +24,6 @@ from stavpr_ros.commands.feature_options import (
     make_extractor,
     require_descriptors_alone,
 )
-from stavpr_ros.devices import choose_device
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.descriptors import (
@@ -173,11 +172,7 @@ class _Loader:
         model = f'--{found.settings.kind}-model'  # a map does not state where it is
         options = {'--projection': given.projection, '--seed': given.seed, **kind_options(given)}
         for option, value in options.items():
-            if value is not None and option not in (
-                model,
-                '--torchscript-allow',
-                '--descriptors-source',
-            ):
+            if value is not None and option not in (model, '--descriptors-source'):
                 raise SettingsError(f'{option}: the map {path} has its own or none; leave it out')
         self._saved = found
         return found
@@ -187,9 +182,7 @@ class _Loader:
             given = self._arguments
             if self._saved is not None:
                 model = getattr(given, f'{self._saved.settings.kind}_model', None)
-                self._extractor = self._saved.extractor(
-                    choose_device(given.device), model or '', bool(given.torchscript_allow)
-                )
+                self._extractor = self._saved.extractor(given.device, model or '')
             else:
                 options = argparse.Namespace(**vars(given))
                 for name, default in DEFAULTS.items():

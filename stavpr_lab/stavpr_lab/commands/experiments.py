@@ -137,8 +137,8 @@ def _check_baselines(options: argparse.Namespace) -> None:
 
     if (options.descriptors or options.ssm_layers) and options.experiment != 'paper':
         raise SettingsError('--descriptors and --ssm-layers go with the experiment paper')
-    if options.ssm_layers and options.features not in ('onnx', 'torchscript'):
-        raise SettingsError('--ssm-layers: give --features onnx or torchscript')
+    if options.ssm_layers and options.features != 'onnx':
+        raise SettingsError('--ssm-layers: give --features onnx')
     known = [row.name for row in PRESETS['paper'] if row.baseline == 'descriptors']
     for entry in options.descriptors:
         column, _, folder = entry.partition('=')
@@ -175,14 +175,12 @@ def _run_row(
     """Run all columns of a row; None where the data set is too short for one."""
     from stavpr_lab.evaluation.paper.experiments import DatasetExperiment
     from stavpr_ros.commands.feature_options import make_extractor
-    from stavpr_ros.devices import choose_device
     from tqdm import tqdm
 
     features = make_extractor(options).settings
-    device = choose_device(options.device)
     inputs = _inputs(options, name)
     experiment = DatasetExperiment(
-        dataset, features.kind, features.backbone, options.mode, device, inputs
+        dataset, features.kind, features.backbone, options.mode, options.device, inputs
     )
     found: dict[str, Metrics | None] = {}
     title = f'{name}, {features.kind}'
@@ -197,7 +195,7 @@ def _reason(name: str, dataset: 'Dataset', column: 'Configuration') -> str:
     if len(dataset.query) < column.sequence.length:
         return f'its {len(dataset.query)} images are fewer than a window has'
     if column.baseline == 'ssm_vpr':
-        return 'give --features onnx or torchscript and --ssm-layers'
+        return 'give --features onnx and --ssm-layers'
     way = {
         'saes': 'from any program: SAES is a metric trained on SPED, without public weights',
         'netvlad': 'evaluate --export writes them, with --features netvlad',

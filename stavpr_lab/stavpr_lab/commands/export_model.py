@@ -14,52 +14,61 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.output_file import atomic_output, ONNX, require_replaceable
 
 if TYPE_CHECKING:
-    from stavpr_lab.features.export import Exported, Outputs
+    from stavpr_lab.features.export import Exported
 
 LICENSES = ('LICEN', 'COPYING')  # in American and British spelling
 
 DESCRIPTION = """
-Makes one ONNX file, with the outputs `global` (a vector an image) and `map`, of a network: of an
-entry of a torch.hub repository, a TorchScript file or an ONNX file. The file is compared with the
-original on random images. build_map and the node take it as features onnx.
+Makes one ONNX file, with the outputs `global` (a vector an image) and `map`, of the network that
+an entry of a torch.hub repository returns. The file is compared with the original on random
+images. build_map and the node take it as features onnx.
 """
 
 EPILOG = """
 A repository is a program of somebody else, which runs with all your rights, here and only here,
-and only with --allow-foreign-code; so is a TorchScript file. Its own downloads (weights, other
-repositories) are not pinned by --commit.
+and only with --allow-foreign-code. Its own downloads (weights, other repositories) are not pinned
+by --commit.
 
 examples:
   export_model --repository gmberton/MegaLoc --commit SHA --entry get_trained_model --size 322 \\
       --map-module backbone --allow-foreign-code --output megaloc.onnx
   export_model --repository facebookresearch/dinov2 --commit SHA --entry dinov2_vits14_reg \\
       --map-module norm --prefix-tokens 5 --size 224 --allow-foreign-code --output dinov2.onnx
-  export_model --onnx net.onnx --vector pooled --map conv5 --output named.onnx
 
 docs/features.md has recipes. exit codes: 0 done, 1 failed (the reason is printed), 2 usage
 """
 
 
+def _argument(text: str) -> tuple[str, Any]:
+    name, separator, value = text.partition('=')
+    if not separator or not name.isidentifier():
+        raise argparse.ArgumentTypeError(f'{text}: expected NAME=JSON')
+    try:
+        return name, json.loads(value)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f'{text}: {value!r} is no JSON ({error})') from error
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = make_parser('export_model', DESCRIPTION, EPILOG)
     add = parser.add_argument_group('network').add_argument
-    add('--repository', metavar='OWNER/NAME|FOLDER', help='with a hubconf.py')
+    repository = 'with a hubconf.py'
+    add('--repository', required=True, metavar='OWNER/NAME|FOLDER', help=repository)
     add('--commit', default='', metavar='SHA', help='of a repository on GitHub, 40 digits')
-    add('--entry', metavar='NAME', help='function in hubconf.py')
+    add('--entry', required=True, metavar='NAME', help='function in hubconf.py')
     add(
         '--argument',
         action='append',
+        type=_argument,
         default=[],
         metavar='NAME=JSON',
         help='of the entry, such as fc_output_dim=512 or backbone=\'"ResNet18"\'; may be repeated',
     )
-    add('--torchscript', metavar='FILE', help='a TorchScript file instead')
-    add('--onnx', metavar='FILE', help='an ONNX file instead')
-    add('--allow-foreign-code', action='store_true', help='run the repository or TorchScript file')
+    add('--allow-foreign-code', action='store_true', help='run the repository')
     add = parser.add_argument_group('outputs').add_argument
     add('--size', type=int, default=224, help='side of the images in pixels (%(default)s)')
     vector = "which output of the network is the vector: number or key, '' for none (0)"
-    add('--vector', metavar='OUTPUT', help=vector)
+    add('--vector', default='0', metavar='OUTPUT', help=vector)
     add('--map-module', default='', metavar='PATH', help='module whose output is the map')
     maps = 'which of its outputs, or of the network, is the map or the tokens (0 with a module)'
     add('--map', metavar='OUTPUT', help=maps)
@@ -70,66 +79,26 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _outputs(arguments: argparse.Namespace) -> 'Outputs':
-    from stavpr_lab.features.export import Outputs
-
-    vector = arguments.vector
-    if vector is None:
-        vector = '' if arguments.onnx else '0'
-    maps = arguments.map
-    if maps is None:
-        maps = '0' if arguments.map_module else ''
-    return Outputs(vector, arguments.map_module, maps, arguments.prefix_tokens)
-
-
-def _check(arguments: argparse.Namespace) -> None:
-    sources = [name for name in ('repository', 'torchscript', 'onnx') if getattr(arguments, name)]
-    if len(sources) != 1:
-        raise SettingsError('give one of --repository, --torchscript and --onnx')
-    if (sources[0] == 'repository') != bool(arguments.entry):
-        raise SettingsError('--repository and --entry go together')
-    if sources[0] != 'onnx' and not arguments.allow_foreign_code:
+def _export(arguments: argparse.Namespace) -> 'Exported':
+    if not arguments.allow_foreign_code:
         raise SettingsError(
-            f'--{sources[0]} {getattr(arguments, sources[0])} is a program, which would run with '
-            'all your rights: give --allow-foreign-code if you trust its source'
+            f'--repository {arguments.repository} is a program, which would run with all your '
+            'rights: give --allow-foreign-code if you trust its source'
         )
-    if arguments.onnx and arguments.map_module:
-        raise SettingsError('--map-module: in an ONNX file name a tensor by --map')
-    if arguments.size < 8 or arguments.size > 4096:
+    if not 8 <= arguments.size <= 4096:
         raise SettingsError(f'--size {arguments.size} must be 8 to 4096 pixels')
     require_replaceable(arguments.output, ONNX, arguments.force)
-
-
-def _arguments(texts: list[str]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for text in texts:
-        name, separator, value = text.partition('=')
-        try:
-            found[name] = json.loads(value)
-        except ValueError as error:
-            raise SettingsError(f'--argument {text}: {value!r} is no JSON ({error})') from error
-        if not separator or not name.isidentifier():
-            raise SettingsError(f'--argument {text}: expected NAME=JSON')
-    return found
-
-
-def _export(arguments: argparse.Namespace) -> 'Exported':
-    from stavpr_lab.features import export
-    from stavpr_ros.features.weights import open_model
+    from stavpr_lab.features.export import Chosen, export_network, load_hub
     import torch
 
     torch.backends.mha.set_fastpath_enabled(False)  # its operator is not in the ONNX standard
-    outputs = _outputs(arguments)
-    if arguments.onnx:
-        with open_model(Path(arguments.onnx)) as file:
-            return export.export_onnx(file.read(), outputs, arguments.size)
-    if arguments.torchscript:
-        network = export.load_torchscript(Path(arguments.torchscript))
-    else:
-        given = _arguments(arguments.argument)
-        network = export.load_hub(arguments.repository, arguments.commit, arguments.entry, given)
-        print(f'license of {arguments.repository}: {_license(arguments)}')
-    return export.export_network(network, outputs, arguments.size)
+    given, module, maps = dict(arguments.argument), arguments.map_module, arguments.map
+    if maps is None:
+        maps = '0' if module else ''
+    network = load_hub(arguments.repository, arguments.commit, arguments.entry, given)
+    print(f'license of {arguments.repository}: {_license(arguments)}')
+    chosen = Chosen(network, arguments.vector, module, maps, arguments.prefix_tokens)
+    return export_network(chosen, arguments.size)
 
 
 def _license(arguments: argparse.Namespace) -> str:
@@ -152,7 +121,6 @@ def main(args: list[str] | None = None) -> int:
 
     def work() -> None:
         arguments = _parser().parse_args(args)
-        _check(arguments)
         exported = _export(arguments)
         with atomic_output(arguments.output, ONNX, arguments.force) as file:
             file.write(exported.content)

@@ -3,14 +3,13 @@
 """
 Any network to one ONNX file with the outputs ``global`` (n, D) and ``map`` (n, C, H, W).
 
-A network in Python or TorchScript is a program of somebody else. It runs here, once, to be
-recorded; nodes and maps only ever see the ONNX file, which is data. Requires the extra ``onnx``.
+A network in Python is a program of somebody else. It runs here, once, to be recorded; nodes and
+maps only ever see the ONNX file, which is data. Requires the extra ``onnx``.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-import importlib.util
 import io
 from pathlib import Path
 import tempfile
@@ -19,38 +18,16 @@ import warnings
 
 import numpy as np
 from stavpr_ros.errors import SettingsError, UnavailableError
+from stavpr_ros.features.onnx import BATCH, import_onnx, ON_CPU, TOLERANCE
 from stavpr_ros.features.outputs import as_maps, one_of
-from stavpr_ros.features.weights import last_line, open_model
+from stavpr_ros.features.weights import last_line
 import torch
 from torch import nn
 
 GLOBAL, MAP = 'global', 'map'
-BATCH = 'stavpr_batch'  # property of a file: '1' = the images of a batch influence each other
-TOLERANCE = 1e-3  # largest difference from the original, over the largest value
 LARGEST = 2**31  # bytes of an ONNX file: limit of its format
 OPSET = 17
 CHECKED = 3  # random images that the file is verified on
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """
-    What of a network becomes the outputs of the file.
-
-    :param vector: number or key of the network's output (n, D); '' = no output ``global``.
-    :param module: path of the module whose output is the map; '' = the network's own output.
-    :param map: number or key of the output that is the map, or tokens; '' = no output ``map``.
-    :param prefix_tokens: leading tokens that are no patches.
-    """
-
-    vector: str = '0'
-    module: str = ''
-    map: str = ''
-    prefix_tokens: int = 1
-
-    def __post_init__(self) -> None:
-        if not self.vector and not self.map:
-            raise SettingsError('neither a vector nor a map is chosen: name one of the outputs')
 
 
 @dataclass(frozen=True)
@@ -106,84 +83,74 @@ def load_hub(repository: str, commit: str, entry: str, arguments: Mapping[str, A
     return network.module if isinstance(network, nn.DataParallel) else network
 
 
-def load_torchscript(path: Path) -> nn.Module:
-    """
-    Load a TorchScript file, a program that may read and write files.
-
-    :raises UnavailableError: it is none.
-    """
-    with open_model(path) as file:
-        try:
-            return torch.jit.load(file, map_location='cpu')
-        except Exception as error:  # damaged files raise errors of any type
-            raise UnavailableError(
-                f'{path} is no usable TorchScript file: {last_line(error)}'
-            ) from error
-
-
 class Chosen(nn.Module):
-    """The chosen outputs of a network, in the order vector, map."""
+    """
+    The chosen outputs of a network: what becomes the outputs of the file.
 
-    def __init__(self, network: nn.Module, outputs: Outputs, image: torch.Tensor) -> None:
+    :param vector: number or key of the network's output (n, D); '' = no output ``global``.
+    :param module: path of the module whose output is the map; '' = the network's own output.
+    :param map: number or key of the output that is the map, or tokens; '' = no output ``map``.
+    :param prefix_tokens: leading tokens that are no patches.
+    :raises SettingsError: neither is chosen, or there is no such module.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        vector: str = '0',
+        module: str = '',
+        map: str = '',  # noqa: A002
+        prefix_tokens: int = 1,
+    ) -> None:
         super().__init__()
-        self.network, self._outputs = network.eval().float(), outputs
+        if not vector and not map:
+            raise SettingsError('neither a vector nor a map is chosen: name one of the outputs')
+        self.names = [name for name, kept in ((GLOBAL, vector), (MAP, map)) if kept]
+        self.network = network.eval().float()
+        self._vector, self._module, self._map, self._prefix = vector, module, map, prefix_tokens
         self._kept: list[Any] = []
-        if outputs.module and isinstance(network, torch.jit.ScriptModule):
-            raise SettingsError(
-                f'module {outputs.module!r} of a TorchScript file cannot be an output: use '
-                'features torchscript, which can, or export the network in Python'
-            )
-        if outputs.map and outputs.module:
+        if map and module:
             try:
-                module = network.get_submodule(outputs.module)
+                inner = network.get_submodule(module)
             except AttributeError as error:
                 names = [name for name, _ in network.named_modules() if name]
                 raise SettingsError(
-                    f'the network has no module {outputs.module!r}: its modules are '
+                    f'the network has no module {module!r}: its modules are '
                     f'{", ".join(names[:60])}'
                 ) from error
-            module.register_forward_hook(lambda *call: self._kept.append(call[-1]))
-        self._side = 0
-        self._side = self._tokens_side(image)
-
-    def _tokens_side(self, image: torch.Tensor) -> int:
-        """Check the outputs for one image; return the side of a map of tokens, 0 without."""
-        vector, maps_or_tokens = self._both(image)
-        name = f'output {self._outputs.vector or self._outputs.map!r}'
-        if self._outputs.vector and (not isinstance(vector, torch.Tensor) or vector.ndim != 2):
-            found = getattr(vector, 'shape', type(vector).__name__)
-            raise SettingsError(f'{name} of the network is {found}: expected a vector (n, D)')
-        if not self._outputs.map:
-            return 0
-        name = f'module {self._outputs.module!r}' if self._outputs.module else name
-        maps = as_maps(maps_or_tokens, 1, self._outputs.prefix_tokens, name)
-        if maps.ndim != 4:
-            raise SettingsError(f'{name} returns vectors {tuple(maps.shape)}: expected a map')
-        return maps.shape[2] if maps_or_tokens.ndim == 3 else 0
-
-    def _both(self, images: torch.Tensor) -> tuple[Any, Any]:
-        chosen = self._outputs
-        self._kept.clear()
-        returned = self.network(images)
-        vector = one_of(returned, chosen.vector, 'the network') if chosen.vector else None
-        if not chosen.map:
-            return vector, None
-        if chosen.module:
-            if not self._kept:
-                raise SettingsError(f'module {chosen.module!r} is not called by the network')
-            returned = self._kept[-1]
-        return vector, one_of(returned, chosen.map, chosen.module or 'the network')
+            inner.register_forward_hook(lambda *call: self._kept.append(call[-1]))
 
     def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the chosen outputs of images (n, 3, size, size)."""
-        vector, maps = self._both(images)
-        if self._side:
-            maps = maps[:, self._outputs.prefix_tokens :].transpose(1, 2)
-            maps = maps.unflatten(2, (self._side, self._side))
-        return tuple(value for value in (vector, maps) if value is not None)
+        """
+        Return the vectors (n, D) and the maps (n, C, H, W) of images (n, 3, size, size).
+
+        :raises SettingsError: the network has no such outputs, or of another shape.
+        """
+        found = []
+        self._kept.clear()
+        returned = self.network(images)
+        if self._vector:
+            vector = one_of(returned, self._vector, 'the network')
+            if not isinstance(vector, torch.Tensor) or vector.ndim != 2:
+                shape = getattr(vector, 'shape', type(vector).__name__)
+                raise SettingsError(
+                    f'output {self._vector!r} of the network is {shape}: expected a vector (n, D)'
+                )
+            found.append(vector)
+        if self._map:
+            if self._module and not self._kept:
+                raise SettingsError(f'module {self._module!r} is not called by the network')
+            owner = self._kept[-1] if self._module else returned
+            output = one_of(owner, self._map, self._module or 'the network')
+            name = f'module {self._module!r}' if self._module else f'output {self._map!r}'
+            maps = as_maps(output, len(images), self._prefix, name)
+            if maps.ndim != 4:
+                raise SettingsError(f'{name} returns vectors {tuple(maps.shape)}: expected a map')
+            found.append(maps)
+        return tuple(found)
 
 
-def export_network(network: nn.Module, outputs: Outputs, size: int) -> Exported:
+def export_network(chosen: Chosen, size: int) -> Exported:
     """
     Record a network as an ONNX file, and verify it on random images.
 
@@ -194,32 +161,28 @@ def export_network(network: nn.Module, outputs: Outputs, size: int) -> Exported:
     :raises SettingsError: the network has no such outputs.
     :raises UnavailableError: it cannot be recorded, or the file computes something else.
     """
-    weights = sum(value.nbytes for value in network.state_dict().values())
+    weights = sum(value.nbytes for value in chosen.state_dict().values())
     if weights >= LARGEST:
         raise UnavailableError(
             f'the network has {weights / 1e9:.1f} GB of weights, more than an ONNX file holds '
             '(2 GiB): compute its descriptors with its own program, and give those'
         )
-    generator = torch.Generator().manual_seed(0)
-    images = torch.randn(CHECKED, 3, size, size, generator=generator)
-    with torch.inference_mode():
-        chosen = Chosen(network, outputs, images[:1])
+    images = torch.randn(CHECKED, 3, size, size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         singles = [chosen(image[None]) for image in images]
-        references = [torch.cat(parts).numpy() for parts in zip(*singles, strict=True)]
-    names = [name for name, kept in ((GLOBAL, outputs.vector), (MAP, outputs.map)) if kept]
+    references = [torch.cat(parts).numpy() for parts in zip(*singles, strict=True)]
     if not all(np.isfinite(reference).all() for reference in references):
         raise UnavailableError('the network returns NaN or infinite numbers for random images')
     reasons = []
     for batch, step in ((2, CHECKED), (1, 1)):  # recorded with two images; else with one
         try:
-            content = _recorded(chosen, images[:batch], names, alone=step == 1)
-            difference = _difference(content, names, images.numpy(), references, step)
+            content = _recorded(chosen, images[:batch], alone=step == 1)
+            difference = _difference(content, images.numpy(), references, step)
         except Exception as error:  # of the network, the recorder and the runtime
             reasons.append(last_line(error))
             continue
         if difference <= TOLERANCE:
-            shapes = {n: (1, *r.shape[1:]) for n, r in zip(names, references, strict=True)}
+            shapes = {n: (1, *r.shape[1:]) for n, r in zip(chosen.names, references, strict=True)}
             return Exported(content, shapes, difference, step > 1)
         reasons.append(f'its outputs differ by {difference:.2g}')
     raise UnavailableError(
@@ -228,8 +191,9 @@ def export_network(network: nn.Module, outputs: Outputs, size: int) -> Exported:
     )
 
 
-def _recorded(chosen: Chosen, images: torch.Tensor, names: list[str], alone: bool) -> bytes:
-    onnx = _import_onnx()
+def _recorded(chosen: Chosen, images: torch.Tensor, alone: bool) -> bytes:
+    onnx, _ = import_onnx()
+    batched = {name: {0: 'batch'} for name in ('image', *chosen.names)}
     with (
         tempfile.TemporaryDirectory() as folder,
         warnings.catch_warnings(),
@@ -238,15 +202,13 @@ def _recorded(chosen: Chosen, images: torch.Tensor, names: list[str], alone: boo
     ):
         path = Path(folder) / 'recorded.onnx'
         warnings.simplefilter('ignore')  # of recording sizes as constants: the result is verified
-        # the recorder takes a TorchScript file itself only, not within another module
-        script = isinstance(chosen.network, torch.jit.ScriptModule)
         torch.onnx.export(
-            chosen.network if script else chosen,
+            chosen,
             (images,),
             path,
             input_names=['image'],
-            output_names=names,
-            dynamic_axes=None if alone else {name: {0: 'batch'} for name in ('image', *names)},
+            output_names=chosen.names,
+            dynamic_axes=None if alone else batched,
             opset_version=OPSET,
             dynamo=False,
         )
@@ -256,120 +218,15 @@ def _recorded(chosen: Chosen, images: torch.Tensor, names: list[str], alone: boo
     return model.SerializeToString()
 
 
-def export_onnx(content: bytes, outputs: Outputs, size: int) -> Exported:
-    """
-    Give outputs of an ONNX file the names ``global`` and ``map``, and verify it.
-
-    :param outputs: names of tensors as vector and map; ``module`` is not used.
-    :raises SettingsError: no such tensor, or another shape.
-    :raises UnavailableError: the file cannot be run.
-    """
-    onnx = _import_onnx()
-    model = onnx.load_model_from_string(content)
-    graph = model.graph
-    weights = {tensor.name for tensor in graph.initializer}
-    images_in = [value for value in graph.input if value.name not in weights]
-    if len(images_in) != 1:
-        raise SettingsError(f'there are {len(images_in)} inputs: expected one, the image')
-    tensor_type = images_in[0].type.tensor_type
-    tensor_type.shape.dim[0].dim_param = 'batch'
-    del graph.value_info[:]  # it may fix the batch size
-    content = model.SerializeToString()
-    tensors = [name for node in graph.node for name in node.output]
-    for wanted in filter(None, (outputs.vector, outputs.map)):
-        if wanted not in tensors:
-            raise SettingsError(
-                f'there is no tensor {wanted!r}: they are {", ".join(tensors[:60])}'
-            )
-    run = _runner(_with_outputs(onnx, content, [t for t in (outputs.vector, outputs.map) if t]))
-    images = np.random.default_rng(0).standard_normal((CHECKED, 3, size, size)).astype(np.float32)
-    singles = [[torch.from_numpy(a) for a in run(image[None])] for image in images]
-    originals = [torch.cat(parts) for parts in zip(*singles, strict=True)]
-    names, references = [], []
-    for name, tensor, found in zip(
-        [n for n, t in ((GLOBAL, outputs.vector), (MAP, outputs.map)) if t],
-        [t for t in (outputs.vector, outputs.map) if t],
-        originals,
-        strict=True,
-    ):
-        maps = as_maps(found, CHECKED, outputs.prefix_tokens, f'tensor {tensor!r}')
-        if maps.ndim != (2 if name == GLOBAL else 4):
-            raise SettingsError(f'tensor {tensor!r} is {tuple(found.shape)}: it is no {name}')
-        nodes = _renaming(onnx, tensor, name, found, maps, outputs.prefix_tokens)
-        for node, constants in nodes:
-            graph.node.append(node)
-            graph.initializer.extend(constants)
-        names.append(name)
-        references.append(maps.numpy())
-    del graph.output[:]
-    graph.output.extend(
-        onnx.helper.make_tensor_value_info(
-            name, tensor_type.elem_type, ['batch', *reference.shape[1:]]
-        )
-        for name, reference in zip(names, references, strict=True)
-    )
-    content = model.SerializeToString()
-    reason = ''
-    for step in (CHECKED, 1):
-        try:
-            difference = _difference(content, names, images, references, step)
-        except Exception as error:  # a batch size that the file does not take
-            reason = f': {last_line(error)}'
-            continue
-        if difference <= TOLERANCE:
-            if step == 1:
-                onnx.helper.set_model_props(model, {BATCH: '1'})
-            shapes = {n: (1, *r.shape[1:]) for n, r in zip(names, references, strict=True)}
-            return Exported(model.SerializeToString(), shapes, difference, step > 1)
-    raise UnavailableError(f'the file with the new outputs computes something else{reason}')
-
-
-def _renaming(
-    onnx: Any, tensor: str, name: str, found: torch.Tensor, maps: torch.Tensor, prefix: int
-) -> list[tuple[Any, list[Any]]]:
-    """Return the nodes from a tensor to an output, and their constants."""
-    node = onnx.helper.make_node
-    if found.ndim > maps.ndim:
-        return [(node('Flatten', [tensor], [name], axis=1), [])]
-    if tensor == name and found.ndim == maps.ndim:
-        return []
-    if found.ndim == maps.ndim:
-        return [(node('Identity', [tensor], [name]), [])]
-
-    def constant(part: str, values: list[int]) -> Any:
-        return onnx.numpy_helper.from_array(np.array(values, np.int64), f'{name}/{part}')
-
-    slices = [constant('first', [prefix]), constant('end', [2**31]), constant('axis', [1])]
-    cut, turned = f'{name}/patches', f'{name}/channels'
-    return [
-        (node('Slice', [tensor, *(c.name for c in slices)], [cut]), slices),
-        (node('Transpose', [cut], [turned], perm=[0, 2, 1]), []),
-        (
-            node('Reshape', [turned, f'{name}/shape'], [name]),
-            [constant('shape', [0, *maps.shape[1:]])],
-        ),
-    ]
-
-
-def _with_outputs(onnx: Any, content: bytes, names: list[str]) -> bytes:
-    model = onnx.load_model_from_string(content)
-    del model.graph.output[:]
-    model.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names)
-    return model.SerializeToString()
-
-
 def _difference(
-    content: bytes,
-    names: list[str],
-    images: np.ndarray,
-    references: list[np.ndarray],
-    step: int,
+    content: bytes, images: np.ndarray, references: list[np.ndarray], step: int
 ) -> float:
     """Return the largest difference of a file's outputs, ``step`` images at a time."""
-    run = _runner(content)
+    _, onnxruntime = import_onnx()
+    session = onnxruntime.InferenceSession(content, providers=[ON_CPU])
     largest = 0.0
     for first in range(0, len(images), step):
-        found = run(images[first : first + step])
+        found = session.run(None, {'image': images[first : first + step]})
         for output, reference in zip(found, references, strict=True):
             expected = reference[first : first + step]
             if output.shape != expected.shape:
@@ -377,26 +234,3 @@ def _difference(
             scale = max(float(abs(expected).max()), 1e-12)
             largest = max(largest, float(abs(output - expected).max()) / scale)
     return largest
-
-
-def _runner(content: bytes) -> Callable[[np.ndarray], list[np.ndarray]]:
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(content, providers=['CPUExecutionProvider'])
-    image = session.get_inputs()[0]
-    dtype = np.float16 if image.type == 'tensor(float16)' else np.float32
-
-    def run(images: np.ndarray) -> list[np.ndarray]:
-        outputs = session.run(None, {image.name: images.astype(dtype)})
-        return [output.astype(np.float32) for output in outputs]
-
-    return run
-
-
-def _import_onnx() -> Any:
-    for name in ('onnx', 'onnxruntime'):
-        if importlib.util.find_spec(name) is None:
-            raise UnavailableError('export_model needs the packages onnx and onnxruntime')
-    import onnx
-
-    return onnx

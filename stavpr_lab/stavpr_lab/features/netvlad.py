@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from stavpr_ros.devices import choose_device
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.preprocessing import BatchMaker
 from stavpr_ros.features.registry import IMAGENET_MEAN, IMAGENET_STD, NetVladSettings
@@ -78,7 +79,7 @@ class NetVlad:
                 f'{path} has no PCA whitening: set whitening to false for vectors of '
                 f'{found.centers.numel()} dimensions, or take a file with it'
             )
-        self._device = torch.device(device)
+        self._device = torch.device(choose_device(device))
         self._convolutions = [
             tuple(value.to(self._device) for value in pair) for pair in found.convolutions
         ]
