@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Map files: time to the first answer, memory, damaged files, killed nodes; both format versions.
+Map files: time to the first answer, memory, damaged files, killed nodes.
 
 Every start is a process of its own, after imports and a start on a tiny map, which loads compiled
 kernels. The times are those of ``open_map``, of the recognizer, and of its first match; *cold*:
@@ -38,9 +38,8 @@ class Case:
 
 
 CASES = (
-    Case('version 1', 'float32'),
-    Case('version 2', 'float32'),
-    Case('version 2', 'int8'),
+    Case('plain', 'float32'),
+    Case('plain', 'int8'),
     Case('statistics', 'float32'),
     Case('statistics', 'float16'),
     Case('statistics', 'int8'),
@@ -49,11 +48,10 @@ CASES = (
 
 
 def write_files(folder: Path, places: int) -> None:
-    """Write maps of simulated places, float16, and float32 in version 1."""
+    """Write maps of simulated places, float16."""
     sys.path.insert(0, str(TESTS))
     from city import city
     from data import data_folder
-    from map_files import version1
     from stavpr_ros.commands.map import main as map_main
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import PlaceMap, save_map
@@ -63,20 +61,9 @@ def write_files(folder: Path, places: int) -> None:
     source = open_source(data_folder() / 'gardens_point/day_left')
     features, _ = city(extract_features(source, FeatureExtractor(), progress=False), places, 0)
     place_map = PlaceMap(features, None, np.zeros(places, np.int64), ('',) * places)
-    save_map(place_map, folder / 'version 2', 'float16')
-    settings = json.loads(features.settings.to_json())
-    settings.pop('feature_version', None)
-    manifest = {
-        'format': 'stavpr-map', 'version': 1, 'settings': json.dumps(settings),
-        'projection': None, 'cells': features.cells, 'ids': [''] * places,
-    }  # fmt: skip
-    arrays = {
-        'strips': features.half.float().numpy(), 'weights': features.weights.numpy(),
-        'stamps': place_map.stamps,
-    }  # fmt: skip
-    (folder / 'version 1').write_bytes(version1(manifest, arrays))
+    save_map(place_map, folder / 'plain', 'float16')
     for name, options in (('statistics', []), ('codes', ['--codes'])):
-        assert map_main(['compact', str(folder / 'version 2'), str(folder / name), *options]) == 0
+        assert map_main(['compact', str(folder / 'plain'), str(folder / name), *options]) == 0
 
 
 def start(path: Path, precision: str, cache: str) -> dict[str, Any]:

@@ -1,11 +1,9 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Map files of both versions, taken apart and put together again with correct hashes."""
+"""Map files, taken apart and put together again with correct hashes."""
 
 import hashlib
-import io
 import json
-import zipfile
 
 import numpy as np
 
@@ -13,7 +11,7 @@ PIECE = 2**22
 
 
 def parts_of(content: bytes) -> tuple[dict, dict[str, tuple[str, list[int], bytes]]]:
-    """Return the manifest of a file of version 2, and type, shape and bytes of its tensors."""
+    """Return the manifest of a file, and type, shape and bytes of its tensors."""
     length = int.from_bytes(content[:8], 'little')
     header = json.loads(content[8 : 8 + length])
     manifest = json.loads(header.pop('__metadata__')['manifest'])
@@ -71,30 +69,3 @@ def array_of(part: tuple[str, list[int], bytes]) -> np.ndarray:
     """Return the array of a tensor."""
     dtype = part[0].lower().replace('f', 'float').replace('i', 'int').replace('u', 'uint')
     return np.frombuffer(part[2], dtype).reshape(part[1]).copy()
-
-
-def members_of(content: bytes) -> tuple[dict, dict[str, np.ndarray]]:
-    """Return the manifest of a file of version 1, and its arrays."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        manifest = json.loads(archive.read('manifest.json'))
-        arrays = {name: np.load(archive.open(f'{name}.npy')) for name in manifest['members']}
-    return manifest, arrays
-
-
-def version1(manifest: dict, arrays: dict, compression: int = zipfile.ZIP_STORED) -> bytes:
-    """Put a file of version 1 together; arrays may be bytes of a member."""
-    members = {}
-    for name, array in arrays.items():
-        stream = io.BytesIO()
-        if isinstance(array, bytes):
-            stream.write(array)
-        else:
-            np.lib.format.write_array(stream, np.asarray(array))
-        members[name] = stream.getvalue()
-    listed = {name: hashlib.sha256(content).hexdigest() for name, content in members.items()}
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, 'w', compression) as archive:
-        archive.writestr('manifest.json', json.dumps(manifest | {'members': listed}))
-        for name, content in members.items():
-            archive.writestr(f'{name}.npy', content)
-    return stream.getvalue()

@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 
-from map_files import array_of, members_of, parts_of, tensor, version1, version2
+from map_files import array_of, parts_of, tensor, version2
 import numpy as np
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping import load_map, open_map, PlaceMap, verify_map
@@ -126,7 +126,7 @@ def _changed_array(array: np.ndarray, rng: random.Random) -> np.ndarray:
 
 def hand_made(content: bytes, rng: random.Random) -> bytes:
     """Return a file with correct hashes and something else wrong, as a rule."""
-    manifest, parts = (members_of if content[:2] == b'PK' else parts_of)(content)
+    manifest, parts = parts_of(content)
     for _ in range(rng.choice((1, 1, 2))):
         name = rng.choice(sorted(parts))
         kind = rng.randrange(5)
@@ -135,14 +135,10 @@ def hand_made(content: bytes, rng: random.Random) -> bytes:
             _change_manifest(manifest, rng)
         elif kind == 2:
             del parts[name]
-        elif content[:2] == b'PK':
-            parts[name] = _changed_array(parts[name], rng)
         else:
             parts[name] = tensor(_changed_array(array_of(parts[name]), rng))
         if not parts:
             break
-    if content[:2] == b'PK':
-        return version1(manifest, parts)
     if rng.random() < 0.8:
         manifest.pop('parts', None)
     return version2(manifest, parts)
