@@ -12,8 +12,6 @@ import re
 import socket
 
 from conftest import route_images
-from hypothesis import given, HealthCheck, settings
-from hypothesis import strategies as st
 from map_examples import example_files, example_map, VERSION2
 from map_files import parts_of, tensor, version2
 from map_fuzz import hand_made, mutated, rejected_or_works, use
@@ -110,8 +108,7 @@ def test_reader_written_from_the_documentation_finds_the_same(example, saved):
     }  # fmt: skip
     assert arrays['ids'] == list(example.ids)
     assert arrays['thumbnails'] == list(example.thumbnails)
-    for name in ('float32', 'float16'):
-        assert read(VERSION2 / f'{name}.stavpr')[1]['poses'].shape == (24, 7)
+    assert read(VERSION2 / 'float16.stavpr')[1]['poses'].shape == (24, 7)
 
 
 @pytest.mark.parametrize('name', ['float32', 'float16'])
@@ -163,22 +160,15 @@ def changed(content: bytes, change=lambda manifest: None, **parts) -> bytes:
 
 @pytest.mark.parametrize('required', [False, True])
 def test_unknown_section_is_ignored_unless_it_is_required(saved, example, required):
-    section = {'codes': {'version': 3, 'required': required, 'data': {'bits': 4}}}
-    saved.write_bytes(
-        changed(
-            saved.read_bytes(),
-            lambda manifest: manifest.update(sections=section),
-            codes__words=np.arange(9, dtype=np.uint8),
-        )
-    )
+    sections = {'codes': {'version': 3, 'required': required, 'data': {'bits': 4}}}
+    words = np.arange(9, dtype=np.uint8)
+    content = saved.read_bytes()
+    saved.write_bytes(changed(content, lambda m: m.update(sections=sections), codes__words=words))
     if required:
         with pytest.raises(MapFileError, match='requires section codes, version 3'):
             load_map(saved)
     else:
         assert_same(load_map(saved), example)
-    saved.write_bytes(changed(saved.read_bytes(), lambda manifest: manifest.update(sections={})))
-    with pytest.raises(MapFileError, match='part codes/words is of no section'):
-        load_map(saved)
 
 
 # ------------------------------------------------------------------------------------- the file
@@ -283,12 +273,11 @@ def test_is_map_recognizes_maps_and_no_other_file(tmp_path, saved):
 @pytest.mark.parametrize('part', ['strips', 'thumbnails', 'stamps'])
 def test_damage_is_named_by_part_and_offset(example, saved, part):
     content = bytearray(saved.read_bytes())
-    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], 'little')])
-    first, last = header[part]['data_offsets']
-    start = 8 + int.from_bytes(content[:8], 'little') + first
-    content[start + (last - first) // 2] ^= 1
+    stored = open_map(saved).features.file.parts[part]
+    content[stored.start + stored.size // 2] ^= 1
     saved.write_bytes(content)
-    expected = rf'bytes {start} to {start + last - first}, of part {part}, do not match'
+    last = stored.start + stored.size
+    expected = rf'bytes {stored.start} to {last}, of part {part}, do not match'
     if part in ('strips', 'thumbnails'):  # left in the file, and verified later
         opened = open_map(saved)
         with pytest.raises(MapFileError, match=expected):
@@ -297,16 +286,11 @@ def test_damage_is_named_by_part_and_offset(example, saved, part):
         load_map(saved)
 
 
-def test_damage_of_a_large_part_is_named_to_four_megabytes(tmp_path):
-    from stavpr_ros.features import FeatureSettings, LocalFeatures
-    from stavpr_ros.features.gradient import GradientSettings
-
-    shape = 1, 2500, 900
-    strips = torch.zeros(shape)
-    strips[:, :, 0] = 1
-    kind = FeatureSettings('gradient', GradientSettings(60, cell=4, orientations=4), 1)
-    features = LocalFeatures(strips, torch.ones(1, 2500), kind)
-    save_map(PlaceMap(features, None, np.zeros(2500, np.int64), ('',) * 2500), tmp_path / 'map')
+def test_damage_of_a_large_part_is_named_to_four_megabytes(example, tmp_path):
+    strips = torch.zeros(2, 70_000, 32)
+    features = dataclasses.replace(example.features, strips=strips, weights=torch.zeros(2, 70_000))
+    stamps = np.zeros(70_000, np.int64)
+    save_map(PlaceMap(features, None, stamps, ('',) * 70_000), tmp_path / 'map')
     with (tmp_path / 'map').open('r+b') as file:
         file.seek(5 * 2**20)
         file.write(b'x')
@@ -382,6 +366,7 @@ HAND_MADE = [
     ({'session': None}, None, 'session index of 2 sessions: none'),
     ({'projection': np.eye(32, dtype=np.float32)}, None, 'whether there is a projection'),
     ({'surplus': np.zeros(3)}, None, 'part surplus is unknown'),
+    ({'codes__words': np.zeros(3)}, None, 'part codes/words is of no section'),
     ({f's{i}': np.zeros(1, np.uint8) for i in range(100)}, None, 'at most 64 keys'),
     ({}, lambda m: m.update(extra=1), "unknown 'extra'"),
     ({}, lambda m: m.pop('cells') and None, "lacks 'cells'"),
@@ -474,33 +459,28 @@ def test_map_of_version1_is_to_be_built_again(saved):
 # ------------------------------------------------------------------------------------------ fuzz
 
 
+def test_damaged_file_is_rejected_or_harmless(originals, example, tmp_path):
+    rng = random.Random(os.environ.get('CI') and 0)
+    for _ in range(150):
+        (tmp_path / 'map').write_bytes(mutated(originals[0], rng))
+        try:
+            loaded = load_map(tmp_path / 'map')
+        except MapFileError as error:
+            assert str(tmp_path / 'map') in str(error)  # noqa: PT017
+        else:
+            assert_same(loaded, example)
+            assert torch.equal(loaded.features.strips, example.features.strips)
+
+
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
-def test_damaged_and_hand_made_files_are_rejected_or_work(originals, tmp_path):
+def test_hand_made_files_are_rejected_or_work(originals, tmp_path):
     """Nothing foreign leaves; map_fuzz.py tries more of them."""
     rng = random.Random(os.environ.get('CI') and 0)
     found = set()
-    for i in range(300):
-        make = mutated if i % 2 else hand_made
-        (tmp_path / 'map').write_bytes(make(originals[i % 2], rng))
-        found.add(rejected_or_works(tmp_path / 'map', thorough=not i % 10))
+    for i in range(150):
+        (tmp_path / 'map').write_bytes(hand_made(originals[i % 2], rng))
+        found.add(rejected_or_works(tmp_path / 'map', thorough=not i % 5))
     assert found == {True, False}
-
-
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_one_changed_byte_is_an_error_or_harmless(originals, example, tmp_path, data):
-    content = bytearray(originals[0])
-    near = data.draw(st.booleans())  # half of them in the header
-    at = data.draw(st.integers(0, 4000 if near else len(content) - 1))
-    content[at] ^= data.draw(st.integers(1, 255))
-    (tmp_path / 'damaged').write_bytes(content)
-    try:
-        loaded = load_map(tmp_path / 'damaged')
-    except MapFileError as error:
-        assert str(tmp_path / 'damaged') in str(error)  # noqa: PT017
-    else:
-        assert_same(loaded, example)
-        assert torch.equal(loaded.features.strips, example.features.strips)
 
 
 def test_stored_features_are_an_array_like_those_in_memory(example, saved):
