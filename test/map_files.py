@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Map files, taken apart and put together again with correct hashes."""
 
+from collections.abc import Callable
 import hashlib
 import json
 
@@ -69,3 +70,38 @@ def array_of(part: tuple[str, list[int], bytes]) -> np.ndarray:
     """Return the array of a tensor."""
     dtype = part[0].lower().replace('f', 'float').replace('i', 'int').replace('u', 'uint')
     return np.frombuffer(part[2], dtype).reshape(part[1]).copy()
+
+
+def changed(content: bytes, change: Callable | None = None, **parts: np.ndarray | None) -> bytes:
+    """
+    Return a file with another manifest, and other parts.
+
+    :param change: changes the manifest.
+    :param parts: by name, ``__`` for its slash; None drops one.
+    """
+    manifest, tensors = parts_of(content)
+    del manifest['parts']
+    for key, array in parts.items():
+        name = key.replace('__', '/')
+        tensors.pop(name, None)
+        if array is not None:
+            tensors[name] = tensor(array)
+    if change is not None:
+        change(manifest)
+    return version2(manifest, tensors)
+
+
+def network(**values: object) -> Callable[[dict], None]:
+    """Return a change of a manifest: to features of a TorchScript file of these settings."""
+
+    def change(manifest: dict) -> None:
+        manifest['settings'] |= {
+            'kind': 'torchscript',
+            'backbone': {
+                'size': 32, 'resize': 'area', 'layer': '', 'channels': 'rgb', 'scale': 1.0,
+                'mean': [0, 0, 0], 'std': [1, 1, 1], 'sha256': '0' * 64,
+            } | values,
+        }  # fmt: skip
+        manifest['cells'] = None
+
+    return change

@@ -8,7 +8,7 @@ from pathlib import Path
 import shutil
 import subprocess
 
-from map_files import parts_of, version2
+from map_files import changed, network
 from processes import node_process, Process, SECOND
 import pytest
 from robot import image_message, PARAMETERS
@@ -39,21 +39,6 @@ def resident(process: Process) -> int:
     return next(int(line.split()[1]) for line in lines if line.startswith('VmRSS')) // 1024
 
 
-def network_map(content: bytes, sha256: str, **values) -> bytes:
-    """Return a map of features of a TorchScript file, with correct hashes."""
-    manifest, tensors = parts_of(content)
-    del manifest['parts']
-    manifest['settings'] |= {
-        'kind': 'torchscript',
-        'backbone': {
-            'size': 32, 'resize': 'area', 'layer': '', 'channels': 'rgb', 'scale': 1.0,
-            'mean': [0, 0, 0], 'std': [1, 1, 1], 'sha256': sha256,
-        } | values,
-    }  # fmt: skip
-    manifest['cells'] = None
-    return version2(manifest, tensors)
-
-
 def test_running_node_refuses_hostile_files_and_goes_on(nodes, robot, route, map_file, tmp_path):
     """A pipe, a device, a file of holes, a program, names outside: over ROS, one by one."""
     maps, models = tmp_path / 'maps', tmp_path / 'models'
@@ -70,8 +55,9 @@ def test_running_node_refuses_hostile_files_and_goes_on(nodes, robot, route, map
     program = models / 'network.pt'
     program.write_bytes(b'PK\x03\x04 a TorchScript program')
     sha256 = hashlib.sha256(program.read_bytes()).hexdigest()
-    (maps / 'program').write_bytes(network_map(content, sha256))
-    (maps / 'located').write_bytes(network_map(content, sha256, model=str(program)))
+    (maps / 'program').write_bytes(changed(content, network(sha256=sha256)))
+    located = network(sha256=sha256, model=str(program))
+    (maps / 'located').write_bytes(changed(content, located))
     node = nodes(maps_folder=maps, map_path=maps / 'good', model_path=models)
     robot.wait_for_node()
     robot.drive(route[:6])

@@ -13,7 +13,7 @@ import socket
 
 from conftest import route_images
 from map_examples import example_files, example_map, VERSION2
-from map_files import parts_of, tensor, version2
+from map_files import changed, network, parts_of, version2
 from map_fuzz import hand_made, mutated, rejected_or_works, use
 import numpy as np
 import pytest
@@ -144,18 +144,6 @@ def test_map_without_optional_parts_has_three_parts(example, tmp_path):
     loaded = load_map(tmp_path / 'plain')
     assert loaded.poses is loaded.session(0) is loaded.thumbnail(0) is None
     assert (set(loaded.ids), loaded.sessions) == ({''}, ())
-
-
-def changed(content: bytes, change=lambda manifest: None, **parts) -> bytes:
-    """Change the manifest and parts of a file of version 2; None drops a part."""
-    manifest, tensors = parts_of(content)
-    del manifest['parts']
-    for name, array in parts.items():
-        tensors.pop(name, None)
-        if array is not None:
-            tensors[name.replace('__', '/')] = tensor(array)
-    result = change(manifest)
-    return version2(manifest if result is None else result, tensors)
 
 
 @pytest.mark.parametrize('required', [False, True])
@@ -311,20 +299,6 @@ def _backbone(name, value):
     return lambda manifest: manifest['settings']['backbone'].update({name: value})
 
 
-def _network(**values):
-    def change(manifest):
-        manifest['settings'] |= {
-            'kind': 'torchscript',
-            'backbone': {
-                'size': 32, 'resize': 'area', 'layer': '', 'channels': 'rgb', 'scale': 1.0,
-                'mean': [0, 0, 0], 'std': [1, 1, 1], 'sha256': '0' * 64,
-            } | values,
-        }  # fmt: skip
-        manifest['cells'] = None
-
-    return change
-
-
 def _jpeg(width: int, height: int) -> bytes:
     size = height.to_bytes(2, 'big') + width.to_bytes(2, 'big')
     return b'\xff\xd8\xff\xc0\x00\x11\x08' + size + b'\x03' + bytes(9) + b'\xff\xd9'
@@ -387,20 +361,20 @@ HAND_MADE = [
     ({}, _backbone('size', '32'), 'size is '),
     ({}, _backbone('signed', 1), 'signed is 1'),
     ({}, _backbone('orientations', 2**31), 'orientations'),
-    ({}, _network(model='/dev/zero'), "unknown 'model'"),
-    ({}, _network(allow=True), "unknown 'allow'"),
-    ({}, _network(sha256=''), 'lack the sha256 of the model'),
-    ({}, _network(sha256='abc'), '64 digits'),
-    ({}, _network(scale=float('inf')), 'no number'),
-    ({}, _network(std=[0, 0, 0]), 'std not 0'),
-    ({}, _network(mean=['a', 'b', 'c']), r'mean\[0\]'),
+    ({}, network(model='/dev/zero'), "unknown 'model'"),
+    ({}, network(allow=True), "unknown 'allow'"),
+    ({}, network(sha256=''), 'lack the sha256 of the model'),
+    ({}, network(sha256='abc'), '64 digits'),
+    ({}, network(scale=float('inf')), 'no number'),
+    ({}, network(std=[0, 0, 0]), 'std not 0'),
+    ({}, network(mean=['a', 'b', 'c']), r'mean\[0\]'),
 ]
 
 
 @pytest.mark.parametrize(('parts', 'change', 'text'), HAND_MADE)
 def test_hand_made_file_is_rejected_by_name(saved, parts, change, text):
     """The hashes are correct, so that only the schema rejects it."""
-    saved.write_bytes(changed(saved.read_bytes(), change or (lambda manifest: None), **parts))
+    saved.write_bytes(changed(saved.read_bytes(), change, **parts))
     with pytest.raises(MapFileError, match=text) as caught:
         load_map(saved)
     assert re.search('backup|update', str(caught.value))
