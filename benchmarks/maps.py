@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Map files: time to the first answer, memory, damaged files, killed nodes; both format versions.
+Map files: time to the first answer, and memory.
 
 Every start is a process of its own, after imports and a start on a tiny map, which loads compiled
 kernels. The times are those of ``open_map``, of the recognizer, and of its first match; *cold*:
@@ -38,9 +38,8 @@ class Case:
 
 
 CASES = (
-    Case('version 1', 'float32'),
-    Case('version 2', 'float32'),
-    Case('version 2', 'int8'),
+    Case('plain', 'float32'),
+    Case('plain', 'int8'),
     Case('statistics', 'float32'),
     Case('statistics', 'float16'),
     Case('statistics', 'int8'),
@@ -49,11 +48,10 @@ CASES = (
 
 
 def write_files(folder: Path, places: int) -> None:
-    """Write maps of simulated places, float16, and float32 in version 1."""
+    """Write maps of simulated places, float16."""
     sys.path.insert(0, str(TESTS))
     from city import city
     from data import data_folder
-    from map_files import version1
     from stavpr_ros.commands.map import main as map_main
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import PlaceMap, save_map
@@ -63,20 +61,9 @@ def write_files(folder: Path, places: int) -> None:
     source = open_source(data_folder() / 'gardens_point/day_left')
     features, _ = city(extract_features(source, FeatureExtractor(), progress=False), places, 0)
     place_map = PlaceMap(features, None, np.zeros(places, np.int64), ('',) * places)
-    save_map(place_map, folder / 'version 2', 'float16')
-    settings = json.loads(features.settings.to_json())
-    settings.pop('feature_version', None)
-    manifest = {
-        'format': 'stavpr-map', 'version': 1, 'settings': json.dumps(settings),
-        'projection': None, 'cells': features.cells, 'ids': [''] * places,
-    }  # fmt: skip
-    arrays = {
-        'strips': features.half.float().numpy(), 'weights': features.weights.numpy(),
-        'stamps': place_map.stamps,
-    }  # fmt: skip
-    (folder / 'version 1').write_bytes(version1(manifest, arrays))
+    save_map(place_map, folder / 'plain', 'float16')
     for name, options in (('statistics', []), ('codes', ['--codes'])):
-        assert map_main(['compact', str(folder / 'version 2'), str(folder / name), *options]) == 0
+        assert map_main(['compact', str(folder / 'plain'), str(folder / name), *options]) == 0
 
 
 def start(path: Path, precision: str, cache: str) -> dict[str, Any]:
@@ -152,27 +139,11 @@ def lines(rows: list[dict[str, Any]]) -> list[str]:
     return table((*head, 'processor', 'read once', 'MB', 'load'), cells)
 
 
-def harm(mutated: int, hand_made: int, kills: bool) -> str:
-    """Return what came of damaged files and of killed nodes."""
-    fuzz = [sys.executable, str(TESTS / 'map_fuzz.py'), str(mutated), str(hand_made)]
-    text = subprocess.run(fuzz, stdout=subprocess.PIPE, text=True, check=True).stdout
-    if kills:
-        tests = '-m', 'pytest', '-q', '-m', 'long', '-k', 'killed_at'
-        command = [sys.executable, *tests, str(TESTS / 'test_node_journal.py')]
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-        lost = 'no published place lost' if done.returncode == 0 else done.stdout
-        text += f'20 kills of a recording node at random moments: {lost}\n'
-    return text
-
-
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('--places', type=int, default=100_000)
     parser.add_argument('--runs', type=int, default=3, help='of each start (%(default)s)')
-    parser.add_argument('--mutated', type=int, default=10_000, help='damaged files (%(default)s)')
-    parser.add_argument('--hand-made', type=int, default=1_000, help='others (%(default)s)')
-    parser.add_argument('--no-kills', action='store_true', help='without killed nodes')
     parser.add_argument('--output', type=Path, help='JSON file')
     parser.add_argument('--start', nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -195,11 +166,9 @@ def main() -> None:
     print(f'{cpu_model()}, {torch.get_num_threads()} threads; {arguments.places:,} places')
     print(', '.join(f'{name}: {size:.0f} MB' for name, size in sizes.items()))
     print('\n'.join(lines(rows)))
-    text = harm(arguments.mutated, arguments.hand_made, not arguments.no_kills)
-    print(text)
     if arguments.output:
         found = {'processor': cpu_model(), 'places': arguments.places, 'megabytes': sizes}
-        content = json.dumps(found | {'starts': rows, 'harm': text.splitlines()}, indent=1)
+        content = json.dumps(found | {'starts': rows}, indent=1)
         arguments.output.write_text(content + '\n', encoding='utf-8')
 
 

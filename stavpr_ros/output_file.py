@@ -10,15 +10,14 @@ import hashlib
 import io
 import os
 from pathlib import Path
-import re
 import shutil
 import stat
 from typing import NamedTuple
 
 from stavpr_ros.errors import OutputError, OutputTakenError
+from stavpr_ros.regular_file import open_regular
 
 HEAD = 4096  # first bytes of a file, enough to recognize its kind
-_TEMPORARY = re.compile(r'\.stavpr-[0-9a-f]{12}')
 
 
 @dataclass(frozen=True)
@@ -34,12 +33,7 @@ class FileKind:
     matches: Callable[[bytes], bool]
 
 
-def _is_map(head: bytes) -> bool:
-    # version 1: ZIP whose manifest comes first; version 2: safetensors, a length and a header
-    return (head.startswith(b'PK\x03\x04') or head[8:9] == b'{') and b'"stavpr-map"' in head
-
-
-MAP = FileKind('map', _is_map)
+MAP = FileKind('map', lambda head: head[8:9] == b'{' and b'"stavpr-map"' in head)
 RECORDING = FileKind('recording of matches', lambda head: head.startswith(b'{"stamp": '))
 JSON = FileKind('JSON file', lambda head: head.lstrip()[:1] in (b'{', b'['))
 PNG = FileKind('PNG image', lambda head: head.startswith(b'\x89PNG'))
@@ -77,50 +71,33 @@ Force = bool | FileVersion  # whether to replace a file of the kind; a version: 
 
 
 class AtomicFile(io.BufferedWriter):
-    """
-    A new file that takes its place when it is committed; see :func:`atomic_output`.
-
-    It is written under a temporary name in the folder of its target, and locked until it is
-    closed: a killed writer leaves a temporary without a lock, which the next one deletes.
-    """
+    """A new file that takes its place when it is committed; see :func:`atomic_output`."""
 
     def __init__(self, path: str | Path, kind: FileKind, force: Force) -> None:
-        self._path, self._kind, self._force = path, kind, force
-        self._target = Path(os.path.realpath(path))
-        _require_replaceable(self._target, path, kind, force)
+        require_replaceable(path, kind, force)
+        self._target, self._kind, self._force = Path(os.path.realpath(path)), kind, force
         self.committed = False
-        _sweep(self._target.parent)
         self._temporary, file = create_temporary(self._target)
         super().__init__(io.FileIO(file, 'r+'))
-        try:
-            with suppress(FileNotFoundError):
-                self._take_over(os.stat(self._target))
-        except BaseException:
-            self.abandon()
-            raise
-
-    def _take_over(self, there: os.stat_result) -> None:
-        """Give this file the owner, where the rights allow it, and the mode of another."""
-        with suppress(PermissionError):
-            os.fchown(self.fileno(), there.st_uid, there.st_gid)
-        os.fchmod(self.fileno(), stat.S_IMODE(there.st_mode))
+        with suppress(FileNotFoundError):
+            there = os.stat(self._target)
+            with suppress(PermissionError):
+                os.fchown(file, there.st_uid, there.st_gid)
+            os.fchmod(file, stat.S_IMODE(there.st_mode))
 
     def commit(self) -> None:
         """
-        Sync the file, and let it replace its target; writing may go on.
+        Sync the file, and let it replace its target the first time; writing may go on.
 
         :raises OutputTakenError: meanwhile the target came into being, or changed its kind.
         """
-        self.sync()
-        _require_replaceable(self._target, self._path, self._kind, self._force)
-        os.replace(self._temporary, self._target)
-        self.committed = True
-        sync_folder(self._target.parent)
-
-    def sync(self) -> None:
-        """Write everything to the disk."""
         self.flush()
         os.fsync(self.fileno())
+        if not self.committed:
+            require_replaceable(self._target, self._kind, self._force)
+            os.replace(self._temporary, self._target)
+            self.committed = True
+            sync_folder(self._target.parent)
 
     def abandon(self) -> None:
         """Close the file without what is not flushed; delete it if it is not committed."""
@@ -146,7 +123,7 @@ def atomic_output(path: str | Path, kind: FileKind, force: Force = False) -> Ite
         try:
             yield file
             if not file.closed:  # by the block, which abandoned it
-                file.sync() if file.committed else file.commit()
+                file.commit()
         finally:
             file.abandon()
 
@@ -155,6 +132,42 @@ def write_output(path: str | Path, content: str | bytes, kind: FileKind, force: 
     """Write a file at once, text as UTF-8; see :func:`atomic_output`."""
     with atomic_output(path, kind, force) as file:
         file.write(content.encode() if isinstance(content, str) else content)
+
+
+@contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+    """
+    Make a folder of files; when the block ends it is complete under its name, or not there.
+
+    The block makes the folder that is yielded, of the same name in a temporary one, which is
+    locked like the temporaries of :func:`atomic_output`. Files and folders are synced.
+
+    :raises OutputTakenError: there is something of this name already, or it is being written.
+    :raises OutputError: it cannot be written.
+    """
+    target = Path(os.path.abspath(path))
+    with _explained(path):
+        _require_new(target, path)
+        temporary, lock = create_temporary(target, is_folder=True)
+        made = temporary / target.name
+        try:
+            yield made
+            for each in (*made.iterdir(), made):
+                sync_folder(each)
+            _require_new(target, path)
+            os.rename(made, target)
+            sync_folder(target.parent)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+            os.close(lock)
+
+
+def _require_new(target: Path, path: str | Path) -> None:
+    require_room(target.parent / f'{target.name}.new')
+    if os.path.lexists(target):
+        raise OutputTakenError(
+            f'{path} exists already: expected a new folder; remove it or choose another name'
+        )
 
 
 def require_room(path: str | Path) -> None:
@@ -179,15 +192,19 @@ def require_replaceable(path: str | Path, kind: FileKind, force: Force = False) 
     :raises OutputTakenError: it exists, and is no file of this kind or ``force`` is not given.
     :raises OutputError: its folder is missing or write-protected.
     """
-    with _explained(path):
-        _require_replaceable(Path(os.path.realpath(path)), path, kind, force)
-
-
-def _require_replaceable(target: Path, path: str | Path, kind: FileKind, force: Force) -> None:
+    target = os.path.realpath(path)
     require_room(target)
     if not os.path.lexists(target):
         return
-    head = _head(target, path)
+    with _explained(path):
+        if not stat.S_ISREG(os.stat(target).st_mode):
+            raise OutputTakenError(f'{path} exists and is no regular file: it is never replaced')
+        with open_regular(target) as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise _busy(path) from error
+            head = file.read(HEAD)
     if head and not kind.matches(head):
         raise OutputTakenError(f'{path} exists and is no {kind.name}: it is never replaced')
     if force is not True and (force is False or force != FileVersion.of(target)):
@@ -197,146 +214,57 @@ def _require_replaceable(target: Path, path: str | Path, kind: FileKind, force: 
         )
 
 
-def _head(target: Path, path: str | Path) -> bytes:
-    """Return the first bytes of a regular file that no one is writing."""
-    file = os.open(target, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    try:
-        if not stat.S_ISREG(os.fstat(file).st_mode):
-            raise OutputTakenError(f'{path} exists and is no regular file: it is never replaced')
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise _busy(path) from error
-        return os.read(file, HEAD)
-    finally:
-        os.close(file)
-
-
 def _busy(path: str | Path) -> OutputTakenError:
     return OutputTakenError(
         f'{path} is being written by another program: wait, or name another file'
     )
 
 
-def _temporary_of(target: Path) -> Path:
-    name = hashlib.sha256(os.fsencode(target.name)).hexdigest()[:12]
-    return target.parent / f'.stavpr-{name}'
-
-
-@contextmanager
-def atomic_folder(path: str | Path) -> Iterator[Path]:
+def create_temporary(target: Path, is_folder: bool = False) -> tuple[Path, int]:
     """
-    Make a folder of files; when the block ends it is complete under its name, or not there.
-
-    The block makes the folder that is yielded, of the same name in a temporary one, which is
-    locked like the temporaries of :func:`atomic_output`. Files and folders are synced.
-
-    :raises OutputTakenError: there is something of this name already, or it is being written.
-    :raises OutputError: it cannot be written.
-    """
-    target = Path(os.path.abspath(path))
-    temporary, made = _temporary_of(target), target.name
-    with _explained(path):
-        _require_new(target, path)
-        lock = _locked_folder(temporary, target)
-        try:
-            yield temporary / made
-            for file in (temporary / made).iterdir():
-                _sync(file)
-            _sync(temporary / made)
-            _require_new(target, path)
-            os.rename(temporary / made, target)
-            sync_folder(target.parent)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-            os.close(lock)
-
-
-def _require_new(target: Path, path: str | Path) -> None:
-    require_room(target.parent / f'{target.name}.new')
-    if os.path.lexists(target):
-        raise OutputTakenError(
-            f'{path} exists already: expected a new folder; remove it or choose another name'
-        )
-
-
-def _locked_folder(temporary: Path, target: Path) -> int:
-    """Make the temporary folder of a target, and lock it; that of a killed writer is deleted."""
-    while True:
-        with suppress(FileExistsError):
-            temporary.mkdir()
-        lock = os.open(temporary, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            os.close(lock)
-            raise _busy(target) from error
-        if os.path.lexists(temporary) and os.path.samestat(os.fstat(lock), os.lstat(temporary)):
-            for stale in temporary.iterdir():
-                shutil.rmtree(stale)
-            return lock
-        os.close(lock)
-
-
-def create_temporary(target: Path) -> tuple[Path, int]:
-    """
-    Create and lock the temporary file of a target; one that a killed writer left is deleted.
+    Create and lock the temporary file, or folder, of a target; those of killed writers go.
 
     :returns: its path, and its descriptor.
     :raises OutputTakenError: another program writes the target.
     """
-    temporary = _temporary_of(target)
-    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+    name = hashlib.sha256(os.fsencode(target.name)).hexdigest()[:12]
+    temporary = target.parent / f'.stavpr-{name}'
+    flags = os.O_RDONLY if is_folder else os.O_RDWR | os.O_CREAT | os.O_EXCL
     while True:
+        _delete_stale(target.parent)
         try:
-            file = os.open(temporary, flags, 0o666)
+            if is_folder:
+                temporary.mkdir()
+            file = os.open(temporary, flags | os.O_CLOEXEC, 0o666)
         except FileExistsError as error:
-            if not _delete_stale(temporary):
-                raise _busy(target) from error
-            continue
+            raise _busy(target) from error
         fcntl.flock(file, fcntl.LOCK_EX)
-        if os.fstat(file).st_nlink:
+        if _is_at(temporary, file):
             return temporary, file
         os.close(file)  # another writer took it for a stale one before it was locked
 
 
-def _sweep(folder: Path) -> None:
-    """Delete the temporaries of killed writers."""
-    with os.scandir(folder) as entries:
-        stale = [entry.path for entry in entries if _TEMPORARY.fullmatch(entry.name)]
-    for path in stale:
-        _delete_stale(Path(path))
+def _delete_stale(folder: Path) -> None:
+    """Delete the temporaries of killed writers: those without a lock."""
+    for path in folder.glob('.stavpr-' + '[0-9a-f]' * 12):
+        with suppress(OSError):  # locked, gone, or of another user
+            file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if _is_at(path, file):
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+            finally:
+                os.close(file)
 
 
-def _delete_stale(temporary: Path) -> bool:
-    """Delete a temporary file unless its writer lives; return whether it is gone."""
-    try:
-        file = os.open(temporary, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return True
-    except OSError:
-        return False
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # a writer that was done meanwhile has moved this one, and the next made another
-        if os.path.samestat(os.fstat(file), os.lstat(temporary)):
-            os.unlink(temporary)
-    except FileNotFoundError:
-        pass
-    except OSError:
-        return False
-    finally:
-        os.close(file)
-    return True
+def _is_at(path: Path, file: int) -> bool:
+    """Return whether an open file, or folder, is still the one of this name."""
+    return os.path.lexists(path) and os.path.samestat(os.fstat(file), os.lstat(path))
 
 
 def sync_folder(folder: Path) -> None:
-    """Write the names in a folder to the disk."""
-    _sync(folder)
-
-
-def _sync(path: Path) -> None:
-    file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    """Write the names in a folder, or the content of a file, to the disk."""
+    file = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(file)
     finally:

@@ -1,11 +1,10 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Map files of both versions, taken apart and put together again with correct hashes."""
+"""Map files, taken apart and put together again with correct hashes."""
 
+from collections.abc import Callable
 import hashlib
-import io
 import json
-import zipfile
 
 import numpy as np
 
@@ -13,7 +12,7 @@ PIECE = 2**22
 
 
 def parts_of(content: bytes) -> tuple[dict, dict[str, tuple[str, list[int], bytes]]]:
-    """Return the manifest of a file of version 2, and type, shape and bytes of its tensors."""
+    """Return the manifest of a file, and type, shape and bytes of its tensors."""
     length = int.from_bytes(content[:8], 'little')
     header = json.loads(content[8 : 8 + length])
     manifest = json.loads(header.pop('__metadata__')['manifest'])
@@ -73,28 +72,36 @@ def array_of(part: tuple[str, list[int], bytes]) -> np.ndarray:
     return np.frombuffer(part[2], dtype).reshape(part[1]).copy()
 
 
-def members_of(content: bytes) -> tuple[dict, dict[str, np.ndarray]]:
-    """Return the manifest of a file of version 1, and its arrays."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        manifest = json.loads(archive.read('manifest.json'))
-        arrays = {name: np.load(archive.open(f'{name}.npy')) for name in manifest['members']}
-    return manifest, arrays
+def changed(content: bytes, change: Callable | None = None, **parts: np.ndarray | None) -> bytes:
+    """
+    Return a file with another manifest, and other parts.
+
+    :param change: changes the manifest.
+    :param parts: by name, ``__`` for its slash; None drops one.
+    """
+    manifest, tensors = parts_of(content)
+    del manifest['parts']
+    for key, array in parts.items():
+        name = key.replace('__', '/')
+        tensors.pop(name, None)
+        if array is not None:
+            tensors[name] = tensor(array)
+    if change is not None:
+        change(manifest)
+    return version2(manifest, tensors)
 
 
-def version1(manifest: dict, arrays: dict, compression: int = zipfile.ZIP_STORED) -> bytes:
-    """Put a file of version 1 together; arrays may be bytes of a member."""
-    members = {}
-    for name, array in arrays.items():
-        stream = io.BytesIO()
-        if isinstance(array, bytes):
-            stream.write(array)
-        else:
-            np.lib.format.write_array(stream, np.asarray(array))
-        members[name] = stream.getvalue()
-    listed = {name: hashlib.sha256(content).hexdigest() for name, content in members.items()}
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, 'w', compression) as archive:
-        archive.writestr('manifest.json', json.dumps(manifest | {'members': listed}))
-        for name, content in members.items():
-            archive.writestr(f'{name}.npy', content)
-    return stream.getvalue()
+def network(**values: object) -> Callable[[dict], None]:
+    """Return a change of a manifest: to features of an ONNX file of these settings."""
+
+    def change(manifest: dict) -> None:
+        manifest['settings'] |= {
+            'kind': 'onnx',
+            'backbone': {
+                'size': 32, 'resize': 'area', 'layer': 'y', 'channels': 'rgb', 'scale': 1.0,
+                'mean': [0, 0, 0], 'std': [1, 1, 1], 'sha256': '0' * 64,
+            } | values,
+        }  # fmt: skip
+        manifest['cells'] = None
+
+    return change

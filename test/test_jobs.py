@@ -16,6 +16,7 @@ from stavpr_ros.commands.jobs import Job, job_names, other_arguments, run_jobs
 from stavpr_ros.errors import SettingsError
 
 NAMES = ('monday', 'tuesday')
+BUILD_MAP = 'stavpr_ros.commands.build_map'
 
 
 @pytest.fixture(scope='module')
@@ -78,36 +79,35 @@ def test_run_jobs_failed_job_does_not_stop_others(monkeypatch, capfd):
         return subprocess.CompletedProcess(command, int(command[-1]), f'{command[-1]}\n')
 
     monkeypatch.setattr(subprocess, 'run', run)
-    assert run_jobs([Job(f'job{i}', 'build_map', (str(i),)) for i in (1, 0, 2)], 1, None) == 2
+    assert run_jobs([Job(f'job{i}', BUILD_MAP, (str(i),)) for i in (1, 0, 2)], 1, None) == 2
     text = capfd.readouterr().out
-    assert text.splitlines()[::2] == [
-        '--- job1: failed, exit code 1',
-        '--- job0: done',
-        '--- job2: failed, exit code 2',
-    ]
+    for part in ('job1: failed, exit code 1\n1\n', 'job0: done\n0', 'job2: failed, exit code 2'):
+        assert f'--- {part}' in text
 
 
-@pytest.mark.parametrize('is_new', [False, True])
-def test_run_jobs_killed_job_is_run_again(is_new, monkeypatch, capfd):
+@pytest.mark.parametrize(
+    ('codes', 'is_new', 'forced', 'shown'),
+    [
+        ([-9, 0], False, [False, False], 'done\nout\n'),
+        ([-9, 0], True, [False, True], 'done\nout\n'),
+        ([-9] * 4, False, [False] * 4, 'failed, exit code 1\nout\nkilled by signal 9\n'),
+    ],
+)
+def test_run_jobs_killed_job_is_run_again(codes, is_new, forced, shown, monkeypatch, capfd):
     """It may have written its output before: another try replaces what was not there at first."""
     runs = []
 
     def run(command, **_):
-        runs.append(command)
-        return subprocess.CompletedProcess(command, -9 if len(runs) == 1 else 0, 'fine\n')
+        runs.append('--force' in command)
+        return subprocess.CompletedProcess(command, codes[len(runs) - 1], 'out\n')
 
     monkeypatch.setattr(subprocess, 'run', run)
-    assert run_jobs([Job('a', 'build_map', ('--help',), is_new)], 1, None) == 0
-    assert [command[3:] for command in runs] == [['--help'], ['--help', *['--force'] * is_new]]
-    assert capfd.readouterr().out == '--- a: done\nfine\n'
+    assert run_jobs([Job('a', BUILD_MAP, (), is_new)], 1, None) == (codes[-1] < 0)
+    assert (runs, capfd.readouterr().out) == (forced, f'--- a: {shown}')
 
 
 def test_job_names_and_arguments():
-    assert job_names(['a/monday.bag', 'b/tuesday/', 'c.mat:x']) == [
-        'monday',
-        'tuesday',
-        'c',
-    ]
+    assert job_names(['a/monday.bag', 'b/tuesday/', 'c.mat:x']) == ['monday', 'tuesday', 'c']
     with pytest.raises(SettingsError, match="'monday'"):
         job_names(['a/monday.bag', 'b/monday'])
     given = ['--input', 'a', 'b', '--every', '2', '--output', 'c', '--ray', 'auto', '--force']
@@ -122,11 +122,11 @@ def test_several_queries_reject_options_of_one(capfd):
     assert '--window goes with one --query' in capfd.readouterr().err
 
 
-def test_run_here_returns_code_and_output_without_bars():
-    code, text = jobs.run_here(Job('a', 'build_map', ('--input', '/none', '--output', '/none/a')))
+def test_run_here_returns_code_and_output():
+    code, text = jobs.run_here(Job('a', BUILD_MAP, ('--input', '/none', '--output', '/none/a')))
     assert code == 1
     assert '/none' in text
-    assert jobs.run_here(Job('a', 'build_map', ('--wrong',)))[0] == 2
+    assert jobs.run_here(Job('a', BUILD_MAP, ('--wrong',)))[0] == 2
 
 
 @pytest.mark.long

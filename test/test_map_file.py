@@ -10,12 +10,10 @@ import pickle
 import random
 import re
 import socket
-import zipfile
 
-from hypothesis import given, HealthCheck, settings
-from hypothesis import strategies as st
-from map_examples import example_files, example_map, VERSION1
-from map_files import members_of, parts_of, tensor, version1, version2
+from conftest import route_images
+from map_examples import example_files, example_map, VERSION2
+from map_files import changed, network, parts_of, version2
 from map_fuzz import hand_made, mutated, rejected_or_works, use
 import numpy as np
 import pytest
@@ -24,8 +22,6 @@ from stavpr_ros.errors import InputError, MapFileError, OutputError, SettingsErr
 from stavpr_ros.mapping import is_map, load_map, open_map, PlaceMap, save_map, Session, verify_map
 from stavpr_ros.mapping.stored_features import StoredFeatures
 import torch
-
-VERSION2 = Path(__file__).parent / 'data' / 'version2'
 
 
 @pytest.fixture(scope='module')
@@ -112,8 +108,7 @@ def test_reader_written_from_the_documentation_finds_the_same(example, saved):
     }  # fmt: skip
     assert arrays['ids'] == list(example.ids)
     assert arrays['thumbnails'] == list(example.thumbnails)
-    for name in ('float32', 'float16'):
-        assert read(VERSION2 / f'{name}.stavpr')[1]['poses'].shape == (24, 7)
+    assert read(VERSION2 / 'float16.stavpr')[1]['poses'].shape == (24, 7)
 
 
 @pytest.mark.parametrize('name', ['float32', 'float16'])
@@ -125,6 +120,23 @@ def test_kept_file_of_version2_loads(name, example):
     use(kept)
 
 
+@pytest.mark.parametrize('kind', ['gradient', 'onnx', 'vgg16', 'densenet161_places365'])
+def test_features_extracted_now_are_those_of_a_kept_map(kind, request):
+    """
+    Maps of ``route_images(8)``, of the settings that features had in the first commits.
+
+    ``tiny.onnx`` is one convolution and a ReLU; weights of the other networks are random.
+    """
+    if kind == 'onnx':
+        pytest.importorskip('onnxruntime', reason='the extra onnx is not installed')
+    made = {'vgg16': 'vgg_file', 'densenet161_places365': 'densenet_file'}
+    model = request.getfixturevalue(made[kind]) if kind in made else VERSION2 / 'tiny.onnx'
+    kept = load_map(VERSION2 / f'{kind}.stavpr')
+    query = kept.extractor(model=str(model)).extract(route_images(8))
+    torch.testing.assert_close(query.strips, kept.features.strips, rtol=0, atol=1e-5)
+    torch.testing.assert_close(query.weights, kept.features.weights, rtol=0, atol=1e-5)
+
+
 def test_map_without_optional_parts_has_three_parts(example, tmp_path):
     plain = PlaceMap(example.features, None, example.stamps, ('',) * 24)
     save_map(plain, tmp_path / 'plain')
@@ -134,45 +146,17 @@ def test_map_without_optional_parts_has_three_parts(example, tmp_path):
     assert (set(loaded.ids), loaded.sessions) == ({''}, ())
 
 
-def changed(content: bytes, change=lambda manifest: None, **parts) -> bytes:
-    """Change the manifest and parts of a file of version 2; None drops a part."""
-    manifest, tensors = parts_of(content)
-    del manifest['parts']
-    for name, array in parts.items():
-        tensors.pop(name, None)
-        if array is not None:
-            tensors[name.replace('__', '/')] = tensor(array)
-    result = change(manifest)
-    return version2(manifest if result is None else result, tensors)
-
-
 @pytest.mark.parametrize('required', [False, True])
 def test_unknown_section_is_ignored_unless_it_is_required(saved, example, required):
-    section = {'codes': {'version': 3, 'required': required, 'data': {'bits': 4}}}
-    saved.write_bytes(
-        changed(
-            saved.read_bytes(),
-            lambda manifest: manifest.update(sections=section),
-            codes__words=np.arange(9, dtype=np.uint8),
-        )
-    )
+    sections = {'codes': {'version': 3, 'required': required, 'data': {'bits': 4}}}
+    words = np.arange(9, dtype=np.uint8)
+    content = saved.read_bytes()
+    saved.write_bytes(changed(content, lambda m: m.update(sections=sections), codes__words=words))
     if required:
         with pytest.raises(MapFileError, match='requires section codes, version 3'):
             load_map(saved)
     else:
         assert_same(load_map(saved), example)
-    saved.write_bytes(changed(saved.read_bytes(), lambda manifest: manifest.update(sections={})))
-    with pytest.raises(MapFileError, match='part codes/words is of no section'):
-        load_map(saved)
-
-
-def test_features_of_another_version_are_rejected_by_name(saved):
-    def newer(manifest):
-        manifest['settings']['feature_version'] = 2
-
-    saved.write_bytes(changed(saved.read_bytes(), newer))
-    with pytest.raises(MapFileError, match='gradient of version 2 are unknown'):
-        load_map(saved)
 
 
 # ------------------------------------------------------------------------------------- the file
@@ -237,15 +221,9 @@ def test_load_map_takes_regular_files_only(tmp_path, saved):
         load_map(tmp_path / 'missing')
 
 
-@pytest.mark.parametrize('size', [2**33, 2**50])
-def test_sparse_file_is_rejected_before_memory_is_taken(saved, size):
+def test_sparse_file_is_rejected_before_memory_is_taken(saved):
     content = saved.read_bytes()
-    with saved.open('wb') as file:
-        file.write(content)
-        try:
-            file.truncate(size)
-        except OSError:
-            pytest.skip('the file system has no files of this size')
+    os.truncate(saved, 2**33)
     with pytest.raises(MapFileError, match='has a hole at byte'):
         load_map(saved)
     saved.write_bytes((2**62).to_bytes(8, 'little') + content[8:])
@@ -254,31 +232,26 @@ def test_sparse_file_is_rejected_before_memory_is_taken(saved, size):
 
 
 @pytest.mark.parametrize(
-    ('content', 'text'),
+    'content',
     [
-        (b'', 'no map'),
-        (b'hello', 'no map'),
-        (b'PK\x03\x04' + bytes(100), 'no map'),
-        (bytes(range(256)) * 4, 'no map'),
-        (b'\x02' + bytes(7) + b'{}', 'no map'),
-        (version1({}, {}), 'does not state'),
-        ((18).to_bytes(8, 'little') + b'{"__metadata__":{}}', 'no map'),
-        ((9000).to_bytes(8, 'little') + b'[' * 9000, 'no map'),
-        (pickle.dumps([1, 2]), 'no map'),
+        b'',
+        b'hello',
+        bytes(range(256)) * 4,
+        b'\x02' + bytes(7) + b'{}',
+        (18).to_bytes(8, 'little') + b'{"__metadata__":{}}',
+        (9000).to_bytes(8, 'little') + b'[' * 9000,
+        pickle.dumps([1, 2]),
     ],
 )
-def test_other_file_is_no_map(tmp_path, content, text):
-    path = tmp_path / 'other'
-    path.write_bytes(content)
-    with pytest.raises(MapFileError, match=text):
-        load_map(path)
+def test_other_file_is_no_map(tmp_path, content):
+    (tmp_path / 'other').write_bytes(content)
+    with pytest.raises(MapFileError, match='no map'):
+        load_map(tmp_path / 'other')
 
 
-def test_is_map_knows_both_versions_and_no_other_file(tmp_path, saved, originals):
-    for content in originals:
-        saved.write_bytes(content)
-        assert is_map(saved)
-    for other in (b'', b'PK\5\6', b'\x89PNG' + bytes(9)):
+def test_is_map_recognizes_maps_and_no_other_file(tmp_path, saved):
+    assert is_map(saved)
+    for other in (b'', b'PK\3\4', b'\x89PNG' + bytes(9)):
         saved.write_bytes(other)
         assert not is_map(saved)
     assert not is_map(tmp_path / 'missing')
@@ -288,12 +261,11 @@ def test_is_map_knows_both_versions_and_no_other_file(tmp_path, saved, originals
 @pytest.mark.parametrize('part', ['strips', 'thumbnails', 'stamps'])
 def test_damage_is_named_by_part_and_offset(example, saved, part):
     content = bytearray(saved.read_bytes())
-    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], 'little')])
-    first, last = header[part]['data_offsets']
-    start = 8 + int.from_bytes(content[:8], 'little') + first
-    content[start + (last - first) // 2] ^= 1
+    stored = open_map(saved).features.file.parts[part]
+    content[stored.start + stored.size // 2] ^= 1
     saved.write_bytes(content)
-    expected = rf'bytes {start} to {start + last - first}, of part {part}, do not match'
+    last = stored.start + stored.size
+    expected = rf'bytes {stored.start} to {last}, of part {part}, do not match'
     if part in ('strips', 'thumbnails'):  # left in the file, and verified later
         opened = open_map(saved)
         with pytest.raises(MapFileError, match=expected):
@@ -302,16 +274,11 @@ def test_damage_is_named_by_part_and_offset(example, saved, part):
         load_map(saved)
 
 
-def test_damage_of_a_large_part_is_named_to_four_megabytes(tmp_path):
-    from stavpr_ros.features import FeatureSettings, LocalFeatures
-    from stavpr_ros.features.gradient import GradientSettings
-
-    shape = 1, 2500, 900
-    strips = torch.zeros(shape)
-    strips[:, :, 0] = 1
-    kind = FeatureSettings('gradient', GradientSettings(60, cell=4, orientations=4), 1)
-    features = LocalFeatures(strips, torch.ones(1, 2500), kind)
-    save_map(PlaceMap(features, None, np.zeros(2500, np.int64), ('',) * 2500), tmp_path / 'map')
+def test_damage_of_a_large_part_is_named_to_four_megabytes(example, tmp_path):
+    strips = torch.zeros(2, 70_000, 32)
+    features = dataclasses.replace(example.features, strips=strips, weights=torch.zeros(2, 70_000))
+    stamps = np.zeros(70_000, np.int64)
+    save_map(PlaceMap(features, None, stamps, ('',) * 70_000), tmp_path / 'map')
     with (tmp_path / 'map').open('r+b') as file:
         file.seek(5 * 2**20)
         file.write(b'x')
@@ -330,20 +297,6 @@ def _setting(name, value):
 
 def _backbone(name, value):
     return lambda manifest: manifest['settings']['backbone'].update({name: value})
-
-
-def _network(**values):
-    def change(manifest):
-        manifest['settings'] |= {
-            'kind': 'onnx',
-            'backbone': {
-                'size': 32, 'resize': 'area', 'layer': 'y', 'channels': 'rgb', 'scale': 1.0,
-                'mean': [0, 0, 0], 'std': [1, 1, 1], 'sha256': '0' * 64,
-            } | values,
-        }  # fmt: skip
-        manifest['cells'] = None
-
-    return change
 
 
 def _jpeg(width: int, height: int) -> bytes:
@@ -365,7 +318,6 @@ def _poses(row) -> dict[str, np.ndarray]:
 HAND_MADE = [
     ({'stamps': np.zeros((24, 3), np.int64)}, None, r'stamps is I64 \(24, 3\)'),
     ({'stamps': np.full(24, 2**62)}, None, 'a stamp is out of range'),
-    ({'stamps': np.zeros(24)}, None, 'stamps is F64'),
     ({'stamps': np.zeros(23, np.int64)}, None, 'expected 24 for n'),
     ({'stamps': None}, None, 'part stamps is missing'),
     ({'weights': np.full((2, 24), -1, np.float32)}, None, 'weights is not between 0 and 1'),
@@ -373,16 +325,13 @@ HAND_MADE = [
     ({'strips': np.full((2, 24, 32), np.nan, np.float32)}, None, 'strip 0, from place 0 on'),
     ({'strips': np.full((2, 24, 32), 1, np.float16)}, None, 'longer than 1'),
     ({'strips': np.zeros((2, 24, 33), np.float32)}, None, 'strips of 33 dimensions'),
-    ({'strips': np.zeros((3, 24, 32), np.float32)}, None, 'expected 2 for W'),
     ({'strips': np.zeros((2, 24, 0), np.float32)}, None, 'no dimensions'),
     (_poses([0, 0, 0, 0, 0, 0, 0]), None, 'quaternion of place 0'),
     (_poses([np.inf, 0, 0, 0, 0, 0, 1]), None, 'pose of place 0'),
-    (_poses([np.nan, 0, 0, 0, 0, 0, 1]), None, 'pose of place 0'),
     ({'ids': np.full(24, 255, np.uint8), 'id_ends': np.arange(1, 25)}, None, 'utf-8'),
     ({'ids': np.zeros(24, np.uint8), 'id_ends': np.arange(1, 25)}, None, 'identifier of place 0'),
     ({'id_ends': np.arange(24)[::-1].copy()}, None, 'id_ends does not increase'),
     ({'id_ends': None}, None, 'ids and id_ends, one is missing'),
-    ({'id_ends': np.full(24, 2**62)}, None, 'id_ends does not increase'),
     (_thumbnail(_jpeg(20000, 20000)), None, 'thumbnail of place 0 has 400000000 pixels'),
     (_thumbnail(b'\x89PNG\r\n\x1a\n' + bytes(40)), None, 'thumbnail of place 0 is no JPEG'),
     ({'thumbnail_ends': np.full(24, -5)}, None, 'thumbnail_ends does not increase'),
@@ -391,6 +340,7 @@ HAND_MADE = [
     ({'session': None}, None, 'session index of 2 sessions: none'),
     ({'projection': np.eye(32, dtype=np.float32)}, None, 'whether there is a projection'),
     ({'surplus': np.zeros(3)}, None, 'part surplus is unknown'),
+    ({'codes__words': np.zeros(3)}, None, 'part codes/words is of no section'),
     ({f's{i}': np.zeros(1, np.uint8) for i in range(100)}, None, 'at most 64 keys'),
     ({}, lambda m: m.update(extra=1), "unknown 'extra'"),
     ({}, lambda m: m.pop('cells') and None, "lacks 'cells'"),
@@ -404,28 +354,27 @@ HAND_MADE = [
     ({}, lambda m: m.update(projection='gaussian'), 'whether there is a projection'),
     ({}, _setting('kind', 'teleport'), 'teleport'),
     ({}, _setting('strips', 2.0), r'strips is 2\.0'),
-    ({}, _setting('strips', 10**9), 'strips is 1000000000'),
     ({}, _setting('feature_version', '1'), 'feature_version'),
+    ({}, _setting('feature_version', 2), 'gradient of version 2 are unknown'),
     ({}, _setting('projection', 'mine'), 'projection None is not that of the features, mine'),
     ({}, _backbone('size', 10**6), 'size = 1000000 must be at most'),
     ({}, _backbone('size', '32'), 'size is '),
     ({}, _backbone('signed', 1), 'signed is 1'),
     ({}, _backbone('orientations', 2**31), 'orientations'),
-    ({}, _backbone('model', '/dev/zero'), "unknown 'model'"),
-    ({}, _network(model='/dev/zero'), "unknown 'model'"),
+    ({}, network(model='/dev/zero'), "unknown 'model'"),
     ({}, _setting('kind', 'torchscript'), 'export the network to an ONNX file'),
-    ({}, _network(sha256=''), 'lack the sha256 of the model'),
-    ({}, _network(sha256='abc'), '64 digits'),
-    ({}, _network(scale=float('inf')), 'no number'),
-    ({}, _network(std=[0, 0, 0]), 'std not 0'),
-    ({}, _network(mean=['a', 'b', 'c']), r'mean\[0\]'),
+    ({}, network(sha256=''), 'lack the sha256 of the model'),
+    ({}, network(sha256='abc'), '64 digits'),
+    ({}, network(scale=float('inf')), 'no number'),
+    ({}, network(std=[0, 0, 0]), 'std not 0'),
+    ({}, network(mean=['a', 'b', 'c']), r'mean\[0\]'),
 ]
 
 
 @pytest.mark.parametrize(('parts', 'change', 'text'), HAND_MADE)
 def test_hand_made_file_is_rejected_by_name(saved, parts, change, text):
     """The hashes are correct, so that only the schema rejects it."""
-    saved.write_bytes(changed(saved.read_bytes(), change or (lambda manifest: None), **parts))
+    saved.write_bytes(changed(saved.read_bytes(), change, **parts))
     with pytest.raises(MapFileError, match=text) as caught:
         load_map(saved)
     assert re.search('backup|update', str(caught.value))
@@ -467,107 +416,45 @@ def test_header_that_disagrees_is_rejected(saved, change, text):
         load_map(saved)
 
 
-def test_longer_file_than_its_parts_is_rejected(saved):
-    saved.write_bytes(saved.read_bytes() + b'\0')
-    with pytest.raises(MapFileError, match=r'tensors end at byte \d+, the file at byte \d+'):
+def test_file_of_another_length_is_rejected(saved):
+    content = saved.read_bytes()
+    for other in (content + b'\0', content[:-1]):
+        saved.write_bytes(other)
+        with pytest.raises(MapFileError, match=r'tensors end at byte \d+, the file at byte \d+'):
+            load_map(saved)
+
+
+def test_map_of_version1_is_to_be_built_again(saved):
+    saved.write_bytes(b'PK\x03\x04' + bytes(26) + b'manifest.json{"format": "stavpr-map"')
+    with pytest.raises(MapFileError, match='version 1 were: build the map again with build_map'):
         load_map(saved)
-
-
-VERSION1_HAND_MADE = [
-    (lambda m, a: m.update(version=99), 'version 99'),
-    (lambda m, a: m.update(version=float('nan')), 'NaN is no number'),
-    (lambda m, a: m.update(version=True), 'version is True'),
-    (lambda m, a: m.update(ids=['\ud800'] * 8), r'ids\[0\]'),
-    (lambda m, a: m.update(ids=[1] * 8), r'ids\[0\]'),
-    (lambda m, a: m.update(ids=['']), '8 places, 8 stamps, 1 ids'),
-    (lambda m, a: m.update(settings=m['settings'].replace('"gradient"', '"vgg16"')), 'vgg16'),
-    (lambda m, a: m.update(settings='[' * 60000), 'nested|no JSON'),
-    (lambda m, a: a.update(stamps=np.zeros((8, 3), np.int64)), 'stamps is I64'),
-    (lambda m, a: a.update(stamps=np.array([{}] * 8)), 'no array of numbers'),
-    (lambda m, a: a.update(stamps=b'\x93NUMPY\1\0\xff\xff'), 'truncated'),
-    (lambda m, a: a.update(weights=-a['weights']), 'weights is not between'),
-    (lambda m, a: a.update(surplus=np.zeros(3)), 'part surplus is unknown'),
-    (lambda m, a: a.update({f's{i}': np.zeros(1) for i in range(3000)}), 'its directory has'),
-    (lambda m, a: a.pop('stamps') is None, 'part stamps is missing'),
-    (lambda m, a: m.update(format='other'), 'does not state'),
-]
-
-
-@pytest.mark.parametrize(('change', 'text'), VERSION1_HAND_MADE)
-def test_hand_made_file_of_version1_is_rejected_by_name(tmp_path, change, text):
-    manifest, arrays = members_of((VERSION1 / 'gradient.stavpr').read_bytes())
-    change(manifest, arrays)
-    path = tmp_path / 'old.stavpr'
-    path.write_bytes(version1(manifest, arrays))
-    with pytest.raises(MapFileError, match=text):
-        load_map(path)
-
-
-def test_version1_map_that_grants_itself_a_model_does_not(tmp_path):
-    """Its location is dropped, and one without the model's hash is rejected."""
-    manifest, arrays = members_of((VERSION1 / 'onnx.stavpr').read_bytes())
-    record = json.loads(manifest['settings'])
-    record['backbone']['model'] = '/dev/zero'
-    manifest['settings'] = json.dumps(record)
-    path = tmp_path / 'old.stavpr'
-    path.write_bytes(version1(manifest, arrays))
-    assert load_map(path).settings.backbone.model == ''
-    record['backbone']['sha256'] = ''
-    manifest['settings'] = json.dumps(record)
-    path.write_bytes(version1(manifest, arrays))
-    with pytest.raises(MapFileError, match='lack the sha256 of the model'):
-        load_map(path)
-
-
-def test_compressed_and_doubled_members_are_rejected(tmp_path):
-    content = (VERSION1 / 'gradient.stavpr').read_bytes()
-    path = tmp_path / 'old.stavpr'
-    path.write_bytes(version1(*members_of(content), zipfile.ZIP_DEFLATED))
-    with pytest.raises(MapFileError, match='compressed'):
-        load_map(path)
-    path.write_bytes(content)
-    with pytest.warns(UserWarning, match='Duplicate'), zipfile.ZipFile(path, 'a') as archive:
-        archive.writestr('stamps.npy', b'')
-    with pytest.raises(MapFileError, match='each once'):
-        load_map(path)
 
 
 # ------------------------------------------------------------------------------------------ fuzz
 
 
+def test_damaged_file_is_rejected_or_harmless(originals, example, tmp_path):
+    rng = random.Random(os.environ.get('CI') and 0)
+    for _ in range(150):
+        (tmp_path / 'map').write_bytes(mutated(originals[0], rng))
+        try:
+            loaded = load_map(tmp_path / 'map')
+        except MapFileError as error:
+            assert str(tmp_path / 'map') in str(error)  # noqa: PT017
+        else:
+            assert_same(loaded, example)
+            assert torch.equal(loaded.features.strips, example.features.strips)
+
+
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
-def test_damaged_and_hand_made_files_are_rejected_or_work(originals, tmp_path):
+def test_hand_made_files_are_rejected_or_work(originals, tmp_path):
     """Nothing foreign leaves; map_fuzz.py tries more of them."""
     rng = random.Random(os.environ.get('CI') and 0)
     found = set()
-    for i in range(300):
-        make = mutated if i % 2 else hand_made
-        (tmp_path / 'map').write_bytes(make(originals[i % 4], rng))
-        found.add(rejected_or_works(tmp_path / 'map', thorough=not i % 10))
+    for i in range(150):
+        (tmp_path / 'map').write_bytes(hand_made(originals[i % 2], rng))
+        found.add(rejected_or_works(tmp_path / 'map', thorough=not i % 5))
     assert found == {True, False}
-
-
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_one_changed_byte_is_an_error_or_harmless(originals, example, tmp_path, data):
-    whole, cut = originals[0], data.draw(st.booleans(), label='truncate')
-    if cut:
-        content = whole[: data.draw(st.integers(0, len(whole) - 1))]
-    else:
-        flipped = bytearray(whole)
-        near = data.draw(st.booleans())  # half of them in the header
-        at = data.draw(st.integers(0, 4000 if near else len(whole) - 1))
-        flipped[at] ^= data.draw(st.integers(1, 255))
-        content = bytes(flipped)
-    (tmp_path / 'damaged').write_bytes(content)
-    try:
-        loaded = load_map(tmp_path / 'damaged')
-    except MapFileError as error:
-        assert str(tmp_path / 'damaged') in str(error)  # noqa: PT017
-    else:
-        assert not cut
-        assert_same(loaded, example)
-        assert torch.equal(loaded.features.strips, example.features.strips)
 
 
 def test_stored_features_are_an_array_like_those_in_memory(example, saved):

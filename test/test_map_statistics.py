@@ -8,7 +8,7 @@ from unittest.mock import patch
 
 from fixtures import route_images
 from map_examples import example_map
-from map_files import parts_of, tensor, version2
+from map_files import changed
 import numpy as np
 import pytest
 from stavpr_ros.commands.build_map import main as build_map_main
@@ -106,23 +106,20 @@ def test_small_map_keeps_none(place_map, monkeypatch):
     assert statistics_of_map(place_map) is None
 
 
-def changed(path, change=lambda data: None, **parts):
-    """Change the data of the section, and its parts; None drops a part."""
-    manifest, tensors = parts_of(path.read_bytes())
-    del manifest['parts']
-    change(manifest['sections']['statistics'])
-    for key, array in parts.items():
-        name = key if key == 'strips' else f'statistics/{key}'
-        tensors.pop(name, None)
-        if array is not None:
-            tensors[name] = tensor(array)
-    path.write_bytes(version2(manifest, tensors))
+def change_file(path, change=lambda section: None, **parts):
+    """Change the section, and its parts; None drops a part."""
+    named = {
+        name if name == 'strips' else f'statistics/{name}': array for name, array in parts.items()
+    }
+    path.write_bytes(
+        changed(path.read_bytes(), lambda m: change(m['sections']['statistics']), **named)
+    )
 
 
 def test_statistics_of_other_features_are_learned_again_and_logged(place_map, tmp_path):
     path = save(place_map, tmp_path / 'map')
     other = place_map.features.strips.flip(1).numpy()
-    changed(path, strips=other)
+    change_file(path, strips=other)
     opened = open_map(path)
     found, note = answers(opened, 'float32')
     assert f'the statistics in {path} are of other features: learned again' in note
@@ -136,7 +133,7 @@ def test_statistics_of_other_features_are_learned_again_and_logged(place_map, tm
 
 def test_statistics_of_another_method_are_learned_again_and_logged(place_map, tmp_path):
     path = save(place_map, tmp_path / 'map')
-    changed(path, lambda section: section['data'].update(method='by\nguess'))
+    change_file(path, lambda section: section['data'].update(method='by\nguess'))
     opened = open_map(path)
     found, note = answers(opened, 'float32')
     assert r"learned by another version ('by\nguess')" in note
@@ -146,7 +143,7 @@ def test_statistics_of_another_method_are_learned_again_and_logged(place_map, tm
 
 def test_statistics_of_a_later_version_of_the_section_are_not_looked_at(place_map, tmp_path):
     path = save(place_map, tmp_path / 'map')
-    changed(path, lambda section: section.update(version=2, data=None), gains=np.zeros(3))
+    change_file(path, lambda section: section.update(version=2, data=None), gains=np.zeros(3))
     opened = open_map(path)
     assert opened.features.statistics is None
     assert answers(opened, 'float32') == answers(load_map(path), 'float32')
@@ -176,7 +173,7 @@ def test_statistics_of_a_later_version_of_the_section_are_not_looked_at(place_ma
 )
 def test_hand_made_statistics_are_rejected_by_name(place_map, tmp_path, change, parts, text):
     path = save(place_map, tmp_path / 'map')
-    changed(path, change or (lambda section: None), **parts)
+    change_file(path, change or (lambda section: None), **parts)
     with pytest.raises(MapFileError, match=text):
         open_map(path)
 
@@ -239,7 +236,7 @@ def test_answers_of_codes_are_those_of_features_bit_for_bit(place_map, tmp_path,
 def test_hand_made_codes_are_rejected_by_name(place_map, tmp_path, codes, text):
     """Longer ones would overflow the sums of the kernels."""
     path = save(place_map, tmp_path / 'map')
-    changed(path, codes=codes)
+    change_file(path, codes=codes)
     with pytest.raises(MapFileError, match=text):
         PlaceRecognizer(open_map(path), SETTINGS, 'cpu', 'int8')
 

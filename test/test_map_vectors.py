@@ -61,20 +61,16 @@ def test_map_file_returns_vectors(place_map, tmp_path, storage):
     assert torch.equal(opened.features.vectors, expected)
     some = np.array([3, 4, 40])
     assert torch.equal(opened.features[some].vectors, expected[some])
-    manifest, arrays = map_reader.read(path)
-    assert manifest['sections']['vectors'] == {'version': 1, 'required': False, 'data': None}
-    np.testing.assert_array_equal(arrays['vectors/vectors'].astype(np.float32), expected)
+    stored = map_reader.read(path)[1]['vectors/vectors']
+    np.testing.assert_array_equal(stored.astype(np.float32), expected)
     save_map(opened, tmp_path / 'b.stavpr')
     assert load_map(tmp_path / 'b.stavpr').map_id == loaded.map_id
 
 
 def test_map_file_without_vectors_has_no_section(place_map, tmp_path):
-    save_map(
-        replace(place_map, features=replace(place_map.features, vectors=None)), tmp_path / 'a'
-    )
-    manifest, arrays = map_reader.read(tmp_path / 'a')
-    assert 'vectors' not in manifest['sections']
-    assert 'vectors/vectors' not in arrays
+    bare = replace(place_map, features=replace(place_map.features, vectors=None))
+    save_map(bare, tmp_path / 'a')
+    assert 'vectors' not in map_reader.read(tmp_path / 'a')[0]['sections']
     assert open_map(tmp_path / 'a').features.vectors is None
 
 

@@ -17,9 +17,9 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
-from stavpr_lab.demonstration.bag_writer import write_bag
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.ros import process
+from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 
 COMMAND = [sys.executable, '-m', 'stavpr_ros.commands.replay']

@@ -11,12 +11,11 @@ from bags import SECOND, TEXT, writing
 import cv2
 import numpy as np
 import pytest
-from stavpr_lab.demonstration.bag_writer import write_bag
-from stavpr_ros import output_file
 from stavpr_ros.errors import ImageError, OutputError, SettingsError, SourceError
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import BagSource, COMPRESSED, RAW
 from stavpr_ros.sources.bag_file import open_bag
+from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 
 T0 = 1_700_000_000_000_000_000
@@ -54,7 +53,7 @@ def test_bag_is_written_by_one_writer_and_over_what_a_killed_one_left(tmp_path):
         yield from records()
         assert not path.exists()
 
-    stale = output_file._temporary_of(path)
+    stale = tmp_path / '.stavpr-0123456789ab'
     (stale / 'drive').mkdir(parents=True)  # a killed writer left it
     (stale / 'drive' / 'drive.db3').write_bytes(b'old')
     assert write_bag(path, '/image', others()) == 5

@@ -17,7 +17,6 @@ import numpy as np
 from processes import DOMAIN, executable, Process, TIMEOUT
 import pytest
 from stavpr_lab.commands import demo
-from stavpr_lab.demonstration.bag_writer import write_bag
 from stavpr_lab.demonstration.loops import read_result
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.records import evaluate_records
@@ -26,6 +25,7 @@ from stavpr_ros.commands import build_map, node, record, replay, stavpr
 from stavpr_ros.commands.record import loop_closure_record, match_record
 from stavpr_ros.mapping import load_map
 from stavpr_ros.recognition import Status
+from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 
 HANGS = 5 * TIMEOUT  # seconds after which an executable counts as stuck

@@ -4,7 +4,6 @@
 
 import numpy as np
 import pytest
-from stavpr_lab.demonstration.bag_writer import write_bag
 from stavpr_lab.demonstration.live import run_live
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.metrics import best_f1, image_matches
@@ -13,6 +12,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, extract_features, save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
+from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 
 TOLERANCE, ACCEPT_ALL = 2, 10.0

@@ -319,7 +319,7 @@ def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:
     for name, one in zip(job_names(arguments.input), arguments.input, strict=True):
         output = Path(f'{folder / name}.stavpr')
         options = ('--input', one, '--output', str(output), *others)
-        jobs.append(Job(name, 'build_map', options, is_new=not output.exists()))
+        jobs.append(Job(name, 'stavpr_ros.commands.build_map', options, is_new=not output.exists()))
     return run_jobs(jobs, arguments.processes, arguments.ray)
 
 

@@ -4,8 +4,8 @@
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import as_completed, ThreadPoolExecutor
-from contextlib import redirect_stderr, redirect_stdout
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 import importlib
 import io
@@ -20,6 +20,7 @@ from stavpr_ros.commands.program import DONE, FAILED
 from stavpr_ros.errors import SettingsError, UnavailableError
 
 RETRIES = 3  # of a job whose process is killed, or whose machine is lost
+Result = tuple[int, str]  # exit code and output
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Job:
     One run of a command.
 
     :param name: of its input, unique.
-    :param command: module in ``stavpr_ros.commands``.
+    :param command: full name of the module.
     :param arguments: of its command line.
     :param is_new: none of its outputs was there before.
     """
@@ -92,43 +93,50 @@ def run_jobs(jobs: Sequence[Job], processes: int | None, ray: str | None) -> int
         raise SettingsError(
             f'--processes {processes}, --ray {ray}: expected at least 1 process, or a cluster'
         )
+    count = min(processes or os.cpu_count() or 1, len(jobs))
     worst = DONE
-    done = _on_ray(jobs, ray) if ray is not None else _in_processes(jobs, processes)
-    for job, code, text in done:
-        print(f'--- {job.name}: {"done" if code == DONE else f"failed, exit code {code}"}')
-        print(text, end='', flush=True)
-        worst = max(worst, code)
+    with _processes(count) if ray is None else _cluster(ray) as submit:
+        waiting = {submit(job): (job, RETRIES) for job in jobs}
+        while waiting:
+            future = wait(waiting, return_when=FIRST_COMPLETED).done.pop()
+            job, retries = waiting.pop(future)
+            error = future.exception()
+            if error is not None and retries:
+                waiting[submit(job.again())] = job, retries - 1
+                continue
+            code, text = future.result() if error is None else (FAILED, f'{error}\n')
+            print(f'--- {job.name}: {"done" if code == DONE else f"failed, exit code {code}"}')
+            print(text, end='', flush=True)
+            worst = max(worst, code)
     return worst
 
 
-def _in_processes(jobs: Sequence[Job], processes: int | None) -> Iterator[tuple[Job, int, str]]:
-    cores = os.cpu_count() or 1
-    count = min(processes or cores, len(jobs))
-    threads = str(max(1, cores // count))
+@contextmanager
+def _processes(count: int) -> Iterator[Callable[[Job], Future[Result]]]:
+    """Yield what starts a job in a process of its own, so many at a time."""
+    threads = str(max(1, (os.cpu_count() or 1) // count))
     environment = {'OMP_NUM_THREADS': threads, 'NUMBA_NUM_THREADS': threads} | os.environ
 
-    def run(job: Job) -> tuple[int, str]:
-        command = [sys.executable, '-m', f'stavpr_ros.commands.{job.command}']
-        for attempt in range(1 + RETRIES):
-            done = subprocess.run(
-                [*command, *(job.again() if attempt else job).arguments],
-                env=environment,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                check=False,
-            )
-            if done.returncode >= 0:  # not killed by a signal
-                break
-        return (done.returncode if done.returncode >= 0 else FAILED), _without_bars(done.stdout)
+    def run(job: Job) -> Result:
+        done = subprocess.run(
+            [sys.executable, '-m', job.command, *job.arguments],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+        )
+        if done.returncode < 0:
+            raise ChildProcessError(f'{done.stdout}killed by signal {-done.returncode}')
+        return done.returncode, done.stdout
 
     with ThreadPoolExecutor(count) as pool:
-        futures = {pool.submit(run, job): job for job in jobs}
-        for future in as_completed(futures):
-            yield futures[future], *future.result()
+        yield lambda job: pool.submit(run, job)
 
 
-def _on_ray(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, int, str]]:
+@contextmanager
+def _cluster(address: str) -> Iterator[Callable[[Job], Future[Result]]]:
+    """Yield what starts a job on a Ray cluster."""
     try:
         import ray
     except ImportError as error:
@@ -139,38 +147,20 @@ def _on_ray(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, int, str]]
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:  # ConnectionError, ValueError, and others
         raise UnavailableError(f'--ray {address}: no cluster there: {error}') from error
+    remote = ray.remote(num_cpus=1, max_retries=0, retry_exceptions=False)(run_here).remote
     try:
-        remote: Callable[..., object] = ray.remote(
-            num_cpus=1, max_retries=0, retry_exceptions=False
-        )(run_here).remote
-        waiting = {remote(job): (job, 0) for job in jobs}
-        while waiting:
-            (future, *_), _ = ray.wait(list(waiting))
-            job, retries = waiting.pop(future)
-            try:
-                yield job, *ray.get(future)
-            except ray.exceptions.RayError as error:
-                if retries < RETRIES:
-                    waiting[remote(job.again())] = job, retries + 1
-                else:
-                    yield job, FAILED, f'{error}\n'
+        yield lambda job: remote(job).future()
     finally:
         ray.shutdown()
 
 
-def run_here(job: Job) -> tuple[int, str]:
+def run_here(job: Job) -> Result:
     """Run a job in this process; return its exit code and output."""
-    main = importlib.import_module(f'stavpr_ros.commands.{job.command}').main
+    main = importlib.import_module(job.command).main
     output = io.StringIO()
     with redirect_stdout(output), redirect_stderr(output):
         try:
             code = main(list(job.arguments))
         except SystemExit as end:  # of argparse
             code = end.code if isinstance(end.code, int) else FAILED
-    return code, _without_bars(output.getvalue())
-
-
-def _without_bars(text: str) -> str:
-    """Return an output without progress bars."""
-    lines = (line.rpartition('\r')[2] for line in text.splitlines())
-    return ''.join(f'{line}\n' for line in lines if not re.search(r'\d+%\|', line))
+    return code, output.getvalue()

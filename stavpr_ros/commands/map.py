@@ -163,6 +163,7 @@ def _tool(name: str) -> Callable[..., Any]:
 def describe(place_map: 'PlaceMap', path: Path) -> str:
     """Return what an opened map holds, a line each."""
     import numpy as np
+    from stavpr_ros.mapping.map_version2 import VERSION
     from stavpr_ros.mapping.stored_features import StoredFeatures
 
     features, settings, n = place_map.features, place_map.settings, len(place_map)
@@ -172,8 +173,7 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
     posed = sum(place_map.pose(place) is not None for place in range(n))
     known = place_map.stamps[place_map.stamps != 0]
     rows = {
-        'file': f'{path}, {path.stat().st_size / 1e6:.1f} MB, format version '
-        f'{features.file.version}',
+        'file': f'{path}, {path.stat().st_size / 1e6:.1f} MB, format version {VERSION}',
         'id': place_map.map_id,
         'places': f'{n}, {posed} with a pose, {sum(map(bool, place_map.ids))} with an identifier, '
         f'{"with" if len(place_map.thumbnails) else "without"} thumbnails',

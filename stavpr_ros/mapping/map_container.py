@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-An open map file of any version: manifest, and parts that are read by their position.
+An open map file: manifest, and parts that are read by their position.
 
 Nothing is mapped into memory: a mapped file that another program shortens ends the process.
 """
@@ -16,7 +16,7 @@ import math
 import os
 from pathlib import Path
 import time
-from typing import Any, NamedTuple
+from typing import Any
 import weakref
 
 import numpy as np
@@ -29,16 +29,9 @@ DTYPES = {
     'U32': np.uint32, 'F16': np.float16, 'BF16': np.uint16, 'I16': np.int16, 'U16': np.uint16,
     'I8': np.int8, 'U8': np.uint8, 'BOOL': np.bool_,
 }  # fmt: skip
+PIECE = 2**22  # bytes that have one hash
 AT_ONCE = 2**20  # bytes hashed at a time
 BUILD_AGAIN = 'get it from a backup, or build it again'
-
-
-class Piece(NamedTuple):
-    """Bytes of the file that are hashed together."""
-
-    start: int
-    end: int
-    sha256: str
 
 
 @dataclass(frozen=True)
@@ -48,13 +41,13 @@ class Part:
 
     :param dtype: key of :data:`DTYPES`.
     :param start: its first byte in the file.
-    :param pieces: all its bytes, in their order.
+    :param hashes: SHA-256 of every ``PIECE`` bytes.
     """
 
     dtype: str
     shape: tuple[int, ...]
     start: int
-    pieces: tuple[Piece, ...]
+    hashes: list[str]
 
     @property
     def size(self) -> int:
@@ -73,10 +66,8 @@ class MapFile:
     def __init__(self, file: io.FileIO, path: Path) -> None:
         self.path, self._file = path, file
         self.size = os.fstat(file.fileno()).st_size
-        self.version = 0
         self.map_id = ''
         self.manifest: dict[str, Any] = {}
-        self.ids: list[str] | None = None  # of version 1, which has them in the manifest
         self.parts: dict[str, Part] = {}
         weakref.finalize(self, file.close)
 
@@ -119,7 +110,10 @@ class MapFile:
         :raises MapFileError: names the damaged part and where it is in the file.
         """
         for name in names or self.parts:
-            for start, end, sha256 in self.parts[name].pieces:
+            part = self.parts[name]
+            for i, sha256 in enumerate(part.hashes):
+                start = part.start + i * PIECE
+                end = min(start + PIECE, part.start + part.size)
                 if self._hash(start, end, rest) != sha256:
                     raise self.damaged(
                         f'is damaged: bytes {start} to {end}, of part {name}, do not match their '

@@ -73,7 +73,7 @@ def map_content(file: MapFile) -> PlaceMap:
     if weights.size and not (weights.min() >= 0 and weights.max() <= LONGEST):
         raise ValueError('part weights is not between 0 and 1')
     n = sizes['n']
-    ids = file.ids or [''] * n
+    ids = [''] * n
     if 'ids' in arrays:
         ends = _ends(arrays['id_ends'], len(arrays['ids']), 'id_ends')
         content = arrays['ids'].tobytes()

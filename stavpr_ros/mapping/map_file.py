@@ -3,9 +3,7 @@
 """
 One map, one file: saving, opening and checking it.
 
-:mod:`stavpr_ros.mapping.map_version2` writes and reads the present format, docs/map_format.md
-explains it; :mod:`stavpr_ros.mapping.map_version1` reads the former one. Nothing in a file is
-executed.
+docs/map_format.md defines the format. Nothing in a file is executed.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +18,6 @@ from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile
 from stavpr_ros.mapping.map_content import map_content, PARTS, require_jpegs
 from stavpr_ros.mapping.map_schema import identity_fields
 from stavpr_ros.mapping.map_statistics import MapStatistics, STATISTICS
-from stavpr_ros.mapping.map_version1 import read_version1
 from stavpr_ros.mapping.map_version2 import MOST_HEADER, NewPart, read_version2, write_version2
 from stavpr_ros.mapping.place_map import PlaceMap
 from stavpr_ros.mapping.stored_features import MappedFeatures, StoredFeatures
@@ -180,8 +177,7 @@ def open_map(path: str | Path) -> PlaceMap:
     with errors_of(path):
         file = MapFile(open_regular(path), path)
         file.require_whole()
-        archive = file.bytes_at(0, min(4, file.size)) == b'PK\x03\x04'
-        (read_version1 if archive else read_version2)(file)
+        read_version2(file)
         return map_content(file)
 
 
@@ -205,5 +201,4 @@ def is_map(path: str | Path) -> bool:
             start = file.read(9)
     except OSError:
         return False
-    short = int.from_bytes(start[:8], 'little') <= MOST_HEADER
-    return start[:4] == b'PK\x03\x04' or (short and start[8:] == b'{')
+    return int.from_bytes(start[:8], 'little') <= MOST_HEADER and start[8:] == b'{'

@@ -68,7 +68,5 @@ def statistics_of(file: MapFile, arrays: dict[str, np.ndarray]) -> MapStatistics
         if array.size and not (array.min() >= least and array.max() <= most):  # NaN included
             raise ValueError(f'part {part} is not between {least} and {most}')
         found.append(array)
-    hashes = [piece.sha256 for piece in file.parts['strips'].pieces]
-    return (
-        MapStatistics(data['method'], *found) if data['features'] == features_key(hashes) else None
-    )
+    is_present = data['features'] == features_key(file.parts['strips'].hashes)
+    return MapStatistics(data['method'], *found) if is_present else None

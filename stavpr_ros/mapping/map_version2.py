@@ -10,12 +10,11 @@ from typing import Any, IO, NamedTuple
 
 import numpy as np
 from stavpr_ros.errors import MapFileError
-from stavpr_ros.mapping.map_container import DTYPES, MapFile, Part, Piece, read_json
+from stavpr_ros.mapping.map_container import DTYPES, MapFile, Part, PIECE, read_json
 from stavpr_ros.mapping.map_schema import Int, ListOf, MANIFEST, Object, Text
 
 FORMAT, VERSION = 'stavpr-map', 2
 MOST_HEADER = 2**20  # bytes: parsing takes at most 25 times as much memory
-PIECE = 2**22  # bytes that are hashed together
 # name: highest known version
 KNOWN_SECTIONS = {'intrinsics': 1, 'same_places': 1, 'statistics': 1, 'vectors': 1}
 _TEXT = Text(MOST_HEADER)
@@ -49,7 +48,13 @@ def read_version2(file: MapFile) -> None:
     :raises MapFileError: no map, or of another version.
     :raises ValueError: anything else that is wrong with it.
     """
-    length = int.from_bytes(file.bytes_at(0, min(8, file.size)), 'little')
+    head = file.bytes_at(0, min(8, file.size))
+    if head.startswith(b'PK'):
+        raise MapFileError(
+            f'{file.path} is a ZIP archive, as maps of format version 1 were: build the map again '
+            'with build_map'
+        )
+    length = int.from_bytes(head, 'little')
     if file.size < 8 or not 2 <= length <= min(MOST_HEADER, file.size - 8):
         raise file.foreign(f'its header would have {length} of {file.size} bytes')
     text = file.bytes_at(8, length)
@@ -63,15 +68,15 @@ def read_version2(file: MapFile) -> None:
         raise file.foreign(f'no manifest in its header, {error}') from error
     if version != str(VERSION):
         raise MapFileError(
-            f'{file.path} has format version {str(version)[:20]}, this program reads 1 to '
-            f'{VERSION}: update it'
+            f'{file.path} has format version {str(version)[:20]}, this program reads {VERSION}: '
+            'update it'
         )
     _METADATA.check(metadata, 'the metadata')
     manifest = metadata['manifest'].encode()
     digest = hashlib.sha256(manifest).hexdigest()
     if digest != metadata['sha256']:
         raise ValueError('bytes 8 on, the manifest in the header, do not match their hash')
-    file.version, file.map_id = VERSION, digest[:16]
+    file.map_id = digest[:16]
     file.manifest = read_json(manifest, 'the manifest')
     MANIFEST.check(file.manifest, 'manifest')
     file.parts = _parts(header, file.manifest['parts'], 8 + length, file.size)
@@ -99,14 +104,9 @@ def _parts(
             raise ValueError(f'tensor {name} has another type or shape than in the manifest')
         if tensor['dtype'] not in DTYPES:
             raise ValueError(f'tensor {name} has the unknown type {tensor["dtype"]}')
-        start = end
         first, last = (begin + offset for offset in tensor['data_offsets'])
-        pieces = [
-            Piece(at, min(at + PIECE, last), sha256)
-            for at, sha256 in zip(range(first, last, PIECE), entry['sha256'], strict=False)
-        ]
-        part = Part(tensor['dtype'], tuple(tensor['shape']), first, tuple(pieces))
-        end = start + part.size
+        part = Part(tensor['dtype'], tuple(tensor['shape']), end, entry['sha256'])
+        start, end = end, end + part.size
         if (first, last) != (start, end):
             raise ValueError(
                 f'tensor {name}: bytes {first} to {last}, expected {start} to {end}, by its shape'

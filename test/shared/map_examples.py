@@ -14,7 +14,7 @@ from stavpr_ros.mapping import build_map, PlaceMap, save_map, Session
 from stavpr_ros.recognition import held_map
 from stavpr_ros.sources.frame import Frame
 
-VERSION1 = Path(__file__).parents[1] / 'data' / 'version1'
+VERSION2 = Path(__file__).parents[1] / 'data' / 'version2'
 PLACES = 24
 
 
@@ -40,7 +40,7 @@ def example_map(projection: int | None = None) -> PlaceMap:
 
 
 def example_files(folder: Path) -> list[bytes]:
-    """Return the content of map files of both versions and both storages."""
+    """Return the content of map files of both storages, with and without a projection."""
     save_map(example_map(), folder / 'float32')
     projected = example_map(projection=16)
     with patch.object(held_map, 'LEAST_PLACES', 1):
@@ -48,6 +48,4 @@ def example_files(folder: Path) -> list[bytes]:
         assert statistics is not None
         statistics = held_map.with_codes(statistics, projected, 'float16')
     save_map(projected, folder / 'projected', 'float16', statistics=statistics)
-    version1 = VERSION1 / 'gradient.stavpr', VERSION1 / 'gradient_projected.stavpr'
-    files = [folder / 'float32', folder / 'projected', *version1]
-    return [file.read_bytes() for file in files]
+    return [(folder / name).read_bytes() for name in ('float32', 'projected')]

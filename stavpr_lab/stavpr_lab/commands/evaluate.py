@@ -437,7 +437,8 @@ def _run_each(
         own = folder / name
         written = ('--output', str(own), '--json', f'{own}.json')
         is_new = not (own.exists() or Path(f'{own}.json').exists())
-        jobs.append(Job(name, 'evaluate', ('--query', query, *written, *others), is_new))
+        given = ('--query', query, *written, *others)
+        jobs.append(Job(name, 'stavpr_lab.commands.evaluate', given, is_new))
     folder.mkdir(parents=True, exist_ok=True)
     return run_jobs(jobs, arguments.processes, arguments.ray)
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import shutil
 
 import numpy as np
-from stavpr_lab.demonstration.bag_writer import write_bag
 from stavpr_lab.demonstration.street import (
     first_traverse,
     GOOD_LIGHT,
@@ -25,6 +24,7 @@ from stavpr_ros.mapping import build_map, PlaceMap, save_map
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import BagSource
 from stavpr_ros.sources.bag_file import is_bag, METADATA
+from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord
 from tqdm import tqdm

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
-from stavpr_lab.demonstration.bag_writer import write_bag
 from stavpr_lab.demonstration.recordings import remove_earlier_bag, TOPIC
 from stavpr_lab.demonstration.street.laps import intrinsics, LapDrive
 from stavpr_lab.demonstration.street.traverses import SIZE
@@ -18,6 +17,7 @@ from stavpr_lab.evaluation.plots import INK, page, QUIET
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping.trajectory import SECOND
 from stavpr_ros.output_file import JSON, write_output
+from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord
 from stavpr_slam.pose_graph.files import TUM, tum_text
 from stavpr_slam.pose_graph.transforms import planar_poses
