@@ -19,6 +19,7 @@ from typing import Any
 from data import data_folder, NoDataError
 import numpy as np
 from results import environment, heading, RESULTS, table, write
+from stavpr_lab.evaluation.drive import cropped, DriveChanges, KINDS
 from stavpr_lab.evaluation.evaluate import (
     evaluate_loop_closures,
     evaluate_on_map,
@@ -27,7 +28,6 @@ from stavpr_lab.evaluation.evaluate import (
 )
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import accepted_counts
-from stavpr_lab.evaluation.warp import cropped, KINDS, warp_indices
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class
@@ -119,33 +119,22 @@ def extractors(feature: str, folder: Path) -> dict[str, FeatureExtractor]:
     model = folder / NETWORK
     if not model.is_file():
         raise UnavailableError(f'no file {model}')
-    settings = settings_class('onnx')(
-        model=str(model),
-        layer='fire6/concat_1',
-        channels='bgr',
-        scale=1.0,
-        mean=(104, 117, 123),
-        std=(1, 1, 1),
-    )
+    colors = {'channels': 'bgr', 'scale': 1.0, 'mean': (104, 117, 123), 'std': (1, 1, 1)}
+    settings = settings_class('onnx')(model=str(model), layer='fire6/concat_1', **colors)
     return dict.fromkeys(MODES, FeatureExtractor('onnx', settings))
 
 
-def numbers(evaluation: Evaluation, threshold: float | None) -> dict[str, Any]:
-    """
-    Return the numbers of a row.
-
-    :param threshold: the mode's default; None for mode paper, which has none.
-    """
+def numbers(evaluation: Evaluation, mode: str) -> dict[str, Any]:
+    """Return the numbers of a row; mode paper has no default threshold."""
     found: dict[str, Any] = {
         name: {k: v for k, v in metrics.to_json().items() if isinstance(v, int | float)}
         for name, metrics in (('sequence', evaluation.sequence), ('single', evaluation.single))
     }
-    if threshold is not None:
-        results, truth = evaluation.results, evaluation.ground_truth
-        correct = truth.accepts(results.sequence.best)
-        counts = accepted_counts(results.accepted, correct, truth.has_match)
+    if mode == 'robust':
+        accepted, has_match = evaluation.results.accepted, evaluation.ground_truth.has_match
+        counts = accepted_counts(accepted, evaluation.correct, has_match)
         found['at_default'] = {
-            'threshold': threshold, 'precision': counts.precision, 'recall': counts.recall
+            'threshold': THRESHOLD, 'precision': counts.precision, 'recall': counts.recall
         }  # fmt: skip
     return found
 
@@ -162,13 +151,11 @@ def evaluate_case(
         truth = case.truth(len(query), len(place_map))
         settings = RecognizerSettings(THRESHOLD, mode=mode)
         for warp in ('same', *KINDS) if case.warps else ('same',):
-            count = len(query)
-            images = np.arange(count) if warp == 'same' else warp_indices(count, warp)
+            images = DriveChanges.named(warp, len(query)).images(len(query))
             evaluation = evaluate_on_map(
                 place_map, query.features[images], truth.select(images), settings
             )
-            threshold = THRESHOLD if mode == 'robust' else None
-            yield f'{case.name}/{feature}/{mode}/{warp}', numbers(evaluation, threshold)
+            yield f'{case.name}/{feature}/{mode}/{warp}', numbers(evaluation, mode)
 
 
 def evaluate_hallway(
@@ -181,8 +168,7 @@ def evaluate_hallway(
         truth = GroundTruth.from_file(file, len(route), len(route), 0).loop_closures(EXCLUDED - 1)
         settings = RecognizerSettings(THRESHOLD, mode=mode)
         evaluation = evaluate_loop_closures(route.features, truth, settings, EXCLUDED)
-        threshold = THRESHOLD if mode == 'robust' else None
-        yield f'hallway/{feature}/{mode}/same', numbers(evaluation, threshold)
+        yield f'hallway/{feature}/{mode}/same', numbers(evaluation, mode)
 
 
 def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict[str, Any]:
@@ -286,18 +272,11 @@ def markdown(about: dict[str, Any], results: Results) -> list[str]:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
-    parser.add_argument(
-        '--quick', action='store_true', help='gradient features, without Nordland and tower'
-    )
-    parser.add_argument(
-        '--compare', type=Path, metavar='OLD', help='table to compare with; 1 if worse'
-    )
-    parser.add_argument(
-        '--commit', default='', help='name of the measured commit, outside a git checkout'
-    )
-    parser.add_argument(
-        '--output', type=Path, default=RESULTS, help='folder of the table (%(default)s)'
-    )
+    add = parser.add_argument
+    add('--quick', action='store_true', help='gradient features, without Nordland and tower')
+    add('--compare', type=Path, metavar='OLD', help='table to compare with; 1 if worse')
+    add('--commit', default='', help='name of the measured commit, outside a git checkout')
+    add('--output', type=Path, default=RESULTS, help='folder of the table (%(default)s)')
     options = parser.parse_args(arguments)
     try:
         folder = data_folder()

@@ -23,7 +23,7 @@ from data import data_folder
 import numpy as np
 from results import commit, cpu_model, RESULTS, ROOT, table
 from scipy.signal import lfilter
-from stavpr_lab.evaluation.warp import warp_indices
+from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import PlaceMap, save_map
 from stavpr_ros.mapping.builder import extract_features
@@ -158,7 +158,7 @@ def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dic
     extractor = FeatureExtractor()
     real = extract_features(open_source(folder / reference), extractor, progress=False)
     query = extract_features(open_source(folder / query_folder), extractor, progress=False)
-    shown = np.arange(len(query)) if speed == '1x' else warp_indices(len(query), speed)
+    shown = DriveChanges.named(speed, len(query)).images(len(query))
     shown = shown[:images]
     query = query[shown]
     features, first = city(real, n, seed)

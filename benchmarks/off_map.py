@@ -8,7 +8,7 @@ benchmarks/results/. Rows: benchmarks/README.md.
 """
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 import json
 from pathlib import Path
@@ -22,11 +22,10 @@ import numpy as np
 from off_map_page import DAY, markdown, NIGHT, Results, summary_section
 from results import environment, RESULTS, ROOT
 from stavpr_lab.evaluation.calibration import calibrate
-from stavpr_lab.evaluation.drive import DriveChanges
+from stavpr_lab.evaluation.drive import DriveChanges, select_places
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import accepted_counts, image_matches, sweep
-from stavpr_lab.evaluation.warp import select_places
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import build_map, PlaceMap
@@ -118,11 +117,9 @@ class Outcome:
         return document | {'bins': [row for row in document['bins'] if row['images']]}
 
 
-def matches_of(
-    place_map: PlaceMap, features: LocalFeatures, settings: RecognizerSettings
-) -> list[Match]:
+def matches_of(place_map: PlaceMap, features: LocalFeatures) -> list[Match]:
     """Return the matches of a drive, one an image, by a recognizer of its own."""
-    return recognize_all(PlaceRecognizer(place_map, settings), features)
+    return recognize_all(PlaceRecognizer(place_map, SETTINGS), features)
 
 
 def outcome(
@@ -138,7 +135,7 @@ def outcome(
     :param truth: of the same images.
     :param unseen: images whose place was removed; None = none was.
     """
-    found = image_matches(matches_of(place_map, features, SETTINGS), SETTINGS.sequence.length)
+    found = image_matches(matches_of(place_map, features), SETTINGS.sequence.length)
     return Outcome(
         found.accepted,
         found.probabilities,
@@ -180,23 +177,11 @@ def detours(pair: Pair, coarser: int = 1) -> Iterator[tuple[str, list[Outcome]]]
             yield f'{pair.name}/{removed}', found
 
 
-def change_of(name: str, n: int) -> DriveChanges:
-    """Return the changes of a query of n images by the name of a row."""
-    kind, _, value = name.partition(' ')
-    if kind == 'stop':
-        return DriveChanges(stops=((n // 2, int(value)),))
-    if kind == 'drop':
-        return DriveChanges(drop=float(value))
-    if kind == 'varying':
-        return DriveChanges(speed='varying')
-    return DriveChanges(speed=1.0 if kind == 'same' else float(kind.rstrip('x')))
-
-
 def drives(pair: Pair) -> Iterator[tuple[str, Outcome]]:
     """Yield the outcome of each change of a query: all for day and night, few for the others."""
     names = CHANGES if pair.name in WARPED else CHANGES[:1]
     for name in (*names, '4.5x') if pair.long else names:
-        yield f'{pair.name}/{name}', changed(pair, change_of(name, len(pair.query)))
+        yield f'{pair.name}/{name}', changed(pair, DriveChanges.named(name, len(pair.query)))
 
 
 def first_right(matches: Sequence[Match], truth: GroundTruth, length: int) -> int | None:
@@ -218,24 +203,19 @@ def first_right(matches: Sequence[Match], truth: GroundTruth, length: int) -> in
 def starts(pair: Pair, coarser: int = 1) -> Iterator[tuple[str, list[int | None]]]:
     """Yield the images until the first right match, for starts on the map and on a small one."""
     n, step = len(pair.query), (LONG_STEP if pair.long else STEP) * coarser
-    whole: list[int | None] = []
-    small: list[int | None] = []
+    counts: dict[str, list[int | None]] = {'whole map': [], f'map of {SMALL_MAP} places': []}
     for start in range(STEP, n - START_IMAGES, step):
         images = np.arange(start, start + START_IMAGES)
         first = min(max(0, start - 5), len(pair.places) - SMALL_MAP)
-        for found, stretch in (
-            (whole, (0, len(pair.places))),
-            (small, (first, first + SMALL_MAP)),
-        ):
+        stretches = (0, len(pair.places)), (first, first + SMALL_MAP)
+        for found, stretch in zip(counts.values(), stretches, strict=True):
             kept = np.arange(*stretch)
             truth = pair.truth.select(images).on_places(kept)
-            if not truth.has_match.any():
-                continue
-            place_map = select_places(pair.places, kept)
-            matches = matches_of(place_map, pair.query.features[images], SETTINGS)
-            found.append(first_right(matches, truth, SETTINGS.sequence.length))
-    yield f'{pair.name}/whole map', whole
-    yield f'{pair.name}/map of {SMALL_MAP} places', small
+            if truth.has_match.any():
+                matches = matches_of(select_places(pair.places, kept), pair.query.features[images])
+                found.append(first_right(matches, truth, SETTINGS.sequence.length))
+    for name, found in counts.items():
+        yield f'{pair.name}/{name}', found
 
 
 def start_numbers(counts: Sequence[int | None]) -> dict[str, Any]:
@@ -273,13 +253,8 @@ class Measurement:
         """Add a row."""
         self.rows[f'{section}/{self.feature}/{name}'] = values
 
-    def pair(self, pair: Pair, bar: Callable[[str], object] = str) -> None:
-        """
-        Add the rows of a pair.
-
-        :param bar: called with the name of each part.
-        """
-        bar(f'{pair.name} drives')
+    def pair(self, pair: Pair) -> None:
+        """Add the rows of a pair."""
         found = dict(drives(pair))
         for name, each in found.items():
             self.add('drives', name, each.numbers())
@@ -287,10 +262,8 @@ class Measurement:
         if len(found) > 1:
             self.add('drives', f'{pair.name}/all', Outcome.pooled(pooled).numbers())
         self.driven += pooled
-        bar(f'{pair.name} in reverse order')
         if not pair.long:
             self.add('reverse', pair.name, changed(pair, DriveChanges(reverse=True)).numbers())
-        bar(f'{pair.name} detours')
         for name, outcomes in detours(pair, self.coarser):
             each = [one.numbers() for one in outcomes]
             shares = [one['unseen_matched'] / one['unseen'] for one in each if one['unseen']]
@@ -298,7 +271,6 @@ class Measurement:
             values |= {'worst': max(shares, default=0.0)}
             self.add('detours', name, values)
             self.left += outcomes
-        bar(f'{pair.name} starts')
         for name, counts in starts(pair, self.coarser):
             self.add('start', name, start_numbers(counts))
 
@@ -371,18 +343,12 @@ def measure(
             print(f'left out: {FEATURES[feature]}: {error}', file=sys.stderr)
             continue
         measurement = Measurement(feature, coarser)
-        with tqdm(desc=FEATURES[feature], unit='part') as bar:
-
-            def advance(name: str, bar: Any = bar) -> None:
-                bar.set_postfix_str(name)
-                bar.update()
-
-            for pair, floors in opened(folder, feature, making, sets):
-                if pair is not None:
-                    measurement.pair(pair, advance)
-                else:
-                    advance('floors')
-                    measurement.floors(floors)
+        for pair, floors in opened(folder, feature, making, sets):
+            print(f'{FEATURES[feature]}: {TOWER if pair is None else pair.name}', file=sys.stderr)
+            if pair is not None:
+                measurement.pair(pair)
+            else:
+                measurement.floors(floors)
         results |= measurement.finish()
     return results
 

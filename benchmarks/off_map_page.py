@@ -122,7 +122,7 @@ def _start_cells(row: dict[str, Any]) -> list[str]:
     return [str(row['starts']), str(row['right']), *counts]
 
 
-SECTIONS: tuple[tuple[str, str, str, tuple[str, ...], Callable[..., list[str]]], ...] = (
+SECTIONS: tuple[tuple[str, str, str, str, Callable[..., list[str]]], ...] = (
     (
         'detours',
         'Detours: a stretch is missing in the map',
@@ -130,14 +130,8 @@ SECTIONS: tuple[tuple[str, str, str, tuple[str, ...], Callable[..., list[str]]],
         'the stretch (steps of 10 places, Nordland 100) are pooled. Unseen are images more than 5 '
         'places from each place of the map. Precision counts all matches, recall the images '
         'whose place the map has.',
-        (
-            'map and query / places removed',
-            'positions',
-            'unseen images matched',
-            'worst position',
-            'precision',
-            'recall',
-        ),
+        'map and query / places removed | positions | unseen images matched | worst position | '
+        'precision | recall',
         _detour_cells,
     ),
     (
@@ -145,7 +139,7 @@ SECTIONS: tuple[tuple[str, str, str, tuple[str, ...], Callable[..., list[str]]],
         'Floors on maps of other floors',
         'Eight floors of a building that look alike; every match is wrong. "standstill": each map '
         'has 200 more places, equal, in its middle.',
-        ('data set', 'pairs', 'images matched', 'worst pair'),
+        'data set | pairs | images matched | worst pair',
         _floor_cells,
     ),
     (
@@ -155,14 +149,14 @@ SECTIONS: tuple[tuple[str, str, str, tuple[str, ...], Callable[..., list[str]]],
         'times; "drop" leaves images out with this probability; "all" pools the rows above it '
         'but the stop of 1000. '
         'Best F1 is over all thresholds, P and R are those of the default.',
-        ('map and query / change', 'images', 'best F1', 'P', 'R', 'R at 100 % P'),
+        'map and query / change | images | best F1 | P | R | R at 100 % P',
         _drive_cells,
     ),
     (
         'reverse',
         'The route in reverse order',
         'The images of the query, the last one first: places are right, the direction is not.',
-        ('map and query', 'matched', 'wrong', 'precision'),
+        'map and query | matched | wrong | precision',
         _reverse_cells,
     ),
     (
@@ -170,7 +164,7 @@ SECTIONS: tuple[tuple[str, str, str, tuple[str, ...], Callable[..., list[str]]],
         'Start in the middle',
         'Thirty images from a start on the route, with an empty window; images until the first '
         'match is right (a window has 20). The small map has the places around the start.',
-        ('map and query / map', 'starts', 'with a right match', 'median images', 'most images'),
+        'map and query / map | starts | with a right match | median images | most images',
         _start_cells,
     ),
 )
@@ -191,19 +185,18 @@ def calibration_section(results: Results) -> list[str]:
 
 def markdown(about: dict[str, Any], results: Results) -> list[str]:
     """Return the lines of the page."""
-    steps, coarse = about.get('steps', 1), []
-    if steps > 1:
-        coarse = [f'Steps between positions are {steps} times as coarse as below.', '']
     lines = [
         *heading('Off the map, at night, at other speeds', about),
         'Mode robust with its defaults on all data sets, by `make off-map`. '
         'Data sets: benchmarks/README.md; the method: [robust mode](robust_mode.md).',
         '',
-        *coarse,
-        *summary_section(results),
     ]
+    if (steps := about.get('steps', 1)) > 1:
+        lines += [f'Steps between positions are {steps} times as coarse as below.', '']
+    lines += summary_section(results)
     for section, title, text, head, cells in SECTIONS:
         rows = [[FEATURES[f], name, *cells(row)] for f, name, row in _rows(results, section)]
         if rows:
-            lines += [f'## {title}', '', text, '', *table(('features', *head), rows)]
+            columns = ['features', *head.split(' | ')]
+            lines += [f'## {title}', '', text, '', *table(columns, rows)]
     return [*lines, *calibration_section(results)]

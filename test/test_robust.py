@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mode robust: each option alone, and all on real traverses of other speed, season and view."""
 
+from evaluation_commands import best_f1
 import numpy as np
 import pytest
 from stavpr_lab.demonstration.street import first_traverse, World
+from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.ground_truth import GroundTruth
-from stavpr_lab.evaluation.metrics import best_f1, counts_at, image_matches
-from stavpr_lab.evaluation.warp import warp_indices
+from stavpr_lab.evaluation.metrics import counts_at, image_matches
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
@@ -268,7 +269,7 @@ def test_gardens_point_at_every_speed_is_recognized(traverses):
     assert f1 >= 0.99
     assert precision >= 0.95
     for kind in WARPS:
-        indices = warp_indices(200, kind)
+        indices = DriveChanges.named(kind, 200).images(200)
         f1, precision = evaluated(reference, taken(query, indices), truth.select(indices))
         print(f'Gardens Point {kind}: F1 {f1:.4f}, precision {precision:.4f}')
         assert f1 >= 0.95

@@ -33,7 +33,6 @@ import results
 from results import PeerTime, Row
 from run import Peer, Run
 import stages
-from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.alignment import match_sequence, SequenceDistances
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
@@ -369,20 +368,6 @@ def test_first_right_match_counts_images_since_start():
     matches += [match(Status.MATCH, 5), match(Status.NO_MATCH, 2), match(Status.MATCH, 3)]
     assert off_map.first_right(matches, truth, 4) == 6  # windows of 4: image 3 is the middle
     assert off_map.first_right(matches[:5], truth, 4) is None
-
-
-@pytest.mark.parametrize(
-    ('name', 'changes'),
-    [
-        ('same', DriveChanges()),
-        ('3x', DriveChanges(speed=3)),
-        ('varying', DriveChanges(speed='varying')),
-        ('stop 30', DriveChanges(stops=((50, 30),))),
-        ('drop 0.3', DriveChanges(drop=0.3)),
-    ],
-)
-def test_change_by_name_is_drive(name, changes):
-    assert off_map.change_of(name, 100) == changes
 
 
 # ------------------------------------------------ the command

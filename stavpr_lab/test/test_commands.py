@@ -56,6 +56,10 @@ def run(monkeypatch, capfd):
     return run_main
 
 
+def read_records(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
 def interrupt(*_, **__):
     raise KeyboardInterrupt
 
@@ -84,9 +88,6 @@ def test_command_help_lists_exit_codes(name, run):
     assert result.code == 0
     assert 'usage:' in result.out
     assert 'exit codes' in result.out
-
-
-# --------------------------------------------------------------------------- build_map
 
 
 def test_build_map_with_options_writes_map(run, traverse, poses, tmp_path):
@@ -187,9 +188,6 @@ def test_build_map_with_damaged_image_fails_or_skips(run, tmp_path):
     assert load_map(tmp_path / 'map.stavpr').ids == ('000.png', '002.png')
 
 
-# --------------------------------------------------------------------------- node, record, replay
-
-
 @pytest.mark.parametrize(
     ('command', 'arguments', 'code', 'words'),
     [
@@ -235,29 +233,25 @@ def test_match_record_names_every_status():
         assert (plain['status'], plain['inliers']) == (status.name, 12)
 
 
-# --------------------------------------------------------------------------- demo
-
-
 @pytest.mark.parametrize(
     ('options', 'word'),
     [
-        (['--map', 'x'], 'go together'),
-        (['--truth', 'identity'], '--truth'),
-        (['--mode', 'paper', '--threshold', '-1'], '--threshold'),
-        (['--threshold', '0.8'], 'give --min-probability'),
-        (['--min-probability', '1'], '--min-probability'),
-        (['--map', 'x', '--query', 'y', '--truth', 'file.csv'], 'expected identity'),
-        (['--loop', '--map', 'x', '--query', 'y'], 'leave --map'),
-        (['--loop', 'synthetic', '--truth', 'file.csv'], 'is known'),
-        (['--loop', 'x', '--truth', 'identity'], 'takes a file'),
-        (['--loop', '--sequence-length', '1'], '--sequence-length'),
-        (['--loop', '--mode', 'paper'], '--threshold'),
-        (['--loop', '.', '--geometric-check', 'surf'], 'surf'),
-        (['--map', 'x', '--query', 'y', '--geometric-check', 'sift'], 'go with --loop'),
+        ('--map x', 'go together'),
+        ('--truth identity', '--truth'),
+        ('--mode paper --threshold -1', '--threshold'),
+        ('--threshold 0.8', 'give --min-probability'),
+        ('--min-probability 1', '--min-probability'),
+        ('--map x --query y --truth file.csv', 'expected identity'),
+        ('--map x --query y --geometric-check sift', 'go with --loop'),
+        ('--loop --map x --query y', 'leave --map'),
+        ('--loop synthetic --truth file.csv', 'is known'),
+        ('--loop x --truth identity', 'takes a file'),
+        ('--loop --sequence-length 1', '--sequence-length'),
+        ('--loop --mode paper', '--threshold'),
     ],
 )
 def test_demo_with_wrong_options_names_them(run, tmp_path, options, word):
-    result = run(demo, '--output', tmp_path / 'output', *options)
+    result = run(demo, '--output', tmp_path / 'output', *options.split())
     assert result.code == 2
     assert word in result.err
     assert not (tmp_path / 'output').exists()
@@ -292,8 +286,7 @@ def test_demo_on_bag_and_folder_reports_matches(run, traverse, tmp_path):
     assert result.returncode == 0, result.stdout + result.stderr
     assert '24.png' in result.stdout
     assert '24 of 24 images matched' in result.stdout
-    lines = (output / 'matches.jsonl').read_text().splitlines()
-    records = [json.loads(line) for line in lines]
+    records = read_records(output / 'matches.jsonl')
     assert [match['status'] for match in records] == ['WARMING_UP'] * 19 + ['MATCH'] * 5
     assert records[-1]['newest_index'] == 23
     assert cv2.imread(str(output / 'demo.png')).std() > 5
@@ -312,11 +305,9 @@ def test_demo_of_loop_closure_reports_closures(run, tmp_path):
     options += ['--geometric-check', 'none', '--tolerance', 0, '--output', output]
     result = run_process('demo', '--loop', traverse, *options)
     assert result.returncode == 0, result.stdout + result.stderr
-    lines = (output / 'matches.jsonl').read_text().splitlines()
-    records = [json.loads(line) for line in lines]
+    records = read_records(output / 'matches.jsonl')
     assert [i for i, match in enumerate(records) if match['status'] == 'SKIPPED'] == [36]
-    lines = (output / 'loop_closures.jsonl').read_text().splitlines()
-    closures = [json.loads(line) for line in lines]
+    closures = read_records(output / 'loop_closures.jsonl')
     on_time = [closure for closure in closures if not closure['is_late']]
     assert len(on_time) == sum(match['status'] == 'MATCH' for match in records) > 20
     last = on_time[-1]
@@ -348,35 +339,24 @@ def test_demo_terminated_ends_its_processes(traverse, tmp_path):
     assert str(output) not in listed.stdout
 
 
-# --------------------------------------------------------------------------- results of the demo
-
-
 def test_read_result_counts_images_not_places():
     """Windows of one; of six images, image 1 is no place: place 3 is image 4, place 4 image 5."""
     names = ['WARMING_UP', 'SKIPPED', 'NO_MATCH', 'NO_MATCH', 'MATCH', 'MATCH']
     statuses = [{'status': name} for name in names]
     truth = GroundTruth.from_pairs([4, 5], [0, 3], 6, 6)
+    pairs = {3: [[3, 9, 0, 9], [2, 9, 0, 9]], 4: [[4, 9, 0, 9]]}
     closures = [
-        {
-            'query_index': 3,
-            'place_index': 0,
-            'distance': 0.5,
-            'pairs': [[3, 9, 0, 9], [2, 9, 0, 9]],
-        },
-        {'query_index': 4, 'place_index': 0, 'distance': 0.6, 'pairs': [[4, 9, 0, 9]]},
+        {'query_index': query, 'place_index': 0, 'distance': 0.5, 'pairs': listed}
+        for query, listed in pairs.items()
     ]
     result = read_result(statuses, closures, truth, 2)
     assert result.closures.tolist() == [[4, 0], [5, 0]]
     assert result.are_correct(result.closures).tolist() == [True, False]
     assert result.pairs.tolist() == [[3, 0], [4, 0], [5, 0]]
-    first, second, third = result.summary().splitlines()
-    assert first == '2 loop closures in 6 images (1 too similar to the last)'
-    assert second == '1 of 2 loop closures are correct, precision 0.500'
-    assert third.startswith('1 of 2 images')
-    assert third.endswith('recall 0.500')
-    assert read_result(statuses, [], None, 2).summary() == (
-        '0 loop closures in 6 images (1 too similar to the last)'
-    )
+    assert '1 of 2 loop closures are correct, precision 0.500' in result.summary()
+    assert result.summary().endswith('recall 0.500')
+    unknown = read_result(statuses, [], None, 2).summary()
+    assert unknown == '0 loop closures in 6 images (1 too similar to the last)'
 
 
 def plain_match(status, place=-1):

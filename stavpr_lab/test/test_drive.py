@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drives by hand: which images are shown, which places are kept, and their ground truth."""
 
+from evaluation_commands import truth_matrix
 import numpy as np
 import pytest
-from stavpr_lab.evaluation.drive import DriveChanges
+from stavpr_lab.evaluation.drive import cropped, DriveChanges
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.errors import SettingsError
+from stavpr_ros.sources.frame import Frame
 
 # four images in six places: 0 -> 1; 1 -> 2, 3; 2 -> nothing; 3 -> 0, 5
 PAIRS = [(0, 1), (1, 2), (1, 3), (3, 0), (3, 5)]
@@ -21,8 +23,8 @@ def by_hand(pairs=PAIRS, N=4, n=6):
     [
         ({}, [0, 1, 2, 3, 4, 5, 6]),
         ({'speed': 3}, [0, 3, 6]),
+        ({'speed': 1.5}, [0, 1, 3, 4, 6]),
         ({'speed': 0.5}, [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6]),
-        ({'speed': 0.7}, [0, 0, 1, 2, 2, 3, 4, 4, 5, 6]),
         ({'speed': 4.5}, [0, 4]),
         ({'stops': ((2, 3), (6, 1))}, [0, 1, 2, 2, 2, 2, 3, 4, 5, 6, 6]),
         ({'reverse': True}, [6, 5, 4, 3, 2, 1, 0]),
@@ -31,6 +33,37 @@ def by_hand(pairs=PAIRS, N=4, n=6):
 )
 def test_images_of_seven_by_hand(changes, images):
     assert DriveChanges(**changes).images(7).tolist() == images
+
+
+def test_images_at_seven_tenths_of_the_speed_are_exact():
+    """floor(0.7 i), also where 0.7 i is a whole number that binary fractions miss."""
+    images = DriveChanges(speed=0.7).images(1000)
+    assert images.tolist() == [i * 7 // 10 for i in range(1429)]
+
+
+def test_images_at_varying_speed_are_between_half_and_double():
+    """Steps of 2 ** sin(2 pi i / 60): 1, 1.08, 1.16, ...; 2 near i = 15, 1/2 near i = 45."""
+    images = DriveChanges(speed='varying').images(2000)
+    assert (images[16] - images[13], images[49] - images[41]) == (6, 4)
+    steps = 2 ** np.sin(2 * np.pi * np.arange(len(images)) / 60)
+    assert images.tolist() == [int(steps[:i].sum()) for i in range(len(images))]
+    assert images[-1] <= 1999 < images[-1] + 3
+
+
+@pytest.mark.parametrize(
+    ('name', 'changes'),
+    [
+        ('same', DriveChanges()),
+        ('0.7x', DriveChanges(speed=0.7)),
+        ('vary', DriveChanges(speed='varying')),
+        ('varying', DriveChanges(speed='varying')),
+        ('stop', DriveChanges(stops=((50, 30),))),
+        ('stop 100', DriveChanges(stops=((50, 100),))),
+        ('drop 0.3', DriveChanges(drop=0.3)),
+    ],
+)
+def test_named_changes_are_those_of_the_name(name, changes):
+    assert DriveChanges.named(name, 100) == changes
 
 
 def test_images_are_dropped_with_the_probability_and_by_the_seed():
@@ -49,7 +82,6 @@ def test_apply_moves_the_ground_truth_with_images_and_places():
     assert drive.places.tolist() == [0, 3, 4, 5]
     assert drive.truth.pairs.tolist() == [[0, 0], [0, 3], [2, 1], [3, 1]]
     assert (drive.truth.N, drive.truth.n) == (5, 4)
-    assert drive.truth.has_match.tolist() == [True, False, True, True, False]
 
 
 def test_apply_equals_the_matrix_of_any_ground_truth():
@@ -58,12 +90,10 @@ def test_apply_equals_the_matrix_of_any_ground_truth():
         matrix = rng.random((30, 25)) < 0.08
         truth = GroundTruth.from_pairs(*np.nonzero(matrix), 30, 25)
         first, other = sorted(rng.choice(25, 2, replace=False).tolist())
-        changes = DriveChanges(
-            removed=((first, other),), drop=0.2, seed=seed, speed=0.6, stops=((seed, 4),)
-        )
-        drive = changes.apply(truth)
+        removed, stops = ((first, other),), ((seed, 4),)
+        drive = DriveChanges(removed, drop=0.2, seed=seed, speed=0.6, stops=stops).apply(truth)
         expected = np.delete(matrix[drive.images], np.arange(first, other), axis=1)
-        np.testing.assert_array_equal(drive.truth.matrix(), expected)
+        np.testing.assert_array_equal(truth_matrix(drive.truth), expected)
 
 
 def test_apply_mirrored_has_no_correct_place():
@@ -96,10 +126,9 @@ def test_unseen_images_of_two_places_have_lost_both():
     truth = by_hand([(0, 20), (0, 50), (1, 20)], 3, 60)
     both = DriveChanges(removed=((10, 30), (40, 60))).apply(truth).unseen()
     assert [mask.tolist() for mask in both] == [[True, True, False], [False] * 3]
-    one = DriveChanges(removed=((10, 30),)).apply(truth).unseen()
-    assert one[0].tolist() == [False, True, False]
-    backward = DriveChanges(removed=((10, 30),), reverse=True, mirror=True).apply(truth).unseen()
-    assert backward[0].tolist() == [False, True, False]
+    for others in ({}, {'reverse': True, 'mirror': True}):
+        one = DriveChanges(removed=((10, 30),), **others).apply(truth).unseen()
+        assert one[0].tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize(
@@ -122,3 +151,38 @@ def test_unseen_images_of_two_places_have_lost_both():
 def test_changes_out_of_range_raise(changes, message):
     with pytest.raises(SettingsError, match=message):
         DriveChanges(**changes).apply(GroundTruth.identity(7, 7))
+
+
+@pytest.mark.parametrize(
+    ('name', 'message'),
+    [
+        ('fast', "'fast' is unknown: take same, 2x, "),
+        ('drop 1.5', 'drop = 1.5'),
+        ('0x', 'speed 0'),
+    ],
+)
+def test_invalid_name_raises(name, message):
+    with pytest.raises(SettingsError, match=message):
+        DriveChanges.named(name, 7)
+
+
+# ---------------------------------------------------------------------------------- cropping
+
+
+def test_cropped_images_by_hand():
+    """Of 10 columns 1 and 3 are cut off; of 15 the rounded 1.5 and 4.5: 2 and 5."""
+    ramps = [np.tile(np.arange(width, dtype=np.uint8)[:, None], (2, 1, 3)) for width in (10, 15)]
+    frames = list(cropped([Frame(ramps[0], 7, 'a'), Frame(ramps[1], 8, 'b')], 0.1, 0.3))
+    assert frames[0].image[0, :, 0].tolist() == list(range(1, 7))
+    assert frames[1].image[0, :, 0].tolist() == list(range(2, 10))
+    assert [(frame.stamp, frame.identifier) for frame in frames] == [(7, 'a'), (8, 'b')]
+    assert all(frame.image.flags.c_contiguous and frame.image.shape[2] == 3 for frame in frames)
+    assert ramps[0].shape == (2, 10, 3)
+
+
+@pytest.mark.parametrize(
+    'fractions', [(-0.1, 0), (0, -0.1), (0.5, 0.5), (1, 0), (float('nan'), 0)]
+)
+def test_cropped_by_invalid_fractions_raises(fractions):
+    with pytest.raises(SettingsError, match='fractions >= 0'):
+        cropped([], *fractions)

@@ -3,18 +3,17 @@
 """The command ``evaluate``, on synthetic traverses and on real ones."""
 
 import csv
-from dataclasses import replace
 import os
 import re
 
 import cv2
-from evaluation_commands import read_json, runner, write_images
+from evaluation_commands import best_f1, read_json, runner, write_images
 from fixtures import route_images
 import numpy as np
 import pytest
 from stavpr_lab.commands import evaluate
 from stavpr_lab.evaluation.evaluate import recognize_all
-from stavpr_lab.evaluation.metrics import best_f1, image_matches
+from stavpr_lab.evaluation.metrics import image_matches
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, save_map
@@ -67,49 +66,32 @@ def page_data(page):
     return read_json(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))
 
 
-# ---------------------------------------------------------------------------------- numbers
-
-
 def test_evaluate_compares_odometry_with_the_map_poses(folders, numbers, tmp_path):
     """The map turns left at place 30; the query does, too, or turns right."""
-    ways = {}
+    paths = {}
     for name, side in (('left', 1), ('right', -1)):
         steps = np.array([[1, 0]] * 30 + [[0, side]] * (PLACES - 30))
-        ways[name] = tmp_path / f'{name}.csv'
-        np.savetxt(ways[name], np.column_stack([np.cumsum(steps, 0), np.zeros(PLACES)]), '%g', ',')
-    options = [*pair(folders), '--map-poses', ways['left']]
+        paths[name] = tmp_path / f'{name}.csv'
+        np.savetxt(
+            paths[name], np.column_stack([np.cumsum(steps, 0), np.zeros(PLACES)]), '%g', ','
+        )
+    options = [*pair(folders), '--map-poses', paths['left']]
     plain = numbers(*pair(folders))['decision']
-    same = numbers(*options, '--odometry', ways['left'])
+    same = numbers(*options, '--odometry', paths['left'])
     assert same['decision'] == plain
-    assert same['settings']['odometry'] == str(ways['left'])
-    other = numbers(*options, '--odometry', ways['right'])['decision']
+    assert same['settings']['odometry'] == str(paths['left'])
+    other = numbers(*options, '--odometry', paths['right'])['decision']
     assert other['matched'] < plain['matched'] - 15
-    short = tmp_path / 'short.csv'
-    short.write_text('0,0,0\n' * 9)
-    with pytest.raises(AssertionError, match='9 poses for 60 images'):
-        numbers(*options, '--odometry', short)
-    with pytest.raises(AssertionError, match='the map has no poses: give --map-poses'):
-        numbers(*pair(folders), '--odometry', ways['left'])
 
 
 def test_evaluate_of_two_folders_writes_numbers_and_settings(folders, numbers):
     found = numbers(*pair(folders), '--features', 'gradient', '--mode', 'paper', '--tolerance', 1)
-    for kind in KINDS:
-        metrics = found[kind]
-        assert metrics['f1'] > 0.9
-        assert 0 < metrics['threshold'] < 1
-        assert metrics['average_precision'] > 0.9
-        assert (
-            0.9 < metrics['recall_at_1'] <= metrics['recall_at_5'] <= metrics['recall_at_20'] <= 1
-        )
-        assert 0 <= metrics['recall_at_100_precision'] <= 1
+    assert all(found[kind]['average_precision'] > 0.9 for kind in KINDS)
     assert found['sequence']['queries'] == PLACES
     assert found['sequence_without_ends']['queries'] == PLACES - 19
-    settings = found['settings']
-    assert (settings['mode'], settings['tolerance'], settings['vertical']) == ('paper', 1, False)
-    assert (settings['strategy'], settings['sequence_length']) == ('adaptive', 20)
-    assert (settings['loop_closure'], settings['exclude_places']) == (False, None)
-    assert 'gradient' in settings['features']
+    expected = {'mode': 'paper', 'tolerance': 1, 'strategy': 'adaptive', 'exclude_places': None}
+    assert expected.items() <= found['settings'].items()
+    assert 'gradient' in found['settings']['features']
     assert found['times']['total_s'] > 0
     assert not {'false_alarm_rate', 'default_threshold'} & found.keys()
 
@@ -141,7 +123,6 @@ def test_evaluate_numbers_are_those_of_the_recognizer(folders, numbers, options,
     distances = recognizer.distances(query)
     single = best_f1(distances.min(axis=1), np.abs(distances.argmin(axis=1) - true) <= 2)
     assert found['single']['f1'] == single.f1
-    assert found['single']['threshold'] == pytest.approx(single.threshold, abs=1e-6)
     ends = slice(3, PLACES // 2 - 4)
     inner = best_f1(matches.distances[ends], correct[ends])
     assert found['sequence_without_ends']['f1'] == inner.f1
@@ -161,30 +142,20 @@ def test_evaluate_with_unknown_images_counts_false_alarms(folders, numbers):
     assert other['sequence']['f1'] == same['sequence']['f1']
 
 
-@pytest.mark.parametrize(('kind', 'images'), [('2x', 30), ('stop', 90)])
-def test_evaluate_with_warp_changes_images_and_ground_truth(folders, numbers, kind, images):
-    found = numbers(*pair(folders), '--warp', kind, '--tolerance', 0)
-    assert found['images'] == found['single']['queries'] == images
-    assert found['places'] == PLACES
+def test_evaluate_with_warp_changes_images_and_ground_truth(folders, numbers):
+    found = numbers(*pair(folders), '--warp', 'stop', '--tolerance', 0)
+    assert (found['images'], found['places']) == (PLACES + 30, PLACES)
     assert found['single']['recall_at_1'] == 1
 
 
 def test_evaluate_with_crop_equals_images_cropped_before(folders, numbers, tmp_path):
-    def crop(name, first, last):
+    def crop(name, columns):
         images = [cv2.imread(str(file))[:, :, ::-1] for file in sorted((folders / name).iterdir())]
-        return write_images(tmp_path / name, [image[:, first:last] for image in images])
+        return write_images(tmp_path / name, [image[:, columns] for image in images])
 
-    width = 128
-    first, second = (
-        crop('map', 0, width - round(0.3 * width)),
-        crop('query', round(0.1 * width), width),
-    )
+    first, second = crop('map', slice(128 - 38)), crop('query', slice(13, None))
     found = numbers(*pair(folders), '--crop-map', 0.3, '--crop-query', 0.1)['sequence']
     assert found == numbers('--map', first, '--query', second)['sequence']
-    assert found['threshold'] != numbers(*pair(folders))['sequence']['threshold']
-
-
-# ---------------------------------------------------------------------------------- inputs
 
 
 def test_evaluate_with_saved_maps_equals_folders(folders, tmp_path, numbers, run):
@@ -200,10 +171,8 @@ def test_evaluate_with_saved_maps_equals_folders(folders, tmp_path, numbers, run
     for wrong, word in (
         (['--features', 'onnx'], 'was made with gradient'),
         (['--strips', 5], 'was made with 7'),
-        (['--projection', 9], '--projection'),
         (['--seed', 0], '--seed'),
         (['--gradient-cell', 32], '--gradient-cell'),
-        (['--densenet161_places365-size', 224], '--densenet161_places365-size'),
         (['--crop-map', 0.3], '--crop-map'),
     ):
         code, _, errors = run('--map', saved, '--query', query, *wrong)
@@ -222,8 +191,6 @@ def test_evaluate_with_a_dataset_finds_map_query_and_tolerance(tmp_path, numbers
     assert numbers(*options)['unknown_images'] == 24
     code, _, errors = run(*options, '--seed', 1)
     assert (code, 'those of the first sequence' in errors) == (1, True)
-    code, _, errors = run('--dataset', 'nordland')
-    assert (code, 'NAME=FOLDER' in errors) == (2, True)
 
 
 def test_evaluate_with_a_ground_truth_file_has_tolerance_zero(folders, numbers, tmp_path):
@@ -245,12 +212,13 @@ def test_evaluate_with_poses_accepts_near_places(folders, numbers, run, tmp_path
     assert numbers(*both, '--meters', 1)['single']['recall_at_1'] == 0
     (tmp_path / 'short.csv').write_text('0,0,0\n')
     for wrong, code, word in (
-        (options, 2, '--map-poses'),
+        (options, 2, 'the map has no poses: give --map-poses'),
         ([*both, '--degrees', 9], 1, 'no orientations'),
         ([*options, '--map-poses', tmp_path / 'short.csv'], 1, '1 poses for 60 images'),
+        ([*pair(folders), '--odometry', tmp_path / 'short.csv'], 1, '1 poses for 60 images'),
     ):
         found, _, errors = run(*wrong)
-        assert (found, word in errors) == (code, True)
+        assert (found, word in errors) == (code, True), errors
 
 
 def test_evaluate_with_loop_closure_matches_the_second_lap(tmp_path, numbers):
@@ -269,11 +237,7 @@ def test_evaluate_with_loop_closure_matches_the_second_lap(tmp_path, numbers):
     assert numbers(*options, '--exclude-places', 40)['single']['recall_at_1'] > 0.8
     beyond = numbers(*options, '--exclude-places', 41)['single']
     assert (beyond['queries_with_match'], beyond['recall_at_1'], beyond['f1']) == (0, None, 0)
-    settings = numbers(*options)['settings']
-    assert (settings['loop_closure'], settings['exclude_places']) == (True, 50)
-
-
-# ---------------------------------------------------------------------------------- drives
+    assert numbers(*options)['settings']['exclude_places'] == 50
 
 
 @pytest.fixture
@@ -308,17 +272,11 @@ def test_evaluate_with_places_removed_counts_unseen_images(folders, report, mode
     assert f'20 .. 39: {matched} of 10 unseen images matched' in text
     right = [int(row['sequence_right']) for row in rows]
     wrong = sum(a and not r for a, r in zip(accepted, right, strict=True))
-    decision = found['decision']
+    decision, threshold = found['decision'], found['sequence']['threshold']
     assert (decision['matched'], decision['wrongly_matched']) == (sum(accepted), wrong)
-    if mode == 'robust':
-        distances = [float(row['sequence_distance']) for row in rows]
-        assert accepted == [int(distance < 0.5) for distance in distances]
-        assert decision['rule'] == 'default'
-        assert found['default_threshold']['precision'] == decision['precision']
-    else:
-        counts = found['sequence']
-        assert sum(accepted) == counts['true_positives'] + counts['false_positives']
-        assert decision['rule'] == 'best F1'
+    assert decision['rule'] == ('default' if mode == 'robust' else 'best F1')
+    limit = 0.5 if mode == 'robust' else threshold
+    assert accepted == [int(float(row['sequence_distance']) < limit) for row in rows]
 
 
 def test_evaluate_combines_drive_options(folders, report):
@@ -327,21 +285,18 @@ def test_evaluate_combines_drive_options(folders, report):
     found, rows, _ = report(*pair(folders), *options, '--mode', 'paper', '--tolerance', 0)
     images = [*range(0, 30, 2), *[30] * 13, *range(32, PLACES, 2)][::-1]
     assert [int(row['recorded_image']) for row in rows] == images
-    assert [row['identifier'] for row in rows] == [f'{i:03}.png' for i in images]
+    assert rows[0]['identifier'] == '058.png'
     number = {place: i for i, place in enumerate([*range(20), *range(40, PLACES)])}
     assert [int(row['true_place']) for row in rows] == [number.get(i, -1) for i in images]
     assert [stretch['images'] for stretch in found['unseen']] == [13 + len((26, 28, 32, 34))]
     assert found['single']['recall_at_1'] == 1
-    settings = found['settings']
-    assert (settings['speed'], settings['stop']) == (2, [[30, 12]])
-    assert settings['remove_from_map'] == [[20, 40]]
+    assert found['settings']['remove_from_map'] == [[20, 40]]
 
 
 def test_evaluate_with_drop_leaves_images_out_by_the_seed(folders, report):
     found, rows, _ = report(*pair(folders), '--drop', 0.3, '--drop-seed', 4, '--tolerance', 0)
     kept = np.flatnonzero(np.random.default_rng(4).random(PLACES) >= 0.3)
     assert [int(row['recorded_image']) for row in rows] == kept.tolist()
-    assert [int(row['true_place']) for row in rows] == kept.tolist()
     assert found['images'] == len(kept)
 
 
@@ -354,40 +309,22 @@ def test_evaluate_mirrored_equals_images_mirrored_before(folders, report, run, t
     assert [row['sequence_distance'] for row in rows] == [r['sequence_distance'] for r in before]
     assert found['sequence']['queries_with_match'] == 0
     assert found['decision']['wrongly_matched'] == found['decision']['matched']
-    assert {row['sequence_right'] for row in rows} == {'0'}
-    query = open_source(folders / 'query')
-    save_map(build_map(query, FeatureExtractor(), progress=False), tmp_path / 'q.stavpr')
+    query = build_map(open_source(folders / 'query'), FeatureExtractor(), progress=False)
+    save_map(query, tmp_path / 'q.stavpr')
     code, _, errors = run('--map', folders / 'map', '--query', tmp_path / 'q.stavpr', '--mirror')
     assert (code, 'has no images' in errors) == (2, True)
 
 
-def test_evaluate_with_declared_probabilities_shows_their_calibration(
-    folders, report, monkeypatch, tmp_path
-):
-    """Every window is declared to be right with 97 %, and is."""
-    update = PlaceRecognizer.update
-
-    def declaring(self, *arguments, **options):
-        match = update(self, *arguments, **options)
-        probability = 0.97 if match.sequence else float('nan')
-        return replace(match, probability=probability, path_ratios=np.empty(0))
-
+def test_evaluate_shows_the_calibration_of_declared_probabilities(folders, report, tmp_path):
     assert report(*pair(folders), '--mode', 'paper')[0]['calibration'] is None
-    monkeypatch.setattr(PlaceRecognizer, 'update', declaring)
     found, rows, text = report(*pair(folders))
-    assert [float(row['probability']) for row in rows] == [0.97] * PLACES
     calibration = found['calibration']
-    assert calibration['images'] == calibration['bins'][9]['images'] == PLACES
-    right = np.mean([int(row['sequence_right']) for row in rows])
+    assert calibration['images'] == sum(row['probability'] != 'nan' for row in rows) > 0
     error = calibration['expected_calibration_error']
-    assert error == pytest.approx(abs(0.97 - right))
     assert f'expected calibration error {error:.4f}' in text
     page = (tmp_path / 'report' / 'report.html').read_text(encoding='utf-8')
     assert f'Expected calibration error {error:.4f}' in page
     assert cv2.imread(str(tmp_path / 'report' / 'calibration.png')).std() > 5
-
-
-# ---------------------------------------------------------------------------------- report
 
 
 def test_report_holds_numbers_matches_plots_and_page(folders, run, tmp_path):
@@ -398,11 +335,8 @@ def test_report_holds_numbers_matches_plots_and_page(folders, run, tmp_path):
     assert 'false alarm rate' in text
     plots = {'precision_recall', 'distances', 'similarity_matrix', 'drive', 'window_30'}
     assert plots <= {file.stem for file in folder.glob('*.png')}
-    for file in folder.glob('*.png'):
-        assert cv2.imread(str(file)).std() > 5, f'{file} is empty'
     with (folder / 'answers.csv').open() as file:
         rows = list(csv.DictReader(file))
-    assert [int(row['image']) for row in rows] == list(range(PLACES))
     right = [int(row['sequence_right']) for row in rows]
     assert right == [int(abs(int(row['sequence_place']) - i) <= 3) for i, row in enumerate(rows)]
     with (folder / 'curves.csv').open() as file:
@@ -414,19 +348,15 @@ def test_report_holds_numbers_matches_plots_and_page(folders, run, tmp_path):
     data = page_data(page)
     assert [view['image'] for view in data['views']] == list(range(9, PLACES - 10))
     view = data['views'][21]
-    assert view['place'] == int(rows[30]['sequence_place'])
-    assert view['right'] is bool(right[30])
+    assert (view['place'], view['right']) == (int(rows[30]['sequence_place']), bool(right[30]))
     assert [0, 18, 24] in view['truth']  # image 21 ± 3, the first of the window
     assert data['queries']['30'].startswith('data:image/jpeg')
-    assert view['path'][0][1] >= view['first']
     for left, top, width, height in data['boxes'].values():
         assert 0 < left < left + width < 1
         assert 0 < top < top + height < 1
     results = read_json((folder / 'results.json').read_text())
     assert f'<td>{results["sequence"]["f1"]:.4f}</td>' in page
-    default = results['default_threshold']  # mode robust has one
-    assert 0 <= default['f1'] <= results['sequence']['f1']
-    assert default['threshold'] == 1 - results['settings']['min_probability'] == 0.5
+    assert results['default_threshold']['f1'] <= results['sequence']['f1']
 
 
 def test_report_of_names_with_markup_escapes_them(tmp_path, run):
@@ -445,70 +375,55 @@ def test_report_of_names_with_markup_escapes_them(tmp_path, run):
     assert len(page_data(page)['views']) == 5  # windows of 20 in 24 images
 
 
-# ---------------------------------------------------------------------------------- errors
-
-LOOP = ['--query', 'x', '--loop-closure', '--truth', 'y']
+LOOP, PAIR = '--query x --loop-closure --truth y', '--map x --query y'
 
 
 @pytest.mark.parametrize(
     ('options', 'code', 'word'),
     [
-        ([], 2, '--query is required'),
-        (['--query', 'x'], 2, '--loop-closure'),
-        (['--map', '/missing', '--query', '/missing'], 1, '/missing'),
-        (['--query', 'x', '--loop-closure'], 2, '--truth'),
-        ([*LOOP, '--exclude-places', '0'], 2, 'at least 1'),
-        ([*LOOP, '--warp', '2x'], 2, '--warp'),
-        ([*LOOP, '--remove-from-map', '3:4'], 2, '--remove-from-map needs a --map'),
-        (
-            ['--map', 'x', '--query', 'y', '--remove-from-map', '3-4'],
-            2,
-            "'3-4': expected two whole",
-        ),
-        (['--map', 'x', '--query', 'y', '--warp', '2x', '--speed', '3'], 2, 'give one of them'),
-        ([*LOOP[:-1], 'poses', '--map-poses', 'y'], 2, '--map-poses'),
-        (['--map', 'x', '--query', 'y', '--exclude-places', '9'], 2, 'goes with --loop-closure'),
-        (['--map', 'x', '--query', 'y', '--late-closures'], 2, 'goes with --loop-closure'),
-        (['--dataset', 'a=b', '--odometry', 'x.csv'], 2, 'give --map and --query'),
-        (['--map', 'x', '--query', 'y', '--tolerance', '-1'], 2, '--tolerance'),
-        (['--map', 'x', '--query', 'y', '--nms-radius', '-1'], 2, 'nms_radius'),
-        (['--map', 'x', '--query', 'y', '--map-poses', 'z'], 2, '--truth poses'),
-        (['--map', 'x', '--query', 'y', '--json', '/missing/x.json'], 1, 'does not exist'),
-        (['--map', 'x', '--query', 'y', '--output', __file__], 1, 'takes a folder'),
-        (['--dataset', 'ua=x', '--map', 'y'], 2, 'leave'),
+        ('', 2, '--query is required'),
+        ('--dataset nordland', 2, 'NAME=FOLDER'),
+        ('--dataset a=b --odometry x.csv', 2, 'give --map and --query'),
+        ('--dataset ua=x --map y', 2, 'leave'),
+        ('--query x', 2, '--loop-closure'),
+        ('--map /missing --query /missing', 1, '/missing'),
+        ('--query x --loop-closure', 2, '--truth'),
+        (f'{LOOP} --exclude-places 0', 2, 'at least 1'),
+        (f'{LOOP} --warp 2x', 2, '--warp'),
+        (f'{LOOP} --remove-from-map 3:4', 2, '--remove-from-map needs a --map'),
+        ('--query x --loop-closure --truth poses --map-poses y', 2, '--map-poses'),
+        (f'{PAIR} --remove-from-map 3-4', 2, "'3-4': expected two whole"),
+        (f'{PAIR} --warp 2x --speed 3', 2, 'give one of them'),
+        (f'{PAIR} --exclude-places 9', 2, 'goes with --loop-closure'),
+        (f'{PAIR} --late-closures', 2, 'goes with --loop-closure'),
+        (f'{PAIR} --tolerance -1', 2, '--tolerance'),
+        (f'{PAIR} --nms-radius -1', 2, 'nms_radius'),
+        (f'{PAIR} --map-poses z', 2, '--truth poses'),
+        (f'{PAIR} --json /missing/x.json', 1, 'does not exist'),
+        (f'{PAIR} --output {__file__}', 1, 'takes a folder'),
     ],
 )
 def test_evaluate_with_invalid_options_fails_before_the_work(run, options, code, word):
-    found, _, errors = run(*options)
+    found, _, errors = run(*options.split())
     assert (found, word in errors) == (code, True)
 
 
 def test_evaluate_of_inputs_that_do_not_fit_fails(folders, run, tmp_path):
-    folder, pickled = tmp_path / 'none', tmp_path / 'truth.npy'
-    np.save(pickled, np.array([[1], [1, 2]], object), allow_pickle=True)
+    folder = tmp_path / 'none'
     for options, code, word in (
         (['--query', folders / 'elsewhere'], 1, '40 query images and 60 places'),
-        (['--strips', 0], 2, 'W = 0'),
         (['--remove-from-map', '50:61'], 2, 'FIRST < LAST <= 60'),
-        (['--stop', '60:5'], 2, 'the query has the images 0 .. 59'),
         (['--speed', 'fast'], 2, 'a number or varying'),
-        (['--drop', 1.5], 2, 'drop = 1.5'),
         (['--speed', 4], 1, 'at least l = 20'),
-        (['--sequence-length', 61], 1, 'at least l = 61'),
         (['--window', 3, '--output', folder], 2, '9 .. 49'),
-        (['--truth', pickled], 1, 'pickle'),
     ):
         found, _, errors = run(*pair(folders), *options)
         assert (found, word in errors) == (code, True), errors
     assert not folder.exists()
 
 
-# ---------------------------------------------------------------------------------- real data
-
-
 def test_evaluate_on_gardens_point_gives_the_measured_f1(data_folder, numbers):
-    folder = data_folder / 'gardens_point'
-    options = ['--map', folder / 'day_left', '--query', folder / 'day_right', '--tolerance', 2]
+    options = ['--dataset', f'gardens_point={data_folder / "gardens_point"}']
     paper, robust = numbers(*options, '--mode', 'paper'), numbers(*options)
     assert paper['sequence']['f1'] == pytest.approx(0.792, abs=0.02)
     assert robust['sequence']['f1'] > 0.95
@@ -540,4 +455,3 @@ def test_reports_and_numbers_are_replaced_only_by_force(run, folders, tmp_path):
     out.write_text('my notes')
     code, _, errors = run(*pair(folders), '--json', out, '--force')
     assert (code, 'is no JSON file: it is never replaced' in errors) == (1, True), errors
-    assert (out.read_text(), os.listdir(folder)) == ('my notes', ['report.html'])

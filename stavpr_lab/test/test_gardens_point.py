@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real images through the node over ROS: equal to the library, match for match."""
 
+from evaluation_commands import best_f1
 import numpy as np
 import pytest
 from stavpr_lab.demonstration.live import run_live
 from stavpr_lab.evaluation.evaluate import recognize_all
-from stavpr_lab.evaluation.metrics import best_f1, image_matches
+from stavpr_lab.evaluation.metrics import image_matches
 from stavpr_lab.evaluation.records import evaluate_records
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, extract_features, save_map

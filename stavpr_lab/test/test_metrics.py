@@ -7,7 +7,6 @@ import oracle
 import pytest
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import (
-    best_f1,
     counts_at,
     evaluate_ranking,
     image_matches,
@@ -33,9 +32,6 @@ def window(middle, path, distance):
     return Match(Status.NO_MATCH, sequence=nearest, path=np.array(path, np.int32))
 
 
-# ---------------------------------------------------------------------------------- counts
-
-
 def test_counts_at_four_queries_by_hand():
     """Accepted and correct, accepted and wrong, rejected, rejected and not in the map."""
     distances = np.array([0.1, 0.2, 0.5, 0.6])
@@ -48,7 +44,8 @@ def test_counts_at_four_queries_by_hand():
 
 def test_best_f1_on_a_tie_is_that_of_the_lowest_threshold():
     """Below .3: 2 TP, 1 FN; accepting all: 2 TP, 1 FP; F1 is .8 both times."""
-    best = best_f1(np.array([0.1, 0.2, 0.3]), np.array([True, True, False]))
+    truth = GroundTruth.identity(3, 3)
+    best = evaluate_ranking(ranking([0, 1, 0], [0.1, 0.2, 0.3]), truth).best
     assert (best.f1, best.threshold) == (pytest.approx(0.8), 0.3)
 
 
@@ -57,24 +54,15 @@ def test_best_f1_and_average_precision_equal_oracle_and_scikit_learn():
 
     rng = np.random.default_rng(0)
     for _ in range(40):
-        scores, places, true = (
-            rng.integers(0, 9, 15) / 8,
-            rng.integers(0, 6, 15),
-            rng.integers(0, 6, 15),
-        )
+        scores = rng.integers(0, 9, 15) / 8
+        places, true = rng.integers(0, 6, (2, 15))
         truth = GroundTruth.from_pairs(np.arange(15), true, N=15, n=6, tolerance=1)
         metrics = evaluate_ranking(ranking(places, scores), truth)
         answers = list(zip(places.tolist(), scores.tolist(), strict=True))
-        assert metrics.best.f1 == pytest.approx(
-            oracle.best_f1(answers, [[place] for place in true.tolist()], 1)
-        )
-        correct = np.abs(places - true) <= 1
-        assert metrics.average_precision == pytest.approx(
-            average_precision_score(correct, -scores)
-        )
-
-
-# ---------------------------------------------------------------------------------- windows
+        best = oracle.best_f1(answers, [[place] for place in true.tolist()], 1)
+        assert metrics.best.f1 == pytest.approx(best)
+        average = average_precision_score(np.abs(places - true) <= 1, -scores)
+        assert metrics.average_precision == pytest.approx(average)
 
 
 def test_image_matches_of_windows_of_four_by_hand():
@@ -95,9 +83,6 @@ def test_image_matches_of_windows_of_four_by_hand():
     assert matches.distances.tolist() == [0.3, 0.3, 0.2, 0.4, 0.4, 0.4]
     within = matches.within(np.array([11, 14, -1, 14, 12, 19]), 2)
     assert within.tolist() == [True, False, False, True, False, False]
-
-
-# ---------------------------------------------------------------------------------- rankings
 
 
 def test_evaluate_ranking_of_five_queries_by_hand():
@@ -137,12 +122,7 @@ def test_evaluate_ranking_recall_at_k_counts_any_of_the_first_k():
     places[2, :1] = 8
     places[3, :1] = 3  # not in the map: not counted
     found = evaluate_ranking(ranking(places, np.arange(4)), truth).recall_at
-    assert found == {
-        1: 0,
-        5: pytest.approx(1 / 3),
-        10: pytest.approx(2 / 3),
-        20: pytest.approx(2 / 3),
-    }
+    assert found == {1: 0, 5: 1 / 3, 10: 2 / 3, 20: 2 / 3}
 
 
 def test_evaluate_ranking_of_a_slice_counts_only_these_queries():

@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """SSM-VPR: golden cases, every step against plain loops, and a traverse."""
 
-from dataclasses import replace
-import math
-
 import numpy as np
 import pytest
 from stavpr_lab.evaluation.ssm_vpr import (
@@ -38,9 +35,6 @@ def agreement(nearest, side, reach):
     return total
 
 
-# ------------------------------------------------ golden
-
-
 def test_identical_images_score_one():
     maps = random_maps(6, 8, 14)
     scores = SpatialReranker(maps).scores(maps[3], np.arange(6))
@@ -51,20 +45,10 @@ def test_identical_images_score_one():
 def test_image_shifted_by_one_cell_scores_its_overlap():
     """All cubes but those of the lost column are displaced equally."""
     wide = random_maps(1, 8, 15)[0]
-    left, right = wide[:, :14, :14], wide[:, :14, 1:]
     others = random_maps(5, 8, 14, seed=1)
-    reranker = SpatialReranker(torch.cat([left[None], others]))
-    side, reach = reranker.side, reranker.reach
-    found = reranker.scores(right, np.arange(6))
-    cells = np.arange(side**2).reshape(side, side)
-    pairs = sum(
-        (side - abs(u)) * max(0, side - 1 - abs(v))
-        for u in range(-reach, reach + 1)
-        for v in range(-reach, reach + 1)
-    )
-    own = agreement(cells.ravel(), side, reach)
-    assert found[0] >= pairs / own > 0.8
-    assert found[0] < 1
+    reranker = SpatialReranker(torch.cat([wide[None, :, :14, :14], others]))
+    found = reranker.scores(wide[:, :14, 1:], np.arange(6))
+    assert 0.8 < found[0] < 1
     assert found[1:].max() < 0.2
 
 
@@ -72,14 +56,10 @@ def test_reach_is_that_of_the_paper():
     assert SpatialReranker(random_maps(3, 4, 28)).reach == 9
 
 
-# ------------------------------------------------ against plain loops
-
-
 @pytest.mark.parametrize('seed', range(4))
 def test_agreement_equals_plain_loops(seed):
     reranker = SpatialReranker(random_maps(3, 4, 8))
-    side = reranker.side
-    rng = np.random.default_rng(seed)
+    side, rng = reranker.side, np.random.default_rng(seed)
     nearest = np.arange(side**2)[None].repeat(3, 0)
     nearest[1] = rng.integers(0, side**2, side**2)
     nearest[2, rng.random(side**2) < 0.4] = 5
@@ -91,16 +71,10 @@ def test_cubes_equal_plain_loops():
     maps = random_maps(2, 3, 5)
     found = cubes(maps, 3)
     assert found.shape == (2, 9, 27)
-    for n in range(2):
-        for y in range(3):
-            for x in range(3):
-                expected = []
-                for dy in range(3):
-                    for dx in range(3):
-                        column = [float(v) for v in maps[n, :, y + dy, x + dx]]
-                        norm = math.sqrt(sum(v * v for v in column))
-                        expected += [v / norm for v in column]
-                np.testing.assert_allclose(found[n, 3 * y + x], expected, atol=1e-6)
+    columns = maps / maps.norm(dim=1, keepdim=True)
+    for n, y, x in np.ndindex(2, 3, 3):
+        cells = [columns[n, :, y + dy, x + dx] for dy in range(3) for dx in range(3)]
+        np.testing.assert_allclose(found[n, 3 * y + x], torch.cat(cells), atol=1e-6)
     with pytest.raises(InputError, match='at least 9 x 9'):
         cubes(maps, 9)
 
@@ -128,13 +102,6 @@ def test_candidates_equal_plain_loops():
     expected = sorted(range(7), key=lambda image: (-votes[image], image))[:3]
     assert ssm.candidates(query).tolist() == expected
     assert expected[0] == 4
-
-
-def test_faiss_finds_the_same_candidates():
-    pytest.importorskip('faiss', reason='the extra faiss is not installed')
-    maps, query = random_maps(7, 4, 6), random_maps(1, 4, 6, seed=3)[0]
-    one, other = (SsmVpr(maps, maps, replace(SMALL, search=s)) for s in ('torch', 'faiss'))
-    assert one.candidates(query).tolist() == other.candidates(query).tolist()
 
 
 def test_weights_of_last_answers_by_hand():

@@ -65,9 +65,8 @@ def test_render_with_lateral_step_shows_parallax(world):
         after = view(world, along, replace(STILL, lane=0.6), (320, 240))
         near += [shift_of_patch(before, after, x, 60) for x in (24, 260)]
         far.append(shift_of_patch(before, after, 142, 116))
-    assert (
-        -9 <= np.median(near) <= -3
-    )  # the camera steps to the right, the image moves to the left
+    # the camera steps to the right, the image moves to the left
+    assert -9 <= np.median(near) <= -3
     assert abs(np.median(far)) <= 2
     assert abs(np.median(near)) >= 2 * abs(np.median(far))
 
@@ -103,8 +102,7 @@ def test_second_traverse_stops_once_and_varies_speed(world):
     assert 8 <= np.count_nonzero(step == 0) <= 20
     driving = step[step > 0.9]
     assert driving.min() < 1.3
-    assert driving.max() > 3.0
-    assert driving.max() < 4.5
+    assert 3.0 < driving.max() < 4.5
 
 
 def test_nearest_places_by_hand(world):

@@ -178,9 +178,9 @@ def _keyframes(arguments: argparse.Namespace) -> 'KeyframeSettings':
 
 def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajectory | None':
     """Read the poses of all images of the source, or the odometry."""
-    from stavpr_lab.evaluation.ground_truth_files import read_poses
     from stavpr_ros.mapping import Trajectory
     from stavpr_ros.sources.bag import read_odometry
+    from stavpr_ros.sources.pose_file import read_poses
 
     if arguments.odometry:
         return Trajectory.from_arrays(*read_odometry(arguments.input, arguments.odometry))
@@ -319,7 +319,8 @@ def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:
     for name, one in zip(job_names(arguments.input), arguments.input, strict=True):
         output = Path(f'{folder / name}.stavpr')
         options = ('--input', one, '--output', str(output), *others)
-        jobs.append(Job(name, 'stavpr_ros.commands.build_map', options, is_new=not output.exists()))
+        command = 'stavpr_ros.commands.build_map'
+        jobs.append(Job(name, command, options, is_new=not output.exists()))
     return run_jobs(jobs, arguments.processes, arguments.ray)
 
 

@@ -357,9 +357,8 @@ def _slam(arguments: argparse.Namespace, folder: Path) -> None:
         **_limit(arguments, arguments.threshold),
         'sequence_length': arguments.sequence_length,
         'keyframe_change': 0.0,
+        'camera_transform': ' '.join(f'{value:g}' for value in CAMERA_IN_BASE),
     }
-    if 'camera_transform' in BY_NAME:
-        parameters['camera_transform'] = ' '.join(f'{value:g}' for value in CAMERA_IN_BASE)
     result: list[Any] = []
 
     def fetch(closures: list[dict[str, Any]], environment: dict[str, str]) -> None:

@@ -124,7 +124,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_drive_options(parser: argparse.ArgumentParser) -> None:
-    from stavpr_lab.evaluation.warp import KINDS
+    from stavpr_lab.evaluation.drive import KINDS
 
     add = parser.add_argument_group('another drive').add_argument
     pairs: dict[str, Any] = {'type': _pair, 'action': 'append', 'default': []}
@@ -265,40 +265,26 @@ def _evaluate(
 ) -> 'Evaluation':
     from stavpr_lab.evaluation.evaluate import evaluate_loop_closures, evaluate_on_map
 
-    shown = () if arguments.window is None else (arguments.window,)
     query, ground_truth = sequences.query.features, sequences.drive.truth
+    common: dict[str, Any] = {
+        'shown': () if arguments.window is None else (arguments.window,),
+        'backend': arguments.backend,
+        'precision': arguments.precision,
+        'progress': True,
+        'odometry': sequences.odometry,
+    }
     if sequences.reference is None:
-        return evaluate_loop_closures(
-            query,
-            ground_truth,
-            settings,
-            arguments.exclude_places,
-            shown,
-            progress=True,
-            odometry=sequences.odometry,
-            late=arguments.late_closures,
-            backend=arguments.backend,
-            precision=arguments.precision,
-        )
-    return evaluate_on_map(
-        sequences.reference,
-        query,
-        ground_truth,
-        settings,
-        sequences.unknown.features if sequences.unknown else None,
-        shown,
-        arguments.backend,
-        arguments.precision,
-        progress=True,
-        odometry=sequences.odometry,
-    )
+        exclude, late = arguments.exclude_places, arguments.late_closures
+        return evaluate_loop_closures(query, ground_truth, settings, exclude, late=late, **common)
+    unknown = sequences.unknown.features if sequences.unknown else None
+    return evaluate_on_map(sequences.reference, query, ground_truth, settings, unknown, **common)
 
 
 def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dict[str, Any]:
     """Return everything that decides the numbers."""
     from stavpr_ros.sources.folder import text_of
 
-    poses = ('query_poses', 'map_poses', 'meters', 'degrees') if sequences.posed else ()
+    poses = ('query_poses', 'map_poses', 'meters', 'degrees') if arguments.truth == 'poses' else ()
     names = [
         *('map', 'query', 'dataset', 'topic', 'unknown', 'loop_closure', 'exclude_places', 'warp'),
         *('remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
@@ -317,22 +303,20 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
 
 def _report(arguments: argparse.Namespace) -> 'Report':
     from stavpr_lab.commands.evaluate_sequences import load_sequences
-    from stavpr_lab.evaluation.extra import import_extra
     from stavpr_lab.evaluation.report import Report
 
     began = time.perf_counter()
-    import_extra('sklearn.metrics')  # an error before the work, not after it
     settings = node_settings(arguments)
     sequences = load_sequences(arguments)
     loaded = time.perf_counter()
     evaluation = _evaluate(arguments, sequences, settings.recognition())
     ended = time.perf_counter()
-    milliseconds = evaluation.results.seconds * 1e3
+    milliseconds = sorted(evaluation.results.seconds * 1e3)
     times = {
         **sequences.times,
         'drives_s': loaded - began,
         'recognition_s': ended - loaded,
-        'recognition_median_ms': float(sorted(milliseconds)[len(milliseconds) // 2]),
+        'recognition_median_ms': float(milliseconds[len(milliseconds) // 2]),
         'total_s': ended - began,
     }
     return Report(
@@ -359,9 +343,8 @@ def _print_metrics(report: 'Report') -> None:
         print(
             f'{row.replace("_", " "):28}' + ''.join(f'{number[row]:12.4f}' for number in numbers)
         )
-    alarms = [report.evaluation.false_alarm_rate(kind) for kind in ('sequence', 'single')]
-    if alarms[0] is not None:
-        print(f'{"false alarm rate":28}{alarms[0]:12.4f}{"":12}{alarms[1]:12.4f}')
+    if alarms := report.evaluation.false_alarm_rates:
+        print(f'{"false alarm rate":28}{alarms["sequence"]:12.4f}{alarms["single"]:24.4f}')
     decision, calibration = report.decision(), report.evaluation.calibration
     print(
         f'matched, {decision["rule"]}: {decision["matched"]} of {decision["images"]} images, '
@@ -399,6 +382,7 @@ def _run(arguments: argparse.Namespace) -> None:
     from stavpr_lab.evaluation.report import chosen_window
     from stavpr_lab.evaluation.report_files import PAGE, write_folder, write_json
 
+    import_extra('sklearn.metrics')  # an error before the work, not after it
     folder = arguments.output or (None if arguments.json else OUTPUT)
     if arguments.json:
         require_replaceable(arguments.json, JSON, arguments.force)

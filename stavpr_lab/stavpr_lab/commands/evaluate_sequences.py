@@ -8,17 +8,16 @@ from pathlib import Path
 import time
 
 import numpy as np
-from stavpr_lab.evaluation.drive import Drive, DriveChanges
-from stavpr_lab.evaluation.ground_truth import GroundTruth
-from stavpr_lab.evaluation.ground_truth_files import read_poses
-from stavpr_lab.evaluation.paper.datasets import open_dataset
-from stavpr_lab.evaluation.warp import (
+from stavpr_lab.evaluation.drive import (
     cropped,
+    Drive,
+    DriveChanges,
     FrameSource,
     mirrored,
     select_places,
-    warp_changes,
 )
+from stavpr_lab.evaluation.ground_truth import GroundTruth
+from stavpr_lab.evaluation.paper.datasets import open_dataset
 from stavpr_ros.commands.feature_options import (
     kind_options,
     make_extractor,
@@ -35,6 +34,7 @@ from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, Plac
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag_file import is_bag
 from stavpr_ros.sources.folder import text_of
+from stavpr_ros.sources.pose_file import read_poses
 
 IDENTITY_TOLERANCE = 3  # places; a file of accepted pairs includes its tolerance
 DEFAULTS = {'features': 'gradient', 'seed': 0}
@@ -50,7 +50,6 @@ class Sequences:
     :param unknown: a traverse through places that are not in the map, if there is one.
     :param drive: these changes, and the ground truth of the query's images.
     :param tolerance: places.
-    :param posed: the ground truth comes from poses.
     :param title: names of the inputs, a line.
     :param times: of the extraction of features, milliseconds an image.
     :param odometry: poses of the query's images by odometry, (N, 7); None = unknown.
@@ -61,7 +60,6 @@ class Sequences:
     unknown: PlaceMap | None
     drive: Drive
     tolerance: int
-    posed: bool
     title: str
     times: dict[str, float] = field(default_factory=dict)
     odometry: np.ndarray | None = None
@@ -161,18 +159,18 @@ class _Loader:
         if first is not None:
             found.features.require_same_settings(first.settings, 'the first sequence')
             return found
-        for name, requested, present in (
-            ('features', given.features, found.settings.kind),
-            ('strips', given.strips, found.settings.strips),
-        ):
+        own = {'features': found.settings.kind, 'strips': found.settings.strips}
+        for name, present in own.items():
+            requested = getattr(given, name)
             if requested is not None and requested != present:
                 raise SettingsError(
                     f'--{name} {requested}: the map {path} was made with {present}; leave it out'
                 )
-        model = f'--{found.settings.kind}-model'  # a map does not state where it is
+        # a map does not state where its model is
+        usable = f'--{found.settings.kind}-model', '--descriptors-source'
         options = {'--projection': given.projection, '--seed': given.seed, **kind_options(given)}
         for option, value in options.items():
-            if value is not None and option not in (model, '--descriptors-source'):
+            if value is not None and option not in usable:
                 raise SettingsError(f'{option}: the map {path} has its own or none; leave it out')
         self._saved = found
         return found
@@ -184,10 +182,8 @@ class _Loader:
                 model = getattr(given, f'{self._saved.settings.kind}_model', None)
                 self._extractor = self._saved.extractor(given.device, model or '')
             else:
-                options = argparse.Namespace(**vars(given))
-                for name, default in DEFAULTS.items():
-                    if getattr(options, name) is None:
-                        setattr(options, name, default)
+                chosen = {name: value for name, value in vars(given).items() if value is not None}
+                options = argparse.Namespace(**(vars(given) | DEFAULTS | chosen))
                 self._extractor = make_extractor(options)
         return self._extractor
 
@@ -203,7 +199,6 @@ def _of_dataset(arguments: argparse.Namespace, loader: _Loader) -> Sequences:
         unknown=loader.load('unknown', arguments.unknown) if arguments.unknown else None,
         drive=DriveChanges().apply(found.ground_truth),
         tolerance=found.tolerance,
-        posed=False,
         title=name.replace('_', ' '),
         times=loader.times,
     )
@@ -223,7 +218,6 @@ def _of_paths(
         title = f'{_name(arguments.query)}: loop closures'
     else:
         title = f'{_name(arguments.query)} on the map {_name(arguments.map)}'
-    posed = arguments.truth == 'poses'
     unknown = opened.get('unknown')
     drive = DriveChanges().apply(ground_truth)
     odometry = None
@@ -233,7 +227,7 @@ def _of_paths(
             reference = replace(
                 reference, poses=_poses(arguments.map_poses, reference, 'map', None)
             )
-    return Sequences(reference, query, unknown, drive, tolerance, posed, title, times, odometry)
+    return Sequences(reference, query, unknown, drive, tolerance, title, times, odometry)
 
 
 def _name(path: str) -> str:
@@ -275,10 +269,9 @@ def _poses(path: str | None, place_map: PlaceMap, name: str, degrees: float | No
 def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
     """Drive the query as the options want it, on a map without the places that they remove."""
     query, reference = sequences.query, sequences.reference
-    if arguments.warp is None:
-        warp = DriveChanges(speed=1.0 if arguments.speed is None else arguments.speed)
-    else:
-        warp = warp_changes(len(query), arguments.warp)
+    warp = DriveChanges.named(arguments.warp or 'same', len(query))
+    if arguments.speed is not None:
+        warp = replace(warp, speed=arguments.speed)
     changes = replace(
         warp,
         removed=tuple(arguments.remove_from_map),
@@ -295,9 +288,7 @@ def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
         reference = select_places(reference, drive.places)
     title = f'{sequences.title}, {_description(arguments)}'
     query = select_places(query, drive.images)
-    odometry = sequences.odometry
-    if odometry is not None:
-        odometry = odometry[drive.images]
+    odometry = None if sequences.odometry is None else sequences.odometry[drive.images]
     return replace(
         sequences,
         reference=reference,

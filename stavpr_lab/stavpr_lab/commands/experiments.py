@@ -15,7 +15,7 @@ from stavpr_ros.output_file import JSON, require_replaceable, write_output
 if TYPE_CHECKING:
     from stavpr_lab.evaluation.metrics import Metrics
     from stavpr_lab.evaluation.paper.datasets import Dataset
-    from stavpr_lab.evaluation.paper.experiments import BaselineInputs, Configuration
+    from stavpr_lab.evaluation.paper.experiments import Configuration
 
 EMPTY = '-'
 
@@ -54,37 +54,23 @@ def _parser() -> argparse.ArgumentParser:
     from stavpr_ros.commands.feature_options import add_feature_options
 
     parser = make_parser('experiments', DESCRIPTION, EPILOG)
-    parser.add_argument('experiment', choices=(*PRESETS, 'sweep'), help='see below')
-    parser.add_argument('--data', metavar='FOLDER', help='the folder that holds the data sets')
-    parser.add_argument(
-        '--datasets',
-        nargs='+',
-        metavar='NAME[=FOLDER]',
-        help='data sets to run (those of the paper in --data)',
+    add = parser.add_argument
+    add('experiment', choices=(*PRESETS, 'sweep'), help='see below')
+    add('--data', metavar='FOLDER', help='the folder that holds the data sets')
+    datasets = 'data sets to run (those of the paper in --data)'
+    add('--datasets', nargs='+', metavar='NAME[=FOLDER]', help=datasets)
+    add('--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)')
+    add('--parameter', choices=tuple(SWEEPS), help='of sweep (l)')
+    add('--values', nargs='+', type=float, default=(), metavar='X', help='of sweep')
+    arrays = (
+        'of paper: arrays FOLDER/DATASET/map.npy and query.npy (or .npz .csv .mat) for the '
+        'column netvlad, saes or vgg_fc6; may be repeated'
     )
-    parser.add_argument(
-        '--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)'
-    )
-    parser.add_argument('--parameter', choices=tuple(SWEEPS), help='of sweep (l)')
-    parser.add_argument(
-        '--values', nargs='+', type=float, default=(), metavar='X', help='of sweep'
-    )
-    parser.add_argument(
-        '--descriptors',
-        action='append',
-        default=[],
-        metavar='COLUMN=FOLDER',
-        help='of paper: arrays FOLDER/DATASET/map.npy and query.npy (or .npz .csv .mat) for the '
-        'column netvlad, saes or vgg_fc6; may be repeated',
-    )
-    parser.add_argument(
-        '--ssm-layers',
-        nargs=2,
-        metavar=('FIRST', 'SECOND'),
-        help='of paper: two layers of the network of --features for SSM-VPR, the coarser first',
-    )
-    parser.add_argument('--json', metavar='FILE', help='write all numbers')
-    parser.add_argument('--force', action='store_true', help='replace an existing FILE')
+    add('--descriptors', action='append', default=[], metavar='COLUMN=FOLDER', help=arrays)
+    layers = 'of paper: two layers of the network of --features for SSM-VPR, the coarser first'
+    add('--ssm-layers', nargs=2, metavar=('FIRST', 'SECOND'), help=layers)
+    add('--json', metavar='FILE', help='write all numbers')
+    add('--force', action='store_true', help='replace an existing FILE')
     add_feature_options(parser)
     return parser
 
@@ -124,46 +110,39 @@ def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset | SourceError
     return found
 
 
-def _check_features(options: argparse.Namespace) -> None:
-    """Reject options of features that the experiment sets itself."""
+def _check(options: argparse.Namespace) -> dict[str, str]:
+    """Reject options that contradict each other; return the folders of descriptors by column."""
+    from stavpr_lab.evaluation.paper.experiments import PRESETS
+
     if options.strips is not None or options.projection is not None or options.seed:
         raise SettingsError(
             '--strips, --projection, --seed: the experiment sets them; leave them out'
         )
-
-
-def _check_baselines(options: argparse.Namespace) -> None:
-    from stavpr_lab.evaluation.paper.experiments import PRESETS
-
     if (options.descriptors or options.ssm_layers) and options.experiment != 'paper':
         raise SettingsError('--descriptors and --ssm-layers go with the experiment paper')
     if options.ssm_layers and options.features != 'onnx':
         raise SettingsError('--ssm-layers: give --features onnx')
     known = [row.name for row in PRESETS['paper'] if row.baseline == 'descriptors']
+    folders = {}
     for entry in options.descriptors:
         column, _, folder = entry.partition('=')
         if column not in known or not folder or not Path(folder).is_dir():
             raise SettingsError(
                 f'--descriptors {entry}: expected {" or ".join(known)}, = and a folder'
             )
+        folders[column] = folder
+    return folders
 
 
-def _inputs(options: argparse.Namespace, dataset: str) -> 'BaselineInputs':
-    """Return the inputs of the baselines on a data set; its descriptors may be missing."""
-    from stavpr_lab.evaluation.paper.experiments import BaselineInputs
+def _arrays(folder: Path) -> tuple[str, str] | None:
+    """Return the descriptors of map and query in a folder; None where one is missing."""
     from stavpr_ros.features.descriptors import is_descriptors
 
-    arrays: dict[str, tuple[str, str]] = {}
-    for entry in options.descriptors:
-        column, _, folder = entry.partition('=')
-        both = [
-            [str(path) for path in sorted(Path(folder, dataset).glob(f'{name}.*'))]
-            for name in ('map', 'query')
-        ]
-        places, queries = ([path for path in paths if is_descriptors(path)] for paths in both)
-        if places and queries:
-            arrays[column] = places[0], queries[0]
-    return BaselineInputs(arrays, tuple(options.ssm_layers) if options.ssm_layers else None)
+    places, queries = (
+        [str(path) for path in sorted(folder.glob(f'{name}.*')) if is_descriptors(str(path))]
+        for name in ('map', 'query')
+    )
+    return (places[0], queries[0]) if places and queries else None
 
 
 def _run_row(
@@ -171,14 +150,19 @@ def _run_row(
     options: argparse.Namespace,
     columns: 'tuple[Configuration, ...]',
     name: str,
+    folders: dict[str, str],
 ) -> 'dict[str, Metrics | None]':
     """Run all columns of a row; None where the data set is too short for one."""
-    from stavpr_lab.evaluation.paper.experiments import DatasetExperiment
+    from stavpr_lab.evaluation.paper.experiments import BaselineInputs, DatasetExperiment
     from stavpr_ros.commands.feature_options import make_extractor
     from tqdm import tqdm
 
     features = make_extractor(options).settings
-    inputs = _inputs(options, name)
+    arrays = {column: _arrays(Path(folder, name)) for column, folder in folders.items()}
+    inputs = BaselineInputs(
+        {column: both for column, both in arrays.items() if both is not None},
+        tuple(options.ssm_layers) if options.ssm_layers else None,
+    )
     experiment = DatasetExperiment(
         dataset, features.kind, features.backbone, options.mode, options.device, inputs
     )
@@ -196,13 +180,14 @@ def _reason(name: str, dataset: 'Dataset', column: 'Configuration') -> str:
         return f'its {len(dataset.query)} images are fewer than a window has'
     if column.baseline == 'ssm_vpr':
         return 'give --features onnx and --ssm-layers'
-    way = {
+    remedy = {
         'saes': 'from any program: SAES is a metric trained on SPED, without public weights',
         'netvlad': 'evaluate --export writes them, with --features netvlad',
         'vgg_fc6': 'evaluate --export writes them, with --features vgg16_fc6',
     }[column.name]
     return (
-        f'give --descriptors {column.name}=FOLDER with FOLDER/{name}/map.npy and query.npy; {way}'
+        f'give --descriptors {column.name}=FOLDER with FOLDER/{name}/map.npy and query.npy; '
+        f'{remedy}'
     )
 
 
@@ -216,9 +201,7 @@ def _published(
         backbone: [published_f1(dataset, backbone, column.name) for column in columns]
         for backbone in (DENSENET, VGG)
     }
-    return {
-        backbone: row for backbone, row in rows.items() if any(value is not None for value in row)
-    }
+    return {backbone: row for backbone, row in rows.items() if any(row)}
 
 
 def _table(rows: list[list[str]]) -> str:
@@ -245,19 +228,17 @@ def _run(arguments: argparse.Namespace) -> None:
     import_extra('sklearn.metrics')
     if arguments.json:
         require_replaceable(arguments.json, JSON, arguments.force)
-    _check_features(arguments)
-    _check_baselines(arguments)
+    folders = _check(arguments)
     columns, datasets = _columns(arguments), _datasets(arguments)
     rows = [['data set', 'features', *(column.title for column in columns)]]
     results: list[dict[str, Any]] = []
     blanks: dict[str, list[str]] = {}  # data sets and columns, by reason
     for name, dataset in datasets.items():
-        metrics: dict[str, Metrics | None] = {}
+        metrics: dict[str, Metrics | None] = dict.fromkeys(column.name for column in columns)
         if isinstance(dataset, SourceError):
-            metrics = dict.fromkeys(column.name for column in columns)
             blanks[f'no data: {dataset}'] = [name]
         else:
-            metrics = _run_row(dataset, arguments, columns, name)
+            metrics = _run_row(dataset, arguments, columns, name, folders)
             for column in columns:
                 if metrics[column.name] is None:
                     reason = _reason(name, dataset, column)

@@ -20,6 +20,8 @@ from stavpr_lab.evaluation.plots import (
     page,
     PAPER,
     QUIET,
+    runs,
+    shade_runs,
     THRESHOLD,
 )
 from stavpr_lab.evaluation.records import TraverseEvaluation
@@ -137,7 +139,7 @@ def _draw_matrix(figure: 'SubFigure', distances: np.ndarray, result: TraverseEva
     matches = {'right': pairs[correct], 'wrong': pairs[result.accepted & ~correct]}
     label = f'true place ± {result.tolerance}'
     draw_matrix(figure, axes, distances, distances.shape, cells, label, matches)
-    for start, stop in _runs(truth < 0):
+    for start, stop in runs(truth < 0):
         axes.axhspan(start - 0.5, stop - 0.5, color=PAPER, alpha=0.32, lw=0)
         if stop - start > len(truth) / 25:
             at = distances.shape[1] * 0.02, (start + stop - 1) / 2
@@ -157,9 +159,7 @@ def _draw_time(axes: 'Axes', result: TraverseEvaluation, threshold: float) -> No
     name = f'threshold {threshold:.3g}'
     axes.axhline(threshold, color=THRESHOLD, lw=1.3, ls=(0, (5, 3)), label=name, zorder=1.5)
     truth = np.zeros(len(index)) if result.true_places is None else result.true_places
-    for number, (start, stop) in enumerate(_runs(truth < 0)):
-        name = '' if number else 'not in the map'
-        axes.axvspan(start - 0.5, stop - 0.5, color='#e9e9e4', lw=0, zorder=0, label=name)
+    shade_runs(axes, truth < 0, 'not in the map')
     axes.set(
         xlabel='query image',
         ylabel='distance of the best match',
@@ -167,9 +167,3 @@ def _draw_time(axes: 'Axes', result: TraverseEvaluation, threshold: float) -> No
     )
     axes.grid(axis='y', color=GRID, lw=0.7)
     legend_above(axes, 3)
-
-
-def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """Return the runs of True as (first, one past the last)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -3,45 +3,43 @@
 """
 A recorded query driven differently: faster, with stops, dropped images, backward, off the map.
 
-Nothing here touches images or features: a :class:`Drive` is the indices of the images that are
-shown and of the places that the map keeps, and their ground truth.
+A :class:`Drive` is the indices of the images that are shown and of the places that the map keeps,
+and their ground truth; :func:`select_places` applies them. :func:`mirrored` and :func:`cropped`
+change the images themselves.
 """
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 import math
+from typing import Protocol, Self
 
 import numpy as np
 from stavpr_lab.evaluation.ground_truth import GroundTruth
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import ImageError, SettingsError
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.sources.frame import Frame
 
 VARYING = 'varying'
+STOP = 30  # images that a stop adds, where no number is given
+KINDS = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')  # the drives of the accuracy table
 SPEEDS = 0.01, 100.0  # slowest and fastest, places per image
 PERIOD = 60  # images of one period of the varying speed: 1, 2, 1, 1/2, 1
 UNSEEN_DISTANCE = 5  # places from the map within which a removed place may look like a mapped one
 
 
-def speed_indices(n: int, speed: float) -> np.ndarray:
-    """
-    Return the images of a drive at a constant speed: floor(speed * i), as long as it is below n.
-
-    :param n: images of the recorded query.
-    :param speed: recorded images per shown image; below 1, images are repeated. It counts as a
-        fraction, so that ten images at 0.7 are exactly seven.
-    :returns: shape (N,), int64, ascending.
-    """
+def _images_at(n: int, speed: float | str) -> np.ndarray:
+    """Return the images of a drive at a speed of :class:`DriveChanges`, ascending, int64."""
+    if isinstance(speed, str):
+        positions = [0.0]
+        while positions[-1] < n:
+            phase = 2 * math.pi * (len(positions) - 1) / PERIOD
+            positions.append(positions[-1] + 2 ** math.sin(phase))
+        return np.floor(positions[:-1]).astype(np.int64)
+    # as a fraction, so that ten images at 0.7 are exactly seven
     ratio = Fraction(speed).limit_denominator(1000)
     count = math.ceil(n / ratio)
     return np.arange(count, dtype=np.int64) * ratio.numerator // ratio.denominator
-
-
-def varying_indices(n: int) -> np.ndarray:
-    """Return the images of a drive at speed 2 ** sin(2 pi i / 60) at image i, from 1/2 to 2."""
-    positions = [0.0]
-    while positions[-1] < n:
-        phase = 2 * math.pi * (len(positions) - 1) / PERIOD
-        positions.append(positions[-1] + 2 ** math.sin(phase))
-    return np.floor(positions[:-1]).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,8 @@ class DriveChanges:
     :param drop: probability with which each image is left out.
     :param seed: of the images that are left out.
     :param stops: (image, count): at this image of the recorded query, it is repeated count times.
-    :param speed: recorded images per shown image, or ``varying``.
+    :param speed: recorded images per shown image: image i is floor(speed * i); below 1, images are
+        repeated. ``varying``: 2 ** sin(2 pi i / 60) at image i, from 1/2 to 2.
     :raises SettingsError: a value is out of its range.
     """
 
@@ -84,16 +83,36 @@ class DriveChanges:
                 'of the query per image'
             )
 
+    @classmethod
+    def named(cls, name: str, n: int) -> Self:
+        """
+        Return the changes of a query of n images by the name of a row or of an option.
+
+        :param name: ``same``; a speed, such as ``0.5x``, or ``vary``, ``varying``; ``stop`` or
+            ``stop 100``: images that are added in the middle; ``drop 0.3``.
+        :raises SettingsError: an unknown name, or a value out of its range.
+        """
+        if name in ('vary', VARYING):
+            return cls(speed=VARYING)
+        known = {'same': '1x', 'stop': f'stop {STOP}'}
+        kind, _, value = known.get(name, name).rpartition(' ')
+        try:
+            number = float(value.removesuffix('x'))
+        except ValueError as error:
+            raise SettingsError(
+                f'drive {name!r} is unknown: take same, {", ".join(KINDS)} or drop P'
+            ) from error
+        if kind == 'stop':
+            return cls(stops=((n // 2, int(number)),))
+        return cls(drop=number) if kind == 'drop' else cls(speed=number)
+
     def images(self, n: int) -> np.ndarray:
         """
         Return the images that are shown, of n recorded ones, shape (N,), int64.
 
         :raises SettingsError: a stop at an image that there is not, or no image is left.
         """
-        if isinstance(self.speed, str):
-            images = varying_indices(n)
-        else:
-            images = speed_indices(n, self.speed)
+        images = _images_at(n, self.speed)
         for at, count in self.stops:
             if not 0 <= at < n:
                 raise SettingsError(f'stop {at}:{count}: the query has the images 0 .. {n - 1}')
@@ -183,3 +202,81 @@ class Drive:
         place = np.full(truth.N, -1)
         place[run_query[::-1]] = middle[::-1]  # the first run comes last and stays
         return [(place >= first) & (place < last) & ~near for first, last in self.removed]
+
+
+class FrameSource(Protocol):
+    """A folder, a bag, or another source with a length whose frames can be read repeatedly."""
+
+    def __len__(self) -> int:
+        """Return the number of images."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield one image after the other."""
+
+
+class ChangedSource:
+    """
+    A source whose images are changed one by one; stamps and identifiers stay.
+
+    :param change: returns the changed image of a frame.
+    """
+
+    def __init__(self, source: FrameSource, change: Callable[[Frame], np.ndarray]) -> None:
+        self._source, self._change = source, change
+
+    def __len__(self) -> int:
+        """Return the number of images."""
+        return len(self._source)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield one changed image after the other."""
+        for frame in self._source:
+            yield replace(frame, image=np.ascontiguousarray(self._change(frame)))
+
+
+def mirrored(source: FrameSource) -> FrameSource:
+    """Mirror every image of a source left-right."""
+    return ChangedSource(source, lambda frame: frame.image[:, ::-1])
+
+
+def _pixels(width: float) -> int:
+    return math.floor(width + 0.5)
+
+
+def cropped(source: FrameSource, left: float, right: float) -> FrameSource:
+    """
+    Crop every image of a source.
+
+    :param left, right: fractions of the width, rounded to pixels.
+    :returns: the source itself where nothing is cropped.
+    :raises SettingsError: negative fractions, or 1 and more together.
+    """
+    if not (left >= 0 and right >= 0 and left + right < 1):
+        raise SettingsError(
+            f'cropping {left} on the left and {right} on the right: expected fractions >= 0, '
+            'below 1 together'
+        )
+
+    def crop(frame: Frame) -> np.ndarray:
+        width = frame.image.shape[1]
+        first, last = _pixels(left * width), width - _pixels(right * width)
+        if first >= last:
+            raise ImageError(
+                f'{frame.identifier} is {width} pixels wide: cropping {left} on the left and '
+                f'{right} on the right leaves none'
+            )
+        return frame.image[:, first:last]
+
+    return source if left == right == 0 else ChangedSource(source, crop)
+
+
+def select_places(place_map: PlaceMap, indices: np.ndarray) -> PlaceMap:
+    """Return some places of a map, or images of a query, in any order, repeated or not."""
+    return replace(
+        place_map,
+        features=place_map.features[indices],
+        stamps=place_map.stamps[indices],
+        ids=tuple(place_map.ids[i] for i in indices),
+        poses=None if place_map.poses is None else place_map.poses[indices],
+        thumbnails=tuple(place_map.thumbnails[i] for i in indices) if place_map.thumbnails else (),
+    )

@@ -116,23 +116,47 @@ class Evaluation:
         """Return the images that have a window centered on them."""
         return centered_images(len(self.results.single), self.sequence_length)
 
-    def false_alarm_rate(self, kind: str) -> float | None:
-        """
-        Return the share of unknown images that are accepted; None without any.
+    @cached_property
+    def correct(self) -> np.ndarray:
+        """Return which matches of the windows are correct, shape (N,), bool."""
+        return self.ground_truth.accepts(self.results.sequence.best)
 
-        :param kind: ``sequence`` or ``single``; at the threshold of its best F1.
+    @cached_property
+    def best_accepted(self) -> np.ndarray:
+        """Return the matches of the windows below the threshold of the best F1, (N,), bool."""
+        return self.results.sequence.scores < self.sequence.best.threshold
+
+    @property
+    def false_alarm_rates(self) -> dict[str, float]:
+        """
+        Return the share of unknown images that are accepted; empty without any.
+
+        By ``sequence`` and ``single``, at the threshold of the best F1 of each.
         """
         if self.unknown is None:
-            return None
-        metrics: Metrics = getattr(self, kind)
-        scores = getattr(self.unknown, kind).scores
-        return int(np.count_nonzero(scores < metrics.best.threshold)) / len(scores)
+            return {}
+        both = {
+            'sequence': (self.unknown.sequence, self.sequence),
+            'single': (self.unknown.single, self.single),
+        }
+        return {
+            kind: float(np.mean(matches.scores < metrics.best.threshold))
+            for kind, (matches, metrics) in both.items()
+        }
+
+    @property
+    def distances(self) -> dict[str, np.ndarray]:
+        """Return the distances of the windows' matches, by what they are."""
+        scores = self.results.sequence.scores
+        groups = {'correct': scores[self.correct], 'wrong': scores[~self.correct]}
+        if self.unknown is not None:
+            groups['unknown places'] = self.unknown.sequence.scores
+        return groups
 
     @cached_property
     def calibration(self) -> Calibration | None:
         """Return how far the declared probabilities hold; None without any."""
-        correct = self.ground_truth.accepts(self.results.sequence.best)
-        return calibrate(self.results.probabilities, correct, self.ground_truth.has_match)
+        return calibrate(self.results.probabilities, self.correct, self.ground_truth.has_match)
 
 
 def centered_images(count: int, length: int) -> slice:

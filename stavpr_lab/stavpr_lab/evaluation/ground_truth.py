@@ -161,12 +161,6 @@ class GroundTruth:
         first, end = np.searchsorted(self.keys, [query * self.n, (query + 1) * self.n])
         return self.keys[first:end] % self.n
 
-    def matrix(self) -> np.ndarray:
-        """Return the accepted pairs as a matrix, shape (N, n), bool: a byte a pair."""
-        matrix = np.zeros(self.N * self.n, bool)
-        matrix[self.keys] = True
-        return matrix.reshape(self.N, self.n)
-
     def accepts(self, places: np.ndarray) -> np.ndarray:
         """
         Return which places are correct.

@@ -1,8 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of ground truth: text, arrays, black and white images, poses."""
+"""Files of ground truth: text, arrays, black and white images."""
 
-import csv
 from pathlib import Path
 import re
 import zipfile
@@ -45,31 +44,6 @@ def read_pairs(path: Path, N: int, n: int) -> Pairs:
     if not queries.size:
         raise InputError(f'ground truth {path} accepts no pair: is it the right file?')
     return queries, places
-
-
-def read_poses(path: Path) -> tuple[np.ndarray, bool]:
-    """
-    Read poses as ``build_map --poses`` takes them: x,y,z or x,y,z,qx,qy,qz,qw a line, meters.
-
-    :returns: shape (images, 7), float64, and whether the file has orientations.
-    :raises SourceError: the file cannot be read.
-    """
-    try:
-        require_regular(path)
-        with path.open(newline='') as file:
-            lines = [row for row in csv.reader(file) if row and row[0][:1] != '#']
-            rows = [[float(value) for value in row] for row in lines]
-    except (OSError, ValueError) as error:
-        raise SourceError(f'poses {path} cannot be read: {error}') from error
-    if {len(row) for row in rows} not in ({3}, {7}):
-        raise SourceError(f'poses {path}: expected 3 or 7 numbers on every line')
-    poses = np.array(rows)
-    if not np.isfinite(poses).all():
-        raise SourceError(f'poses {path}: expected finite numbers')
-    oriented = poses.shape[1] == 7
-    if not oriented:
-        poses = np.hstack([poses, np.tile([0.0, 0.0, 0.0, 1.0], (len(poses), 1))])
-    return poses, oriented
 
 
 # ------------------------------------------------------------------------------------------ text

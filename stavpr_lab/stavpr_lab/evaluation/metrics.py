@@ -216,13 +216,6 @@ def sweep(
     return _counts(thresholds, distances, correct, has_match)
 
 
-def best_f1(
-    distances: np.ndarray, correct: np.ndarray, has_match: np.ndarray | None = None
-) -> ConfusionCounts:
-    """Return the counts of the threshold with the best F1, the lowest on a tie."""
-    return max(sweep(distances, correct, has_match), key=lambda counts: counts.f1)
-
-
 def _counts(
     thresholds: np.ndarray,
     distances: np.ndarray,

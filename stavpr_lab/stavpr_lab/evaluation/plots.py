@@ -16,6 +16,7 @@ from typing import Any, Literal, TYPE_CHECKING
 
 import numpy as np
 from stavpr_lab.evaluation.calibration import Calibration
+from stavpr_lab.evaluation.metrics import Metrics
 from stavpr_ros.output_file import PNG, write_output
 
 if TYPE_CHECKING:
@@ -73,13 +74,6 @@ class MatchPair:
     outcome: Outcome
 
 
-def match_overview(path: Path, pairs: Sequence[MatchPair], columns: int = 3) -> None:
-    """Draw queries beside their matched places; the color of the frame is the outcome."""
-    rows = max(1, -(-len(pairs) // columns))
-    with page(path, 10, 0.5 + 1.42 * rows) as figure:
-        draw_pairs(figure, pairs, columns)
-
-
 def reduced_matrix(
     path: Path,
     distances: np.ndarray,
@@ -96,25 +90,24 @@ def reduced_matrix(
     :param matches: (query, place) of accepted matches, shape (count, 2), by outcome.
     :returns: where the axes are.
     """
-    with matrix_page(path, shape) as figure:
+    with page(path, 7.5, float(np.clip(7.5 * shape[0] / shape[1], 4, 9))) as figure:
         axes = figure.add_subplot()
         draw_matrix(figure, axes, distances, shape, truth, 'true place', matches)
     return _box(axes)
 
 
-def precision_recall(
-    path: Path, curves: Mapping[str, tuple[str, np.ndarray, np.ndarray, tuple[float, float]]]
-) -> Box:
+def precision_recall(path: Path, curves: Mapping[str, tuple[str, Metrics]]) -> Box:
     """
     Draw precision over recall, and a ring where F1 is best.
 
-    :param curves: color, recall and precision, shape (T,), and recall and precision at the best
-        F1, by name.
+    :param curves: color and metrics, by name.
     :returns: where the axes are.
     """
     with page(path, 5.2, 4.8) as figure:
         axes = figure.add_subplot()
-        for name, (color, recall, precision, best) in curves.items():
+        for name, (color, metrics) in curves.items():
+            _, precision, recall = metrics.curve.T
+            best = metrics.best.recall, metrics.best.precision
             axes.plot(recall, precision, color=color, lw=1.8, label=name, clip_on=False, zorder=3)
             ring: dict[str, Any] = {'ms': 8, 'mfc': PAPER, 'mec': color, 'mew': 1.8, 'zorder': 4}
             axes.plot(*best, 'o', clip_on=False, **ring)
@@ -208,10 +201,7 @@ def drive(
     with page(path, 10, 4.2) as figure:
         axes = figure.add_subplot()
         axes.plot(truth[:, 0], truth[:, 1], '.', color=TRUTH, ms=3, mew=0, label='true place')
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], unseen, [False]]).astype(int)))
-        for number, (first, end) in enumerate(edges.reshape(-1, 2)):
-            label = '' if number else 'unseen'
-            axes.axvspan(first - 0.5, end - 0.5, color='#e9e9e4', lw=0, zorder=0, label=label)
+        shade_runs(axes, unseen, 'unseen')
         rejected = -0.04 * places  # below the axis of the places
         for outcome, color in COLORS.items():
             at = index[outcomes == outcome]
@@ -270,11 +260,17 @@ def page(path: Path, width: float, height: float) -> Iterator['Figure']:
         write_output(path, content.getvalue(), PNG, force=True)
 
 
-@contextmanager
-def matrix_page(path: Path, shape: tuple[int, ...]) -> Iterator['Figure']:
-    """Yield a figure of a matrix's proportions, within limits, then write it."""
-    with page(path, 7.5, float(np.clip(7.5 * shape[0] / shape[1], 4, 9))) as figure:
-        yield figure
+def runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """Return the runs of True as (first, one past the last)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
+
+
+def shade_runs(axes: 'Axes', mask: np.ndarray, label: str) -> None:
+    """Shade the images where a mask is true, over the whole height."""
+    for number, (first, end) in enumerate(runs(mask)):
+        name = '' if number else label
+        axes.axvspan(first - 0.5, end - 0.5, color='#e9e9e4', lw=0, zorder=0, label=name)
 
 
 def _box(axes: 'Axes') -> Box:

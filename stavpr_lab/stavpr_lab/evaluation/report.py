@@ -54,9 +54,9 @@ class Report:
         calibration = evaluation.calibration
         numbers['calibration'] = None if calibration is None else calibration.to_json()
         if evaluation.unknown is not None:
-            for kind in ('sequence', 'single'):
-                numbers[kind]['false_alarm_rate'] = evaluation.false_alarm_rate(kind)
-            numbers['false_alarm_rate'] = evaluation.false_alarm_rate('sequence')
+            for kind, rate in evaluation.false_alarm_rates.items():
+                numbers[kind]['false_alarm_rate'] = rate
+            numbers['false_alarm_rate'] = evaluation.false_alarm_rates['sequence']
             numbers['unknown_images'] = len(evaluation.unknown.single)
         numbers |= {'images': len(self.query), 'places': len(self.reference)}
         numbers['map_id'] = self.reference.map_id
@@ -71,17 +71,15 @@ class Report:
         Those that the recognizer accepts by default; in mode paper, which has no default, those
         below the threshold of the best F1.
         """
-        results = self.evaluation.results
         if self.default_threshold is None:
-            return results.sequence.scores < self.evaluation.sequence.best.threshold
-        return results.accepted
+            return self.evaluation.best_accepted
+        return self.evaluation.results.accepted
 
     @cached_property
     def counts(self) -> ConfusionCounts:
         """Return the counts of :attr:`accepted`."""
-        truth = self.evaluation.ground_truth
-        correct = truth.accepts(self.evaluation.results.sequence.best)
-        return accepted_counts(self.accepted, correct, truth.has_match)
+        has_match = self.evaluation.ground_truth.has_match
+        return accepted_counts(self.accepted, self.evaluation.correct, has_match)
 
     def decision(self) -> dict[str, Any]:
         """Return how many images are matched, and how many of them wrongly."""
@@ -127,19 +125,6 @@ def jsonable(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def accepted_matches(evaluation: Evaluation) -> dict[str, np.ndarray]:
-    """
-    Return the windows' matches that are accepted at the threshold of the best F1.
-
-    :returns: image and place, shape (count, 2), of the ``right`` and of the ``wrong`` ones.
-    """
-    matches = evaluation.results.sequence
-    accepted = matches.scores < evaluation.sequence.best.threshold
-    correct = evaluation.ground_truth.accepts(matches.best)
-    pairs = np.stack([np.arange(len(matches)), matches.best], axis=1)
-    return {'right': pairs[accepted & correct], 'wrong': pairs[accepted & ~correct]}
-
-
 def worst_mistakes(evaluation: Evaluation, count: int) -> list[int]:
     """
     Choose wrong matches: those a window off or more first, then by distance, half a window apart.
@@ -147,7 +132,7 @@ def worst_mistakes(evaluation: Evaluation, count: int) -> list[int]:
     :returns: up to ``count`` images, the worst first.
     """
     matches, true = evaluation.results.sequence, evaluation.ground_truth.middles
-    wrong = ~evaluation.ground_truth.accepts(matches.best) & np.isfinite(matches.scores)
+    wrong = ~evaluation.correct & np.isfinite(matches.scores)
     near = (true >= 0) & (np.abs(matches.best - true) < evaluation.sequence_length)
     apart = evaluation.sequence_length // 2
     chosen: list[int] = []

@@ -12,13 +12,7 @@ import numpy as np
 from stavpr_lab.evaluation import plots
 from stavpr_lab.evaluation.evaluate import Evaluation
 from stavpr_lab.evaluation.plots import Box
-from stavpr_lab.evaluation.report import (
-    accepted_matches,
-    chosen_window,
-    METRICS,
-    Report,
-    worst_mistakes,
-)
+from stavpr_lab.evaluation.report import chosen_window, METRICS, Report, worst_mistakes
 from stavpr_lab.evaluation.report_page import html_page
 from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import csv_kind, HTML, JSON, require_replaceable, write_output
@@ -57,15 +51,10 @@ def write_folder(report: Report, folder: Path, force: bool = False) -> Path:
     _write_matches(report, folder / 'answers.csv')
     _write_curves(report.evaluation, folder / 'curves.csv')
     boxes = _draw(report, folder)
-    embedded = {
-        'precision_recall': folder / 'precision_recall.png',
-        'distances': folder / 'distances.png',
-        'matrix': folder / 'similarity_matrix.png',
-        'drive': folder / 'drive.png',
-    }
+    embedded = ['precision_recall', 'distances', 'similarity_matrix', 'drive']
     if report.evaluation.calibration is not None:
-        embedded['calibration'] = folder / 'calibration.png'
-    contents = {name: path.read_bytes() for name, path in embedded.items()}
+        embedded.append('calibration')
+    contents = {name: (folder / f'{name}.png').read_bytes() for name in embedded}
     mistakes = worst_mistakes(report.evaluation, MISTAKES)
     write_output(page, html_page(report, mistakes, contents, boxes), HTML, force)
     write_json(report, folder / 'results.json', force=True)
@@ -82,7 +71,7 @@ def _write_matches(report: Report, path: Path) -> None:
         'true_place': truth.middles.tolist(),
         'sequence_place': sequence.best.tolist(),
         'sequence_distance': sequence.scores.tolist(),
-        'sequence_right': truth.accepts(sequence.best).astype(int).tolist(),
+        'sequence_right': report.evaluation.correct.astype(int).tolist(),
         'single_place': single.best.tolist(),
         'single_distance': single.scores.tolist(),
         'single_right': truth.accepts(single.best).astype(int).tolist(),
@@ -137,27 +126,15 @@ def _draw_curves(evaluation: Evaluation, path: Path) -> Box:
         'sequences, without the ends': (plots.SEQUENCE_INNER, evaluation.sequence_without_ends),
         'single images': (plots.SINGLE, evaluation.single),
     }
-    curves = {
-        name: (
-            color,
-            metrics.curve[:, 2],
-            metrics.curve[:, 1],
-            (metrics.best.recall, metrics.best.precision),
-        )
-        for name, (color, metrics) in kinds.items()
-    }
-    return plots.precision_recall(path, curves)
+    return plots.precision_recall(path, kinds)
 
 
 def _draw_distances(evaluation: Evaluation, path: Path) -> None:
-    matches = evaluation.results.sequence
-    correct = evaluation.ground_truth.accepts(matches.best)
+    colors = (plots.COLORS['right'], plots.COLORS['wrong'], plots.UNKNOWN)
     groups = {
-        'correct': (plots.COLORS['right'], matches.scores[correct]),
-        'wrong': (plots.COLORS['wrong'], matches.scores[~correct]),
+        name: (color, distances)
+        for color, (name, distances) in zip(colors, evaluation.distances.items(), strict=False)
     }
-    if evaluation.unknown is not None:
-        groups['unknown places'] = (plots.UNKNOWN, evaluation.unknown.sequence.scores)
     plots.distance_histogram(path, groups, evaluation.sequence.best.threshold)
 
 
@@ -166,7 +143,7 @@ def _draw_drive(report: Report, path: Path) -> None:
     unseen = np.any([np.zeros(truth.N, bool), *report.drive.unseen()], axis=0)
     outcomes = np.where(
         report.accepted,
-        np.where(truth.accepts(places), 'right', 'wrong'),
+        np.where(report.evaluation.correct, 'right', 'wrong'),
         np.where(truth.has_match, 'no match', 'unseen'),
     )
     plots.drive(path, truth.pairs, truth.n, places, outcomes, unseen)
@@ -177,7 +154,7 @@ def _draw_matrix(evaluation: Evaluation, path: Path) -> Box:
     true_blocks = np.zeros(reduced.values.shape, bool)
     rows, columns = (truth.pairs // reduced.block).T
     true_blocks[rows, columns] = True
-    shape = truth.N, truth.n
-    return plots.reduced_matrix(
-        path, reduced.values, shape, true_blocks, accepted_matches(evaluation)
-    )
+    pairs = np.stack([np.arange(truth.N), evaluation.results.sequence.best], axis=1)
+    accepted, correct = evaluation.best_accepted, evaluation.correct
+    matches = {'right': pairs[accepted & correct], 'wrong': pairs[accepted & ~correct]}
+    return plots.reduced_matrix(path, reduced.values, (truth.N, truth.n), true_blocks, matches)

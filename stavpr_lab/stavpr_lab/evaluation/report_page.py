@@ -44,8 +44,8 @@ def html_page(
     Return the page.
 
     :param mistakes: images whose wrong matches are shown, the worst first.
-    :param plots: PNG files ``precision_recall``, ``distances``, ``matrix``, ``drive`` and, where
-        probabilities are declared, ``calibration``.
+    :param plots: PNG files ``precision_recall``, ``distances``, ``similarity_matrix``, ``drive``
+        and, where probabilities are declared, ``calibration``.
     :param boxes: where the axes of ``curves`` and ``matrix`` are.
     :raises UnavailableError: jinja2 is not installed.
     """
@@ -54,16 +54,12 @@ def html_page(
     environment.policies['json.dumps_kwargs'] = {'separators': (',', ':')}
     template = resources.files('stavpr_lab.evaluation').joinpath(TEMPLATE).read_text('utf-8')
     evaluation = report.evaluation
-    unknown = evaluation.unknown is not None
-    kinds = ('sequence', 'single')
     return environment.from_string(template).render(
         title=report.title,
         images=len(report.query),
         best=evaluation.sequence.best,
         single=evaluation.single.best,
-        false_alarms={kind: evaluation.false_alarm_rate(kind) for kind in kinds}
-        if unknown
-        else None,
+        false_alarms=evaluation.false_alarm_rates,
         colors={'right': COLORS['right'], 'wrong': COLORS['wrong'], 'sequence': SEQUENCE},
         cards=_cards(evaluation),
         decision=report.decision(),
@@ -71,7 +67,10 @@ def html_page(
         unseen_distance=UNSEEN_DISTANCE,
         calibration=evaluation.calibration and evaluation.calibration.to_json(),
         plots={name: _data_url(content, 'png') for name, content in plots.items()},
-        infinite=_infinite(evaluation),
+        infinite={
+            name: np.count_nonzero(~np.isfinite(distances))
+            for name, distances in evaluation.distances.items()
+        },
         mistakes=[_mistake(report, image) for image in mistakes],
         rows=_rows(evaluation),
         settings={name: _text(value) for name, value in report.settings.items()},
@@ -88,25 +87,14 @@ def _text(value: Any) -> str:
     return '–' if value is None else value if isinstance(value, str) else json.dumps(value)
 
 
-def _cards(evaluation: Evaluation) -> list[dict[str, Any]]:
-    kinds = ('sequence', 'single')
-    sequence, single = (getattr(evaluation, kind).to_json() for kind in kinds)
-    cards = [('F1 of sequences', sequence['f1'], single['f1'], SEQUENCE)]
-    cards += [(name, sequence[NUMBERS[name]], single[NUMBERS[name]], SEQUENCE) for name in CARDS]
-    if evaluation.unknown is not None:
-        rate, single_rate = (evaluation.false_alarm_rate(kind) for kind in kinds)
-        cards.append(('false alarms', rate, single_rate, COLORS['wrong']))
-    return [dict(zip(('name', 'value', 'single', 'color'), card, strict=True)) for card in cards]
-
-
-def _infinite(evaluation: Evaluation) -> dict[str, int]:
-    """Count the matches without a distance, which the histogram lacks."""
-    scores = evaluation.results.sequence.scores
-    correct = evaluation.ground_truth.accepts(evaluation.results.sequence.best)
-    groups = {'correct matches': scores[correct], 'wrong matches': scores[~correct]}
-    if evaluation.unknown is not None:
-        groups['images of unknown places'] = evaluation.unknown.sequence.scores
-    return {name: int(np.count_nonzero(~np.isfinite(values))) for name, values in groups.items()}
+def _cards(evaluation: Evaluation) -> list[tuple[str, float, float, str]]:
+    """Return name, value of sequences and of single images, and color of each card."""
+    sequence, single = evaluation.sequence.to_json(), evaluation.single.to_json()
+    keys = {'F1 of sequences': 'f1'} | {name: NUMBERS[name] for name in CARDS}
+    cards = [(name, sequence[key], single[key], SEQUENCE) for name, key in keys.items()]
+    if rates := evaluation.false_alarm_rates:
+        cards.append(('false alarms', rates['sequence'], rates['single'], COLORS['wrong']))
+    return cards
 
 
 def _rows(evaluation: Evaluation) -> dict[str, list[str]]:
@@ -114,9 +102,8 @@ def _rows(evaluation: Evaluation) -> dict[str, list[str]]:
     columns = [getattr(evaluation, name).to_json() for name in METRICS]
     rows = {name: [f'{column[key]:.4f}' for column in columns] for name, key in NUMBERS.items()}
     rows['scikit-learn’s F1'] = [f'{column["scikit_learn"]["f1"]:.4f}' for column in columns]
-    if evaluation.unknown is not None:
-        rates = [f'{evaluation.false_alarm_rate(kind):.4f}' for kind in ('sequence', 'single')]
-        rows['false alarms'] = [rates[0], '', rates[1], '']
+    if rates := evaluation.false_alarm_rates:
+        rows['false alarms'] = [f'{rates["sequence"]:.4f}', '', f'{rates["single"]:.4f}', '']
     rows['queries'] = [str(column['queries']) for column in columns]
     rows['with a place in the map'] = [str(column['queries_with_match']) for column in columns]
     return rows
@@ -126,15 +113,11 @@ def _mistake(report: Report, image: int) -> dict[str, Any]:
     matches = report.evaluation.results.sequence
     place, true = int(matches.best[image]), int(report.evaluation.ground_truth.middles[image])
     images = [
-        {'name': f'image {image}', 'url': _image(report.query, image)},
-        {'name': f'place {place}', 'url': _image(report.reference, place)},
-        {
-            'name': f'place {true}' if true >= 0 else 'not in the map',
-            'url': _image(report.reference, true),
-        },
+        (f'image {image}', _image(report.query, image)),
+        (f'place {place}', _image(report.reference, place)),
+        (f'place {true}' if true >= 0 else 'not in the map', _image(report.reference, true)),
     ]
-    accepted = matches.scores[image] < report.evaluation.sequence.best.threshold
-    status = 'accepted' if accepted else 'rejected, correctly'
+    status = 'accepted' if report.evaluation.best_accepted[image] else 'rejected, correctly'
     off = f', {abs(place - true)} places off' if true >= 0 else ''
     return {'images': images, 'caption': f'distance {matches.scores[image]:.4f}, {status}{off}'}
 
@@ -186,7 +169,6 @@ def _view(evaluation: Evaluation, window: WindowDistances) -> dict[str, Any]:
     low, high = np.nanmin(window.distances), np.nanmax(window.distances)
     share = (window.distances - low) / max(float(high - low), 1e-9)
     cells = np.where(np.isnan(share), 255, np.round(np.nan_to_num(share) * 254)).astype(np.uint8)
-    place, score = int(matches.best[window.image]), float(matches.scores[window.image])
     return {
         'image': window.image,
         'newest': window.newest,
@@ -196,12 +178,12 @@ def _view(evaluation: Evaluation, window: WindowDistances) -> dict[str, Any]:
         'cells': base64.b64encode(cells.tobytes()).decode(),
         'path': window.path.tolist(),
         'truth': _true_stretches(truth, window),
-        'place': place,
+        'place': int(matches.best[window.image]),
         'single': int(evaluation.results.single.best[window.image]),
         'true': int(truth.middles[window.image]),
-        'right': bool(place in truth.accepted(window.image)),
-        'accepted': score < evaluation.sequence.best.threshold,
-        'score': score,
+        'right': bool(evaluation.correct[window.image]),
+        'accepted': bool(evaluation.best_accepted[window.image]),
+        'score': float(matches.scores[window.image]),
     }
 
 

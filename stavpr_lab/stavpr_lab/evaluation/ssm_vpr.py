@@ -25,12 +25,11 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
-from stavpr_ros.errors import InputError, UnavailableError
+from stavpr_ros.errors import InputError
 import torch
 from torch.nn.functional import normalize
 
 SAMPLE = 1000  # cubes that a whitening is learned from
-SEARCHES = ('torch', 'faiss')
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,6 @@ class SsmVprSettings:
     :param memory: last answers that frame correlation uses; 0 = none.
     :param gain: most additional weight of a candidate.
     :param reach: places from an answer at which that weight is 0.
-    :param search: of the nearest cubes, exact: ``torch``, or ``faiss`` (package faiss-cpu).
     """
 
     large: int = 9
@@ -57,7 +55,6 @@ class SsmVprSettings:
     memory: int = 2
     gain: float = 0.4
     reach: int = 15
-    search: str = 'torch'
 
 
 def cubes(maps: torch.Tensor, side: int) -> torch.Tensor:
@@ -187,14 +184,11 @@ class SsmVpr:
 
     def __post_init__(self) -> None:
         settings = self.settings
-        if settings.search not in SEARCHES:
-            raise InputError(f'search {settings.search!r}: take one of {", ".join(SEARCHES)}')
         self.reranker = SpatialReranker(self.second, settings)
         self._whitening = learn_whitening(self.first, settings.large, settings.large_dimension)
         found = [self._whitening(cubes(each[None], settings.large)[0]) for each in self.first]
         self._image = np.repeat(np.arange(len(found)), len(found[0]))
         self._cubes = torch.cat(found)
-        self._index = _faiss_index(self._cubes) if settings.search == 'faiss' else None
         self._answers: deque[tuple[int, float]] = deque(maxlen=settings.memory or None)
 
     def candidates(self, query: torch.Tensor) -> np.ndarray:
@@ -205,10 +199,7 @@ class SsmVpr:
         """
         own = self._whitening(cubes(query[None], self.settings.large)[0])
         count = min(self.settings.neighbors, len(self._cubes))
-        if self._index is not None:
-            nearest = self._index.search(own.numpy(), count)[1]
-        else:
-            nearest = torch.cdist(own, self._cubes).topk(count, largest=False).indices.numpy()
+        nearest = torch.cdist(own, self._cubes).topk(count, largest=False).indices.numpy()
         votes = np.bincount(self._image[nearest.ravel()], minlength=len(self.first))
         return np.argsort(-votes, kind='stable')[: self.settings.candidates]
 
@@ -239,15 +230,3 @@ class SsmVpr:
             near = np.clip(settings.reach - abs(places - answer), 0, None) / settings.reach
             best = np.maximum(best, strength * settings.gain * near)
         return 1 + best
-
-
-def _faiss_index(vectors: torch.Tensor):  # type: ignore[no-untyped-def]
-    try:
-        import faiss
-    except ImportError as error:
-        raise UnavailableError(
-            f"search 'faiss' needs the package faiss-cpu ({error}): pip install faiss-cpu"
-        ) from error
-    index = faiss.IndexFlatL2(vectors.shape[1])
-    index.add(vectors.numpy())
-    return index

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 import re
 
+from stavpr_lab.evaluation.drive import cropped, FrameSource
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.ground_truth_files import ARRAYS, TEXT
-from stavpr_lab.evaluation.warp import cropped, FrameSource
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.sources.folder import FolderSource, SUFFIXES
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
+from stavpr_lab.evaluation.drive import FrameSource
 from stavpr_lab.evaluation.evaluate import evaluate_on_map
 from stavpr_lab.evaluation.metrics import evaluate_ranking, Metrics, Ranking
 from stavpr_lab.evaluation.paper.datasets import Dataset
 from stavpr_lab.evaluation.seqslam import seqslam, SeqSlamSettings
 from stavpr_lab.evaluation.ssm_vpr import SsmVpr
-from stavpr_lab.evaluation.warp import FrameSource
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
