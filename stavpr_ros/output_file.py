@@ -222,7 +222,9 @@ def _busy(path: str | Path) -> OutputTakenError:
 
 def create_temporary(target: Path, is_folder: bool = False) -> tuple[Path, int]:
     """
-    Create and lock the temporary file, or folder, of a target; those of killed writers go.
+    Create the temporary file, or folder, of a target, locked as long as it is open.
+
+    A killed writer leaves one without a lock: those in the same folder are deleted.
 
     :returns: its path, and its descriptor.
     :raises OutputTakenError: another program writes the target.
@@ -259,7 +261,9 @@ def _delete_stale(folder: Path) -> None:
 
 def _is_at(path: Path, file: int) -> bool:
     """Return whether an open file, or folder, is still the one of this name."""
-    return os.path.lexists(path) and os.path.samestat(os.fstat(file), os.lstat(path))
+    with suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(file), os.lstat(path))
+    return False
 
 
 def sync_folder(folder: Path) -> None:

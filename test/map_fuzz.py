@@ -68,7 +68,7 @@ def mutated(content: bytes, rng: random.Random) -> bytes:
     for _ in range(rng.choice((1, 1, 1, 2, 5))):
         at = int(len(data) * rng.random() ** rng.choice((1, 8)))
         other = rng.randrange(len(data) + 1)
-        removed = rng.choice((0, 1, 8, rng.randrange(40), len(data)))
+        removed = rng.choice((1, 8, rng.randrange(1, 40), len(data)))
         copied, drawn = data[other : other + 64], rng.randbytes(rng.randrange(40))
         data[at : at + removed] = rng.choice((b'', bytes(8), b'\xff' * 8, drawn, copied))
     return bytes(data)

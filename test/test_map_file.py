@@ -330,7 +330,8 @@ HAND_MADE = [
     (_poses([np.inf, 0, 0, 0, 0, 0, 1]), None, 'pose of place 0'),
     ({'ids': np.full(24, 255, np.uint8), 'id_ends': np.arange(1, 25)}, None, 'utf-8'),
     ({'ids': np.zeros(24, np.uint8), 'id_ends': np.arange(1, 25)}, None, 'identifier of place 0'),
-    ({'id_ends': np.arange(24)[::-1].copy()}, None, 'id_ends does not increase'),
+    ({'id_ends': np.array([200, *range(1, 23), 182])}, None, 'id_ends does not increase'),
+    ({'id_ends': np.arange(24)}, None, 'id_ends does not increase'),
     ({'id_ends': None}, None, 'ids and id_ends, one is missing'),
     (_thumbnail(_jpeg(20000, 20000)), None, 'thumbnail of place 0 has 400000000 pixels'),
     (_thumbnail(b'\x89PNG\r\n\x1a\n' + bytes(40)), None, 'thumbnail of place 0 is no JPEG'),
@@ -422,6 +423,14 @@ def test_file_of_another_length_is_rejected(saved):
         saved.write_bytes(other)
         with pytest.raises(MapFileError, match=r'tensors end at byte \d+, the file at byte \d+'):
             load_map(saved)
+
+
+def test_part_without_hashes_is_rejected(saved):
+    manifest, tensors = parts_of(saved.read_bytes())
+    manifest['parts']['strips']['sha256'] = []
+    saved.write_bytes(version2(manifest, tensors))
+    with pytest.raises(MapFileError, match='tensor strips has 0 hashes'):
+        load_map(saved)
 
 
 def test_map_of_version1_is_to_be_built_again(saved):

@@ -5,6 +5,7 @@
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import os
+import resource
 import stat
 import subprocess
 import sys
@@ -166,25 +167,18 @@ def test_atomic_output_killed_writer_leaves_what_the_next_one_sweeps(writer, tmp
     assert living.poll() is None
 
 
-def test_atomic_output_file_of_a_full_disk_leaves_what_was_there(tmp_path):
-    """RLIMIT_FSIZE of a process of its own stands for the disk."""
-    program = (
-        'import resource, signal\n'
-        'from stavpr_ros.output_file import JSON, write_output\n'
-        'signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n'
-        'resource.setrlimit(resource.RLIMIT_FSIZE, (10000, 10000))\n'
-        'try:\n'
-        '    write_output("a.json", "[" + " " * 100000, JSON, True)\n'
-        'except Exception as error:\n'
-        '    print(type(error).__name__, error)\n'
-    )
-    (tmp_path / 'a.json').write_text('{}')
-    result = subprocess.run(
-        [sys.executable, '-c', program], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert result.stdout.startswith('OutputError a.json cannot be written (File too large); what')
-    assert result.stderr == ''
-    assert ((tmp_path / 'a.json').read_text(), names(tmp_path)) == ('{}', ['a.json'])
+def test_write_output_on_a_full_disk_leaves_what_was_there(tmp_path):
+    """A limit of this process stands for the disk."""
+    path = tmp_path / 'a.json'
+    path.write_text('{}')
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+    try:
+        with pytest.raises(OutputError, match=r'written .File too large.; what was there is unt'):
+            write_output(path, '[' + ' ' * 100_000, JSON, force=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert (path.read_text(), names(tmp_path)) == ('{}', ['a.json'])
 
 
 def test_require_replaceable_names_what_is_wrong(tmp_path):
