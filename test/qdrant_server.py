@@ -9,7 +9,6 @@ served by the local mode of qdrant-client. Without quantization and approximate 
 
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import json
-import sys
 import threading
 from typing import Any
 
@@ -20,8 +19,8 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, port: int) -> None:
-        super().__init__(('127.0.0.1', port), _Handler)
+    def __init__(self) -> None:
+        super().__init__(('127.0.0.1', 0), _Handler)
         self.points, self.lock = QdrantClient(':memory:'), threading.Lock()
         self.requests: list[str] = []
 
@@ -82,14 +81,10 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 class QdrantServer:
-    """
-    The stand-in, on a thread of this process.
+    """The stand-in on a free port, on a thread of this process."""
 
-    :param port: 0 = a free one.
-    """
-
-    def __init__(self, port: int = 0) -> None:
-        self._server = _Server(port)
+    def __init__(self) -> None:
+        self._server = _Server()
         self.port: int = self._server.server_address[1]
         self.requests = self._server.requests
         threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True).start()
@@ -102,9 +97,3 @@ class QdrantServer:
         """Stop; connections are refused afterwards."""
         self._server.shutdown()
         self._server.server_close()
-
-
-if __name__ == '__main__':
-    served = QdrantServer(int(sys.argv[1]) if len(sys.argv) > 1 else 0)
-    print(served.port, flush=True)
-    threading.Event().wait()

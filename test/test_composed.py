@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node in a process of another program: its executor, its context, its end."""
 
-import os
 import threading
 import time
 
@@ -13,9 +12,7 @@ import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from robot import image_message, PARAMETERS, parameters_of, RELIABLE
-from sensor_msgs.msg import Image
-from stavpr_msgs.msg import PlaceMatch
+from robot import image_message, PARAMETERS, parameters_of
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import load_map
 from stavpr_ros.ros.node import PlaceRecognitionNode
@@ -221,42 +218,13 @@ def test_place_has_the_pose_at_the_stamp_of_its_image(make, route):
     assert node.runtime.pipeline.places.poses[0][0] == 12.5
 
 
-def test_start_that_fails_is_repeated_after_a_parameter_set_meanwhile(
-    make, map_file, tmp_path, monkeypatch
-):
-    missing, folder = str(tmp_path / 'missing.stavpr'), os.path.dirname(map_file)
-    node = make(autostart=True, map_path=missing, maps_folder=folder)
-    trigger = node.trigger_configure
-
-    def fail_and_set():
-        result = trigger()
-        assert set_parameter(node, 'map_path', map_file).successful
-        return result
-
-    monkeypatch.setattr(node, 'trigger_configure', fail_and_set)
-    executor = rclpy.executors.SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
-    while node.state == 'unconfigured' and not node.problem:
-        executor.spin_once(timeout_sec=1)
-    monkeypatch.setattr(node, 'trigger_configure', trigger)
-    while node.state != 'active':
-        executor.spin_once(timeout_sec=1)
-    assert len(node.runtime.pipeline.places) == 60
-    executor.shutdown()
-
-
 def test_save_path_that_cannot_be_written_is_rejected(make, tmp_path):
     path = str(tmp_path / 'missing' / 'route.stavpr')
     node = make(operation='mapping', save_path=path, maps_folder=str(tmp_path))
     assert node.trigger_configure() != SUCCESS
     assert (node.state, 'save_path' in node.problem) == ('unconfigured', True)
-    for path, valid in (
-        (tmp_path, False),
-        (tmp_path / 'missing' / 'x', False),
-        (tmp_path / 'x', True),
-    ):
-        result = set_parameter(node, 'save_path', str(path))
-        assert (result.successful, 'save_path' in result.reason) == (valid, not valid)
+    assert not set_parameter(node, 'save_path', str(tmp_path)).successful
+    assert set_parameter(node, 'save_path', str(tmp_path / 'x')).successful
     assert node.trigger_configure() == SUCCESS
 
 
@@ -273,29 +241,7 @@ def test_limit_of_threads_can_be_removed(make):
         assert node.trigger_cleanup() == SUCCESS
 
 
-def test_node_with_another_name_and_namespace_uses_them_everywhere(robot, start, route):
-    """In topics, services and diagnostics; a misspelled parameter is logged."""
-    names = ('-r', '__ns:=/robot', '-r', '__node:=places', '-r', 'image:=front/camera')
-    matches = robot.listen(PlaceMatch, '/robot/places/match')
-    publisher = robot.node.create_publisher(Image, '/robot/front/camera', RELIABLE)
-    start(*names, wait=False, sequence_lenght=5)
-    robot.until(lambda: publisher.get_subscription_count() > 0, 'the subscription')
-
-    def answered():
-        publisher.publish(image_message(route[0], 1 + len(matches)))
-        return bool(matches)
-
-    robot.until(answered, 'a match')
-    robot.until_logged("parameter 'sequence_lenght' is unknown: did you mean sequence_length?")
-
-    def topics():
-        statuses = [status for array in robot.arrays for status in array.status]
-        inputs = [status for status in statuses if status.name == 'robot/places: input']
-        return {value.value for status in inputs for value in status.values}
-
-    robot.until(lambda: '/robot/front/camera' in topics(), 'the topic in the diagnostics')
-    services = dict(robot.node.get_service_names_and_types())
-    assert {f'/robot/places/{name}' for name in ('load_map', 'reset', 'change_state')} <= set(
-        services
-    )
-    robot.node.destroy_publisher(publisher)
+def test_misspelled_parameter_is_logged(make, capfd):
+    make(sequence_lenght=5)
+    words = "parameter 'sequence_lenght' is unknown: did you mean sequence_length?"
+    assert words in capfd.readouterr().err

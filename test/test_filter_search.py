@@ -7,50 +7,30 @@ from itertools import pairwise, product
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
+from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.robust import THRESHOLD
 from stavpr_ros.recognition.sequence_search import _smooth, FilterSearch, SequenceBuffer
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
-PLACES, W, D, LENGTH = 240, 7, 24, 12
+PLACES, LENGTH = 240, 12
 MIDDLE = (LENGTH - 1) // 2
-
-
-def strips_of(seed):
-    """Return a route of PLACES places, each like its neighbors, (W, n, d)."""
-    rng = np.random.default_rng(seed)
-    strips = rng.standard_normal((W, PLACES + 3, D))
-    return sum(strips[:, i : i + PLACES] for i in range(4))
-
-
-def features_of(strips, noise=0.0, seed=0):
-    strips = strips + noise * np.random.default_rng(seed).standard_normal(strips.shape)
-    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
-    return LocalFeatures(
-        torch.from_numpy(strips).float(),
-        torch.ones(strips.shape[:2]),
-        FeatureSettings('gradient', None, W),
-    )
 
 
 @pytest.fixture(scope='module')
 def route():
-    return strips_of(0)
+    return route_strips(0, PLACES)
 
 
 @pytest.fixture
 def recognizer(route):
-    features = features_of(route)
-    place_map = PlaceMap(features, None, np.zeros(PLACES, np.int64), ('',) * PLACES)
     settings = RecognizerSettings(
         THRESHOLD, sequence=SequenceSettings(LENGTH), nms_radius=10, mode='robust'
     )
-    return PlaceRecognizer(place_map, settings)
+    return PlaceRecognizer(map_of(features_of(route)), settings)
 
 
 def drive(recognizer, strips, noise=1.0, seed=1):
@@ -150,12 +130,11 @@ def test_places_of_path_have_probabilities_that_scale_the_match(recognizer, rout
 def test_equal_places_of_the_map_are_one_place_of_the_path(route):
     """The camera stood while the map was recorded: how long, the query cannot know."""
     stop = np.r_[:100, [100] * 40, 101:PLACES]
-    features = features_of(route[:, stop])
-    place_map = PlaceMap(features, None, np.zeros(len(stop), np.int64), ('',) * len(stop))
     settings = RecognizerSettings(
         THRESHOLD, sequence=SequenceSettings(LENGTH), nms_radius=10, mode='robust'
     )
-    recognizer, query = PlaceRecognizer(place_map, settings), features_of(route[:, stop], 1.0, 1)
+    places = map_of(features_of(route[:, stop]))
+    recognizer, query = PlaceRecognizer(places, settings), features_of(route[:, stop], 1.0, 1)
     shares = []
     for i in range(len(query)):
         recognizer.update(query[i : i + 1])
@@ -184,20 +163,6 @@ def test_standing_camera_changes_no_probability(recognizer, route):
     assert repr(again.sequence) == repr(after.sequence)  # NaN like NaN
 
 
-def test_standing_start_is_one_image(route):
-    """The filter after 100 equal images is that after one."""
-    buffer = SequenceBuffer(4, 50, 8)
-    searches = [FilterSearch(buffer) for _ in range(2)]
-    row = np.random.default_rng(0).standard_normal(50).astype(np.float32)
-    for search, images in zip(searches, (1, 100), strict=True):
-        search.change.learn(features_of(route[:, :50]).strips.numpy())
-        for i in range(images):
-            search.update(row, 1.0 if i == 0 else 0.0)
-    one, other = (search.filter for search in searches)
-    assert one.count == other.count == 1
-    np.testing.assert_array_equal(one.places_of_states(), other.places_of_states())
-
-
 def test_equal_images_in_dark_stretch_of_map_move_on(route):
     """Without evidence, at the speed before: the camera may move there."""
     dark = features_of(route).strips.numpy().copy()
@@ -215,7 +180,7 @@ def test_equal_images_in_dark_stretch_of_map_move_on(route):
 
 
 def test_drive_that_leaves_map_and_returns_is_followed(recognizer, route):
-    elsewhere = strips_of(7)[:, :60]
+    elsewhere = route_strips(7, 60)
     strips = np.concatenate([route[:, 20:80], elsewhere, route[:, 120:200]], axis=1)
     answers = drive(recognizer, strips)
     probability = np.array([answer.probability for answer in answers])
@@ -234,18 +199,6 @@ def test_drive_in_reverse_is_not_matched_wrongly(recognizer, route):
     for i, answer in enumerate(answers, LENGTH):
         there = 200 - i + LENGTH - 1 - MIDDLE
         assert not answer.accepted or abs(answer.place_index - there) <= LENGTH
-
-
-def test_search_over_no_places_has_no_match():
-    buffer = SequenceBuffer(3, 0, 6)
-    search = FilterSearch(buffer)
-    for _ in range(3):
-        buffer.push(torch.empty(0))
-        search.update(np.empty(0, np.float32), 1.0)
-    found = search(5)
-    assert found.nearest is None
-    assert found.path.shape == (0, 2)
-    assert [len(values) for values in found.sequences()] == [0, 0]
 
 
 def test_search_counts_places_from_first_ever():

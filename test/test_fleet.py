@@ -5,8 +5,6 @@
 import ast
 from dataclasses import replace
 from pathlib import Path
-import subprocess
-import sys
 import threading
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -352,37 +350,3 @@ def test_fleet_is_imported_within_functions_only():
             tree = ast.parse(path.read_text())
             imported = [ast.unparse(one) for one in tree.body if isinstance(one, ast.ImportFrom)]
             assert not [one for one in imported if 'stavpr_ros.fleet' in one], path
-
-
-@pytest.mark.long
-def test_four_robots_query_one_map_while_the_server_is_cut_off(tmp_path, city, query):
-    """Four processes; each prints its matches. The server is killed in the middle."""
-    folder = Path(__file__).parent
-    server = subprocess.Popen(
-        [sys.executable, folder / 'qdrant_server.py'], stdout=subprocess.PIPE, text=True
-    )
-    address = f'qdrant://127.0.0.1:{int(server.stdout.readline())}/city'
-    upload(city, address)
-    robots = [
-        subprocess.Popen(
-            [sys.executable, folder / 'fleet_robot.py', address, str(500 + 1200 * robot)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        for robot in range(4)
-    ]
-    for robot in robots:
-        assert robot.stdout.readline() == 'half way\n'
-    server.kill()
-    server.wait()
-    for robot in robots:
-        robot.stdin.write('go on\n')
-        robot.stdin.flush()
-    for robot in robots:
-        out, _ = robot.communicate(timeout=120)
-        print(out, end='')
-        accepted, right, problem = out.strip().split(' ', 2)
-        assert int(accepted) >= 35
-        assert int(right) == int(accepted)
-        assert 'Qdrant server' in problem

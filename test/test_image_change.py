@@ -3,6 +3,7 @@
 """Changes of the map and of the query: what they say about speed, standstill and darkness."""
 
 import numpy as np
+from places import route_strips
 import pytest
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.recognition.map_change import AHEAD, APART, STRETCH
@@ -13,11 +14,9 @@ pytestmark = pytest.mark.usefixtures('one_thread')
 SETTINGS = FilterSettings()
 
 
-def drive_strips(places, seed=0, smooth=4):
+def drive_strips(places, seed=0):
     """Return unit-norm strips (3, places, 24) that change from place to place."""
-    rng = np.random.default_rng(seed)
-    strips = rng.standard_normal((3, places + smooth, 24))
-    strips = sum(strips[:, i : i + places] for i in range(smooth))
+    strips = route_strips(seed, places)[:3]
     return (strips / np.linalg.norm(strips, axis=2, keepdims=True)).astype(np.float32)
 
 
@@ -105,24 +104,6 @@ def test_speed_weights_are_of_smoothed_change_over_curve():
             off = (mean - np.log(there + OFFSET)) / SETTINGS.change_deviation
             expected.append(np.exp(-(off**2) / 2) + FLOOR)
         np.testing.assert_allclose(change.speed_weights(seen), expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize('apart', [1, 2, 3])
-def test_speed_weights_are_highest_at_speed_of_query(apart):
-    strips = drive_strips(400)
-    change = learned(strips)
-    query = drive_strips(60, seed=1)[:, ::apart]
-    change.next_query(query[:, 0])
-    for y in range(1, 12):
-        weights = change.speed_weights(change.next_query(query[:, y]))
-    assert abs(SETTINGS.speeds[int(np.argmax(weights))] - apart) <= 0.34
-
-
-def test_speed_weights_after_reset_forget_query():
-    one, other = (learned(drive_strips(50)) for _ in range(2))
-    one.speed_weights(0.9)
-    one.reset()
-    np.testing.assert_array_equal(one.speed_weights(0.2), other.speed_weights(0.2))
 
 
 def likelihoods_of(change, query):

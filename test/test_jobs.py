@@ -79,11 +79,7 @@ def test_run_jobs_failed_job_does_not_stop_others(monkeypatch, capfd):
         return subprocess.CompletedProcess(command, int(command[-1]), f'{command[-1]}\n')
 
     monkeypatch.setattr(subprocess, 'run', run)
-<<<<<<< HEAD
-    assert run_jobs([Job(f'job{i}', BUILD_MAP, (str(i),)) for i in (1, 0, 2)], 1, None) == 2
-=======
-    assert run_jobs([Job(f'job{i}', 'build_map', (str(i),)) for i in (1, 2, 0)], 1, None) == 2
->>>>>>> 95c3ba8 (files)
+    assert run_jobs([Job(f'job{i}', BUILD_MAP, (str(i),)) for i in (1, 2, 0)], 1, None) == 2
     text = capfd.readouterr().out
     for part in ('job1: failed, exit code 1\n1\n', 'job0: done\n0', 'job2: failed, exit code 2'):
         assert f'--- {part}' in text

@@ -3,22 +3,18 @@
 """
 The launch files: their arguments, and the node that they start.
 
-``launch`` cannot be installed by pip, so a recording stand-in replaces it; where it is installed,
-it runs one of the files as well.
+``launch`` cannot be installed by pip, so a recording stand-in replaces it.
 """
 
 import ast
 import importlib.util
 from pathlib import Path
 import re
-import subprocess
 import sys
 from types import ModuleType, SimpleNamespace
 
 from ament_index_python.packages import get_package_share_directory
-import cv2
-from fixtures import route_images
-from processes import environment, executable
+from processes import executable
 import pytest
 from stavpr_ros.parameters import BY_NAME
 
@@ -222,25 +218,23 @@ def test_launch_included_in_another_file_accepts_the_arguments_of_that(load, mon
     assert load('stavpr').start()
 
 
-def test_launch_of_replay_passes_its_options(load):
+def test_launch_of_replay_shuts_down_with_it_on_request_only(load):
     launch = load('replay')
     _, replay = launch.start(bag='drive')
-    assert [words(word) for word in replay.arguments] == ['${bag}']
     assert replay.on_exit is None
     assert words(dict(replay.remappings)['image']) == '${image}'
     assert Path(executable(replay.executable)).exists()
-    _, replay = launch.start(bag='drive', topic='/camera', lossless='true', shutdown='true')
-    expected = ['${bag}', '--topic', '/camera', '--lossless']
-    assert [words(word) for word in replay.arguments] == expected
+    _, replay = launch.start(bag='drive', shutdown='true')
     assert type(replay.on_exit[0]).__name__ == 'Shutdown'
-    _, replay = launch.start(bag='drive', rate='2', start_offset='5', also='/tf /tf_static')
-    expected = ['${bag}', '--also', '/tf', '/tf_static', '--rate', '2', '--start-offset', '5']
-    assert [words(word) for word in replay.arguments] == expected
 
 
 @pytest.mark.parametrize(
     ('given', 'expected'),
     [
+        ({}, []),
+        ({'topic': '/camera', 'lossless': 'true'}, ['--topic', '/camera', '--lossless']),
+        ({'rate': '2', 'start_offset': '5'}, ['--rate', '2', '--start-offset', '5']),
+        ({'also': '/tf /tf_static'}, ['--also', '/tf', '/tf_static']),
         ({'keyframe_distance': '0.5'}, ['--odometry']),
         ({'keyframe_angle': '10'}, ['--odometry']),
         ({'keyframe_distance': '0.5', 'odometry': '/wheels'}, ['--odometry', '/wheels']),
@@ -249,7 +243,8 @@ def test_launch_of_replay_passes_its_options(load):
         ({'use_sim_time': 'false', 'start_paused': 'true'}, ['--start-paused']),
     ],
 )
-def test_launch_of_replay_adds_what_the_parameters_of_the_node_need(load, given, expected):
+def test_launch_of_replay_passes_its_options(load, given, expected):
+    """Also those that the parameters of the node need."""
     _, replay = load('replay').start(bag='drive', **given)
     assert [words(word) for word in replay.arguments] == ['${bag}', *expected]
 
@@ -261,40 +256,3 @@ def test_documented_launch_arguments_exist(load):
     assert {'stavpr', 'replay', 'multi_camera', 'nav2'} <= {name for name, _ in found}
     for name, given in found:
         assert set(re.findall(r'(\w+):=', given)) <= set(load(name).arguments), (name, given)
-
-
-RUN = """
-import sys
-from launch import LaunchDescription, LaunchService
-from launch.actions import IncludeLaunchDescription
-from launch.launch_description_sources import PythonLaunchDescriptionSource
-
-arguments = [word.split(':=') for word in sys.argv[2:]]
-source = PythonLaunchDescriptionSource(sys.argv[1])
-included = IncludeLaunchDescription(source, launch_arguments=arguments)
-service = LaunchService()
-service.include_launch_description(LaunchDescription([included]))
-sys.exit(service.run())
-"""
-
-
-def test_launch_of_replay_in_a_namespace_processes_a_folder(tmp_path):
-    """By launch itself; it ends with the replay."""
-    pytest.importorskip('launch_ros', reason='launch is not installed')
-    for i, image in enumerate(route_images(24)):
-        cv2.imwrite(str(tmp_path / f'{i}.png'), image)
-    given = ['namespace:=robot', 'image:=/camera', 'operation:=mapping', f'bag:={tmp_path}']
-    given += ['lossless:=true', 'shutdown:=true']
-    done = subprocess.run(
-        [sys.executable, '-c', RUN, str(ROOT / 'launch' / 'replay.launch.py'), *given],
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    output = done.stdout + done.stderr
-    assert done.returncode == 0, output
-    assert '24 images published on /camera' in output
-    assert 'robot.stavpr]: 24 images received, 24 processed' in output
-    assert 'Traceback' not in output

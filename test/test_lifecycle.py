@@ -6,7 +6,7 @@ import dataclasses
 import weakref
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from lifecycle_msgs.msg import Transition, TransitionEvent
+from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import pytest
 from robot import image_message, LATCHED, LENGTH
@@ -84,41 +84,6 @@ def test_node_through_all_states_behaves_as_each_state(robot, node, map_file, ro
     assert robot.state() == 'unconfigured'
     robot.until_map(state='none', places=0)
     assert all('is unconfigured' in message for message in rejections(robot))
-
-
-def test_node_in_transitions_publishes_events(robot, node, map_file):
-    messages = robot.listen(TransitionEvent, '/stavpr/transition_event')
-
-    def events():
-        return [(event.start_state.label, event.goal_state.label) for event in messages]
-
-    def received():  # a discovered topic is not necessarily matched
-        robot.transition('configure')
-        robot.transition('cleanup')
-        return bool(messages)
-
-    robot.until(received, 'the first event')
-    robot.until(lambda: events()[-1] == ('cleaningup', 'unconfigured'), 'the last event')
-    messages.clear()
-    configure(robot, map_file)
-    for label in ('activate', 'deactivate', 'cleanup'):
-        assert robot.transition(label)
-    robot.set(map_path='missing.stavpr')
-    assert not robot.transition('configure')
-    robot.until(lambda: len(messages) == 11, 'eleven events')
-    assert events() == [
-        ('unconfigured', 'configuring'),
-        ('configuring', 'inactive'),
-        ('inactive', 'activating'),
-        ('activating', 'active'),
-        ('active', 'deactivating'),
-        ('deactivating', 'inactive'),
-        ('inactive', 'cleaningup'),
-        ('cleaningup', 'unconfigured'),
-        ('unconfigured', 'configuring'),
-        ('configuring', 'errorprocessing'),
-        ('errorprocessing', 'unconfigured'),
-    ]
 
 
 def test_node_at_invalid_transitions_rejects_them(robot, node, map_file):

@@ -6,7 +6,6 @@ import math
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-import numba
 import numpy as np
 import oracle
 import pytest
@@ -182,19 +181,3 @@ def test_match_sequence_of_any_memory_layout_changes_nothing():
         np.testing.assert_array_equal(match_sequence(same, sequence).distances, expected)
     align_sequence(D, 3, sequence)
     np.testing.assert_array_equal(D, before)
-
-
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason='one processor only')
-def test_match_sequence_does_not_depend_on_number_of_threads():
-    D = random_distances(7, 20, 3000, np.float32, 0, 0.01)
-    before = numba.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 2):
-            numba.set_num_threads(threads)
-            results.append(match_sequence(D, SequenceSettings()))
-    finally:
-        numba.set_num_threads(before)
-    alone, together = results
-    assert alone.distances.tobytes() == together.distances.tobytes()
-    assert alone.lengths.tobytes() == together.lengths.tobytes()

@@ -6,6 +6,7 @@ from dataclasses import replace
 import math
 
 import numpy as np
+from places import features_of
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
@@ -17,7 +18,6 @@ from stavpr_ros.errors import (
     SettingsError,
     UnavailableError,
 )
-from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, route_features, Status
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher, CpuRouteMatcher
 from stavpr_ros.recognition.loop_closer import (
@@ -27,7 +27,7 @@ from stavpr_ros.recognition.loop_closer import (
     LEAST_PLACES,
     LoopCloser,
 )
-from stavpr_ros.recognition.place_filter import CLOSE, FilterSettings, PlaceFilter
+from stavpr_ros.recognition.place_filter import CLOSE
 from stavpr_ros.recognition.robust import (
     PAPER,
     ROBUST,
@@ -35,19 +35,13 @@ from stavpr_ros.recognition.robust import (
     z_normalized,
 )
 from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
-from stavpr_ros.recognition.sequence_search import BAND, ImageChange
+from stavpr_ros.recognition.sequence_search import BAND
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 SHORT = SequenceSettings(length=5, beta=2.0)
 SECOND = 10**9
 LM_DTW = ROBUST.without('mean_centering', 'whitening', 'place_filter')
-
-
-def features_of(strips):
-    return LocalFeatures(
-        strips, torch.ones(strips.shape[:2]), FeatureSettings('gradient', None, 7)
-    )
 
 
 def laps_of(count, places, noise=0.4, seed=0):
@@ -57,8 +51,7 @@ def laps_of(count, places, noise=0.4, seed=0):
     strips = known[:, np.arange(count) % places] + noise * rng.standard_normal((7, count, 16))
     strips += rng.standard_normal((7, 1, 16))  # what all images share
     strips[2, 3::17] = 0  # zero features
-    strips /= np.maximum(np.linalg.norm(strips, axis=2, keepdims=True), 1e-12)
-    return features_of(torch.from_numpy(strips).float())
+    return features_of(strips)
 
 
 @pytest.fixture(scope='module')
@@ -177,21 +170,6 @@ def test_loop_closer_with_limit_equals_plain_loop_with_bans(
     assert closer.first > 0
 
 
-@pytest.mark.parametrize('mode', ['paper', 'robust'])
-def test_loop_closer_with_limit_never_reached_equals_unlimited(laps, mode):
-    limit = len(laps) + 1
-    settings = RecognizerSettings(1.0, sequence=SHORT, nms_radius=5, mode=mode)
-    bounded, unbounded = (
-        LoopCloser(settings, 12, laps.settings, limit=value) for value in (limit, None)
-    )
-    for i in range(len(laps)):
-        same(bounded.update(laps[i : i + 1]), unbounded.update(laps[i : i + 1]))
-        assert bounded.ranked(3) == unbounded.ranked(3)
-    np.testing.assert_array_equal(bounded.newest_row(), unbounded.newest_row())
-    assert bounded.first == unbounded.first == 0
-    assert (bounded.limit, unbounded.limit) == (limit, None)
-
-
 def test_loop_closer_at_limit_evicts_an_eighth(laps):
     closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=80)
     for i in range(len(laps)):
@@ -230,6 +208,18 @@ def test_route_features_are_original_less_mean(laps, centering, limit):
     assert route.room == (limit or 512)
 
 
+def test_route_features_are_centered_by_recent_mean(laps):
+    """By one that is at most an eighth old."""
+    route = RouteFeatures(laps.settings, True, False, None)
+    for i in range(100):
+        route.append(laps[i : i + 1])
+    counts = [1]
+    while counts[-1] < 100:
+        counts.append(int(counts[-1] * GROWTH) + 1)
+    last = max(count for count in counts if count <= 100)
+    torch.testing.assert_close(route.mean, laps.strips[:, :last].mean(dim=1), atol=1e-6, rtol=0)
+
+
 @pytest.mark.parametrize(('centering', 'limit'), [(True, None), (False, 90)])
 def test_route_features_whitened_give_back_the_original(laps, centering, limit):
     """Whitening is learned again on the way, and features are as if it had been known before."""
@@ -255,61 +245,10 @@ def test_route_features_whitened_give_back_the_original(laps, centering, limit):
     torch.testing.assert_close(again.strips[:, :1], first)
 
 
-def test_route_features_are_centered_by_recent_mean(laps):
-    """By one that is at most an eighth old."""
-    route = RouteFeatures(laps.settings, True, False, None)
-    for i in range(100):
-        route.append(laps[i : i + 1])
-    counts = [1]
-    while counts[-1] < 100:
-        counts.append(int(counts[-1] * GROWTH) + 1)
-    last = max(count for count in counts if count <= 100)
-    torch.testing.assert_close(route.mean, laps.strips[:, :last].mean(dim=1), atol=1e-6, rtol=0)
-
-
 def of_sequence(belief, best):
     """Return the probability of places around the best one whose path is one sequence."""
     weights = zip(belief.places, belief.weights, strict=True)
     return sum(weight for place, weight in weights if abs(place - best) <= BAND)
-
-
-def test_loop_closer_in_mode_robust_equals_plain_loop_over_filter(laps):
-    """Rows as they are matched with LM-DTW, images' changes, and one filter over all of them."""
-    options, exclude = ROBUST.without('mean_centering', 'whitening'), 12
-    closer = LoopCloser(settings_of(options), exclude, laps.settings, limit=90)
-    plain = PlainCloser(settings_of(options), exclude, laps)
-    s = FilterSettings(speed_weight=0)
-    change, filtered, first = ImageChange(300, s), PlaceFilter(300, 2, s), 0
-    for i in range(len(laps)):
-        answer = closer.update(laps[i : i + 1])
-        if closer.first > first:
-            filtered.evict(closer.first - first)
-            change.evict(closer.first - first)
-            first = closer.first
-        strips = laps.strips[:, first : i + 1].contiguous().numpy()
-        change.learn_newest(strips, i + 1 - first)
-        places = max(0, i + 1 - first - exclude)
-        z = plain.normalized(i, first, first + places)
-        seen = change.next_query(strips[:, -1])
-        assert not change.is_standstill(seen)
-        speeds = np.ones((2, len(s.speeds)))
-        if i:
-            speeds = change.speed_weights(seen), change.speed_likelihoods(seen)
-        filtered.update(z, change.weight(seen), *speeds)
-        if answer.sequence is None:
-            assert not len(z)
-            continue
-        belief = filtered.belief(len(z), 2)
-        near, probabilities = belief.probabilities(len(z))
-        expected = 0
-        if len(near):
-            best = near[np.argmax(probabilities)]
-            expected = closer._window.shares[2] * of_sequence(belief, best)
-        assert answer.probability == pytest.approx(expected, abs=1e-4)
-        if answer.accepted:
-            middle = first + int(near[np.argmax(probabilities)])
-            assert answer.place_index == pytest.approx(middle, abs=2)
-    assert first > 0
 
 
 def test_late_matches_close_what_was_not_certain_at_first():
@@ -323,8 +262,7 @@ def test_late_matches_close_what_was_not_certain_at_first():
     strips = laps_of(2 * lap, lap).strips.numpy()
     rng = np.random.default_rng(1)
     strips[:, lap:] += 0.5 * rng.standard_normal(strips[:, lap:].shape).astype(np.float32)
-    strips /= np.maximum(np.linalg.norm(strips, axis=2, keepdims=True), 1e-12)
-    features = features_of(torch.from_numpy(strips))
+    features = features_of(strips)
     settings = RecognizerSettings(
         THRESHOLD, sequence=SequenceSettings(length), nms_radius=5, mode='robust'
     )
@@ -363,22 +301,6 @@ def test_mode_paper_and_localization_have_no_late_matches(laps, small_map):
     assert {match.late for match in drive(localizer, small_map.features)} == {None}
 
 
-def test_loop_closer_closes_no_loop_within_another_light():
-    """Images of the second light are nearer to each other than to those of their own places."""
-    rng = np.random.default_rng(3)
-    places, lights = rng.standard_normal((2, 7, 200, 64)), rng.standard_normal((7, 2, 64))
-    first = places[0] + lights[:, :1]
-    second = np.concatenate([0.6 * places[0][:, :60], places[1]], 1) + 1.2 * lights[:, 1:]
-    strips = np.concatenate([first, second], 1) + 0.5 * rng.standard_normal((7, 460, 64))
-    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
-    closer = LoopCloser(RecognizerSettings(THRESHOLD, mode='robust'), 20, laps_of(1, 1).settings)
-    answers = drive(closer, features_of(torch.from_numpy(strips).float()))
-    middles = np.array([answer.place_index for answer in answers])
-    again = np.arange(225, 260)  # images half a window behind the second pass
-    assert (np.abs(middles[again] - (again - 210)) <= 2).mean() > 0.8
-    assert (middles[280:] < 0).all()
-
-
 # ------------------------------------------------ seconds
 
 
@@ -397,17 +319,6 @@ def test_exclude_seconds_leaves_young_places_out(laps):
             old += 1
         expected = min(i + 1 - 7, old) if stamps[i] else i + 1 - 7
         assert len(closer.newest_row()) == max(0, expected)
-
-
-def test_exclude_seconds_without_stamps_is_count_alone(laps):
-    plain = LoopCloser(settings_of(ROBUST), 12, laps.settings)
-    stamped = LoopCloser(settings_of(ROBUST), 12, laps.settings)
-    unknown = LoopCloser(settings_of(ROBUST), 12, laps.settings, exclude_seconds=5.0)
-    for i in range(90):
-        image = laps[i : i + 1]
-        answer = plain.update(image)
-        same(answer, stamped.update(image, 7 + i))
-        same(answer, unknown.update(image, 0))
 
 
 def test_loop_closer_with_standing_clock_matches_nothing(laps):
@@ -486,7 +397,7 @@ def test_ranked_places_are_numbered_from_start_of_route(laps, robust_options):
 
 def test_update_with_error_changes_nothing(laps):
     one, other = (LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=70) for _ in range(2))
-    broken = features_of(torch.full((7, 1, 16), math.nan))
+    broken = features_of(np.full((7, 1, 16), math.nan))
     for i in range(100):
         with pytest.raises(InputError):
             other.update(broken, 5)
@@ -524,7 +435,7 @@ def test_loop_closer_with_invalid_input_is_rejected(laps, small_map):
     with pytest.raises(FeatureMismatchError):
         closer.update(small_map.features[:1])
     with pytest.raises(InputError, match='not finite'):
-        closer.update(features_of(torch.full((7, 1, 16), math.nan)))
+        closer.update(features_of(np.full((7, 1, 16), math.nan)))
     assert len(closer) == closer.window_fill == 0
 
 
@@ -547,8 +458,7 @@ def test_loop_closer_on_unknown_backend_or_precision_is_rejected(laps, backend, 
     assert choose_loop_backend('auto') == choose_loop_backend('cpu') == 'cpu'
 
 
-@pytest.mark.parametrize('precision', ['float16', 'int8'])
-@pytest.mark.parametrize('limit', [None, 90])
+@pytest.mark.parametrize(('precision', 'limit'), [('float16', None), ('int8', 90)])
 def test_settled_route_in_less_memory_matches_as_in_float32(laps, monkeypatch, precision, limit):
     """Rounded once, by the mean and the whitening of the day it settled; an eighth is evicted."""
     monkeypatch.setattr(route_features, 'SETTLED', 150)
@@ -595,16 +505,3 @@ def test_settled_route_holds_its_places_through_growth_and_eviction(laps, monkey
         newest[:, 0], torch.ones(7)
     )
     torch.testing.assert_close(found, expected[:-3], atol=1e-6, rtol=0)
-
-
-@pytest.mark.parametrize('precision', ['float16', 'int8'])
-def test_settled_route_of_vectors_holds_its_places(laps, monkeypatch, precision):
-    monkeypatch.setattr(route_features, 'SETTLED', 20)
-    settings = replace(laps.settings, strips=1)
-    vectors = LocalFeatures(laps.strips[:1].contiguous(), laps.weights[:1], settings)
-    route = RouteFeatures(settings, False, False, None, precision)
-    for i in range(50):
-        route.append(vectors[i : i + 1])
-    found = CpuRouteMatcher(1, SpatialSettings()).to_oldest(route.strips, route.newest, 40)
-    cosine = vectors.strips[0, :40] @ vectors.strips[0, 49]
-    torch.testing.assert_close(found, 1 - cosine, atol=0.02, rtol=0)

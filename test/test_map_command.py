@@ -190,13 +190,3 @@ def test_maps_that_do_not_fit_are_not_merged(drive):
         merge_maps([], [])
     with pytest.raises(InputError, match='no place is left'):
         select_session(merge_maps([drive], ['a']), 'a', keep=False)
-
-
-@pytest.mark.parametrize(
-    'action', ['info', 'verify', 'convert', 'compact', 'export', 'merge', 'sessions', 'recover']
-)
-def test_every_action_has_help(action, capsys):
-    with pytest.raises(SystemExit) as caught:
-        main([action, '--help'])
-    assert caught.value.code == 0
-    assert 'usage: map' in capsys.readouterr().out

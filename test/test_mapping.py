@@ -3,7 +3,6 @@
 """Maps of images or keyframes, and their files: what is saved is loaded."""
 
 import dataclasses
-import re
 import threading
 
 import cv2
@@ -20,77 +19,11 @@ from stavpr_ros.mapping import (
     build_map,
     encode_thumbnail,
     KeyframeSettings,
-    load_map,
-    PlaceMap,
-    save_map,
     Trajectory,
 )
 from stavpr_ros.sources.frame import Frame
 
 SECOND = 10**9
-
-
-def assert_same(a: PlaceMap, b: PlaceMap) -> None:
-    assert a.settings == b.settings
-    np.testing.assert_array_equal(a.features.strips.numpy(), b.features.strips.numpy())
-    np.testing.assert_array_equal(a.features.weights.numpy(), b.features.weights.numpy())
-    np.testing.assert_array_equal(a.stamps, b.stamps)
-    assert a.ids == b.ids
-    assert a.thumbnails == b.thumbnails
-    assert (a.poses is None) == (b.poses is None)
-    if a.poses is not None:
-        np.testing.assert_array_equal(a.poses, b.poses)
-
-
-@pytest.fixture(scope='module')
-def partial_map(small_map):
-    """Return a map in which the pose of two places and the thumbnail of one are unknown."""
-    poses = small_map.poses.copy()
-    poses[[0, 7]] = np.nan
-    thumbnails = (b'', *small_map.thumbnails[1:])
-    return dataclasses.replace(small_map, poses=poses, thumbnails=thumbnails)
-
-
-def test_map_id_depends_on_the_content_alone(partial_map, tmp_path):
-    moved = dataclasses.replace(partial_map, stamps=partial_map.stamps + 1)
-    ids = []
-    for name, place_map in (('a', partial_map), ('b', partial_map), ('c', moved)):
-        save_map(place_map, tmp_path / name)
-        ids.append(load_map(tmp_path / name).map_id)
-    assert re.fullmatch('[0-9a-f]{16}', ids[0])
-    assert ids[0] == ids[1] != ids[2]
-    assert partial_map.map_id == ''
-
-
-@pytest.fixture
-def saved(partial_map, tmp_path):
-    path = tmp_path / 'route.stavpr'
-    save_map(partial_map, path)
-    return path
-
-
-def test_save_map_then_load_map_is_identical(partial_map, saved, route):
-    loaded = load_map(saved)
-    assert_same(partial_map, loaded)
-    assert loaded.projection.identity == partial_map.projection.identity
-    assert loaded.thumbnail(0) is loaded.pose(0) is loaded.pose(7) is None
-    assert loaded.thumbnail(3).shape == (96, 128, 3)
-    assert loaded.pose(8).tolist() == [8, 0, 0, 0, 0, 0, 1]
-    query = loaded.extractor().extract([route[5]])
-    np.testing.assert_allclose(query.strips[:, 0], partial_map.features.strips[:, 5], atol=1e-6)
-
-
-def test_save_map_without_extras_loads(route, tmp_path):
-    plain = build_map(
-        [Frame(route[0], 0, '')], FeatureExtractor(), thumbnails=False, progress=False
-    )
-    save_map(plain, tmp_path / 'plain.stavpr')
-    loaded = load_map(tmp_path / 'plain.stavpr')
-    assert_same(plain, loaded)
-    assert loaded.thumbnail(0) is loaded.pose(0) is None
-    assert not loaded.stamps.any()
-    assert not any(loaded.ids)
-    assert not loaded.has_poses
 
 
 def test_recognizer_with_other_features_rejects_them(small_map, route):

@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
-from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from robot import image_message, RELIABLE, SECOND
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_msgs.msg import PlaceMatch
@@ -160,34 +160,6 @@ def test_incompatible_publishers_are_reported(robot, start, publish, route):
     robot.node.destroy_publisher(unreliable)
     robot.until_diagnosed('input', WARN, '1 publisher there, but silent')
     assert robot.counts('input')['publishers_refused'] == '0'
-
-
-def test_best_effort_camera_is_received_and_reported(robot, start, publish, route):
-    start()
-    robot.until_logged('subscription to /image: reliable, every publisher offers it')
-    robot.node.destroy_publisher(robot.publisher)
-    camera = publish(Image, 'image')
-    robot.until_logged('subscription to /image: best effort, 1 of 1 publishers are best effort')
-    robot.wait_for_node(camera)
-    assert robot.show(image_message(route[0]), publisher=camera).status == WARMING_UP
-    assert robot.counts('input')['reliability'].startswith('best effort, 1 of 1')
-    robot.publisher = robot.node.create_publisher(Image, 'image', RELIABLE)
-
-
-def test_qos_overrides_apply_to_one_topic_and_after_a_pause(robot, start):
-    start(**{RELIABILITY: 'best_effort'})
-
-    def offered(topic):
-        infos = robot.node.get_subscriptions_info_by_topic(topic)
-        return [info.qos_profile.reliability for info in infos]
-
-    assert robot.transition('deactivate')
-    assert robot.transition('activate')
-    robot.wait_for_node()
-    robot.until(lambda: offered('/image') == [ReliabilityPolicy.BEST_EFFORT], 'the subscription')
-    robot.set(keyframe_distance=1.0)
-    robot.until(lambda: bool(offered('/odom')), 'the subscriber of odometry')
-    assert offered('/odom') == [ReliabilityPolicy.BEST_EFFORT]
 
 
 def test_durability_override_excludes_volatile_publishers(robot, start, publish):

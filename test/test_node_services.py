@@ -3,7 +3,6 @@
 """Services of the node: valid and invalid requests, and maps that change during a stream."""
 
 from contextlib import contextmanager
-from dataclasses import replace
 import threading
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -15,10 +14,9 @@ from robot import image_message, LENGTH, SECOND
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import MapFileError
-from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.mapping import load_map
 from stavpr_ros.ros import map_loading, runtime
 from std_srvs.srv import Trigger
-import torch
 
 PAPER = {'mode': 'paper', 'threshold': 0.2}  # certain after one window
 
@@ -192,50 +190,6 @@ def test_node_that_maps_with_odometry_saves_and_publishes_poses(robot, start, ro
         position, orientation = pose.pose.pose.position, pose.pose.pose.orientation
         assert (position.x, orientation.w) == (match.newest_index, 1)
         assert pose.pose.covariance[0] == pytest.approx(2.0)  # two places before, two after
-
-
-def test_load_map_during_a_stream_processes_every_image(robot, start, small_map, route, tmp_path):
-    """At 20 Hz: matches with the old map, a window that fills, matches with the new map."""
-    n = 5060
-    strips = torch.randn((7, n, 64), generator=torch.Generator().manual_seed(0))
-    strips /= strips.norm(dim=2, keepdim=True)
-    strips[:, 5000:] = small_map.features.strips
-    features = replace(small_map.features, strips=strips, weights=torch.full((7, n), 7**-0.5))
-    optional = {'poses': None, 'thumbnails': (), 'ids': ('new place',) * n}
-    large = replace(small_map, features=features, stamps=np.arange(1, n + 1), **optional)
-    save_map(large, tmp_path / 'large.stavpr')
-    start(queue_size=1000, **PAPER)
-    robot.until_map(state='loaded', places=60)
-    robot.drive(route[20:28])
-    before, infos = len(robot.answers), len(robot.infos)
-    sent = []
-
-    def publish():
-        stamp = robot.stamp + (1 + len(sent)) * SECOND
-        sent.append(image_message(route[28 + len(sent) % 30], stamp))
-        robot.publisher.publish(sent[-1])
-
-    timer = robot.node.create_timer(0.05, publish)
-    robot.until(lambda: len(sent) >= 4, 'a stream')
-    loaded = robot.does(LoadMap, 'load_map', path=str(tmp_path / 'large.stavpr')).map
-    assert (loaded.places, loaded.path) == (n, str(tmp_path / 'large.stavpr'))
-    during = len(sent)
-    robot.until(lambda: len(sent) >= during + 2 * LENGTH, 'more of the stream')
-    robot.node.destroy_timer(timer)
-    robot.until(lambda: len(robot.answers) >= before + len(sent), 'all matches')
-    matches = robot.answers[before:]
-    assert [match.header for match in matches] == [image.header for image in sent]
-    warming = [i for i, match in enumerate(matches) if match.status == PlaceMatch.WARMING_UP]
-    assert warming == list(range(warming[0], warming[0] + LENGTH - 1))
-    assert 4 <= warming[0] <= during
-    old, new = matches[: warming[0]], matches[warming[-1] + 1 :]
-    for part, word in ((old, 'place'), (new, 'new')):
-        accepted = [match for match in part if match.status == PlaceMatch.MATCH]
-        assert {match.newest_id.split()[0] for match in accepted} == {word}
-    assert max(match.sequence_last for match in old) < 60
-    robot.until_map(state='loaded', places=n, has_poses=False, has_ids=True)
-    shown = [(info.state, info.places) for info in robot.infos[infos:]]
-    assert shown == [('loading', 60), ('loaded', n)]
 
 
 def test_load_map_of_a_damaged_file_keeps_the_map_and_the_window(

@@ -11,7 +11,7 @@ from stavpr_ros.alignment.settings import STRATEGIES
 from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import MapFileError, SettingsError
 from stavpr_ros.features.registry import kinds
-from stavpr_ros.parameters import BASIC, BY_NAME, GROUPS, PARAMETERS
+from stavpr_ros.parameters import BY_NAME, PARAMETERS
 from stavpr_ros.pipeline import (
     node_settings,
     NodeSettings,
@@ -40,7 +40,6 @@ def test_files_are_generated_from_table():
 
 
 def test_rows_are_consistent():
-    assert len(GROUPS[BASIC]) <= 14
     assert len(BY_NAME) == len(PARAMETERS)
     for row in PARAMETERS:
         assert row.sentence.endswith('.'), row.name

@@ -6,18 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 from pipelines import localizing, message, process
+from places import features_of, map_of
 import pytest
 from scipy.stats import chi2
-from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.mapping import PlaceMap, save_map
+from stavpr_ros.mapping import save_map
 from stavpr_ros.mapping.place_map import Session
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.relative_motion import agreement
-from std_srvs.srv import Trigger
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -45,16 +43,8 @@ def corridor(seed=0, noise=0.5):
     return [features_of(each) for each in both]
 
 
-def features_of(strips):
-    strips = strips / np.linalg.norm(strips, axis=2, keepdims=True)
-    settings = FeatureSettings('gradient', None, 7)
-    return LocalFeatures(torch.from_numpy(strips).float(), torch.ones(strips.shape[:2]), settings)
-
-
-def map_of(features, positions, **changes):
-    poses = None if positions is None else poses_of(positions)
-    n = len(features)
-    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n, poses, **changes)
+def driven_map(features, positions, **parts):
+    return map_of(features, None if positions is None else poses_of(positions), **parts)
 
 
 def settings_of(**changes):
@@ -115,7 +105,7 @@ def test_agreement_without_poses_is_unknown():
 def test_look_alike_corridors_are_distinguished_by_their_turns():
     """Equal images; matched until the corner is in the window, and long not after it."""
     places, query = corridor()
-    place_map = map_of(places, track(90))
+    place_map = driven_map(places, track(90))
     by_images = drive(PlaceRecognizer(place_map, settings_of()), query)
     assert all(match.accepted for match in by_images[LENGTH:])
     matches = drive(PlaceRecognizer(place_map, settings_of()), query, track(-90))
@@ -138,7 +128,7 @@ def test_the_same_corridor_is_matched_in_spite_of_drift():
     steps *= np.exp(1j * np.cumsum(np.radians(0.3) * rng.standard_normal(N - 1)))
     way = np.concatenate([[0], np.cumsum(steps)])
     way = np.column_stack([way.real, way.imag])
-    place_map = map_of(places, track(90))
+    place_map = driven_map(places, track(90))
     plain = drive(PlaceRecognizer(place_map, settings_of()), query)
     matches = drive(PlaceRecognizer(place_map, settings_of()), query, way)
     assert [match.probability for match in matches[LENGTH:]] == [
@@ -159,8 +149,8 @@ def test_the_same_corridor_is_matched_in_spite_of_drift():
 def test_absence_of_odometry_or_poses_changes_nothing(positions, way, changes):
     places, query = corridor()
     settings = replace(settings_of(), **changes)
-    expected = drive(PlaceRecognizer(map_of(places, None), settings), query)
-    found = drive(PlaceRecognizer(map_of(places, positions), settings), query, way)
+    expected = drive(PlaceRecognizer(driven_map(places, None), settings), query)
+    found = drive(PlaceRecognizer(driven_map(places, positions), settings), query, way)
     assert [repr(one.sequence) for one in found] == [repr(one.sequence) for one in expected]
     assert [one.reason for one in found] == [one.reason for one in expected]
 
@@ -172,7 +162,7 @@ def test_session_of_a_match_ends_its_track():
     positions[CORNER:] += (1000.0, 0)
     sessions = Session('a'), Session('b')
     index = (np.arange(N) >= CORNER).astype(np.int32)
-    place_map = map_of(places, positions, sessions=sessions, session_index=index)
+    place_map = driven_map(places, positions, sessions=sessions, session_index=index)
     way = np.vstack([track(90)[:CORNER], track(90)[CORNER:]])
     matches = drive(PlaceRecognizer(place_map, settings_of()), query, way)
     assert all(match.accepted for match in matches[LENGTH : CORNER - 6])
@@ -181,10 +171,10 @@ def test_session_of_a_match_ends_its_track():
 
 def test_reset_forgets_the_way():
     places, query = corridor()
-    one = PlaceRecognizer(map_of(places, track(90)), settings_of())
+    one = PlaceRecognizer(driven_map(places, track(90)), settings_of())
     drive(one, query, track(-90))
     one.reset()
-    fresh = drive(PlaceRecognizer(map_of(places, track(90)), settings_of()), query, track(90))
+    fresh = drive(PlaceRecognizer(driven_map(places, track(90)), settings_of()), query, track(90))
     again = drive(one, query, track(90))
     assert [match.probability for match in again[LENGTH:]] == [
         match.probability for match in fresh[LENGTH:]
@@ -227,20 +217,7 @@ def test_invalid_settings_and_poses_are_rejected():
     places, query = corridor()
     with pytest.raises(SettingsError, match='odometry_error = 1\\.5 must be a share'):
         settings_of(odometry_error=1.5)
-    one = PlaceRecognizer(map_of(places, track()), settings_of())
+    one = PlaceRecognizer(driven_map(places, track()), settings_of())
     with pytest.raises(InputError, match='pose has shape'):
         one.update(query[:1], pose=np.zeros(3))
     assert one.window_fill == 0
-
-
-def test_node_compares_odometry_with_the_path(robot, start, route):
-    """Ten meters an image, where the places are one meter apart; then as the places are."""
-    start(relative_pose='none')
-    robot.until(lambda: robot.odometry.get_subscription_count() > 0, 'a subscriber of odometry')
-    far = [robot.show_at(10.0 * i, image) for i, image in enumerate(route[:20])]
-    assert far[-1].status == PlaceMatch.NO_MATCH
-    assert far[-1].reason.endswith('odometry disagrees with its path')
-    assert far[-1].probability < 0.5
-    robot.does(Trigger, 'reset')
-    near = [robot.show_at(500.0 + i, image) for i, image in enumerate(route[:20])]
-    assert (near[-1].status, near[-1].newest_index) == (PlaceMatch.MATCH, 19)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command replay as a process, with a subscriber in this one."""
 
+from functools import partial
 import os
 import signal
 import subprocess
@@ -13,34 +14,26 @@ import cv2
 import numpy as np
 from processes import DOMAIN, environment, TIMEOUT
 import pytest
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.ros import process
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
+from test_playback import spinning
 
 COMMAND = [sys.executable, '-m', 'stavpr_ros.commands.replay']
 
 
 class Subscriber:
-    """A node that subscribes to images with best effort and publishes a match of each."""
+    """Subscribes to images with best effort and publishes a match of each."""
 
-    def __init__(self, answers=lambda images: True):
+    def __init__(self, node, answers=lambda images: True):
         self.answers = answers  # decides from the images received so far
         self.images = []
         self.changed = threading.Condition()
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=DOMAIN)
-        self.node = rclpy.create_node('stavpr', context=self.context)
-        self.publisher = self.node.create_publisher(PlaceMatch, '~/match', 10)
-        self.node.create_subscription(Image, 'image', self.receive, qos_profile_sensor_data)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.thread = threading.Thread(target=self.executor.spin)
-        self.thread.start()
+        self.publisher = node.create_publisher(PlaceMatch, '~/match', 10)
+        node.create_subscription(Image, 'image', self.receive, qos_profile_sensor_data)
 
     def receive(self, image):
         with self.changed:
@@ -59,24 +52,11 @@ class Subscriber:
     def milliseconds(self):
         return [image.header.stamp.nanosec // 1_000_000 for image in self.images]
 
-    def close(self):
-        self.executor.shutdown()
-        self.thread.join()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
-
 
 @pytest.fixture
 def subscribe():
-    subscribers = []
-
-    def start(**options):
-        subscribers.append(Subscriber(**options))
-        return subscribers[-1]
-
-    yield start
-    for subscriber in subscribers:
-        subscriber.close()
+    with spinning('stavpr', DOMAIN) as node:
+        yield partial(Subscriber, node)
 
 
 def start_replay(*arguments):
@@ -185,19 +165,6 @@ def test_replay_without_a_subscriber_fails(tmp_path):
     assert 'waited 0.3 s for a subscriber of /nowhere' in errors
 
 
-def test_replay_with_a_late_subscriber_waits_for_it(tmp_path, subscribe):
-    bag, data = make_bag(tmp_path / 'bag')
-    process = start_replay(bag)
-    try:
-        assert 'waiting for a subscriber of /image' in process.stderr.readline()
-        subscriber = subscribe()
-        process.communicate(timeout=TIMEOUT)
-    finally:
-        process.kill()
-    assert process.returncode == 0
-    assert subscriber.data() == data
-
-
 @pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
 def test_replay_after_a_signal_ends_at_once(tmp_path, subscribe, sent):
     bag, _ = make_bag(tmp_path / 'bag', count=5, gap_ms=60_000)
@@ -225,18 +192,6 @@ def test_replay_of_a_folder_with_a_damaged_image_skips_it(tmp_path, subscribe, r
     assert '1 skipped' in output
     assert '2.png: 7 bytes are no image' in errors
     assert subscriber.milliseconds() == [50, 100, 200]
-
-
-def test_replay_of_real_bags_publishes_their_encodings(data_folder, subscribe):
-    subscriber = subscribe()
-    bags = data_folder / 'bags'
-    for topic in ('/image', '/image/compressed'):
-        bag = bags / 'klintan_rosbag2js_sample.db3'
-        assert replay(bag, '--topic', topic, '--lossless')[0] == 0
-    for camera in (1, 2):
-        topic = f'/camera/fisheye{camera}/image_raw'
-        assert replay(bags / 'kapture_t265_trimmed_locoffice.bag', '--topic', topic)[0] == 0
-    assert [image.encoding for image in subscriber.images] == ['bgr8', 'rgb8'] + ['mono8'] * 6
 
 
 def test_transport_profile_of_the_user_is_kept(monkeypatch):

@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node as a process: signals in every state, options of ROS."""
 
+from pathlib import Path
 import shutil
 import signal
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 import numpy as np
 from processes import node_process
 import pytest
@@ -41,30 +40,17 @@ def ends_well(process, number):
     return True
 
 
-@pytest.mark.parametrize(
-    ('labels', 'number'),
-    [
-        pytest.param(['configure'], signal.SIGINT, marks=pytest.mark.long),
-        pytest.param([], signal.SIGINT, marks=pytest.mark.long),
-        (['configure', 'activate', 'shutdown'], signal.SIGTERM),
-    ],
-)
-def test_node_after_a_signal_in_any_state_ends(robot, run, map_file, labels, number):
+def test_finalized_node_after_a_signal_ends(robot, run, map_file):
     process = run(autostart=False, map_path=map_file)
-    states = {'configure': 'inactive', 'activate': 'active', 'shutdown': 'finalized'}
     robot.until_state('unconfigured')
-    for label in labels:
+    for label in ('configure', 'activate', 'shutdown'):
         assert robot.transition(label)
-        assert robot.state() == states[label]
-    if labels[-1:] == ['shutdown']:
-        robot.wait_for_nobody()
-        robot.until_diagnosed(
-            'processing', DiagnosticStatus.OK, 'finalized: no image is processed'
-        )
-        response = robot.call(LoadMap, 'load_map', path=map_file)
-        assert (response.success, 'the node is finalized' in response.message) == (False, True)
-        assert process.popen.poll() is None
-    assert ends_well(process, number)
+    assert robot.state() == 'finalized'
+    robot.wait_for_nobody()
+    robot.until_diagnosed('processing', DiagnosticStatus.OK, 'finalized: no image is processed')
+    assert 'the node is finalized' in robot.refuses(LoadMap, 'load_map', path=map_file)
+    assert process.popen.poll() is None
+    assert ends_well(process, signal.SIGTERM)
 
 
 def test_node_after_two_signals_during_an_image_ends(robot, run, map_file, route):
@@ -80,55 +66,37 @@ def test_node_after_two_signals_during_an_image_ends(robot, run, map_file, route
     assert len(robot.answers) < before + images  # the signal came before the last image
 
 
-@pytest.mark.long
-def test_node_after_a_signal_during_compilation_ends(robot, run, map_file, tmp_path, monkeypatch):
-    """Compilation takes ten seconds and cannot be interrupted; the node does not wait for it."""
-    monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path / 'cache'))
-    process = run(autostart=False, map_path=map_file)
-    configure, futures = Transition(label='configure'), []
+@pytest.fixture
+def slow_file(map_file, tmp_path):
+    """Return a map on a disk that does not respond once a file of its name is there."""
+    return Path(shutil.copy(map_file, tmp_path / 'slow.stavpr'))
 
-    def begun():
-        return 'image distances on cpu' in process.output()
 
-    with robot.request(futures, ChangeState, 'change_state', begun, transition=configure):
+def test_node_after_a_signal_while_a_map_is_read_ends(robot, run, map_file, slow_file):
+    process = run(slow=True, map_path=map_file)
+    robot.wait_for_node()
+    Path(f'{slow_file}.slow').touch()
+    futures = []
+
+    def loading():
+        return f'loading {slow_file}' in robot.diagnostics['map'].message
+
+    with robot.request(futures, LoadMap, 'load_map', loading, path=str(slow_file)):
         assert not any(future.done() for future in futures)
-        assert ends_well(process, signal.SIGINT)
-    assert 'compil' in process.output()  # the thread was abandoned
+    answer = robot.ask(image_message(np.zeros((96, 128, 3), np.uint8), 1))  # meanwhile
+    assert answer.status == PlaceMatch.WARMING_UP
+    assert ends_well(process, signal.SIGINT)
 
 
-@pytest.mark.parametrize(
-    'how',
-    [
-        'load_map',
-        pytest.param('load_map again', marks=pytest.mark.long),
-        pytest.param('configure', marks=pytest.mark.long),
-    ],
-)
-def test_node_after_a_signal_while_a_map_is_read_ends(robot, run, map_file, tmp_path, how):
-    """The file is on a disk that does not respond: reading it does not end."""
-    path, slow = tmp_path / 'slow.stavpr', tmp_path / 'slow.stavpr.slow'
-    shutil.copy(map_file, path)
-    if how == 'configure':
-        slow.touch()
-    process = run(slow=True, map_path=map_file if how == 'load_map' else path)
-    if how != 'configure':
-        robot.wait_for_node()
-        slow.touch()
-        futures = []
-
-        def loading():
-            return f'loading {path}' in robot.diagnostics['map'].message
-
-        with robot.request(futures, LoadMap, 'load_map', loading, path=str(path)):
-            assert not any(future.done() for future in futures)
-        answer = robot.ask(image_message(np.zeros((96, 128, 3), np.uint8), 1))  # meanwhile
-        assert answer.status == PlaceMatch.WARMING_UP
-    else:
-        robot.until_diagnosed('processing', DiagnosticStatus.OK, 'configuring')
-        robot.until_diagnosed('map', DiagnosticStatus.OK, f'loading {path}')
-        assert robot.state() == 'configuring'  # during the transition
-        assert not robot.transition('cleanup')
-        assert 'another is under way' in process.output()
+@pytest.mark.long
+def test_node_after_a_signal_during_its_configuration_ends(robot, run, slow_file):
+    Path(f'{slow_file}.slow').touch()
+    process = run(slow=True, map_path=slow_file)
+    robot.until_diagnosed('processing', DiagnosticStatus.OK, 'configuring')
+    robot.until_diagnosed('map', DiagnosticStatus.OK, f'loading {slow_file}')
+    assert robot.state() == 'configuring'  # during the transition
+    assert not robot.transition('cleanup')
+    assert 'another is under way' in process.output()
     assert ends_well(process, signal.SIGINT)
 
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recorded map is saved at the end, and no file of another map is overwritten."""
 
-import threading
-
 from pipelines import localizing, process, save, settings_of
 import pytest
 from stavpr_ros.mapping import load_map, open_map, save_map
@@ -170,23 +168,3 @@ def test_save_recorded_map_beside_one_saved_by_another_node_takes_a_numbered_nam
         '63 places written to ' + path[:-7] + '-2.stavpr'
     )
     assert (len(load_map(path)), len(load_map(tmp_path / 'route-2.stavpr'))) == (62, 63)
-
-
-def test_save_recorded_map_of_two_nodes_at_once_keeps_both(route, tmp_path):
-    path, results = tmp_path / 'route.stavpr', []
-    start = threading.Barrier(2)
-    nodes = [Pipeline(settings_of(), 'mapping') for _ in range(2)]
-    for node, images in zip(nodes, (route[:2], route[:3]), strict=True):
-        process(node, images)
-
-    def end(node):
-        start.wait()
-        results.append(at_the_end(node, path)[-1])
-
-    threads = [threading.Thread(target=end, args=(node,)) for node in nodes]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert [level for level, _ in results] == ['info', 'info']
-    assert {len(load_map(file)) for file in tmp_path.iterdir()} == {2, 3}

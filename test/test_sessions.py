@@ -8,15 +8,14 @@ from map_examples import example_map
 import map_reader
 import numpy as np
 import oracle
+from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError
-from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import (
     GrowingMap,
     load_map,
     merge_maps,
-    PlaceMap,
     save_map,
     select_places,
     select_session,
@@ -24,43 +23,26 @@ from stavpr_ros.mapping import (
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.place_filter import FilterSettings, PlaceFilter
 from stavpr_ros.recognition.same_places import with_same_places
-from stavpr_ros.recognition.sequence_search import ImageChange
 from stavpr_ros.recognition.sessions import layout_of
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
-W, D, LENGTH, PLACES = 7, 24, 10, 90
+LENGTH, PLACES = 10, 90
 LIVELY = FilterSettings(
     speeds=(0.0, 1.0, 2.5), levels=(-1.0, -2.0), keep_level=0.7, keep_speed=0.6, spread=0.15,
     leave=0.07, enter=0.2, start=0.6,
 )  # fmt: skip
 
 
-def features_of(strips, noise, seed):
-    strips = strips + noise * np.random.default_rng(seed).standard_normal(strips.shape)
-    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
-    weights = torch.full(strips.shape[:2], W**-0.5)
-    return LocalFeatures(
-        torch.from_numpy(strips).float(), weights, FeatureSettings('gradient', None, W)
-    )
-
-
 def route(seed):
-    """Return a route of PLACES places, each like its neighbors, (W, n, d)."""
-    strips = np.random.default_rng(seed).standard_normal((W, PLACES + 3, D))
-    return sum(strips[:, i : i + PLACES] for i in range(4))
-
-
-def drive_map(strips, seed, noise=0.6):
-    features = features_of(strips, noise, seed)
-    n = len(features)
-    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
+    return route_strips(seed, PLACES)
 
 
 @pytest.fixture(scope='module')
 def town():
     """Return two drives of a route and one of another."""
-    return [drive_map(route(0), 1), drive_map(route(0), 2), drive_map(route(5), 3)]
+    drives = (route(0), 1), (route(0), 2), (route(5), 3)
+    return [map_of(features_of(strips, 0.6, seed)) for strips, seed in drives]
 
 
 def recognizer(place_map, mode='robust'):
@@ -187,19 +169,6 @@ def test_same_place_in_another_session_is_no_candidate_beside(town, mode):
     rows, first = one.window_rows()
     assert (rows.shape, first) == ((LENGTH, len(related)), 0)
     assert np.isfinite(rows).all()
-
-
-def test_change_of_places_is_learned_within_sessions():
-    strips = np.concatenate([route(0), route(5)], axis=1)
-    n, split = strips.shape[1], PLACES
-    features = features_of(strips, 0, 0).strips
-    together = ImageChange(n, FilterSettings())
-    together.learn(features, (0, split))
-    parts = [ImageChange(split, FilterSettings()) for _ in range(2)]
-    parts[0].learn(features[:, :split])
-    parts[1].learn(features[:, split:])
-    expected = np.mean([part.curve for part in parts], axis=0)
-    np.testing.assert_allclose(together.curve, expected, rtol=1e-5)
 
 
 def test_related_places_are_saved(tmp_path):

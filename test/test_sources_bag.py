@@ -177,28 +177,25 @@ def test_bag_with_write_ahead_log_is_read_and_unchanged(tmp_path):
     database.close()
 
 
-@pytest.mark.parametrize('kind', ['sqlite3', 'mcap', 'ros1'])
+@pytest.fixture(params=['sqlite3', 'mcap', 'ros1'])
+def bag_file(tmp_path, request):
+    """Return the file of a bag with images on /raw."""
+    if request.param == 'ros1':
+        return write_mixed(tmp_path / 'mixed.bag', ros1=True)
+    write_bag(tmp_path / 'bag', '/raw', records(200), request.param)
+    return next(file for file in (tmp_path / 'bag').iterdir() if file.suffix != '.yaml')
+
+
 @pytest.mark.parametrize('keep', [0.0, 0.3, 0.99])
-def test_bag_cut_off_fails(tmp_path, kind, keep):
-    if kind == 'ros1':
-        file = write_mixed(tmp_path / 'mixed.bag', ros1=True)
-    else:
-        write_bag(tmp_path / 'bag', '/raw', records(200), kind)
-        file = next(file for file in (tmp_path / 'bag').iterdir() if file.suffix != '.yaml')
-    data = file.read_bytes()
+def test_bag_cut_off_fails(bag_file, keep):
+    file, data = bag_file, bag_file.read_bytes()
     file.write_bytes(data[: int(len(data) * keep)])
     with pytest.raises(SourceError, match=str(file)):
         list(open_source(file, '/raw'))
 
 
-@pytest.mark.parametrize('kind', ['sqlite3', 'mcap', 'ros1'])
-def test_bag_with_damaged_bytes_fails_or_reads(tmp_path, kind):
-    if kind == 'ros1':
-        file = write_mixed(tmp_path / 'mixed.bag', ros1=True)
-    else:
-        write_bag(tmp_path / 'bag', '/raw', records(), kind)
-        file = next(file for file in (tmp_path / 'bag').iterdir() if file.suffix != '.yaml')
-    data, rng = file.read_bytes(), np.random.default_rng(0)
+def test_bag_with_damaged_bytes_fails_or_reads(bag_file):
+    file, data, rng = bag_file, bag_file.read_bytes(), np.random.default_rng(0)
     outcomes = set()
     for _ in range(30):
         damaged = np.frombuffer(data, np.uint8).copy()
@@ -206,7 +203,7 @@ def test_bag_with_damaged_bytes_fails_or_reads(tmp_path, kind):
         damaged[at] = rng.integers(0, 256, 20)
         file.write_bytes(damaged.tobytes())
         try:
-            outcomes.add(len(list(open_source(file, '/raw'))))
+            outcomes.add(sum(1 for _ in open_source(file, '/raw')))
         except (SourceError, ImageError) as error:
             outcomes.add(type(error))
     assert SourceError in outcomes

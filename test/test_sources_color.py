@@ -43,17 +43,6 @@ def test_bayer_of_one_color_is_exact(encoding, height, width, color):
 
 
 @pytest.mark.parametrize('encoding', sorted(BAYER))
-@pytest.mark.parametrize(('height', 'width'), [(3, 5), (8, 9)])
-def test_bayer_of_ramp_is_exact(encoding, height, width):
-    y, x = np.mgrid[:height, :width]
-    scene = np.dstack([10 + 20 * x, 200 - 12 * x - 6 * y, 30 + 16 * y]).astype(np.uint8)
-    step, data = padded(mosaic(encoding, scene), 1)
-    image = decode_image(height, width, encoding, False, step, data)
-    inner = np.s_[1:-1, 1:-1]
-    np.testing.assert_array_equal(image[inner], scene[inner])
-
-
-@pytest.mark.parametrize('encoding', sorted(BAYER))
 def test_bayer_of_noise_is_bilinear(encoding):
     scene = np.random.default_rng(2).integers(0, 256, (8, 9, 3), np.uint8)
     step, data = padded(mosaic(encoding, scene), 0)

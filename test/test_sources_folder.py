@@ -98,9 +98,3 @@ def test_folder_with_names_not_utf8_is_read(tmp_path):
     (tmp_path / os.fsdecode(b'caf\xe9.png')).write_bytes(b'')
     with pytest.raises(ImageError, match=r'caf\ufffd\.png: 0 bytes'):
         list(open_source(tmp_path))
-
-
-def test_folder_of_rtabmap_is_read(data_folder):
-    source = open_source(data_folder / 'rtabmap_hallway_loop' / 'samples')
-    assert [file.name for file in source.files] == [f'{i}.jpg' for i in range(1, 85)]
-    assert next(iter(source)).image.shape == (384, 512, 3)

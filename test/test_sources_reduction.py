@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Large images are reduced while they are decoded; results stay those of whole images."""
 
-from itertools import islice
 from types import SimpleNamespace
 
 import cv2
@@ -10,13 +9,9 @@ import numpy as np
 from pipelines import settings_of
 import pytest
 from stavpr_ros.errors import ImageError
-from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map
-from stavpr_ros.pipeline import LoadedMap, Pipeline
-from stavpr_ros.sources import open_source
+from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.sources.encodings import decode_image, decode_message
 from stavpr_ros.sources.files import reduction
-from stavpr_ros.sources.frame import Frame
 
 LEAST = (224, 224)
 
@@ -132,30 +127,3 @@ def test_pipeline_reduces_large_images_to_what_is_needed(image, resize, changes,
     settings = settings_of(feature_settings=f'{{"resize": "{resize}"}}', **changes)
     pipeline = Pipeline(settings, 'mapping')
     assert pipeline.process(raw(image), 1).image.shape[0] == rows
-
-
-def test_pipeline_on_large_real_images_matches_as_on_whole_ones(data_folder, monkeypatch):
-    """Gardens Point at 1920x1080: equal statuses, places at most one apart."""
-
-    def traverse(name):
-        for frame in islice(open_source(data_folder / 'gardens_point' / name), 40):
-            large = cv2.resize(frame.image, (1920, 1080), interpolation=cv2.INTER_CUBIC)
-            yield Frame(large, frame.stamp, frame.identifier)
-
-    extractor = FeatureExtractor()
-    places = build_map(traverse('day_left'), extractor, progress=False)
-    query = [frame.image for frame in traverse('day_right')]
-
-    def matches(make):
-        pipeline = Pipeline(settings_of())
-        pipeline.change(loaded=LoadedMap('', places, extractor))
-        return [pipeline.process(make(image), (i + 1) * 10**9) for i, image in enumerate(query)]
-
-    reduced = matches(raw), matches(lambda image: compressed(image, '.jpg'))
-    monkeypatch.setattr(Pipeline, '_needed_size', lambda *_: None)
-    whole = matches(raw)
-    assert sum(match.accepted for match in whole) > 20
-    for matched in reduced:
-        assert [match.status for match in matched] == [match.status for match in whole]
-        places_of = np.array([[m.newest_index for m in found] for found in (matched, whole)])
-        assert np.abs(places_of[0] - places_of[1]).max() <= 1

@@ -6,7 +6,6 @@ import math
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-import numba
 import numpy as np
 import oracle
 import pytest
@@ -135,25 +134,6 @@ def test_adaptive_weight_of_even_number_of_strips_by_hand(row, places_away):
     assert aligned_pair(d, ADAPTIVE).weight == math.sqrt(1 + places_away)
 
 
-def cheapest_path(d, a, i=0, j=0):
-    """Return the smallest sum over every monotone path from (i, j) to the end, trying all."""
-    rows, columns = d.shape
-    if (i, j) == (rows - 1, columns - 1):
-        return 0.0
-    costs = []
-    for di, dj, weight in ((1, 1, a), (1, 0, 1.0), (0, 1, 1.0)):
-        if i + di < rows and j + dj < columns:
-            costs.append(weight * d[i + di, j + dj] + cheapest_path(d, a, i + di, j + dj))
-    return min(costs)
-
-
-@pytest.mark.parametrize('seed', range(3))
-def test_accumulated_distance_is_cheapest_of_all_paths(seed):
-    d = np.random.default_rng(seed).random((5, 5))
-    aligned = aligned_pair(d, ADAPTIVE)
-    assert aligned.accumulated == pytest.approx(d[0, 0] + cheapest_path(d, aligned.weight))
-
-
 # ------------------------------------------------ the band
 
 
@@ -238,19 +218,3 @@ def test_image_distances_equal_oracle(
 def test_image_distances_at_block_borders_equal_oracle(n, strategy):
     check(random_distances(n, 5, n, np.float32, 3), strategy)
     check(random_distances(n, 4, n, np.float64, 3), strategy, xi=3)
-
-
-def test_image_distances_do_not_depend_on_number_of_threads():
-    if numba.config.NUMBA_NUM_THREADS < 2:
-        pytest.skip('one processor only')
-    d = random_distances(3, 7, 3000, np.float32, 0)
-    before = numba.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 2):
-            numba.set_num_threads(threads)
-            results.append([image_distances(d, s) for s in (ADAPTIVE, VANILLA, WINDOW)])
-    finally:
-        numba.set_num_threads(before)
-    for alone, together in zip(*results, strict=True):
-        assert alone.tobytes() == together.tobytes()

@@ -3,14 +3,13 @@
 """Long standstills, in the map, of the query, and of a route: all their images count as one."""
 
 import numpy as np
+from places import features_of, map_of
 import pytest
-from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.features import FeatureSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.robust import change_weights, z_normalized
 from stavpr_ros.recognition.route_features import RouteFeatures
-import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 PLACES, STOP, STANDING, D = 160, 70, 400, 32
@@ -30,19 +29,10 @@ def with_stop(strips, at=STOP, images=STANDING):
     return strips[:, places], places
 
 
-def features_of(strips, seed=0):
-    strips = strips / np.linalg.norm(strips, axis=2, keepdims=True)
-    noise = np.random.default_rng(seed).standard_normal(strips.shape) * NOISE / D**0.5
-    strips = torch.from_numpy((strips + noise).astype(np.float32))
-    strips /= strips.norm(dim=2, keepdim=True)
-    return LocalFeatures(
-        strips, torch.ones(strips.shape[:2]), FeatureSettings('gradient', None, 7)
-    )
-
-
-def map_of(features):
-    n = len(features)
-    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
+def noisy(strips, seed=0):
+    """Return features of images of these places."""
+    norms = np.linalg.norm(strips, axis=2, keepdims=True)
+    return features_of(strips / norms, NOISE / D**0.5, seed)
 
 
 def matched(recognizer, features):
@@ -57,18 +47,18 @@ def robust():
 
 def test_unknown_route_is_not_matched_with_a_map_that_has_a_standstill():
     strips, places = with_stop(route(1))
-    place_map = map_of(features_of(strips))
+    place_map = map_of(noisy(strips))
     for seed in range(2, 6):
-        assert not matched(PlaceRecognizer(place_map, robust()), features_of(route(seed)))
-    found = matched(PlaceRecognizer(place_map, robust()), features_of(route(1), 9))
+        assert not matched(PlaceRecognizer(place_map, robust()), noisy(route(seed)))
+    found = matched(PlaceRecognizer(place_map, robust()), noisy(route(1), 9))
     assert len(found) > PLACES - 60
     assert all(abs(places[place] - image) <= 2 for image, place in found.items())
 
 
 def test_query_is_matched_during_a_long_standstill_and_after_it():
-    place_map = map_of(features_of(route(1)))
-    query, places = with_stop(route(1, light=1, strength=0.8), images=2000)
-    found = matched(PlaceRecognizer(place_map, robust()), features_of(query, 9))
+    place_map = map_of(noisy(route(1)))
+    query, places = with_stop(route(1, light=1, strength=0.8), images=1000)
+    found = matched(PlaceRecognizer(place_map, robust()), noisy(query, 9))
     assert len(found) > len(places) - 60
     assert all(abs(place - places[image]) <= 2 for image, place in found.items())
 
@@ -78,7 +68,7 @@ def test_route_with_a_standstill_is_closed_where_it_comes_back_alone():
     unknown = np.concatenate([route(seed) for seed in (2, 3)], axis=1)
     strips = np.concatenate([first, unknown, route(1)], axis=1)
     closer = LoopCloser(robust(), 30, FeatureSettings('gradient', None, 7))
-    found = {i: place for i, place in matched(closer, features_of(strips)).items() if i >= STOP}
+    found = {i: place for i, place in matched(closer, noisy(strips)).items() if i >= STOP}
     back = first.shape[1] + unknown.shape[1]
     assert min(found) >= back
     assert len(found) > PLACES - 60
@@ -88,7 +78,7 @@ def test_route_with_a_standstill_is_closed_where_it_comes_back_alone():
 @pytest.mark.parametrize('limit', [None, 300])
 def test_mean_of_a_route_counts_a_standstill_once(limit):
     strips, places = with_stop(route(1), images=150)
-    features = features_of(strips)
+    features = noisy(strips)
     held = RouteFeatures(features.settings, True, False, limit)
     for i in range(len(features)):
         if held.count == limit:

@@ -98,15 +98,6 @@ def setup(context):
         each.close()
 
 
-def test_subscription_without_a_publisher_is_reliable_at_first(setup):
-    test = setup()
-    assert test.subscription.choice == 'reliable, no publisher is known'
-    camera = test.publisher(RELIABLE)
-    test.until_chosen('reliable, every publisher offers it')
-    test.until_matched(camera)
-    assert test.refused == []
-
-
 def test_subscription_follows_publishers_that_come_and_go(setup):
     test = setup()
     first = test.publisher(BEST_EFFORT)
@@ -159,13 +150,6 @@ def test_overridden_reliability_takes_precedence(setup):
     test.until_matched(test.publisher(RELIABLE))
     assert test.subscription.choice == f'best effort, set by {OVERRIDE}'
     assert test.subscription.loss_remedy == f'remove {OVERRIDE}'
-
-
-def test_overridden_reliability_that_excludes_a_publisher_is_reported(setup):
-    test = setup(**{OVERRIDE: 'reliable'})
-    test.publisher(BEST_EFFORT)
-    test.until(lambda: test.refused == ['RELIABILITY'])
-    assert test.subscription.qos.reliability == RELIABLE
 
 
 @pytest.mark.parametrize('reliability', [RELIABLE, BEST_EFFORT])

@@ -3,9 +3,6 @@
 """Geometric verification: synthetic scenes from two viewpoints, blank images, real places."""
 
 import cv2
-from hypothesis import given
-from hypothesis import settings as hypothesis_settings
-from hypothesis import strategies as st
 import numpy as np
 import pytest
 from stavpr_ros.errors import InputError, SettingsError
@@ -107,37 +104,6 @@ def test_inliers_of_blank_image_are_zero(method):
             assert check.inliers(*pair) == 0
 
 
-@pytest.mark.parametrize('method', METHODS)
-@given(
-    shapes=st.tuples(*[st.integers(1, 90)] * 4), kind=st.integers(0, 3), seed=st.integers(0, 99)
-)
-@hypothesis_settings(max_examples=20)
-def test_inliers_of_any_image_are_not_negative(method, shapes, kind, seed):
-    """Any size, noise, stripes and repeated tiles, whose matches are degenerate."""
-    rng = np.random.default_rng(seed)
-    one, other = (rng.integers(0, 256, (*size, 3), np.uint8) for size in (shapes[:2], shapes[2:]))
-    if kind == 1:
-        one[:], other[:] = one[:, :1], other[:, :1]
-    if kind == 2:
-        one, other = np.tile(one[:8, :8], (6, 6, 1)), np.tile(one[:8, :8], (5, 9, 1))
-    if kind == 3:
-        other = one.copy()
-    assert (
-        GeometricVerifier(GeometricSettings(method, ratio=1.0, width=64)).inliers(one, other) >= 0
-    )
-
-
-def test_inliers_do_not_depend_on_image_size():
-    one = texture(0)
-    other = moved(one, VIEWS['shifted'])
-    check = GeometricVerifier()
-    counts = [
-        check.inliers(one, cv2.resize(other, size, interpolation=cv2.INTER_AREA))
-        for size in ((1280, 960), (640, 480), (192, 144))
-    ]
-    assert min(counts) > 60
-
-
 def test_inliers_after_query_memory_is_reused_are_of_new_query():
     check, buffer = GeometricVerifier(), texture(0)
     place = moved(texture(7), VIEWS['shifted'])
@@ -185,20 +151,13 @@ def thumbnail(image, width=192):
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-@pytest.mark.parametrize(
-    ('name', 'recall'), [('gardens_point', 0.7), ('corridor', 0.6), ('hallway', 0.85)]
-)
+@pytest.mark.parametrize(('name', 'recall'), [('gardens_point', 0.7), ('corridor', 0.6)])
 def test_verifies_separates_real_places(data_folder, name, recall):
     """Thumbnails, as a map keeps them; wrong places are at least twenty away."""
-    if name == 'hallway':
-        query = reference = images(data_folder / 'rtabmap_hallway_loop' / 'samples')[:80]
-        right = [(i, i - 40) for i in range(40, 80, 2)]
-        wrong = [(i, i - 20) for i in range(40, 60, 2)] + [(i, i - 60) for i in range(60, 80, 2)]
-    else:
-        folders = ('day_right', 'day_left') if name == 'gardens_point' else ('query', 'ref')
-        query, reference = (images(data_folder / name / folder) for folder in folders)
-        right = [(i, i) for i in range(0, len(query), 8)]
-        wrong = [(i, (i + 37) % len(query)) for i in range(0, len(query), 8)]
+    folders = ('day_right', 'day_left') if name == 'gardens_point' else ('query', 'ref')
+    query, reference = (images(data_folder / name / folder) for folder in folders)
+    right = [(i, i) for i in range(0, len(query), 8)]
+    wrong = [(i, (i + 37) % len(query)) for i in range(0, len(query), 8)]
     check = GeometricVerifier()
     verified = [
         np.mean([check.verifies(query[i], thumbnail(reference[j])) for i, j in pairs])

@@ -7,14 +7,11 @@ import oracle
 import pytest
 from stavpr_ros.alignment import SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
+from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.mapping import build_map, load_map, save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher, cut_cells
 from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.sources import open_source
-from stavpr_ros.sources.frame import Frame
 import torch
 
 SETTINGS = FeatureSettings('gradient', GradientSettings(), 5)
@@ -68,24 +65,6 @@ def test_vertical_distances_equal_oracle(n, strategy, xi):
     )
 
 
-def test_map_file_keeps_cells(route, tmp_path):
-    place_map = build_map(
-        [Frame(image, i, '') for i, image in enumerate(route[:8])],
-        FeatureExtractor(),
-        progress=False,
-    )
-    assert place_map.features.cells == (14, 2)
-    save_map(place_map, tmp_path / 'map')
-    loaded = load_map(tmp_path / 'map')
-    assert loaded.features.cells == (14, 2)
-    assert loaded.features[2:5].cells == (14, 2)
-    spatial = SpatialSettings(vertical=True)
-    distances = PlaceRecognizer(loaded, RecognizerSettings(1.0, spatial)).distances(
-        loaded.features
-    )
-    np.testing.assert_allclose(np.diag(distances), 0, atol=1e-5)
-
-
 def test_vertical_alignment_of_other_settings_is_rejected(small_map):
     spatial = SpatialSettings(vertical=True)
     with pytest.raises(InputError, match='without projection'):
@@ -94,27 +73,3 @@ def test_vertical_alignment_of_other_settings_is_rejected(small_map):
         SpatialSettings('none', vertical=True)
     with pytest.raises(SettingsError, match='cuda'):
         make_matcher(random_features(3), spatial, 'cuda', 'float32')
-
-
-def test_vertical_alignment_finds_places_from_other_height(data_folder):
-    """A third of every query image is cut off, at the top or at the bottom."""
-    frames = list(open_source(data_folder / 'gardens_point' / 'day_left'))[::4]
-    extractor = FeatureExtractor()
-    place_map = build_map(frames, extractor, progress=False)
-    higher = extractor.extract(
-        [np.ascontiguousarray(f.image[: -f.image.shape[0] // 3]) for f in frames]
-    )
-    lower = extractor.extract(
-        [np.ascontiguousarray(f.image[f.image.shape[0] // 3 :]) for f in frames]
-    )
-    right = {}
-    for vertical in (False, True):
-        recognizer = PlaceRecognizer(
-            place_map, RecognizerSettings(1.0, SpatialSettings(vertical=vertical))
-        )
-        found = [recognizer.distances(query).argmin(axis=1) for query in (higher, lower)]
-        right[vertical] = np.mean(
-            [np.abs(places - np.arange(len(frames))) <= 1 for places in found]
-        )
-    print(f'right places: {right[False]:.3f} without, {right[True]:.3f} with vertical alignment')
-    assert right[True] > right[False] + 0.05

@@ -13,7 +13,7 @@ from builtin_interfaces.msg import Time
 import cv2
 from nav_msgs.msg import Path
 import numpy as np
-from pipelines import LENGTH, localizing, message, process, recorded, SECOND
+from pipelines import LENGTH, localizing, process, recorded
 import pytest
 from robot import LATCHED
 from sensor_msgs.msg import CompressedImage, Image
@@ -206,16 +206,6 @@ def test_visualization_of_distances_states_the_places_after_an_eviction(localize
     values, numbers = np.frombuffer(message.data, np.float32).reshape(-1, 2).T
     assert (message.width, numbers[0]) == (512, 3000)
     np.testing.assert_array_equal(numbers, values + 3000)
-
-
-def test_window_rows_of_a_window_that_fills_are_those_of_its_images(map_file, route):
-    pipeline = localizing(map_file)
-    assert pipeline.window_distances()[0].shape == (0, 0)
-    for i in range(LENGTH + 2):
-        pipeline.process(message(route[i]), (i + 1) * SECOND)
-        rows, _ = pipeline.window_distances()
-        assert rows.shape == (min(i + 1, LENGTH), 60)
-        np.testing.assert_array_equal(rows[-1], pipeline._operation.recognizer.newest_row())
 
 
 def test_least_of_each_part_by_hand():

@@ -47,21 +47,8 @@ def without_header(paths: list[Path]) -> list[Path]:
     return missing
 
 
-def test_python_files_finds_package_tests_and_executables():
-    found = {path.relative_to(ROOT).as_posix() for path in python_files()}
-    assert {'setup.py', 'scripts/node', 'stavpr_ros/__init__.py', 'test/test_linters.py'} <= found
-    assert not {name for name in found if name.split('/')[0] in NOT_OURS | {'.venv'}}
-
-
 def test_python_files_have_license_header():
     assert [str(path.relative_to(ROOT)) for path in without_header(list(python_files()))] == []
-
-
-def test_without_header_names_file(tmp_path):
-    good, bad = tmp_path / 'good.py', tmp_path / 'bad.py'
-    good.write_text('#!/usr/bin/env python3\n' + '\n'.join(HEADER))
-    bad.write_text('# Copyright 2026\n')
-    assert without_header([good, bad]) == [bad]
 
 
 @pytest.mark.long  # ruff checks nearly the same rules in `make lint`

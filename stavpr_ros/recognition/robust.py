@@ -71,23 +71,11 @@ class RobustOptions:
 
         :raises SettingsError: no option of that name.
         """
-        return self._with(names, False)
-
-    @staticmethod
-    def only(*names: str) -> 'RobustOptions':
-        """
-        Return some options alone.
-
-        :raises SettingsError: no option of that name.
-        """
-        return PAPER._with(names, True)
-
-    def _with(self, names: tuple[str, ...], on: bool) -> 'RobustOptions':
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         for name in names:
             if name not in values:
                 raise SettingsError(f'option {name!r} is unknown: take one of {", ".join(values)}')
-            values[name] = on
+            values[name] = False
         return RobustOptions(**values)
 
 
