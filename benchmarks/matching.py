@@ -59,6 +59,7 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
         feature_stages,
         memory_problem,
         paper_stages,
+        process_stages,
         robust_stages,
     )
     import torch
@@ -81,6 +82,8 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
                 problem = f'out of memory: {str(error).splitlines()[0]}'
             if problem:
                 run.skip('frame', n, d, problem)
+    for n in options.sizes:
+        process_stages(run, n, 'int8' if n >= CITY else 'float32', options.seed)
     for n in (size for size in options.sizes if size < CITY):
         paper_stages(run, n, options.seed)
         if run.device == 'cuda':

@@ -75,13 +75,12 @@ def recognize(
     own = [drive.images[:, 0] == lap for lap in range(drive.images[-1, 0] + 1)]
     laps = np.array([0, *np.cumsum([drive.images[lap, 1].max() + 1 for lap in own])])
     pipeline = Pipeline(PipelineSettings(backend='cpu', exclude_places=exclude), 'loop_closure')
-    pipeline.camera = camera
     odometry, found = planar_poses(drive.odometry), []
     image_of = {int(stamp): i for i, stamp in enumerate(drive.stamps)}
     route: Any = None  # pairs without their map can be kept in a file
     for i, (lap, number) in enumerate(drive.images.tolist()):
         record = ImageRecord.of_image(images[laps[lap] + number], int(drive.stamps[i]))
-        match = pipeline.process(record, int(drive.stamps[i]), odometry[i])
+        match = pipeline.process(record, int(drive.stamps[i]), odometry[i], camera)
         for each in (match, match.late):
             pair = pipeline.matched_pair(each) if each is not None else None
             if pair is None or each is None:

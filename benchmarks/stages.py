@@ -3,6 +3,7 @@
 """The stages of matching, measured on windows of distances and on maps of features."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 import gc
 from itertools import cycle
@@ -26,14 +27,17 @@ from stavpr_ros.alignment.lm_dtw import (
     trace_sequence,
 )
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
-from stavpr_ros.features import LocalFeatures
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.pipeline import Pipeline, PipelineSettings
+from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.int8_features import Int8Features
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.place_filter import FilterSettings, PlaceFilter
 from stavpr_ros.recognition.robust import MeanCentering, z_normalized
 from stavpr_ros.recognition.sequence_search import SequenceBuffer
+from stavpr_ros.sources.frame import ImageRecord
 from timing import measure, synchronizer, timed
 import torch
 
@@ -44,6 +48,7 @@ STRIPS = 7
 FRAMES = 20  # of the distance matrix
 MATRIX_PLACES = 20_000  # most places of the distance matrix
 LIBROSA_STARTS, ENDS_CHECKED = 500, 3
+PROJECTED, DRIVEN = 64, 1000  # dimensions, and images of the drive, of `process`
 CHECKED = 2000  # places among which a peer must find the nearest one
 Call = Callable[[], Any]
 
@@ -270,6 +275,47 @@ def city_stages(run: Run, n: int, d: int, seed: int) -> None:
     call = partial(stage.distances, *arguments)
     peer = Peer('exact', timed(partial(exact.distances, *arguments)), 'all places exactly')
     run.measure('first_stage', (n, d), call, reduced, [peer], 'int8', 'robust')
+
+
+def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
+    """
+    Measure ``Pipeline.process`` of images that match, with what their edges need.
+
+    The peer processes images of the same drive that do not match, as no probability is enough.
+    """
+    if n < 2 * DRIVEN:
+        return run.skip('process', n, PROJECTED, f'fewer than {2 * DRIVEN:,} places')
+    extractor, d = FeatureExtractor(projection=PROJECTED), PROJECTED
+    images = np.random.default_rng(seed).integers(0, 256, (DRIVEN, 48, 64, 3), np.uint8)
+    driven, strips = extractor.extract(list(images)), make_features(n, d, STRIPS, 'cpu', seed)
+    strips = strips.strips.mul_(d**0.5 * driven.strips.std(dim=1, keepdim=True))
+    strips.add_(driven.strips.mean(dim=1, keepdim=True))
+    strips.div_(torch.linalg.vector_norm(strips, dim=2, keepdim=True))
+    strips[:, (n - DRIVEN) // 2 :][:, :DRIVEN] = driven.strips
+    features = LocalFeatures(strips, torch.full((STRIPS, n), STRIPS**-0.5), extractor.settings)
+    poses = np.zeros((n, 7))
+    poses[:, 0], poses[:, 6] = np.arange(n), 1
+    names = ('',) * n
+    place_map = PlaceMap(features, extractor.projection, np.zeros(n, np.int64), names, poses)
+    pipeline = Pipeline(PipelineSettings(backend=run.device, precision=precision))
+    pipeline.change(loaded=LoadedMap('', place_map, extractor))
+    following, accepted = cycle(range(DRIVEN)), {0.5: 0, 1.0: 0}
+
+    def process(min_probability: float) -> None:
+        limit = min(min_probability, 1 - 1e-9)
+        pipeline.change(replace(pipeline.settings, min_probability=limit))
+        i = next(following)
+        match = pipeline.process(ImageRecord.of_image(images[i], 0), i, poses[i])
+        pipeline.matched_pair(match)
+        accepted[min_probability] += match.accepted
+
+    for _ in range(2 * SEQUENCE.length):
+        process(0.5)
+    job = timed(partial(process, 1.0), synchronizer(run.device))
+    peer = Peer('without matches', job, 'the same, but no image matches', partial=True)
+    works = frame_works(Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k), 'robust', precision)
+    run.measure('process', (n, d), partial(process, 0.5), works, [peer], precision, 'robust')
+    assert accepted[0.5] > 0 == accepted[1.0]
 
 
 def products(

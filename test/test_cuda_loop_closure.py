@@ -11,6 +11,7 @@ from stavpr_ros.recognition import RecognizerSettings, route_features, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.place_filter import PlaceFilter
 from stavpr_ros.recognition.robust import FilterSettings, z_normalized
+from stavpr_ros.recognition.sequence_search import SequenceBuffer
 import torch
 
 W, D, LAP, LENGTH, EXCLUDE = 3, 16, 20, 6, 8
@@ -136,6 +137,10 @@ def test_loop_closer_on_device_equals_that_of_the_cpu(
     assert late or precision != 'float32'
     assert matched > 10
     np.testing.assert_allclose(cuda.features().strips, cpu.features().strips, atol=1e-5)
+    monkeypatch.setattr(SequenceBuffer, 'rows', None)  # a copy of the whole window
+    places, row = np.arange(cuda.first, cuda.first + 5), cuda.newest_row()[:5]
+    np.testing.assert_array_equal(cuda.window_columns(places)[-1], row)
+    np.testing.assert_allclose(cuda.window_columns(places), cpu.window_columns(places), atol=0.02)
     cuda.reset()
     assert cuda.update(features[:1]).status is Status.WARMING_UP
 

@@ -9,8 +9,9 @@ import pytest
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo
 from stavpr_msgs.msg import LoopClosure, PlaceMatch, RelativePose
-from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.camera import FORWARD
+from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.ros.camera import camera_of, mount_of
@@ -47,11 +48,6 @@ def test_camera_of_binned_and_cut_out_images():
     camera = camera_of(message, FORWARD)
     assert (camera.width, camera.height, camera.focal) == (200, 150, (150.0, 150.0))
     assert camera.center == ((320 - 100) / 2 - 0.5, (240 - 40) / 2 - 0.5)
-
-
-def test_camera_of_a_camera_that_is_not_calibrated_is_rejected():
-    with pytest.raises(InputError, match='calibrate the camera'):
-        camera_of(CameraInfo(width=640, height=480), FORWARD)
 
 
 def test_sources_equal_the_constants_of_the_message():
@@ -108,7 +104,8 @@ def test_closures_without_camera_info_are_aligned(closing):
     assert closures[0].relative_pose.is_independent
 
 
-def test_edges_that_are_off_leave_closures_as_they_were(closing):
+def test_edges_that_are_off_leave_closures_as_they_were(closing, monkeypatch):
+    monkeypatch.setattr(LoopCloser, 'window_columns', lambda *_: pytest.fail('copied'))
     matches, closures = closing(relative_pose='none')
     assert len(matches) == len(closures)
     for message in (*matches, *closures):

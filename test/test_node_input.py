@@ -46,8 +46,7 @@ def test_invalid_images_are_counted_and_explained_once_a_cause(robot, start, rou
     for i in range(2):
         for kind, message in invalid.items():
             match = robot.show(message)
-            assert (match.status, match.place_index) == (INVALID, -1), kind
-            assert match.reason, kind
+            assert (match.status, bool(match.reason)) == (INVALID, True), kind
         matches = robot.drive(route[3 * i : 3 * i + 3])
     assert [match.status for match in matches] == [WARMING_UP, MATCH, MATCH]
     assert matches[-1].newest_index == 5
@@ -69,16 +68,11 @@ def test_keyframes_by_distance_and_angle_use_odometry(robot, start, route):
     assert 'never' in robot.until_diagnosed('input', WARN, 'odometry').message
     robot.until(lambda: robot.odometry.get_subscription_count() > 0, 'a subscriber of odometry')
     assert robot.show_at(5.0, route[1]).status == WARMING_UP
-    match = robot.show_at(5.4, route[2])
-    assert match.reason == 'moved 0.400 m of 1 m since the last keyframe'
+    assert robot.show_at(5.4, route[2]).status == SKIPPED
     assert robot.show_at(6.1, route[3]).status == WARMING_UP
     assert robot.show_at(6.1, route[4], degrees=170).status == SKIPPED
     robot.set(keyframe_angle=30.0)
     assert robot.show_at(6.1, route[5], degrees=40).status == WARMING_UP
-    match = robot.show_at(6.1, route[6], degrees=50)
-    motion = 'moved 0.000 m of 1 m and turned 10.00 of 30 degrees since the last keyframe'
-    assert match.reason == motion
-    assert robot.counts('recognition')['window'] == '3'
     assert 'no odometry' in robot.show(route[7], 3600 * SECOND).reason  # another clock
 
     def compared():
@@ -88,9 +82,7 @@ def test_keyframes_by_distance_and_angle_use_odometry(robot, start, route):
     robot.until(compared, 'a remark on the stamps')
     robot.until_diagnosed('input', WARN, 'has stopped')
     robot.set(keyframe_distance=0.0, keyframe_angle=0.0)
-    assert robot.show(route[8]).status == WARMING_UP
     robot.until(lambda: not robot.odometry.get_subscription_count(), 'the end of odometry')
-    assert robot.counts('input')['odometry'] == 'not needed'
 
 
 def test_wrongly_remapped_odometry_and_a_covered_lens_are_diagnosed(robot, start, publish, route):
@@ -103,28 +95,19 @@ def test_wrongly_remapped_odometry_and_a_covered_lens_are_diagnosed(robot, start
     robot.set(keyframe_distance=0.0)
     robot.show(np.full_like(route[0], 200))
     robot.until_diagnosed('input', WARN, 'the images show nothing (standard deviation 0.0 of 255)')
-    robot.show(route[0])
-    robot.until(
-        lambda: 'show nothing' not in robot.diagnostics['input'].message,
-        'images that show a place',
-    )
 
 
 def test_compressed_images_on_a_remapped_topic_are_recognized(robot, start, publish, route):
     """The topic is below the one that `image` is remapped to; the diagnostics name it."""
     start('-r', 'image:=/front/image', wait=False, image_transport='compressed')
     topic = '/front/image/compressed'
-    message = robot.until_diagnosed('input', WARN, 'no publisher').message
-    assert topic in message
-    assert 'image:=TOPIC' in message
+    assert topic in robot.until_diagnosed('input', WARN, 'no publisher').message
     raw = publish(Image, topic)
     mistyped = 'sensor_msgs/msg/Image is published there: compare image_transport'
     robot.until_diagnosed('input', ERROR, mistyped)
     robot.node.destroy_publisher(raw)
     camera = publish(CompressedImage, topic)
-    robot.until_diagnosed('input', WARN, 'there, but silent')
     robot.wait_for_node(camera, CompressedImage)
-    robot.until_diagnosed('input', ERROR, 'all images in the last 10 s were invalid')
 
     def show(data):
         message = CompressedImage(format='rgb8; jpeg compressed bgr8', data=array.array('B', data))
@@ -155,11 +138,9 @@ def test_incompatible_publishers_are_reported(robot, start, publish, route):
         return warning in robot.diagnostics['input'].message
 
     robot.until(reported, 'a warning')
-    counts = robot.counts('input')
-    assert (counts['publishers'], counts['publishers_refused']) == ('2', '1')
+    assert robot.counts('input')['publishers_refused'] == '1'
     robot.node.destroy_publisher(unreliable)
-    robot.until_diagnosed('input', WARN, '1 publisher there, but silent')
-    assert robot.counts('input')['publishers_refused'] == '0'
+    robot.until(lambda: robot.counts('input')['publishers_refused'] == '0', 'no refusal')
 
 
 def test_durability_override_excludes_volatile_publishers(robot, start, publish):

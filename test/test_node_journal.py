@@ -87,21 +87,15 @@ def test_node_whose_last_save_fails_keeps_the_journal_and_reports_failure(
     assert len(load_map(path)) == 5
 
 
-def test_node_that_saves_deletes_the_journal(make, route, tmp_path):
-    path = tmp_path / 'route.stavpr'
-    node = make(save_path=str(path))
+@pytest.mark.parametrize('operation', ['mapping', 'loop_closure'])
+def test_node_that_ends_without_a_loss_deletes_the_journal(make, route, tmp_path, operation):
+    """Its map is saved, or its route is not to be saved."""
+    files = ['route.stavpr'] if operation == 'mapping' else []
+    node = make(operation=operation, save_path=''.join(str(tmp_path / name) for name in files))
     record(node, route[:5])
-    assert journals(path)
+    assert [name for name in os.listdir(tmp_path) if name.endswith('.journal')]
     assert not end(node)
-    assert os.listdir(tmp_path) == ['route.stavpr']
-
-
-def test_node_with_a_route_that_is_not_to_be_saved_deletes_its_journal(make, route, tmp_path):
-    node = make(operation='loop_closure')
-    record(node, route[:5])
-    assert journals(tmp_path / 'recorded.stavpr')
-    assert not end(node)
-    assert os.listdir(tmp_path) == []
+    assert os.listdir(tmp_path) == files
 
 
 def test_node_that_cannot_write_a_journal_records_all_the_same(make, route, tmp_path):

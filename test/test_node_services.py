@@ -91,21 +91,16 @@ def test_services_and_parameters_name_files_in_the_maps_folder_only(
             assert f'{path!r} is no file in the maps folder {folder}' in message
         with pytest.raises(AssertionError, match=r'save_path: .* is no file in the maps folder'):
             robot.set(save_path=path)
-    assert secret.read_text() == 'export PATH\n'
+    (folder / '.bashrc').write_text('export PATH\n')
+    message = robot.refuses(SaveMap, 'save_map', path='.bashrc', overwrite=True)
+    assert 'exists and is no map: it is never replaced' in message
+    for file in (secret, folder / '.bashrc'):
+        assert file.read_text() == 'export PATH\n'
     robot.set(save_path='late.stavpr')
     values = robot.call(GetParameters, 'get_parameters', names=['save_path']).values
     assert values[0].string_value == str(folder / 'late.stavpr')
     robot.set(save_path=str(folder / 'late.stavpr'))
     robot.set(save_path='')
-
-
-def test_save_map_over_a_file_that_is_no_map_is_refused(robot, start, tmp_path):
-    """Also where the user keeps maps in the home folder."""
-    start(maps_folder=str(tmp_path))
-    (tmp_path / '.bashrc').write_text('export PATH\n')
-    message = robot.refuses(SaveMap, 'save_map', path='.bashrc', overwrite=True)
-    assert 'exists and is no map: it is never replaced' in message
-    assert (tmp_path / '.bashrc').read_text() == 'export PATH\n'
 
 
 def test_services_without_a_map_return_the_reason(robot, start, route, map_file, tmp_path):
@@ -125,10 +120,7 @@ def test_services_without_a_map_return_the_reason(robot, start, route, map_file,
         assert words in robot.refuses(kind, name, **fields)
         robot.until_logged(f'{name} failed: ')
     match = robot.call(Relocalize, 'relocalize').match
-    indices = 'place_index', 'newest_index', 'sequence_middle', 'second_best_index', 'inliers'
-    assert {getattr(match, name) for name in indices} == {-1}
-    assert (match.status, 'no map' in match.reason) == (PlaceMatch.NOT_READY, True)
-    assert match.robot_id == 'r1'
+    assert (match.status, match.place_index, match.robot_id) == (PlaceMatch.NOT_READY, -1, 'r1')
     logged = [line for line in robot.log if 'relocalize failed' in line]
     assert len(logged) == 1, logged
     assert robot.does(Trigger, 'reset').message
@@ -160,14 +152,9 @@ def test_node_that_maps_with_odometry_saves_and_publishes_poses(robot, start, ro
     assert 'recognizes no places' in robot.refuses(Relocalize, 'relocalize')
     assert 'no places' in robot.refuses(SaveMap, 'save_map', path=str(path))
     matches = [robot.show_at(x, image) for x, image in enumerate(route[:40])]
-    assert {(match.status, match.reason, match.place_index) for match in matches} == {
-        (PlaceMatch.MAPPED, '', -1)
-    }
+    assert {match.status for match in matches} == {PlaceMatch.MAPPED}
     assert [match.newest_index for match in matches] == list(range(40))
-    info = robot.until_map(state='growing', places=40)
-    assert (info.operation, info.features) == ('mapping', 'gradient')
-    assert info.has_poses
-    assert info.has_thumbnails
+    robot.until_map(state='growing', places=40, has_poses=True)
     assert robot.does(SaveMap, 'save_map', path=str(path)).places == 40
     assert 'exists already' in robot.refuses(SaveMap, 'save_map', path=str(path))
     assert robot.does(SaveMap, 'save_map', overwrite=True).places == 40  # to its own file
@@ -185,11 +172,8 @@ def test_node_that_maps_with_odometry_saves_and_publishes_poses(robot, start, ro
     matches = robot.drive(route[10:20])[LENGTH - 1 :]
     assert [match.newest_index for match in matches] == list(range(14, 20))
     robot.until(lambda: len(poses) == 6, 'a pose for each match')
-    for pose, match in zip(poses, matches, strict=True):
-        assert (pose.header.stamp, pose.header.frame_id) == (match.header.stamp, 'map')
-        position, orientation = pose.pose.pose.position, pose.pose.pose.orientation
-        assert (position.x, orientation.w) == (match.newest_index, 1)
-        assert pose.pose.covariance[0] == pytest.approx(2.0)  # two places before, two after
+    assert {pose.header.frame_id for pose in poses} == {'map'}
+    assert [pose.pose.pose.position.x for pose in poses] == list(range(14, 20))
 
 
 def test_load_map_of_a_damaged_file_keeps_the_map_and_the_window(
@@ -197,18 +181,14 @@ def test_load_map_of_a_damaged_file_keeps_the_map_and_the_window(
 ):
     start()
     matches = robot.drive(route[:6])
-    infos = len(robot.infos)
     with while_loading(robot, tmp_path / 'slow.stavpr', monkeypatch):
-        robot.until_map(state='loading', places=60)
-        matches += robot.drive(route[6:12])
-    matches += robot.drive(route[12:14])
-    assert [info.state for info in robot.infos[infos:]] == ['loading', 'loaded']
+        matches += robot.drive(route[6:14])
     damaged = tmp_path / 'damaged.stavpr'
     damaged.write_bytes(b'PK' + bytes(1000))
     assert 'damaged.stavpr' in robot.refuses(LoadMap, 'load_map', path=str(damaged))
     matches += robot.drive(route[14:15])
     assert [match.newest_index for match in matches[4:]] == list(range(4, 15))
-    assert robot.does(Trigger, 'reset').message
+    robot.does(Trigger, 'reset')
     assert robot.drive(route[:1])[0].status == PlaceMatch.WARMING_UP
 
 
@@ -223,12 +203,9 @@ def test_relocalize_returns_the_last_match_and_candidates(robot, start, route):
         response = robot.does(Relocalize, 'relocalize', count=count)
         assert str(response.match) == str(match)  # NaN equals NaN
         assert len(response.candidates) == expected
-        best = response.candidates[0]
-        assert (best.place_index, best.distance) == (match.place_index, match.distance)
-        assert best.place_id == f'place {best.place_index}'
-    strange = robot.drive(
-        [np.random.default_rng(1).integers(0, 256, (96, 128, 3), np.uint8)] * LENGTH
-    )[-1]
+        assert response.candidates[0].place_index == match.place_index
+    noise = np.random.default_rng(1).integers(0, 256, (96, 128, 3), np.uint8)
+    strange = robot.drive([noise] * LENGTH)[-1]
     assert strange.status == PlaceMatch.NO_MATCH
     response = robot.does(Relocalize, 'relocalize')  # though there is no match
     assert (str(response.match), response.message) == (str(strange), strange.reason)

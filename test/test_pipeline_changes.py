@@ -3,8 +3,6 @@
 """The pipeline in operation: live settings, keyframes, invalid images, resets, saving."""
 
 from dataclasses import replace
-import itertools
-import os
 
 import cv2
 import numpy as np
@@ -12,7 +10,6 @@ from pipelines import (
     LENGTH,
     localizing,
     message,
-    MIN_PROBABILITY,
     process,
     recorded,
     save,
@@ -22,7 +19,7 @@ from pipelines import (
     statuses,
 )
 import pytest
-from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, OutputError
+from stavpr_ros.errors import ImageError, InputError, OutputError
 from stavpr_ros.mapping import load_map, save_map, thumbnail_of
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.pipeline import OPERATIONS, Pipeline
@@ -52,8 +49,7 @@ def test_min_probability_and_candidates_change_with_a_full_window(operation, rou
     match = process(pipeline, route[8:9], first=8)[0]
     assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 8, 0.9)
     assert len(match.candidates) == 1
-    pipeline.list_candidates = False
-    assert process(pipeline, route[9:10], first=9)[0].candidates == ()
+    assert pipeline.process(message(route[9]), 10, list_candidates=False).candidates == ()
 
 
 def test_live_settings_keep_a_growing_map_and_the_last_keyframe(route):
@@ -71,26 +67,18 @@ def test_live_settings_keep_a_growing_map_and_the_last_keyframe(route):
 
 def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
     pipeline = localizing(map_file, keyframes=KeyframeSettings(change=0.01))
-    still = [route[0]] * 3 + route[1:LENGTH]
-    matches = process(pipeline, still, poses=True)
-    assert statuses(matches) == [
-        Status.WARMING_UP, Status.SKIPPED, Status.SKIPPED, *[Status.WARMING_UP] * 3, Status.MATCH
-    ]  # fmt: skip
-    assert matches[1].cause == 'not a keyframe'
-    assert {match.threshold for match in matches} == {1 - MIN_PROBABILITY}
-    assert 'differs by 0.0000' in matches[1].reason
+    matches = process(pipeline, [route[0]] * 3 + route[1:LENGTH], poses=True)
+    skipped = [match.cause == 'not a keyframe' for match in matches]
+    assert skipped == [False, True, True, *[False] * 4]
     assert matches[-1].window_stamps == tuple(stamp * SECOND for stamp in (1, 4, 5, 6, 7))
     pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(interval=2.0)))
     matches = process(pipeline, route[5:7], first=7)
     assert statuses(matches) == [Status.SKIPPED, Status.MATCH]
-    assert 'less than 2 s' in matches[0].reason
     pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(distance=3.0)))
-    matches = process(pipeline, route[7:9], first=9)
-    assert matches[0].cause == matches[1].cause == 'no odometry'
+    assert process(pipeline, route[7:8], first=9)[0].cause == 'no odometry'
     # the last keyframe has no pose, so that the next image is one; then it is every third meter
     matches = process(pipeline, route[8:14], first=10, poses=True)
     assert [match.status is Status.SKIPPED for match in matches] == [False, True, True] * 2
-    assert 'of 3 m' in matches[1].reason
 
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
@@ -106,15 +94,12 @@ def test_geometric_check_in_mode_paper_accepts_and_rejects(operation, route):
     thumbnail = pipeline.places.thumbnail(7)
     found = GeometricVerifier(check).inliers(thumbnail_of(route[7]), thumbnail)
     assert accepted.inliers == found >= 100
-    for more, status in ((0, Status.MATCH), (1, Status.NO_MATCH)):  # the same images again
-        pipeline.reset()
-        process(pipeline, route[: CERTAIN + 2])
-        just = replace(check, min_inliers=accepted.inliers + more)
-        pipeline.change(replace(pipeline.settings, geometric=just))
-        match = process(pipeline, route[9:10], first=9)[0]
-        assert (match.status, match.inliers) == (status, accepted.inliers)
-    assert (match.place_index, match.sequence.middle % 30) == (-1, 7)
-    assert f'{match.inliers} inliers are fewer than {match.inliers + 1}' in match.reason
+    pipeline.reset()
+    process(pipeline, route[: CERTAIN + 2])  # the same images again
+    pipeline.change(replace(pipeline.settings, geometric=replace(check, min_inliers=found + 1)))
+    match = process(pipeline, route[9:10], first=9)[0]
+    assert (match.status, match.inliers, match.place_index) == (Status.NO_MATCH, found, -1)
+    assert f'{found} inliers are fewer than {found + 1}' in match.reason
     assert match.candidates[0].place == match.sequence.middle
     pipeline.change(replace(pipeline.settings, geometric=None))
     assert statuses(process(pipeline, route[10:11], first=10)) == [Status.MATCH]
@@ -141,12 +126,9 @@ def test_geometric_check_in_mode_robust_weighs_doubtful_matches(map_file, route,
     assert match.sequence.middle == plain.sequence.middle == match.candidates[0].place
 
 
-@pytest.mark.parametrize(
-    'mode', [{}, {'mode': 'paper', 'threshold': 1.0}], ids=['robust', 'paper']
-)
-def test_geometric_check_without_thumbnails_changes_nothing(small_map, route, tmp_path, mode):
+def test_geometric_check_without_thumbnails_changes_nothing(small_map, route, tmp_path):
     save_map(replace(small_map, thumbnails=()), tmp_path / 'blind.stavpr')
-    pipeline = localizing(str(tmp_path / 'blind.stavpr'), geometric=GeometricSettings(), **mode)
+    pipeline = localizing(str(tmp_path / 'blind.stavpr'), geometric=GeometricSettings())
     match = process(pipeline, route[:CERTAIN])[-1]
     assert (match.status, match.inliers) == (Status.MATCH, -1)
 
@@ -187,8 +169,6 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
         extract.error = ImageError('not finite', kind='features')
         broken = pipeline.process(message(image), i)
         assert (broken.cause, broken.reason) == ('invalid: features', 'not finite')
-        extract.error = FeatureMismatchError('another kind')
-        assert pipeline.process(message(image), i).cause == 'invalid: FeatureMismatchError'
         extract.error = None
         if operation != 'localization':
             thumbnail.error = InputError('no JPEG')
@@ -224,27 +204,17 @@ def test_reset_empties_the_window_and_keeps_the_places(operation, route):
 
 
 def test_relocalize_returns_the_match_of_the_window(map_file, route):
-    pipeline = Pipeline(settings_of())
-    with pytest.raises(InputError, match='map_path'):
-        pipeline.relocalize(3)
-    pipeline.change(operation='mapping')
-    with pytest.raises(InputError, match='mapping recognizes no places'):
-        pipeline.relocalize(3)
     pipeline = localizing(map_file, candidates=2)
     for i in range(LENGTH):
         with pytest.raises(InputError, match=f'{i} of 5 images in the window'):
             pipeline.relocalize(3)
         last = process(pipeline, route[i : i + 1], first=i)[0]
+    pipeline.process(message(np.zeros((0, 0, 3), np.uint8)), 0)  # invalid: the window is unchanged
     match = pipeline.relocalize(4)
     assert (match.status, match.sequence) == (Status.MATCH, last.sequence)
     assert match.window_stamps == last.window_stamps
-    assert len(match.candidates) == 4
-    assert match.candidates[:2] == last.candidates
-    pairs = itertools.combinations(match.candidates, 2)
-    assert min(abs(a.place - b.place) for a, b in pairs) > 5
+    assert (len(match.candidates), match.candidates[:2]) == (4, last.candidates)
     assert pipeline.relocalize(0).candidates == ()
-    pipeline.process(message(np.zeros((0, 0, 3), np.uint8)), 0)  # invalid: the window is unchanged
-    assert pipeline.relocalize(4).candidates == match.candidates
     pipeline.reset()
     with pytest.raises(InputError, match='0 of 5'):
         pipeline.relocalize(3)
@@ -264,29 +234,16 @@ def test_saving_nothing_is_an_error(operation, words, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_saving_is_atomic_and_overwrites_on_request_only(route, tmp_path, monkeypatch):
+def test_saving_that_fails_leaves_places_unsaved_and_the_file_unchanged(route, tmp_path):
     path = tmp_path / 'recorded.stavpr'
     pipeline = Pipeline(settings_of(), 'mapping')
     process(pipeline, route[:3])
     with pytest.raises(OutputError, match='make it first'):
         save(pipeline, tmp_path / 'missing' / 'recorded.stavpr')
     assert (save(pipeline, path), pipeline.path, pipeline.unsaved) == (3, str(path), 0)
-    assert stamps_of(load_map(path)) == [1, 2, 3]
     process(pipeline, route[3:4], first=3)
     with pytest.raises(OutputError, match='exists already'):
         save(pipeline, path)
-    assert pipeline.unsaved == 1
-    content = path.read_bytes()
-
-    def fail(*arguments):
-        raise OSError('the disk is full')
-
-    with monkeypatch.context() as disk:
-        disk.setattr(os, 'replace', fail)
-        with pytest.raises(OutputError):
-            save(pipeline, path, overwrite=True)
-    assert (path.read_bytes(), pipeline.unsaved) == (content, 1)
-    assert [file.name for file in tmp_path.iterdir()] == ['recorded.stavpr']
+    assert (stamps_of(load_map(path)), pipeline.unsaved) == ([1, 2, 3], 1)
     assert save(pipeline, path, overwrite=True) == 4
     assert stamps_of(load_map(path)) == [1, 2, 3, 4]
-    assert process(pipeline, route[4:5], first=4)[0].image_index == 4

@@ -84,14 +84,8 @@ def test_recognizer_on_empty_map_never_matches(small_map, mode):
 
 @pytest.mark.parametrize('places', [1, 4])
 def test_recognizer_on_map_shorter_than_window_matches(small_map, places):
-    short = PlaceMap(
-        small_map.features[:places],
-        small_map.projection,
-        small_map.stamps[:places],
-        small_map.ids[:places],
-        None,
-        small_map.thumbnails[:places],
-    )
+    stamps, ids = small_map.stamps[:places], small_map.ids[:places]
+    short = PlaceMap(small_map.features[:places], small_map.projection, stamps, ids, None, ())
     answer = recognize_all(recognizer(short, 2.0), small_map.features[:6])[-1]
     assert answer.status is Status.MATCH
     assert 0 <= answer.place_index < places

@@ -49,10 +49,7 @@ def test_robust_options_by_name():
     assert not PAPER.any
     assert not ROBUST.without('mean_centering', 'place_filter').mean_centering
     assert ROBUST.without('mean_centering').place_filter
-    for wrong in (
-        lambda: ROBUST.without('other'),
-        lambda: options_of('other'),
-    ):
+    for wrong in (lambda: ROBUST.without('other'), lambda: options_of('other')):
         with pytest.raises(SettingsError, match='other'):
             wrong()
     with pytest.raises(SettingsError, match='no probability is left'):

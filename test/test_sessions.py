@@ -166,9 +166,10 @@ def test_same_place_in_another_session_is_no_candidate_beside(town, mode):
     assert np.abs(positions[1:] - positions[0]).min() > 8
     # in another session, a neighbor by number is no neighbor
     assert one.newest_row().shape == (len(related),)
-    rows, first = one.window_rows()
-    assert (rows.shape, first) == ((LENGTH, len(related)), 0)
+    rows = one.window_columns(np.arange(len(related)))
+    assert rows.shape == (LENGTH, len(related))
     assert np.isfinite(rows).all()
+    np.testing.assert_array_equal(rows[-1], one.newest_row())
 
 
 def test_related_places_are_saved(tmp_path):

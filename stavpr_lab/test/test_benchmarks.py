@@ -394,6 +394,13 @@ def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     assert text.index('A frame in mode robust') < text.index('## All stages')
 
 
+def test_process_of_matches_is_measured_beside_process_without():
+    run = Run('cpu', 0.001)
+    stages.process_stages(run, 2 * stages.DRIVEN, 'int8', 0)
+    (row, _), = run.rows
+    assert (row.stage, [peer.name for peer in row.peers]) == ('process', ['without matches'])
+
+
 def test_command_on_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, 'is_available', lambda: False)
     assert matching.main(['--device', 'cuda', '--output', str(tmp_path)]) == 2

@@ -297,7 +297,7 @@ def _report(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
     shape = f'{strips.shape[0]} strips of {strips.shape[2]} dimensions'
     print(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
     try:
-        suggestion = suggest_threshold(
+        threshold = suggest_threshold(
             place_map,
             progress=True,
             model=getattr(arguments, f'{kind}_model', None) or '',
@@ -305,7 +305,8 @@ def _report(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
     except InputError as error:
         print(f'no threshold is suggested for mode paper: {error}')
         return
-    print(f'suggested threshold for mode paper: {suggestion.threshold:.3f}')
+    value = f'{threshold:.3f}'
+    print(f'suggested threshold for mode paper: {value} (-p mode:=paper -p threshold:={value})')
 
 
 def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:

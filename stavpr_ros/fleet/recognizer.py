@@ -235,15 +235,14 @@ class FleetRecognizer(SequenceRecognizer):
             row[self._places[self._order]] = self._images[-1].z[self._order]
         return row
 
-    def window_rows(self) -> tuple[np.ndarray, int]:
-        """See :meth:`SequenceRecognizer.window_rows`; of the places around the nearest one."""
-        if self._layout is None or self._nearest is None:
-            return np.empty((0, 0), np.float32), 0
-        rows, _ = super().window_rows()
-        held, firsts = self._places[self._order], self._layout.firsts
-        run = np.searchsorted(held[firsts], self._nearest.middle, 'right') - 1
-        ends = [*firsts[1:], len(held)]
-        return rows[:, firsts[run] : ends[run]], int(held[firsts[run]])
+    def window_columns(self, places: np.ndarray) -> np.ndarray:
+        """See :meth:`SequenceRecognizer.window_columns`; +inf for places that are not held."""
+        held = self._places[self._order]
+        here = np.isin(places, held)
+        rows = super().window_columns(held.searchsorted(places[here]))
+        columns = np.full((len(rows), len(places)), np.inf, np.float32)
+        columns[:, here] = rows
+        return columns
 
     # neighborhoods
 

@@ -8,7 +8,6 @@ MOST_PIXELS = 2**24  # of a thumbnail: 50 MB when it is decoded
 MOST_SEGMENTS = 64  # before the frame header
 FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive
 FRAME_BYTES = 10  # marker, length, precision, height, width, components
-END_OF_IMAGE = b'\xff\xd9'
 
 
 def jpeg_pixels(content: np.ndarray, ends: np.ndarray) -> np.ndarray:

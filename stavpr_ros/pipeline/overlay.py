@@ -86,22 +86,25 @@ def match_image(
     return sheet
 
 
+def places_to_draw(match: Match, first: int, count: int) -> np.ndarray:
+    """Return those of the places from ``first`` on that are around the nearest sequence, (k,)."""
+    middle = match.sequence.middle if match.sequence is not None else first
+    left = min(max(first, middle - NEARBY), max(first, first + count - 2 * NEARBY))
+    return np.arange(left, min(left + 2 * NEARBY, first + count))
+
+
 def draw_window(rows: np.ndarray, first: int, match: Match) -> np.ndarray:
     """
     Draw the distances of a window, one row per image, and the warping path over them.
 
-    Of a large map, only the surroundings of the nearest sequence are shown.
-
-    :param rows: distances, shape (m, n), oldest image first; +inf = not compared.
+    :param rows: distances to successive places, shape (m, k), oldest image first; +inf = not
+        compared.
     :param first: index of the place of the first column.
     :returns: RGB, uint8, dark = near.
     """
-    middle = match.sequence.middle if match.sequence is not None else first
-    left = min(max(0, middle - first - NEARBY), max(0, rows.shape[1] - 2 * NEARBY))
-    shown = rows[:, left : left + 2 * NEARBY]
-    height, width = shown.shape
+    height, width = rows.shape
     across, down = max(1, round(SIZE[0] / width)), max(1, round(SIZE[1] / max(height, 1)))
-    finite = np.where(np.isfinite(shown), shown, np.nan)
+    finite = np.where(np.isfinite(rows), rows, np.nan)
     low, high = (
         np.nan_to_num(f(finite)) if np.isfinite(finite).any() else 0.0
         for f in (np.nanmin, np.nanmax)
@@ -111,16 +114,15 @@ def draw_window(rows: np.ndarray, first: int, match: Match) -> np.ndarray:
     sheet = np.ascontiguousarray(np.repeat(np.repeat(sheet, down, axis=0), across, axis=1))
     if match.sequence is not None and len(match.path):
         points = [
-            ((place - first - left) * across + across // 2, image * down + down // 2)
+            ((place - first) * across + across // 2, image * down + down // 2)
             for image, place in match.path.tolist()
         ]
         ink = (255, 255, 255) if match.accepted else NO_MATCH
         cv2.polylines(sheet, [np.array(points, np.int32)], False, ink, 2, cv2.LINE_AA)
     bar = np.full((24, sheet.shape[1], 3), _PAPER, np.uint8)
-    text = f'images of the window (newest below) x places {first + left} to '
-    text += f'{first + left + width - 1}'
+    text = f'images of the window (newest below) x places {first} to {first + width - 1}'
     if match.relative and match.sequence is not None:
-        text += f'; place {middle}, p {match.probability:.2f}'
+        text += f'; place {match.sequence.middle}, p {match.probability:.2f}'
     _write(bar, text, 11)
     return np.vstack([sheet, bar])
 

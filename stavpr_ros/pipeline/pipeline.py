@@ -31,7 +31,10 @@ from stavpr_ros.sources.encodings import decode_message
 NO_MAP = (
     "no map: call the service load_map, or set parameter 'map_path' before the node is configured"
 )
-NO_THRESHOLD = "parameter 'threshold' is not set: build_map suggests one, 'ros2 param set' sets it"
+NO_THRESHOLD = (
+    "parameter 'threshold' is not set, which mode paper requires: set the value that build_map "
+    "printed for the map, 'ros2 param set /stavpr threshold VALUE'"
+)
 NOT_A_KEYFRAME = 'not a keyframe'
 
 
@@ -69,8 +72,6 @@ class Pipeline:
         self.save_state = SaveState()  # of the places in use
         # of the map, where loop closure has places of its own
         self._map_save_state = self.save_state
-        self.list_candidates = True  # with every match
-        self.camera: Camera | None = None  # None = unknown: thumbnails of queries are not kept
         self.contrast = math.nan  # of the last image
         self._start(operation, settings, None)
 
@@ -227,33 +228,56 @@ class Pipeline:
             )
         return self._last.with_candidates(recognizer.ranked(count))
 
-    def matched_pair(self, match: Match) -> MatchedPair | None:
-        """Return the pair of the newest match, or its late one, for its edge; None without."""
-        places = self.places
-        if not match.accepted or places is None or match.cause:
+    def matched_pair(self, match: Match, aligned: bool = True) -> MatchedPair | None:
+        """
+        Return the pair of the newest match, or its late one, for its edge; None without.
+
+        :param aligned: the edge may be aligned by odometry, which needs distances of the window.
+        """
+        operation = self._operation
+        if not match.accepted or operation is None or operation.recognizer is None or match.cause:
             return None
+        places, distances = operation.places, operation.recognizer.window_columns
         unknown = np.full(7, np.nan)
         poses = np.array([unknown if pose is None else pose for pose in self._poses])
         query = self._thumbnails[0]
         if match.is_late:
             query = places.thumbnail(match.first_image_index)
-        return matched_pair(match, places, query, poses, self.window_distances())
+        return matched_pair(match, places, query, poses, distances if aligned else None)
 
-    def window_distances(self) -> tuple[np.ndarray, int]:
-        """
-        Return the distances of the images in the window to the places.
-
-        :returns: shape (m, n), float32, empty where nothing is compared; index of the first place.
-        """
+    def newest_distances(self) -> np.ndarray:
+        """Return the distances of the newest image to its places, (n,), float32; none before."""
         recognizer = self._operation.recognizer if self._operation else None
-        return recognizer.window_rows() if recognizer else (np.empty((0, 0), np.float32), 0)
+        if recognizer is None or not recognizer.window_fill:
+            return np.empty(0, np.float32)
+        return recognizer.newest_row()
 
-    def process(self, message: Any, stamp: int, pose: np.ndarray | None = None) -> Match:
+    def window_distances(self, places: np.ndarray) -> np.ndarray:
+        """
+        Return the distances of the images in the window to some places.
+
+        :param places: shape (k,), int64.
+        :returns: shape (m, k), float32, oldest image first, +inf for places not compared.
+        """
+        assert self._operation is not None
+        assert self._operation.recognizer is not None
+        return self._operation.recognizer.window_columns(places)
+
+    def process(
+        self,
+        message: Any,
+        stamp: int,
+        pose: np.ndarray | None = None,
+        camera: Camera | None = None,
+        list_candidates: bool = True,
+    ) -> Match:
         """
         Process one image message, raw or compressed. An invalid image changes nothing.
 
         :param stamp: of the image, ns, 0 = unknown.
         :param pose: of the camera, from odometry, shape (7,), or None.
+        :param camera: None = unknown: in localization, no thumbnail is kept for an edge.
+        :param list_candidates: the match has its candidates.
         :raises InputError: an invalid pose; nothing is changed then.
         """
         threshold = math.nan if self.threshold is None else self.threshold
@@ -266,10 +290,13 @@ class Pipeline:
             return Match(Status.SKIPPED, reason, threshold, cause=cause)
         stages: dict[str, float] = {}
         try:
-            match = self._process(self._operation, stages, message, stamp, pose)
+            match = self._process(self._operation, stages, message, stamp, pose, camera)
         except StavprError as error:
             kind = error.kind if isinstance(error, ImageError) else type(error).__name__
             match = Match(Status.INVALID_IMAGE, str(error), cause=f'invalid: {kind}')
+        recognizer = self._operation.recognizer
+        if list_candidates and recognizer is not None and match.sequence is not None:
+            match = match.with_candidates(recognizer.ranked(self.settings.candidates))
         return replace(match, threshold=threshold, stages=stages)
 
     def _process(
@@ -279,9 +306,11 @@ class Pipeline:
         message: Any,
         stamp: int,
         pose: np.ndarray | None,
+        camera: Camera | None,
     ) -> Match:
+        width = self._thumbnail_width(operation, camera)
         with _timed(stages, 'decoding'):
-            image = decode_message(message, self._needed_size(operation))
+            image = decode_message(message, _needed_size(operation, width))
             self.contrast = _contrast(image)
             if reason := self._keyframes.too_alike(image):
                 return Match(Status.SKIPPED, reason, image=image, cause=NOT_A_KEYFRAME)
@@ -291,13 +320,13 @@ class Pipeline:
         with _timed(stages, 'extraction'):
             features = operation.extractor.extract([image])
         with _timed(stages, 'matching'):
-            thumbnail = self._thumbnail(operation, image)
+            thumbnail = thumbnail_of(image, width) if width else None
             match = operation.update(Observation(features, thumbnail, stamp, pose))
         self._thumbnails.append(thumbnail)
         self._poses.append(pose)
         self._keyframes.accept(stamp, pose, image)
         if not isinstance(operation, Localization):
-            operation.places.camera = operation.places.camera or self.camera
+            operation.places.camera = operation.places.camera or camera
             self.save_state.record(operation.places, features, self._open_journal)
         if operation.recognizer is None:
             return replace(match, image=image)
@@ -305,29 +334,15 @@ class Pipeline:
             match = self._verified(match, operation.places, self._thumbnails[0])
             if match.late is not None:
                 match = replace(match, late=self._verified_late(match, operation.places))
-        if self.list_candidates and match.sequence is not None:
-            ranked = operation.recognizer.ranked(self.settings.candidates)
-            match = match.with_candidates(ranked)
         self._last = replace(match, image=image)
         return self._last
 
-    def _needed_size(self, operation: Operation) -> tuple[int, int] | None:
-        """Return the rows and columns of an image that have an effect; None = all."""
-        backbone = operation.extractor.settings.backbone
-        if backbone.resize != 'area':  # bilinear features are of single pixels
-            return None
-        return backbone.size, max(backbone.size, self._thumbnail_width(operation))
-
-    def _thumbnail_width(self, operation: Operation) -> int:
+    def _thumbnail_width(self, operation: Operation, camera: Camera | None) -> int:
         """Return the width of the thumbnails that are needed, 0 = none is."""
         width = self.settings.thumbnail_width
         if isinstance(operation, Localization):
-            return (width or THUMBNAIL_WIDTH) if self._verifier or self.camera else 0
+            return (width or THUMBNAIL_WIDTH) if self._verifier or camera else 0
         return width
-
-    def _thumbnail(self, operation: Operation, image: np.ndarray) -> np.ndarray | None:
-        width = self._thumbnail_width(operation)
-        return thumbnail_of(image, width) if width else None
 
     def _verified_late(self, match: Match, places: PlaceMap | GrowingMap) -> Match | None:
         """Return the late match beside an accepted one, if it passes the same check."""
@@ -414,6 +429,14 @@ class Pipeline:
     @staticmethod
     def _is_full(operation: Operation | None) -> bool:
         return isinstance(operation, Mapping) and operation.places.full
+
+
+def _needed_size(operation: Operation, thumbnail_width: int) -> tuple[int, int] | None:
+    """Return the rows and columns of an image that have an effect; None = all."""
+    backbone = operation.extractor.settings.backbone
+    if backbone.resize != 'area':  # bilinear features are of single pixels
+        return None
+    return backbone.size, max(backbone.size, thumbnail_width)
 
 
 def _contrast(image: np.ndarray) -> float:

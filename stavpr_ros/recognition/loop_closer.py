@@ -113,11 +113,6 @@ class LoopCloser(SequenceRecognizer):
         """Return the oldest place that is held: the number of evicted places."""
         return self._buffer.first
 
-    @property
-    def limit(self) -> int | None:
-        """Most places that are held, None for all."""
-        return self._limit
-
     def features(self) -> LocalFeatures:
         """Return the features of the places held, strips (W, n, d), as they came."""
         return self._route.original()

@@ -51,7 +51,7 @@ class Match:
     """
     The result for one image; indices are 0-based places of the map.
 
-    The recognizer fills the first seven fields, the pipeline the others.
+    The recognizer fills the fields up to ``window_changes``, the pipeline the others.
 
     :param status: only ``MATCH`` names a place.
     :param reason: why there is no match, one sentence; empty for ``MATCH`` and ``MAPPED``.

@@ -179,21 +179,22 @@ class SequenceRecognizer(ABC):
 
         :returns: shape (n,), float32; lower is nearer.
         """
-        return self._by_place(self._buffer.newest().cpu().numpy())
+        row = self._buffer.newest().cpu().numpy()
+        return row if self._layout is None else row[self._layout.columns]
 
-    def window_rows(self) -> tuple[np.ndarray, int]:
+    def window_columns(self, places: np.ndarray) -> np.ndarray:
         """
-        Return the distances of the images in the window, as :meth:`newest_row`, oldest first.
+        Return the distances of the images in the window, as :meth:`newest_row`, to some places.
 
-        :returns: shape (m, n), float32, +inf for places not compared; the index of the first
-            place.
+        Those to other places are not copied.
+
+        :param places: shape (k,), int64.
+        :returns: shape (m, k), float32, oldest image first, +inf for places not compared.
         """
-        buffer = self._buffer
-        rows = buffer.rows()[buffer.length - len(buffer) :, : buffer.known].cpu().numpy()
-        return self._by_place(rows), buffer.first
-
-    def _by_place(self, rows: np.ndarray) -> np.ndarray:
-        return rows if self._layout is None else rows[..., self._layout.columns[: rows.shape[-1]]]
+        columns = places - self._buffer.first
+        if self._layout is not None:
+            columns = self._layout.columns[columns]
+        return self._buffer.at(columns[None])[self._buffer.length - len(self._buffer) :]
 
     def _clear_window(self) -> None:
         self._buffer.clear()

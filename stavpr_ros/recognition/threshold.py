@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A threshold to start with, from the map alone."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
@@ -11,20 +9,6 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from tqdm import tqdm
-
-
-@dataclass(frozen=True)
-class ThresholdSuggestion:
-    """
-    A threshold and what it rests on.
-
-    :param threshold: the suggested value.
-    :param elsewhere: for each altered window of the map, the distance of the nearest sequence in
-        another part of the map, shape (windows,).
-    """
-
-    threshold: float
-    elsewhere: np.ndarray
 
 
 def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np.ndarray:
@@ -56,7 +40,7 @@ def suggest_threshold(
     windows: int = 24,
     progress: bool = False,
     model: str = '',
-) -> ThresholdSuggestion:
+) -> float:
     """
     Ask how near the map's places come to *other* places of it when they look different.
 
@@ -95,4 +79,4 @@ def suggest_threshold(
         nearest = best_match(match_sequence(window, sequence), settings.nms_radius)
         if nearest is not None:
             elsewhere.append(nearest.distance)
-    return ThresholdSuggestion(float(np.median(elsewhere)), np.array(elsewhere))
+    return float(np.median(elsewhere))

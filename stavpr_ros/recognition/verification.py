@@ -97,10 +97,6 @@ class GeometricVerifier:
         self._detector = _detector(self.settings)
         self._query: tuple[np.ndarray, Keypoints] | None = None  # small and gray; its keypoints
 
-    def verifies(self, query: np.ndarray, place: np.ndarray) -> bool:
-        """Return whether as many matches are explained as the settings ask for."""
-        return self.inliers(query, place) >= self.settings.min_inliers
-
     def inliers(self, query: np.ndarray, place: np.ndarray) -> int:
         """
         Count the matches that one geometry explains; 0 for images that have too few.

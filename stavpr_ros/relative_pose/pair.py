@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A matched pair of images, with all that is known of their surroundings."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,7 +29,7 @@ class MatchedPair:
     :param query_poses: of the base, at the images of the window, shape (l, 7); NaN = unknown.
     :param middle: position of the image in the window.
     :param distances: of the images of the window to the places around, shape (l, k); +inf = not
-        compared.
+        compared. Empty where alignment by odometry is impossible or not wanted.
     :param first: index of the first of the places around it.
     :param poses: of the base at those places, shape (k, 7); NaN = unknown.
     :param thumbnails: of those of them that are at most ``AROUND`` away, and of the same
@@ -67,14 +68,14 @@ def matched_pair(
     places: PlaceMap | GrowingMap,
     query: np.ndarray | None,
     query_poses: np.ndarray,
-    window: tuple[np.ndarray, int],
+    distances_to: Callable[[np.ndarray], np.ndarray] | None,
 ) -> MatchedPair:
     """
-    Take the middle pair of a match out of its map.
+    Copy what the edge of a match needs.
 
     :param query, query_poses: see :class:`MatchedPair`.
-    :param window: distances of the images in the window, shape (l, n), +inf = not compared, and
-        the index of the first place.
+    :param distances_to: returns the distances of the window to places (k,), shape (l, k), +inf =
+        not compared; None = not needed. Called only where the pair has both poses.
     """
     place, start = match.place_index, places.first if isinstance(places, GrowingMap) else 0
     low, high = int(match.path[:, 1].min()), int(match.path[:, 1].max())
@@ -83,10 +84,10 @@ def matched_pair(
     poses = np.full((high - low, 7), np.nan)
     if places.poses is not None:
         poses[:] = places.poses[low - start : high - start]
-    rows, origin = window
-    distances = np.full((len(rows), high - low), np.inf, np.float32)
-    some = rows[:, low - origin : high - origin]
-    distances[:, : some.shape[1]] = some
+    distances = np.empty((0, high - low), np.float32)
+    has_poses = not np.isnan([poses[place - low], query_poses[match.position]]).any()
+    if distances_to is not None and has_poses:
+        distances = distances_to(np.arange(low, high))
     session = places.place(place).session
     thumbnails = {}
     if len(places.thumbnails):

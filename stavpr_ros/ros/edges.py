@@ -51,13 +51,15 @@ class EdgePublisher:
     :param method: parameter relative_pose.
     :param publish: called with each closure, on the thread.
     :param ending: set when the node ends.
+
+    ``aligns``: edges may be aligned by odometry.
     """
 
     def __init__(
         self, method: str, publish: Callable[[LoopClosure], None], ending: threading.Event
     ) -> None:
         self._estimator, self._publish = EdgeEstimator(method), publish
-        self._method = method
+        self.aligns = method in ('auto', 'aligned')
         self._worker = Worker(self._complete, 2**31, ending)
         self._counts: Counter[str] = Counter()
         self._reason = ''
@@ -69,9 +71,9 @@ class EdgePublisher:
 
     def aligned(self, pair: MatchedPair) -> Edge:
         """Return the edge by odometry alone, at once, if the method permits it."""
-        if self._method in ('none', 'pnp'):
-            return Edge(Source.NONE, f'parameter relative_pose is {self._method}')
-        return align(pair)
+        if self.aligns:
+            return align(pair)
+        return Edge(Source.NONE, f'parameter relative_pose is {self._estimator.method}')
 
     def put(
         self,

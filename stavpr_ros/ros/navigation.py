@@ -6,7 +6,6 @@ from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 import numpy as np
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import UnavailableError
@@ -14,6 +13,7 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.recognition import Match
 from stavpr_ros.ros.output import matched_pose_message, pose_message
+from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import Header
 
 # (0.5 m)^2 and (15 degrees)^2, as RViz's 2D Pose Estimate: a place does not determine the lateral
@@ -59,14 +59,11 @@ class Navigation:
         if places is not self._places:
             self._places, self._transform = places, None
             self._unmatched = self._settings.pipeline.sequence.length
-        try:
+        with until_shutdown(self._node):
             if self._tf is not None:
                 self._publish_transform(header, match, places, odometry, odometry_frame)
             if self._initial_pose is not None:
                 self._publish_initial_pose(header, match, places)
-        except rclpy_implementation.RCLError:
-            if self._node.context.ok():  # else ROS was shut down before the node
-                raise
 
     def close(self) -> None:
         """Destroy the publishers, and release the map."""

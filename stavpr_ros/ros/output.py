@@ -11,7 +11,6 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 import numpy as np
 from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, qos_policy_name_from_kind, QoSProfile, ReliabilityPolicy
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
@@ -28,7 +27,7 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.pipeline.overlay import draw_match
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.relative_pose.edge import Edge, Source
-from stavpr_ros.ros.rclpy_workarounds import ManagedNode
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode, until_shutdown
 from std_msgs.msg import Float32, Header, Int32
 
 DEPTH = 50  # matches kept for slower subscribers
@@ -348,7 +347,7 @@ class Output:
         """
         robot_id = self._robot_id
         message = match_message(header, match, places, robot_id, edge, frames.child)
-        try:
+        with until_shutdown(self._node):
             if match.accepted:
                 self.place_index.publish(Int32(data=message.place_index))
                 self.distance.publish(Float32(data=message.distance))
@@ -361,28 +360,20 @@ class Output:
             if match.image is not None and self.match_image.get_subscription_count():
                 self.match_image.publish(image_message(header, draw_match(match, places)))
             self.match.publish(message)
-        except rclpy_implementation.RCLError:
-            if self._node.context.ok():  # else ROS was shut down before the node
-                raise
         return message
 
     def publish_closure(self, message: LoopClosure) -> None:
         """Publish a loop closure."""
-        try:
+        with until_shutdown(self._node):
             self.loop_closure.publish(message)
-        except rclpy_implementation.RCLError:
-            if self._node.context.ok():  # else ROS was shut down before the node
-                raise
 
     @property
     def candidates_requested(self) -> bool:
         """Whether ``~/candidates`` has a subscriber."""
-        try:
-            return bool(self.candidates.get_subscription_count())
-        except rclpy_implementation.RCLError:
-            if self._node.context.ok():
-                raise
-            return False
+        requested = False
+        with until_shutdown(self._node):
+            requested = bool(self.candidates.get_subscription_count())
+        return requested
 
     def close(self) -> None:
         """Destroy the publishers."""

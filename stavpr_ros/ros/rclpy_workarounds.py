@@ -7,8 +7,9 @@ The tests of this module also show the failure of each without its workaround: s
 when upstream is fixed, and the workaround can go.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 import threading
 import time
 import traceback
@@ -29,6 +30,18 @@ RESPONSE_LOST = 'failed to send response'  # part of rclpy's warning
 RESPONSE_TIMEOUT = 3.5  # seconds of attempts; callbacks have a little more when the process ends
 # seconds between attempts; an attempt takes 0.1 s and blocks all other threads
 RESPONSE_PAUSE = 0.05
+
+
+
+@contextmanager
+def until_shutdown(node: Node) -> Iterator[None]:
+    """Ignore errors of the middleware if ROS was shut down before the node."""
+    try:
+        yield
+    except rclpy_implementation.RCLError:
+        if node.context.ok():
+            raise
+
 
 _warning_filters = threading.Lock()  # they belong to the process
 

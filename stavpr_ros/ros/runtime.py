@@ -15,6 +15,7 @@ import numpy as np
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.errors import JournalError, SettingsError
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
@@ -350,14 +351,13 @@ class Runtime:
             # places of a route have the poses of the odometry
             own = self.pipeline.operation != 'localization'
             frames = PoseFrames(odometry.frame if own else frames.frame, odometry.child_frame)
-        self.pipeline.list_candidates = self._output.candidates_requested
-        self.pipeline.list_candidates |= self._views.needs_candidates
-        camera = self.camera
-        if camera is not None:
+        candidates = self._output.candidates_requested or self._views.needs_candidates
+        camera, camera_input = None, self.camera
+        if camera_input is not None:
             base = '' if odometry is None else odometry.child_frame
-            self.pipeline.camera = camera.camera(base, header.frame_id)
+            camera = camera_input.camera(base, header.frame_id)
         try:
-            match = self.pipeline.process(item.message, stamp, pose)
+            match = self.pipeline.process(item.message, stamp, pose, camera, candidates)
         except Exception as error:
             self._node.get_logger().error(
                 f'an image could not be processed: {traceback.format_exc()}'
@@ -370,20 +370,7 @@ class Runtime:
             match = replace(match, reason=f'map {path} is being loaded')
         began = time.monotonic()
         self._views.publish(header, match, self.pipeline, frames.frame, pose)
-        self._publish(header, match, frames, waited, began)
-
-    def _publish(
-        self, header: Header, match: Match, frames: PoseFrames, waited: float, began: float
-    ) -> None:
-        pair = self.pipeline.matched_pair(match)
-        # a match does not wait for PnP
-        edge = self._edges.aligned(pair) if pair is not None else None
-        message = self._output.publish(header, match, self.pipeline.places, frames, edge)
-        if pair is not None:
-            self._put_closure(header, match, frames, pair)
-        late = self.pipeline.matched_pair(match.late) if match.late is not None else None
-        if match.late is not None and late is not None:
-            self._put_closure(header, match.late, frames, late)
+        message = self._publish(header, match, frames, camera)
         stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
         if match.cause:
             self._statistics.dropped(match.cause)
@@ -393,8 +380,29 @@ class Runtime:
         place = message.newest_index if match.status is Status.MAPPED else message.place_index
         self._statistics.answered(match.status.name, match.reason, place, message.distance, stages)
 
+    def _publish(
+        self, header: Header, match: Match, frames: PoseFrames, camera: Camera | None
+    ) -> PlaceMatch:
+        """Publish a match; its closure, and that of its late match, when their edges are ready."""
+        pair = self.pipeline.matched_pair(match, self._edges.aligns)
+        # a match does not wait for PnP
+        edge = self._edges.aligned(pair) if pair is not None else None
+        message = self._output.publish(header, match, self.pipeline.places, frames, edge)
+        if pair is not None:
+            self._put_closure(header, match, frames, pair, camera)
+        if match.late is not None:
+            pair = self.pipeline.matched_pair(match.late, self._edges.aligns)
+            if pair is not None:
+                self._put_closure(header, match.late, frames, pair, camera)
+        return message
+
     def _put_closure(
-        self, header: Header, match: Match, frames: PoseFrames, pair: MatchedPair
+        self,
+        header: Header,
+        match: Match,
+        frames: PoseFrames,
+        pair: MatchedPair,
+        camera: Camera | None,
     ) -> None:
         """Publish the loop closure of a match when its edge is ready."""
         places, odometry = pair.source, self.odometry
@@ -409,7 +417,6 @@ class Runtime:
             header, match, places, self.settings.robot_id, frames, query
         )
         if message is not None:
-            camera = self.pipeline.camera
             self._edges.put(message, pair, camera, places.camera if is_map else camera)
 
     def _publish_route(self) -> None:

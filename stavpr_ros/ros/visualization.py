@@ -13,16 +13,16 @@ from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import Path
 import numpy as np
 from rclpy.event_handler import PublisherEventCallbacks, UnsupportedEventTypeError
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline import Pipeline
-from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each
+from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each, places_to_draw
 from stavpr_ros.recognition import Match
 from stavpr_ros.ros.output import image_message, LATCHED, pose_message
+from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -78,11 +78,8 @@ class Visualization:
         :param frame: of the poses of the places.
         :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
         """
-        try:
+        with until_shutdown(self._node):
             self._publish(header, match, pipeline, frame, odometry)
-        except rclpy_implementation.RCLError:
-            if self._node.context.ok():  # else ROS was shut down before the node
-                raise
 
     def publish_route(self, places: Places, frame: str) -> None:
         """Publish the poses of all places, if they are requested and not published yet."""
@@ -140,17 +137,19 @@ class Visualization:
             self._publish_distances(header, match, pipeline)
 
     def _publish_distances(self, header: Header, match: Match, pipeline: Pipeline) -> None:
-        rows, first = pipeline.window_distances()
-        if not rows.size:
+        row, places = pipeline.newest_distances(), pipeline.places
+        if places is None or not row.size:
             return
+        first = places.first if isinstance(places, GrowingMap) else 0
+        shown = places_to_draw(match, first, len(row))
         if self._is_requested(self._window):
-            self._window.publish(image_message(header, draw_window(rows, first, match)))
+            rows = pipeline.window_distances(shown)
+            self._window.publish(image_message(header, draw_window(rows, int(shown[0]), match)))
         if self._is_requested(self._distances):
-            missing = max(0, len(pipeline.places or ()) - rows.shape[1])
-            row = np.pad(rows[-1:], ((0, 0), (0, missing)), constant_values=np.inf)
-            places = np.arange(first, first + row.size)[None]
+            row = np.pad(row, (0, len(places) - len(row)), constant_values=np.inf)[None]
+            numbers = np.arange(first, first + row.size)[None]
             columns = np.stack(
-                [least_of_each(row, COLUMNS)[0], least_of_each(places, COLUMNS)[0]], axis=1
+                [least_of_each(row, COLUMNS)[0], least_of_each(numbers, COLUMNS)[0]], axis=1
             ).astype(np.float32)
             message = Image(header=header, height=1, width=len(columns), encoding='32FC2')
             message.step = columns.nbytes
@@ -230,12 +229,10 @@ class Visualization:
             return self._node.create_publisher(kind, topic, LATCHED)
 
     def _is_requested(self, publisher: Publisher) -> bool:
-        try:
-            return bool(publisher.get_subscription_count())
-        except rclpy_implementation.RCLError:
-            if self._node.context.ok():
-                raise
-            return False
+        requested = False
+        with until_shutdown(self._node):
+            requested = bool(publisher.get_subscription_count())
+        return requested
 
 
 def color(probability: float) -> ColorRGBA:

@@ -159,11 +159,6 @@ class KeyframeChain:
         """Return the newest keyframe; -1 = none."""
         return self._recorded[-1][1][-1] if self._recorded else -1
 
-    @property
-    def tail(self) -> np.ndarray | None:
-        """Return the pose of the newest odometry, (4, 4)."""
-        return None if self._tail is None else matrices(self._tail[1])
-
     def add(self, stamp: int, pose: np.ndarray) -> bool:
         """
         Add the odometry; return whether it is a new keyframe.
