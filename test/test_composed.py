@@ -56,7 +56,7 @@ def until_processed(node, count):
     end = time.monotonic() + TIMEOUT
     while time.monotonic() < end:
         counts = node.statistics.counts()
-        if counts.answered + sum(counts.drops.values()) == count:
+        if counts.answered.count + counts.dropped.count == count:
             return counts
         node.runtime.worker.run(lambda: None)
     raise AssertionError(counts)
@@ -84,7 +84,7 @@ def test_waiting_images_are_dropped(make, map_file, route, monkeypatch, act, cau
     enqueue(node, route[:3])
     monkeypatch.setattr(worker, 'run', run)
     act(node)
-    assert until_processed(node, 3).drops == {cause: 3}
+    assert until_processed(node, 3).dropped.total == {cause: 3}
     assert node.runtime.pipeline.window_fill == 0
 
 
@@ -95,12 +95,14 @@ def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(
     with monkeypatch.context() as defect:
         defect.setattr(node.runtime.pipeline.extractor, 'extract', lambda images: 1 / 0)
         enqueue(node, route[:1])
-        assert until_processed(node, 1).drops == {'internal error': 1}
+        assert until_processed(node, 1).dropped.total == {'internal error': 1}
     enqueue(node, route[:2])
     counts = until_processed(node, 3)
-    assert (counts.received, counts.answered, counts.status, counts.place) == (3, 2, 'mapped', 1)
-    assert list(counts.stages) == ['waiting', 'decoding', 'extraction', 'matching', 'publishing']
-    assert min(stage.max for stage in counts.stages.values()) > 0
+    assert (counts.received.count, counts.answered.total) == (3, {'mapped': 2})
+    assert (counts.status, counts.place) == ('mapped', 1)
+    stages = ['waiting', 'decoding', 'extraction', 'matching', 'publishing']
+    assert list(counts.times) == ['total', 'work', *stages]
+    assert min(longest for _, longest in counts.times.values()) > 0
 
 
 def test_shutdown_of_ros_before_the_node_saves_the_map(make, context, route, tmp_path):

@@ -2,34 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Counts, rates and times of the node, on a clock that the tests move."""
 
-import dataclasses
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 import math
 import sys
-import threading
 import tracemalloc
+from types import SimpleNamespace
 
 import pytest
-from stavpr_ros.pipeline.statistics import RECENT, SHORTEST_SPAN, Statistics
-
-
-class Clock:
-    """Seconds that only the test moves."""
-
-    def __init__(self, now=1234.56):
-        self.now = now
-
-    def __call__(self):
-        return self.now
+from stavpr_ros.pipeline.statistics import ImageCounts, RECENT, SHORTEST_SPAN, Statistics, Tally
 
 
 @pytest.fixture
 def clock():
-    return Clock()
+    return SimpleNamespace(now=1234.56)
 
 
 @pytest.fixture
 def statistics(clock):
-    return Statistics(clock)
+    return Statistics(lambda: clock.now)
 
 
 def stream(clock, seconds, hertz, event):
@@ -43,14 +34,12 @@ def answer(statistics, status='match', reason='', place=0, distance=0.5, **stage
     statistics.answered(status, reason, place, distance, stages)
 
 
-def test_counts_without_events_are_zero(clock, statistics):
+def test_counts_without_events_are_empty(clock, statistics):
     clock.now += 3
     counts = statistics.counts()
     assert counts.uptime == pytest.approx(3)
-    assert counts.rate_in == counts.rate_out == counts.received == counts.answered == 0
-    assert counts.received_age is counts.answered_age is counts.total is counts.work is None
-    assert counts.drops == counts.recent_drops == counts.statuses == counts.stages == {}
-    assert (counts.status, counts.place) == ('', -1)
+    assert counts.received == counts.answered == counts.dropped == counts.missing == Tally()
+    assert (counts.times, counts.status, counts.place) == ({}, '', -1)
     assert math.isnan(counts.distance)
 
 
@@ -59,17 +48,17 @@ def test_counts_without_events_are_zero(clock, statistics):
 def test_rate_of_a_steady_stream_is_correct_from_the_start(clock, statistics, hertz, seconds):
     clock.now += 100
     stream(clock, seconds, hertz, statistics.received)
-    counts = statistics.counts()
-    assert counts.rate_in == pytest.approx(hertz, abs=0.112 if seconds > 9 else 1e-6)
-    assert (counts.received, counts.rate_out) == (round(hertz * seconds), 0)
+    received = statistics.counts().received
+    assert received.rate == pytest.approx(hertz, abs=0.112 if seconds > 9 else 1e-6)
+    assert received.count == round(hertz * seconds)
 
 
 def test_rate_after_the_last_image_falls_to_zero_within_the_window(clock, statistics):
     stream(clock, 30, 30, statistics.received)
-    rates = [statistics.counts().rate_in]
+    rates = [statistics.counts().received.rate]
     for _ in range(RECENT):
         clock.now += 1
-        rates.append(statistics.counts().rate_in)
+        rates.append(statistics.counts().received.rate)
     assert rates == sorted(rates, reverse=True)
     assert rates[5] == pytest.approx(15, abs=2)
     assert rates[-1] == 0
@@ -77,11 +66,11 @@ def test_rate_after_the_last_image_falls_to_zero_within_the_window(clock, statis
 
 def test_rate_of_a_burst_is_finite(clock, statistics):
     statistics.received()
-    assert statistics.counts().rate_in == pytest.approx(1 / RECENT)
+    assert statistics.counts().received.rate == pytest.approx(1 / RECENT)
     for _ in range(3):
         clock.now += 0.001
         statistics.received()
-    assert statistics.counts().rate_in == pytest.approx(3 / SHORTEST_SPAN)
+    assert statistics.counts().received.rate == pytest.approx(3 / SHORTEST_SPAN)
 
 
 def test_drops_are_counted_by_cause_ever_and_recently(clock, statistics):
@@ -91,11 +80,11 @@ def test_drops_are_counted_by_cause_ever_and_recently(clock, statistics):
     statistics.dropped('queue full', 2)
     clock.now += 5
     statistics.dropped('max_rate')
-    counts = statistics.counts()
-    assert counts.drops == {'queue full': 3, 'lost in transport': 7, 'max_rate': 1}
-    assert counts.recent_drops == {'queue full': 2, 'max_rate': 1}
+    dropped = statistics.counts().dropped
+    assert dropped.total == {'queue full': 3, 'lost in transport': 7, 'max_rate': 1}
+    assert dropped.recent == {'queue full': 2, 'max_rate': 1}
     clock.now += 5.1
-    assert statistics.counts().recent_drops == {'max_rate': 1}
+    assert statistics.counts().dropped.recent == {'max_rate': 1}
 
 
 def test_statuses_are_counted_in_lower_case_with_the_last_result(clock, statistics):
@@ -106,12 +95,12 @@ def test_statuses_are_counted_in_lower_case_with_the_last_result(clock, statisti
     answer(statistics, 'no match', 'failed the check', -1, 0.5)
     clock.now += 4
     counts = statistics.counts()
-    assert counts.statuses == {'no match': 2, 'match': 1}
-    assert counts.recent_statuses == {'match': 1, 'no match': 1}
+    assert counts.answered.total == {'no match': 2, 'match': 1}
+    assert counts.answered.recent == {'match': 1, 'no match': 1}
     last = (counts.status, counts.reason, counts.place, counts.distance)
     assert last == ('no match', 'failed the check', -1, 0.5)
-    assert counts.answered_age == pytest.approx(4)
-    assert counts.received_age is None
+    assert counts.answered.age == pytest.approx(4)
+    assert counts.nearest == 0.25
 
 
 def test_stage_times_are_mean_and_maximum_of_recent_images(clock, statistics):
@@ -121,83 +110,74 @@ def test_stage_times_are_mean_and_maximum_of_recent_images(clock, statistics):
     clock.now += 2
     answer(statistics, waiting=0.004, decoding=0.002)
     answer(statistics)  # not measured: no zero in the mean
-    counts = statistics.counts()
-    assert list(counts.stages) == ['waiting', 'decoding', 'matching']
-    expected = {'waiting': (3, 4), 'decoding': (3, 4), 'matching': (10, 10)}
-    for stage, (mean, largest) in expected.items():
-        assert dataclasses.astuple(counts.stages[stage]) == pytest.approx((mean, largest))
-    assert dataclasses.astuple(counts.total) == pytest.approx((11, 16))
-    assert dataclasses.astuple(counts.work) == pytest.approx((8, 14))
+    expected = {
+        'total': (11, 16),
+        'work': (8, 14),
+        'waiting': (3, 4),
+        'decoding': (3, 4),
+        'matching': (10, 10),
+    }
+    times = statistics.counts().times
+    assert list(times) == list(expected)
+    for stage, mean_and_maximum in expected.items():
+        assert times[stage] == pytest.approx(mean_and_maximum)
 
 
-def test_gaps_and_jumps_are_counted_with_the_longest(statistics):
-    for seconds in (0.5, 3.0, 2.0):
-        statistics.gap(seconds)
-    statistics.jump_back(60)
+def test_steps_of_the_stamps_are_counted_with_the_longest(clock, statistics):
+    for ahead, missing in ((0.5, 0), (3.0, 2), (2.0, 1), (-60.0, 0), (-5.0, 0), (0.0, 0)):
+        statistics.stepped(ahead, missing)
     counts = statistics.counts()
     assert (counts.gaps, counts.longest_gap) == (3, 3.0)
-    assert (counts.jumps_back, counts.longest_jump_back) == (1, 60)
+    assert (counts.jumps_back, counts.longest_jump_back) == (2, 60.0)
+    assert counts.missing.recent.total() == 3
+    clock.now += RECENT
+    missing = statistics.counts().missing
+    assert (missing.recent.total(), missing.count) == (0, 3)
 
 
 def test_restart_keeps_totals_and_nothing_recent(clock, statistics):
-    fresh = statistics.counts()
     statistics.received()
     answer(statistics, 'no match', 'x', 3, 0.1, matching=1)
     statistics.dropped('queue full')
-    statistics.gap(2)
-    statistics.jump_back(3)
+    statistics.stepped(2, 1)
+    statistics.stepped(-3, 0)
     clock.now += 5
     statistics.restart()
-    totals = {'received': 1, 'answered': 1, 'gaps': 1, 'longest_gap': 2, 'jumps_back': 1}
-    totals |= {
-        'nearest': 0.1,
-        'longest_jump_back': 3,
-        'drops': {'queue full': 1},
-        'statuses': {'no match': 1},
-    }
-    expected = dataclasses.replace(fresh, **totals)
+    expected = ImageCounts(
+        received=Tally(Counter({'': 1})),
+        answered=Tally(Counter({'no match': 1})),
+        dropped=Tally(Counter({'queue full': 1})),
+        missing=Tally(Counter({'': 1})),
+        nearest=0.1,
+        gaps=1,
+        longest_gap=2,
+        jumps_back=1,
+        longest_jump_back=3,
+    )
     assert str(statistics.counts()) == str(expected)  # as text, in which NaN equals NaN
 
 
-@pytest.fixture
-def frequent_switches():
-    """Let threads interrupt each other everywhere."""
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    yield
-    sys.setswitchinterval(interval)
-
-
-@pytest.mark.usefixtures('frequent_switches')
 def test_counts_from_many_threads_are_complete():
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # threads interrupt each other everywhere
     statistics = Statistics()
-    threads, each, errors = 8, 300, []
-    begin = threading.Barrier(threads + 1)
 
     def count(number):
-        try:
-            begin.wait(10)
-            for _ in range(each):
-                statistics.received()
-                answer(statistics, waiting=0.001, matching=0.001)
-                statistics.dropped(f'cause {number % 2}')
-                statistics.gap(0.5)
-                statistics.jump_back(0.5)
-        except Exception as error:
-            errors.append(error)
+        for _ in range(300):
+            statistics.received()
+            answer(statistics, waiting=0.001, matching=0.001)
+            statistics.dropped(f'cause {number % 2}')
+            statistics.stepped(0.5, 1)
 
-    workers = [threading.Thread(target=count, args=(number,)) for number in range(threads)]
-    for worker in workers:
-        worker.start()
-    begin.wait(10)
-    while any(worker.is_alive() for worker in workers):
-        counts = statistics.counts()
-        assert sum(counts.statuses.values()) == counts.answered
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(count, range(8)))
+    finally:
+        sys.setswitchinterval(interval)
     counts = statistics.counts()
-    assert not errors
-    total = threads * each
-    assert counts.received == counts.answered == counts.gaps == counts.jumps_back == total
-    assert counts.drops == {'cause 0': total // 2, 'cause 1': total // 2}
+    tallies = (counts.received, counts.answered, counts.dropped, counts.missing)
+    assert [tally.count for tally in tallies] == [2400] * 4
+    assert (counts.gaps, counts.dropped.total) == (2400, {'cause 0': 1200, 'cause 1': 1200})
 
 
 def test_memory_of_a_long_stream_does_not_grow(clock, statistics):

@@ -1,137 +1,85 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""ImageCounts of the node: images, results, drops, gaps of the stamps, time of each stage."""
+"""Counts of images, results, drops and gaps of the stamps, and the time of each stage."""
 
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 import math
 from statistics import median
 import threading
 import time
-from typing import Generic, TypeVar
+from typing import Any
 
-RECENT = 10
-"""Length of the window behind rates, recent counts and times [s]."""
-
-SHORTEST_SPAN = 0.5
-"""
-Shortest time over which a rate is taken [s], so that two images of a burst are not a thousand Hz.
-"""
-
-WAITING = 'waiting'
-"""The stage before the worker takes an image: part of the total, not of the work."""
-
+RECENT = 10  # seconds behind rates, recent counts and times
+SHORTEST_SPAN = 0.5  # seconds of a rate at least: two images of a burst are not a thousand Hz
+WAITING = 'waiting'  # stage before the worker takes an image: in the total, not in the work
 NANOSECONDS = 1_000_000_000
-REORDERING_SECONDS = 0.1
-"""Images less than this out of order were reordered on the way, as on best-effort links."""
-
-INTERVALS = 40
-"""Pauses between images from which the period of a camera is taken; it needs half of them."""
-REGULAR = 0.75
-"""Share of them near a multiple of the period, from which on a camera has one."""
-LONGEST_LOSS = 10
-"""Longer pauses than so many periods are pauses of the camera, not losses."""
-
-Value = TypeVar('Value')
+REORDERING_SECONDS = 0.1  # images less than this out of order were reordered on the way
+INTERVALS = 40  # pauses between images for the period of a camera, which needs half of them
+REGULAR = 0.75  # share of them near a multiple of the period, from which on a camera has one
+LONGEST_LOSS = 10  # periods; longer pauses are pauses of the camera, not losses
 
 
 @dataclass(frozen=True)
-class StageTime:
-    """Mean and maximum over recent images [ms]."""
+class Tally:
+    """
+    The events of one kind; recent ones are those of the last ``RECENT`` seconds.
 
-    mean: float
-    max: float
+    :param total: number since the start, by name; ``recent``: the recent ones.
+    :param rate: recent events per second.
+    :param age: seconds since the last event, None = none since the last activation.
+    """
+
+    total: Counter[str] = field(default_factory=Counter)
+    recent: Counter[str] = field(default_factory=Counter)
+    rate: float = 0.0
+    age: float | None = None
+
+    @property
+    def count(self) -> int:
+        """Return the number since the start, of all names."""
+        return self.total.total()
 
 
-@dataclass(frozen=True)
+@dataclass
 class ImageCounts:
     """
-    All counts at one moment. 'Recent' is the last ``RECENT`` seconds.
+    All counts at one moment; totals are since the start.
 
-    :param uptime: seconds since the start or the last activation; totals are since the start.
-    :param received: images received; ``answered``: those with a result.
-    :param rate_in: images received per second, recently; ``rate_out``: results per second.
-    :param received_age: seconds since the last image, None = there was none; ``answered_age``
-        alike.
-    :param drops: images dropped, by cause; ``recent_drops``: the recent ones.
-    :param statuses: results by status in lower case, as ``'no match'``; ``recent_statuses``:
-        recent ones.
+    :param uptime: seconds since the start or the last activation.
+    :param received: images, without names; ``answered``: results by status in lower case, as
+        ``'no match'``; ``dropped``: images without a result by cause, as ``'queue full'``.
+    :param missing: images that the stamps lack at the rate of the camera, an estimate.
     :param status: of the last result, with its reason, place (-1 = none) and distance (NaN =
         none).
     :param nearest: smallest distance of all results, +inf = none had one.
-    :param stages: recent times by stage.
-    :param total: recent times of all stages together, None = no measurement; ``work``: without
-        waiting.
-    :param missing: images that the stamps lack at the rate of the camera, an estimate;
-        ``recent_missing``: the recent ones.
+    :param times: mean and maximum over recent images [ms] of all stages together (``total``),
+        without waiting (``work``), and of each stage; empty = no measurement.
     :param gaps: pauses in the stamps, the longest of ``longest_gap`` seconds.
     :param jumps_back: jumps back of the stamps, by at most ``longest_jump_back`` seconds.
     """
 
     uptime: float = 0.0
-    received: int = 0
-    answered: int = 0
-    rate_in: float = 0.0
-    rate_out: float = 0.0
-    received_age: float | None = None
-    answered_age: float | None = None
-    drops: Mapping[str, int] = field(default_factory=dict)
-    recent_drops: Mapping[str, int] = field(default_factory=dict)
-    statuses: Mapping[str, int] = field(default_factory=dict)
-    recent_statuses: Mapping[str, int] = field(default_factory=dict)
+    received: Tally = field(default_factory=Tally)
+    answered: Tally = field(default_factory=Tally)
+    dropped: Tally = field(default_factory=Tally)
+    missing: Tally = field(default_factory=Tally)
     status: str = ''
     reason: str = ''
     place: int = -1
     distance: float = math.nan
     nearest: float = math.inf
-    stages: Mapping[str, StageTime] = field(default_factory=dict)
-    total: StageTime | None = None
-    work: StageTime | None = None
-    missing: int = 0
-    recent_missing: int = 0
+    times: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     gaps: int = 0
     longest_gap: float = 0.0
     jumps_back: int = 0
     longest_jump_back: float = 0.0
 
 
-class _Recent(Generic[Value]):
-    """Events of the last ``RECENT`` seconds, each with a value."""
-
-    def __init__(self) -> None:
-        self._events: deque[tuple[float, Value]] = deque()
-        self._last: float | None = None
-
-    def add(self, now: float, value: Value) -> None:
-        self._events.append((now, value))
-        self._last = now
-        self._evict(now)
-
-    def values(self, now: float) -> list[Value]:
-        self._evict(now)
-        return [value for _, value in self._events]
-
-    def rate(self, now: float) -> float:
-        """Return events per second, correct at the start and after a pause, and finite."""
-        self._evict(now)
-        if not self._events:
-            return 0.0
-        # the first event opens the span, so there is one period less than there are events
-        span = max(now - self._events[0][0], SHORTEST_SPAN)
-        return max((len(self._events) - 1) / span, len(self._events) / RECENT)
-
-    def age(self, now: float) -> float | None:
-        return None if self._last is None else now - self._last
-
-    def _evict(self, now: float) -> None:
-        while self._events and self._events[0][0] <= now - RECENT:
-            self._events.popleft()
-
-
 class Statistics:
     """
-    ImageCounts events; every method may be called from any thread. Only recent events are kept.
+    Counts events; every method may be called from any thread. Only recent events are kept.
 
     :param clock: returns seconds that never go back.
     """
@@ -140,25 +88,23 @@ class Statistics:
         self._clock = clock
         self._lock = threading.Lock()
         self._counts = ImageCounts()
-        self._drops: Counter[str] = Counter()
-        self._statuses: Counter[str] = Counter()
+        self._totals: defaultdict[str, Counter[str]] = defaultdict(Counter)
         self.restart()
 
     def restart(self) -> None:
         """Begin another activation: totals stay, recent events and the last result are gone."""
         with self._lock:
             self._start = self._clock()
-            self._count(status='', reason='', place=-1, distance=math.nan)
-            self._received: _Recent[None] = _Recent()
-            self._results: _Recent[tuple[str, Mapping[str, float]]] = _Recent()
-            self._dropped: _Recent[tuple[str, int]] = _Recent()
-            self._missing: _Recent[int] = _Recent()
+            self._counts = replace(self._counts, status='', reason='', place=-1, distance=math.nan)
+            self._last: dict[str, float] = {}  # time of the last event by kind
+            # time, name and number of the events by kind
+            self._recent: defaultdict[str, deque[tuple[float, str, int]]] = defaultdict(deque)
+            self._stages: deque[tuple[float, Mapping[str, float]]] = deque()
 
     def received(self) -> None:
         """Count a received image."""
         with self._lock:
-            self._received.add(self._clock(), None)
-            self._count(received=self._counts.received + 1)
+            self._add('received')
 
     def answered(
         self, status: str, reason: str, place: int, distance: float, stages: Mapping[str, float]
@@ -174,159 +120,142 @@ class Statistics:
         """
         status = status.lower().replace('_', ' ')
         with self._lock:
-            self._results.add(self._clock(), (status, dict(stages)))
-            self._statuses[status] += 1
-            self._count(
-                answered=self._counts.answered + 1,
-                status=status,
-                reason=reason,
-                place=place,
-                distance=distance,
-                nearest=min(self._counts.nearest, distance),  # NaN is not less
-            )
+            self._add('answered', status)
+            if stages:
+                self._stages.append((self._last['answered'], dict(stages)))
+                _evict(self._stages, self._last['answered'])
+            counts = self._counts
+            counts.status, counts.reason = status, reason
+            counts.place, counts.distance = place, distance
+            counts.nearest = min(counts.nearest, distance)  # NaN is not less
 
     def dropped(self, cause: str, count: int = 1) -> None:
         """Count images without a result, by cause: ``'queue full'``, ``'invalid: encoding'``."""
         with self._lock:
-            self._dropped.add(self._clock(), (cause, count))
-            self._drops[cause] += count
+            self._add('dropped', cause, count)
 
-    def missing(self, count: int) -> None:
-        """Count images that the stamps lack."""
+    def stepped(self, ahead: float, missing: int) -> None:
+        """Count a gap or jump back of the stamps, and missing images, see :class:`StampWatch`."""
         with self._lock:
-            self._missing.add(self._clock(), count)
-            self._count(missing=self._counts.missing + count)
-
-    def gap(self, seconds: float) -> None:
-        """Count a pause in the stamps."""
-        with self._lock:
-            self._count(
-                gaps=self._counts.gaps + 1, longest_gap=max(self._counts.longest_gap, seconds)
-            )
-
-    def jump_back(self, seconds: float) -> None:
-        """Count a jump back of the stamps."""
-        with self._lock:
-            self._count(
-                jumps_back=self._counts.jumps_back + 1,
-                longest_jump_back=max(self._counts.longest_jump_back, seconds),
-            )
+            counts = self._counts
+            if missing:
+                self._add('missing', number=missing)
+            if ahead > 0:
+                counts.gaps += 1
+                counts.longest_gap = max(counts.longest_gap, ahead)
+            elif ahead < 0:
+                counts.jumps_back += 1
+                counts.longest_jump_back = max(counts.longest_jump_back, -ahead)
 
     def counts(self) -> ImageCounts:
         """Return all counts; later events do not change them."""
         with self._lock:
             now = self._clock()
-            results = self._results.values(now)
-            measured = [stages for _, stages in results if stages]
+            _evict(self._stages, now)
             return replace(
                 self._counts,
                 uptime=now - self._start,
-                rate_in=self._received.rate(now),
-                rate_out=self._results.rate(now),
-                received_age=self._received.age(now),
-                answered_age=self._results.age(now),
-                drops=dict(self._drops),
-                recent_drops=_sum(self._dropped.values(now)),
-                statuses=dict(self._statuses),
-                recent_statuses=dict(Counter(status for status, _ in results)),
-                recent_missing=sum(self._missing.values(now)),
-                stages=_by_stage(measured),
-                total=_time(sum(stages.values()) for stages in measured),
-                work=_time(sum(stages.values()) - stages.get(WAITING, 0.0) for stages in measured),
+                times=_times([stages for _, stages in self._stages]),
+                received=self._tally('received', now),
+                answered=self._tally('answered', now),
+                dropped=self._tally('dropped', now),
+                missing=self._tally('missing', now),
             )
 
-    def _count(self, **changes: object) -> None:
-        self._counts = replace(self._counts, **changes)  # type: ignore[arg-type]
+    def _add(self, kind: str, name: str = '', number: int = 1) -> None:
+        self._last[kind] = now = self._clock()
+        self._totals[kind][name] += number
+        self._recent[kind].append((now, name, number))
+        _evict(self._recent[kind], now)
+
+    def _tally(self, kind: str, now: float) -> Tally:
+        events, last = self._recent[kind], self._last.get(kind)
+        _evict(events, now)
+        recent: Counter[str] = Counter()
+        for _, name, number in events:
+            recent[name] += number
+        rate = 0.0
+        if events:
+            # the first event opens the span, so there is one period less than there are events
+            span = max(now - events[0][0], SHORTEST_SPAN)
+            rate = max((len(events) - 1) / span, len(events) / RECENT)
+        age = None if last is None else now - last
+        return Tally(self._totals[kind].copy(), recent, rate, age)
 
 
 class StampWatch:
     """
-    Compares each stamp with the newest one; for one thread, while any may set ``gap``.
+    Finds gaps, jumps back and missing images in stamps; for one thread, any may set ``gap``.
 
     :param gap: longer pauses are reported [s]; 0 = none is.
     """
 
     def __init__(self, gap: float) -> None:
         self.gap = gap
-        self._newest = 0
+        self._newest = self._last = 0  # stamps
+        self._intervals: deque[float] = deque(maxlen=INTERVALS)
 
-    def see(self, stamp: int) -> float:
+    def update(self, stamp: int) -> tuple[float, int]:
         """
-        Take the next stamp; return the seconds of a gap, minus those of a jump back, 0 = neither.
+        Take the next stamp; return the step and the number of images missing before it.
 
-        A jump back is an earlier stamp, as when a bag starts again. A reordered image does not
-        move the newest stamp back: otherwise the image after it would seem to come after a gap.
+        The step is the seconds of a gap, minus those of a jump back, 0 = neither. A jump back is
+        an earlier stamp, as when a bag starts again. A reordered image does not move the newest
+        stamp back: otherwise the image after it would seem to come after a gap.
+
+        Missing images are estimated at a camera of steady rate: 0 while the rate is unknown or
+        unsteady, and after a pause. Jitter of a tenth of the period and the loss of half of the
+        images do no harm; a change of the rate is detected after ``INTERVALS`` images.
 
         :param stamp: nanoseconds; 0 = unknown, ignored.
         """
         if stamp == 0:
-            return 0.0
-        newest, self._newest = self._newest, stamp
-        if newest == 0:
-            return 0.0
-        ahead = (stamp - newest) / NANOSECONDS
+            return 0.0, 0
+        last, newest = self._last, self._newest
+        self._last = self._newest = stamp
+        ahead = (stamp - newest) / NANOSECONDS if newest else 0.0
         if ahead <= -REORDERING_SECONDS:
-            return ahead
+            self._last = 0
+            self._intervals.clear()
+            return ahead, 0
         if ahead < 0:
             self._newest = newest
-        return ahead if 0 < self.gap < ahead else 0.0
+        missing = self._missing((stamp - last) / NANOSECONDS) if last else 0
+        return (ahead if 0 < self.gap < ahead else 0.0), missing
 
-
-class PeriodWatch:
-    """Estimates from stamps how many images of a camera of steady rate are missing."""
-
-    def __init__(self) -> None:
-        self._intervals: deque[float] = deque(maxlen=INTERVALS)
-        self._newest = 0
-
-    def see(self, stamp: int) -> int:
-        """
-        Take the next stamp; return the number of images missing before it.
-
-        It is 0 while the rate is unknown or unsteady, and after a pause. Jitter of a tenth of the
-        period and the loss of half of the images do no harm; a change of the rate is detected
-        after ``INTERVALS`` images.
-
-        :param stamp: nanoseconds; 0 = unknown, ignored.
-        """
-        before, self._newest = self._newest, stamp or self._newest
-        interval = (stamp - before) / NANOSECONDS
-        if before == 0 or interval <= 0:  # the first, unknown, or out of order
+    def _missing(self, interval: float) -> int:
+        """Return the number of images missing in an interval [s] by the period of the others."""
+        if interval <= 0:  # equal or out of order
             return 0
         self._intervals.append(interval)
-        period = self._period()
-        if period is None or interval > LONGEST_LOSS * period:
+        ordered = sorted(self._intervals)
+        if len(ordered) < INTERVALS // 2:
+            return 0
+        # a short interval, since long ones have losses, but not the shortest: it has most jitter
+        guess = ordered[len(ordered) // 5]
+        period = median(each / max(round(each / guess), 1) for each in ordered)
+        multiples = [each / period for each in ordered]
+        near = sum(abs(multiple - max(round(multiple), 1)) < 0.25 for multiple in multiples)
+        if near < REGULAR * len(multiples) or interval > LONGEST_LOSS * period:
             return 0
         return max(round(interval / period) - 1, 0)
 
-    def _period(self) -> float | None:
-        """Return the period, seconds, of which most intervals are multiples; None without one."""
-        ordered = sorted(self._intervals)
-        if len(ordered) < INTERVALS // 2:
-            return None
-        # a short interval, since long ones have losses, but not the shortest: it has most jitter
-        guess = ordered[len(ordered) // 5]
-        period = median(interval / max(round(interval / guess), 1) for interval in ordered)
-        multiples = [interval / period for interval in ordered]
-        near = sum(abs(multiple - max(round(multiple), 1)) < 0.25 for multiple in multiples)
-        return period if near >= REGULAR * len(multiples) else None
+
+def _evict(events: deque[Any], now: float) -> None:
+    """Remove the events that are no longer recent; the time is the first item of each."""
+    while events and events[0][0] <= now - RECENT:
+        events.popleft()
 
 
-def _sum(counted: Iterable[tuple[str, int]]) -> dict[str, int]:
-    """Return the counts by word."""
-    total: Counter[str] = Counter()
-    for word, count in counted:
-        total[word] += count
-    return dict(total)
-
-
-def _by_stage(measured: list[Mapping[str, float]]) -> dict[str, StageTime]:
-    """Return the times of each stage, in the order of the stages."""
-    names = dict.fromkeys(name for stages in measured for name in stages)
-    times = {name: _time(stages[name] for stages in measured if name in stages) for name in names}
-    return {name: time for name, time in times.items() if time is not None}
-
-
-def _time(seconds: Iterable[float]) -> StageTime | None:
-    values = list(seconds)
-    return StageTime(1e3 * sum(values) / len(values), 1e3 * max(values)) if values else None
+def _times(measured: list[Mapping[str, float]]) -> dict[str, tuple[float, float]]:
+    """Return mean and maximum [ms] of total, work and each stage."""
+    seconds: dict[str, list[float]] = {}
+    for stages in measured:
+        total = sum(stages.values())
+        sums = {'total': total, 'work': total - stages.get(WAITING, 0.0)}
+        for name, value in {**sums, **stages}.items():
+            seconds.setdefault(name, []).append(value)
+    return {
+        name: (1e3 * sum(values) / len(values), 1e3 * max(values))
+        for name, values in seconds.items()
+    }

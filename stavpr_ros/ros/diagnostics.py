@@ -11,21 +11,11 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from stavpr_ros.pipeline.statistics import ImageCounts, RECENT
-from stavpr_ros.ros.health import (
-    Health,
-    inactive_text,
-    input_findings,
-    map_finding,
-    OK,
-    processing_finding,
-    recognition_finding,
-)
+from stavpr_ros.ros.health import findings, Health
 from std_msgs.msg import Header
 
+# first words of the causes shown with the input; the others are shown with the processing
 INPUT_CAUSES = ('invalid', 'lost in transport', 'no odometry')
-"""
-First words of the causes shown with the input; the other causes are shown with the processing.
-"""
 
 Value = str | int | float | None
 
@@ -68,26 +58,14 @@ def diagnostic_array(health: Health, node: str, stamp: Time) -> DiagnosticArray:
 
     :param node: its full name, the first part of the statuses' names without the leading slash.
     """
-    # a node that is not active is so on purpose: a permanent warning on standby would be ignored
-    idle = [] if health.state == 'active' else [(OK, inactive_text(health.state, node))]
-    parts = {
-        'input': (idle or input_findings(health), _input_values(health)),
-        'map': ([map_finding(health)], _map_values(health)),
-        'recognition': (idle or [recognition_finding(health)], _recognition_values(health)),
-        'processing': (idle or [processing_finding(health)], _processing_values(health)),
-    }
+    values = _values(health)
     statuses = []
-    for part, (findings, values) in parts.items():
-        findings.sort(key=lambda finding: finding[0], reverse=True)  # monitors cut long messages
-        statuses.append(
-            DiagnosticStatus(
-                level=findings[0][0],
-                name=f'{node.lstrip("/")}: {part}',
-                message='; '.join(text for _, text in findings),
-                hardware_id=health.hardware_id,
-                values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
-            )
-        )
+    for part, found in findings(health, node).items():
+        found.sort(key=lambda finding: finding[0], reverse=True)  # monitors cut long messages
+        text = '; '.join(text for _, text in found)
+        shown = {key: _text(value) for key, value in values[part].items()}
+        statuses.append(_status(f'{node}: {part}', found[0][0], text, shown))
+        statuses[-1].hardware_id = health.hardware_id
     return DiagnosticArray(header=Header(stamp=stamp), status=statuses)
 
 
@@ -95,106 +73,91 @@ def one_status(
     node: Node, part: str, level: bytes, text: str, values: Mapping[str, object]
 ) -> DiagnosticArray:
     """Return the diagnostics of a node with one part, stamped now."""
-    status = DiagnosticStatus(
-        level=level,
-        name=f'{node.get_fully_qualified_name().lstrip("/")}: {part}',
-        message=text,
-        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-    )
+    status = _status(f'{node.get_fully_qualified_name()}: {part}', level, text, values)
     header = Header(stamp=node.get_clock().now().to_msg())
     return DiagnosticArray(header=header, status=[status])
 
 
-# the numbers behind the messages
-
-
-def _input_values(health: Health) -> dict[str, Value]:
-    counts = health.counts
-    return {
-        'topic': health.input.topic,
-        'transport': health.settings.image_transport,
-        'publishers': health.input.publishers,
-        'publishers_refused': health.input.incompatible,
-        'reliability': health.input.reliability or None,
-        'received': counts.received,
-        'missing_by_stamps_estimate': counts.missing,
-        f'missing_by_stamps_estimate_{RECENT}s': counts.recent_missing,
-        'rate_in_hz': counts.rate_in,
-        'last_image_age_s': counts.received_age,
-        'gaps': counts.gaps,
-        'longest_gap_s': counts.longest_gap,
-        'jumps_back': counts.jumps_back,
-        'longest_jump_back_s': counts.longest_jump_back,
-        'odometry': _odometry(health),
-        **_drop_values(counts, of_input=True),
-    }
-
-
-def _odometry(health: Health) -> str:
-    if not health.odometry:
-        return 'not needed'
-    return health.odometry + ('' if health.odometry_required else ', optional')
-
-
-def _map_values(health: Health) -> dict[str, Value]:
-    return {
-        'state': health.map_info.state,
-        'path': health.map_path or None,
-        'places': health.map_info.places,
-        'max_places': health.settings.pipeline.max_places,
-        'features': health.map_info.features,
-    }
-
-
-def _recognition_values(health: Health) -> dict[str, Value]:
-    counts, settings = health.counts, health.settings.pipeline
+def _values(health: Health) -> dict[str, dict[str, Value]]:
+    """Return the numbers behind the messages, by part."""
+    counts, settings, info = health.counts, health.settings.pipeline, health.map_info
+    backend = settings.matching_backend(health.settings.operation)
     limit = 'min_probability' if settings.mode == 'robust' else 'threshold'
+    odometry = health.odometry or 'not needed'
+    if health.odometry and not health.odometry_required:
+        odometry += ', optional'
     return {
-        'operation': health.settings.operation,
-        'mode': settings.mode,
-        limit: getattr(settings, limit),
-        'window': health.window,
-        'length': settings.sequence.length,
-        'last_status': counts.status or None,
-        'last_reason': counts.reason or None,
-        'last_place': counts.place if counts.place >= 0 else None,
-        'last_distance': counts.distance,
-        'last_answer_age_s': counts.answered_age,
-        'camera': health.camera,
-        **{_key('edges', source): count for source, count in health.edges.sources.items()},
-        'last_edge_reason': health.edges.reason or None,
-        **{_key('statuses', status): count for status, count in counts.statuses.items()},
+        'input': {
+            'topic': health.input.topic,
+            'transport': health.settings.image_transport,
+            'publishers': health.input.publishers,
+            'publishers_refused': health.input.incompatible,
+            'reliability': health.input.reliability or None,
+            'received': counts.received.count,
+            'missing_by_stamps_estimate': counts.missing.count,
+            f'missing_by_stamps_estimate_{RECENT}s': counts.missing.recent.total(),
+            'rate_in_hz': counts.received.rate,
+            'last_image_age_s': counts.received.age,
+            'gaps': counts.gaps,
+            'longest_gap_s': counts.longest_gap,
+            'jumps_back': counts.jumps_back,
+            'longest_jump_back_s': counts.longest_jump_back,
+            'odometry': odometry,
+            **_drops(counts, of_input=True),
+        },
+        'map': {
+            'state': info.state,
+            'path': health.map_path or None,
+            'places': info.places,
+            'max_places': settings.max_places,
+            'features': info.features,
+        },
+        'recognition': {
+            'operation': health.settings.operation,
+            'mode': settings.mode,
+            limit: getattr(settings, limit),
+            'window': health.window,
+            'length': settings.sequence.length,
+            'last_status': counts.status or None,
+            'last_reason': counts.reason or None,
+            'last_place': counts.place if counts.place >= 0 else None,
+            'last_distance': counts.distance,
+            'last_answer_age_s': counts.answered.age,
+            'camera': health.camera,
+            **{_key('edges', source): count for source, count in health.edges.sources.items()},
+            'last_edge_reason': health.edges.reason or None,
+            **{_key('statuses', name): count for name, count in counts.answered.total.items()},
+        },
+        'processing': {
+            'state': health.state,
+            'uptime_s': counts.uptime,
+            'answered': counts.answered.count,
+            'rate_out_hz': counts.answered.rate,
+            'queue': health.queue,
+            'queue_size': health.settings.queue_size,
+            'backend': backend,
+            'device': _device(backend),
+            'precision': settings.precision,
+            **_drops(counts, of_input=False),
+            **{_key(name, 'mean_ms'): mean for name, (mean, _) in counts.times.items()},
+            **{_key(name, 'max_ms'): largest for name, (_, largest) in counts.times.items()},
+        },
     }
 
 
-def _processing_values(health: Health) -> dict[str, Value]:
-    counts = health.counts
-    times = {'total': counts.total, 'work': counts.work, **counts.stages}
-    measured = {name: time for name, time in times.items() if time is not None}
-    return {
-        'state': health.state,
-        'uptime_s': counts.uptime,
-        'answered': counts.answered,
-        'rate_out_hz': counts.rate_out,
-        'queue': health.queue,
-        'queue_size': health.settings.queue_size,
-        'backend': health.backend,
-        'device': _device(health.backend),
-        'precision': health.settings.pipeline.precision,
-        **_drop_values(counts, of_input=False),
-        **{_key(name, 'mean_ms'): time.mean for name, time in measured.items()},
-        **{_key(name, 'max_ms'): time.max for name, time in measured.items()},
-    }
-
-
-def _drop_values(counts: ImageCounts, of_input: bool) -> dict[str, Value]:
+def _drops(counts: ImageCounts, of_input: bool) -> dict[str, Value]:
     """Return the drops by cause, since the start and recently."""
     values: dict[str, Value] = {}
-    for cause, count in counts.drops.items():
+    for cause, count in counts.dropped.total.items():
         if cause.startswith(INPUT_CAUSES) == of_input:
             values[_key('dropped', cause)] = count
-            values[_key('dropped', cause, f'{RECENT}s')] = counts.recent_drops.get(cause, 0)
+            values[_key('dropped', cause, f'{RECENT}s')] = counts.dropped.recent[cause]
     return values
+
+
+def _status(name: str, level: bytes, text: str, values: Mapping[str, object]) -> DiagnosticStatus:
+    shown = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    return DiagnosticStatus(level=level, name=name.lstrip('/'), message=text, values=shown)
 
 
 def _key(*words: str) -> str:

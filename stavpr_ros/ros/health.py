@@ -2,31 +2,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """The health of a node: its state, and the findings on it: level, cause and remedy."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 import math
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.pipeline import NodeSettings
+from stavpr_ros.pipeline.pipeline import NOT_A_KEYFRAME
 from stavpr_ros.pipeline.statistics import ImageCounts, RECENT
 from stavpr_ros.ros.edges import EdgeCounts
-from stavpr_ros.ros.faults import blank_images, never_matched, short_map
 from stavpr_ros.ros.input import InputStatus
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
-SILENCE = 2.0
-"""Seconds without an image from which on the input of an active node has a fault."""
-
-BUSY = 0.8
-"""Share of its time that the worker is busy; below it, a full queue is due to a burst."""
-
-MISSING = 0.05
-"""Share of the received images; from this estimate of missing ones on it is reported."""
-
-DECIDED = ('match', 'no match')
-NOT_DECODED = ('invalid image', 'dropped', 'not ready', 'skipped')
+SILENCE = 2.0  # seconds without an image from which on the input of an active node has a fault
+BUSY = 0.8  # share of its time that the worker is busy; below it, a full queue is due to a burst
+MISSING = 0.05  # share of the received images; from this estimate on missing ones are reported
+HOPELESS = 5  # windows' lengths of images without any match, from which on the limit is suspect
+BLANK = 3.0
+"""
+Standard deviation of an image [of 255] below which it shows nothing. The darkest tunnels of
+Nordland have 3; of the other data sets no image is below 22.
+"""
 NEXT_TRANSITION = {'unconfigured': 'configure', 'inactive': 'activate'}
+INVALID = 'invalid: '  # first word of the causes of images that cannot be decoded
+RECENTLY = f'in the last {RECENT} s'
 
 Finding = tuple[bytes, str]  # level and message
 
@@ -77,161 +78,124 @@ class Health:
         """Whether images without a pose are skipped; places of recorded maps can do without."""
         return self.settings.pipeline.keyframes.needs_poses
 
-    @property
-    def backend(self) -> str:
-        """Return the backend of the image distances."""
-        return self.settings.pipeline.matching_backend(self.settings.operation)
+
+def findings(health: Health, node: str) -> dict[str, list[Finding]]:
+    """Return the findings on each part of a node, one or more."""
+    of_map = [_map_finding(health)]
+    if health.state != 'active':
+        # it is so on purpose: a permanent warning on standby would be ignored
+        transition = NEXT_TRANSITION.get(health.state)
+        remedy = f"; run 'ros2 lifecycle set {node} {transition}'" if transition else ''
+        idle = [(OK, f'{health.state}: no image is processed{remedy}')]
+        return {'input': idle, 'map': of_map, 'recognition': idle, 'processing': idle}
+    counts, topic = health.counts, health.input.topic
+    normal = f'{counts.received.rate:.1f} images per second on {topic}'
+    if counts.received.age is None:
+        normal = f'waiting for the first image on {topic}'
+    return {
+        'input': [*_silence(health), *_image_faults(health)] or [(OK, normal)],
+        'map': of_map,
+        'recognition': [_recognition_finding(health)],
+        'processing': [_processing_finding(health)],
+    }
 
 
-def inactive_text(state: str, node: str) -> str:
-    """Return the message of a node that is not active."""
-    transition = NEXT_TRANSITION.get(state)
-    remedy = f"; run 'ros2 lifecycle set {node} {transition}'" if transition else ''
-    return f'{state}: no image is processed{remedy}'
-
-
-def input_findings(health: Health) -> list[Finding]:
-    """Return the findings on the images and odometry of an active node."""
-    counts = health.counts
-    recent = f'in the last {RECENT} s'
-    age = counts.uptime if counts.received_age is None else counts.received_age
-    findings = []
-    if age > SILENCE:
-        findings.append(_silence(health, age))
-    elif (
-        health.input.incompatible
-        and health.input.publishers > 1
-        and counts.received_age is not None
-    ):
+def _silence(health: Health) -> Iterator[Finding]:
+    """Yield the likeliest reason why no image arrives, or none of a publisher."""
+    source, age = health.input, health.counts.received.age
+    silent = (health.counts.uptime if age is None else age) > SILENCE
+    nothing = f'no image {"yet" if age is None else f"for {age:.0f} s"} on {source.topic}: '
+    refused = f'{_of(source.incompatible, "publisher")} refused for QoS'
+    qos = source.remedy or f"compare 'ros2 topic info --verbose {source.topic}'"
+    if silent and not source.publishers:
+        remedy = "find the camera's topic with 'ros2 topic list', remap to it"
+        yield WARN, f'{nothing}no publisher; {remedy} with --ros-args -r image:=TOPIC'
+    elif silent and source.incompatible:
+        yield ERROR, f'{nothing}{refused}: {qos}'
+    elif silent and source.mistyped:
+        remedy = 'compare image_transport and the topic'
+        yield ERROR, f'{nothing}{source.mistyped} is published there: {remedy}'
+    elif silent:
+        remedy = 'check for a paused bag or a camera that is off'
+        yield WARN, f'{nothing}{_of(source.publishers, "publisher")} there, but silent; {remedy}'
+    elif source.incompatible and source.publishers > 1 and age is not None:
         # a single publisher is not the refused one: images arrive
-        refused = f'{_of(health.input.incompatible, "publisher")} refused for QoS'
-        findings.append((WARN, f'{refused}, while images of others arrive: {_qos_remedy(health)}'))
-    findings += _invalid(counts)
-    findings += _lost(health)
-    if health.odometry in ('stale', 'never') and (
-        health.odometry_required or health.odometry_fault
-    ):
+        yield WARN, f'{refused}, while images of others arrive: {qos}'
+
+
+def _image_faults(health: Health) -> Iterator[Finding]:
+    """Yield the findings on images that arrived or were lost, and on their odometry."""
+    counts, drops = health.counts, health.counts.dropped.recent
+    invalid = {cause: n for cause, n in drops.items() if cause.startswith(INVALID)}
+    if invalid:
+        kinds = ', '.join(f'{cause.removeprefix(INVALID)} {n}' for cause, n in invalid.items())
+        text = f'{RECENTLY} were invalid ({kinds}): see the log'
+        if counts.answered.recent or NOT_A_KEYFRAME in drops:  # others could be decoded
+            yield WARN, f'{_of(sum(invalid.values()), "image")} {text}'
+        else:
+            yield ERROR, f'all images {text}, and docs/node.md for the supported encodings'
+    missing = counts.missing.recent.total()
+    if lost := drops['lost in transport']:
+        remedy = f'{health.input.loss_remedy} (docs/troubleshooting.md, images are lost)'
+        yield WARN, f'{_of(lost, "image")} lost in transport {RECENTLY}: {remedy}'
+    elif missing > MISSING * RECENT * counts.received.rate:
+        remedy = 'none was lost in transport: check the camera driver, its cable and its exposure'
+        yield WARN, f'about {_of(missing, "image")} missing by their stamps {RECENTLY}; {remedy}'
+    absent = health.odometry in ('stale', 'never')
+    if absent and (health.odometry_required or health.odometry_fault):
         need = 'required by a parameter' if health.odometry_required else 'for poses of the map'
         state = 'was never received' if health.odometry == 'never' else 'has stopped'
         remedy = health.odometry_fault or 'start it, compare its topic and its stamps'
-        findings.append((WARN, f'odometry, {need}, {state}: {remedy}'))
-    elif without := counts.recent_drops.get('no odometry', 0):
-        text = f'{_of(without, "image")} without odometry at their stamps {recent}: compare both'
-        findings.append((WARN, text))
-    if counts.rate_in and (blank := blank_images(health.contrast)):
-        findings.append((WARN, blank))
-    if findings:
-        return findings
-    if counts.received_age is None:
-        return [(OK, f'waiting for the first image on {health.input.topic}')]
-    return [(OK, f'{counts.rate_in:.1f} images per second on {health.input.topic}')]
+        yield WARN, f'odometry, {need}, {state}: {remedy}'
+    elif without := drops['no odometry']:
+        what = _of(without, 'image')
+        yield WARN, f'{what} without odometry at their stamps {RECENTLY}: compare both'
+    if counts.received.rate and health.contrast < BLANK:
+        text = f'the images show nothing (standard deviation {health.contrast:.1f} of 255)'
+        remedy = (
+            'check the lens cap, the exposure and the driver, look at them with rqt_image_view'
+        )
+        yield WARN, f'{text}: {remedy}'
 
 
-def _silence(health: Health, age: float) -> Finding:
-    """Return the likeliest reason why no image arrives."""
-    since = 'yet' if health.counts.received_age is None else f'for {age:.0f} s'
-    nothing = f'no image {since} on {health.input.topic}: '
-    if not health.input.publishers:
-        remedy = "find the camera's topic with 'ros2 topic list', remap to it"
-        return WARN, f'{nothing}no publisher; {remedy} with --ros-args -r image:=TOPIC'
-    if health.input.incompatible:
-        refused = f'{_of(health.input.incompatible, "publisher")} refused for QoS: '
-        return ERROR, nothing + refused + _qos_remedy(health)
-    if health.input.mistyped:
-        remedy = 'compare image_transport and the topic'
-        return ERROR, f'{nothing}{health.input.mistyped} is published there: {remedy}'
-    return WARN, (
-        f'{nothing}{_of(health.input.publishers, "publisher")} there, but silent; '
-        'check for a paused bag or a camera that is off'
-    )
-
-
-def _qos_remedy(health: Health) -> str:
-    return health.input.remedy or f"compare 'ros2 topic info --verbose {health.input.topic}'"
-
-
-def _invalid(counts: ImageCounts) -> list[Finding]:
-    """Return the finding on recent images that could not be decoded, if there are any."""
-    invalid = {cause: n for cause, n in counts.recent_drops.items() if cause.startswith('invalid')}
-    if not invalid:
-        return []
-    kinds = ', '.join(
-        f'{cause.removeprefix("invalid").lstrip(": ")} {n}' for cause, n in invalid.items()
-    )
-    text = f'in the last {RECENT} s were invalid ({kinds}): see the log'
-    # keyframes were decoded, and an image compared with one too
-    valid = sum(n for status, n in counts.recent_statuses.items() if status not in NOT_DECODED)
-    if valid or 'not a keyframe' in counts.recent_drops:
-        return [(WARN, f'{_of(sum(invalid.values()), "image")} {text}')]
-    return [(ERROR, f'all images {text}, and docs/node.md for the supported encodings')]
-
-
-def _lost(health: Health) -> list[Finding]:
-    """Return the finding on images lost on the way, or before that, if there are any."""
-    counts = health.counts
-    recent = f'in the last {RECENT} s'
-    lost = counts.recent_drops.get('lost in transport', 0)
-    if lost:
-        remedy = f'{health.input.loss_remedy} (docs/troubleshooting.md, images are lost)'
-        return [(WARN, f'{_of(lost, "image")} lost in transport {recent}: {remedy}')]
-    if counts.recent_missing > MISSING * RECENT * counts.rate_in:
-        text = f'about {_of(counts.recent_missing, "image")} missing by their stamps {recent}'
-        remedy = 'none was lost in transport: check the camera driver, its cable and its exposure'
-        return [(WARN, f'{text}; {remedy}')]
-    return []
-
-
-def map_finding(health: Health) -> Finding:
+def _map_finding(health: Health) -> Finding:
     """Return the finding on the map, in any state of the node."""
-    places = _of(health.map_info.places, 'place')
-    if health.problem:
-        in_use = health.map_info.state in ('loaded', 'growing', 'full')
-        return (
-            (WARN, f'{health.problem}; the map in use has {places}')
-            if in_use
-            else (ERROR, health.problem)
-        )
+    info, settings = health.map_info, health.settings.pipeline
+    places = _of(info.places, 'place')
     warning = WARN if health.state == 'active' else OK
-    if health.map_info.state == 'none':
+    if health.problem:
+        in_use = info.state in ('loaded', 'growing', 'full')
+        text = f'{health.problem}; the map in use has {places}'
+        return (WARN, text) if in_use else (ERROR, health.problem)
+    if info.state == 'none':
         return warning, 'no map: set map_path or call ~/load_map'
-    if health.map_info.state == 'loading':
-        meanwhile = (
-            f'; the old map of {places} is used meanwhile' if health.map_info.places else ''
-        )
+    if info.state == 'loading':
+        meanwhile = f'; the old map of {places} is used meanwhile' if info.places else ''
         return OK, f'loading {health.map_path}{meanwhile}'
-    if health.map_info.state == 'growing':
-        return OK, f'growing: {places} of at most {health.settings.pipeline.max_places}'
-    if health.map_info.state == 'full':
+    if info.state == 'growing':
+        return OK, f'growing: {places} of at most {settings.max_places}'
+    if info.state == 'full':
         remedy = 'save it with ~/save_map, then raise max_places'
         return warning, f'full: mapping stopped at {places} (max_places); {remedy}'
-    if health.settings.pipeline.geometric and not health.map_info.has_thumbnails:
+    if settings.geometric and not info.has_thumbnails:
         places += ' without thumbnails, so that geometric_check checks no match,'
     return OK, f'{places} of {health.map_path or "a map without a file"}'
 
 
-def recognition_finding(health: Health) -> Finding:
-    """Return the finding on the results of an active node."""
-    counts = health.counts
+def _recognition_finding(health: Health) -> Finding:
+    counts, length = health.counts, health.settings.pipeline.sequence.length
     if health.settings.operation == 'mapping':
         return OK, 'mapping: images become places, none is recognized'
     if health.map_info.state == 'loading' and not health.map_info.places:
         return OK, 'waiting for the map'
     if health.missing:
         return WARN, f'no match is possible: {health.missing}'
-    settings = health.settings.pipeline
-    if health.settings.operation == 'localization' and health.map_info.state == 'loaded':
-        hopeless = short_map(health.map_info.places, settings.sequence.length)
-        hopeless = hopeless or never_matched(counts, settings)
-        if hopeless:
-            return WARN, hopeless
-    if health.window < health.settings.pipeline.sequence.length:
-        return (
-            OK,
-            f'warming up: {health.window} of {health.settings.pipeline.sequence.length} images',
-        )
-    decided = sum(counts.recent_statuses.get(status, 0) for status in DECIDED)
-    matched = counts.recent_statuses.get('match', 0)
-    text = f'{matched} of {_of(decided, "image")} matched in the last {RECENT} s'
+    if hopeless := _hopeless(health):
+        return WARN, hopeless
+    if health.window < length:
+        return OK, f'warming up: {health.window} of {length} images'
+    matched, rejected = (counts.answered.recent[status] for status in ('match', 'no match'))
+    text = f'{matched} of {_of(matched + rejected, "image")} matched {RECENTLY}'
     if counts.status:
         place = f', place {counts.place}' if counts.place >= 0 else ''
         distance = '' if math.isnan(counts.distance) else f', distance {counts.distance:.3f}'
@@ -240,34 +204,54 @@ def recognition_finding(health: Health) -> Finding:
     return OK, text
 
 
-def processing_finding(health: Health) -> Finding:
-    """Return the finding on the speed of an active node."""
-    counts = health.counts
-    recent = f'in the last {RECENT} s'
-    if failed := counts.recent_drops.get('internal error', 0):
-        return ERROR, f'{_of(failed, "image")} failed {recent} by an internal error: see the log'
-    if dropped := counts.recent_drops.get('queue full', 0):
+def _hopeless(health: Health) -> str:
+    """Return why no image can be matched on a loaded map, or was, '' = one may be."""
+    counts, settings, places = health.counts, health.settings.pipeline, health.map_info.places
+    if health.settings.operation != 'localization' or health.map_info.state != 'loaded':
+        return ''
+    if places < (length := settings.sequence.length):
         return (
-            WARN,
-            f'{_of(dropped, "image")} dropped {recent}, the queue was full: {_why_full(health)}',
+            f'the map has fewer places ({places}) than a window has images (sequence_length '
+            f'{length}): record a longer map, with smaller keyframe distances, or set a shorter '
+            'sequence_length'
         )
-    if counts.work is None:
-        return OK, f'no image {recent}'
-    return OK, f'{counts.work.mean:.1f} ms an image, {counts.rate_out:.1f} results per second'
+    tried, limit = counts.answered.total['no match'], settings.applied_threshold
+    if counts.answered.total['match'] or tried < HOPELESS * length:
+        return ''
+    never = f'none of {tried} images was ever matched'
+    if limit is not None and counts.nearest < limit:
+        return f'{never}: the geometric check rejects all, lower min_inliers or set it to none'
+    if settings.mode == 'robust':
+        best = f'probability {1 - counts.nearest:.3f}'
+        remedy = f'lower min_probability ({settings.min_probability:g})'
+    else:
+        best, remedy = f'distance {counts.nearest:.3f}', f'raise threshold ({limit:g})'
+    return (
+        f'{never}, the best had {best}: compare the route, the direction and the keyframe rules '
+        f'with those of the map, or {remedy}'
+    )
 
 
-def _why_full(health: Health) -> str:
-    """Compare the rate of the images with the possible rate; name the remedy."""
-    counts = health.counts
-    arriving = f'{counts.rate_in:.1f} images per second arrive'
-    if counts.work is None:
-        return f'{arriving}, none was finished; check for a map being loaded or a busy machine'
-    takes = f'{arriving}, one takes {counts.work.mean:.1f} ms'
-    if counts.rate_in * counts.work.mean < BUSY * 1e3:
-        return f'{takes}, which is fast enough: they arrive in bursts; raise queue_size'
-    int8 = '' if health.settings.pipeline.precision == 'int8' else 'precision int8, '
-    remedy = f'set max_rate or keyframe_*, {int8}a smaller map'
-    return f'{takes}, so {1e3 / counts.work.mean:.1f} per second are possible: {remedy}'
+def _processing_finding(health: Health) -> Finding:
+    counts, drops = health.counts, health.counts.dropped.recent
+    mean, _ = counts.times.get('work', (math.nan, math.nan))  # [ms]
+    rate, takes = counts.received.rate, f', one takes {mean:.1f} ms'
+    if failed := drops['internal error']:
+        return ERROR, f'{_of(failed, "image")} failed {RECENTLY} by an internal error: see the log'
+    if not drops['queue full']:
+        if math.isnan(mean):
+            return OK, f'no image {RECENTLY}'
+        return OK, f'{mean:.1f} ms an image, {counts.answered.rate:.1f} results per second'
+    if math.isnan(mean):
+        why = ', none was finished; check for a map being loaded or a busy machine'
+    elif rate * mean < BUSY * 1e3:
+        why = f'{takes}, which is fast enough: they arrive in bursts; raise queue_size'
+    else:
+        int8 = '' if health.settings.pipeline.precision == 'int8' else 'precision int8, '
+        remedy = f'set max_rate or keyframe_*, {int8}a smaller map'
+        why = f'{takes}, so {1e3 / mean:.1f} per second are possible: {remedy}'
+    dropped = f'{_of(drops["queue full"], "image")} dropped {RECENTLY}, the queue was full'
+    return WARN, f'{dropped}: {rate:.1f} images per second arrive{why}'
 
 
 def _of(count: int, noun: str) -> str:

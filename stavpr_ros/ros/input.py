@@ -16,7 +16,7 @@ from rclpy.qos import qos_check_compatible, QoSCompatibility
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_ros.errors import StavprError
 from stavpr_ros.pipeline import NodeSettings
-from stavpr_ros.pipeline.statistics import PeriodWatch, StampWatch, Statistics
+from stavpr_ros.pipeline.statistics import StampWatch, Statistics
 from stavpr_ros.ros.output import nanoseconds
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import AdaptiveSubscription, qos_remedy
@@ -79,7 +79,6 @@ class ImageInput:
         self._node, self._statistics = node, statistics
         self._enqueue, self._reject, self._restart = enqueue, reject, restart
         self.stamps = StampWatch(settings.max_stamp_gap)
-        self._period = PeriodWatch()
         self.max_rate = settings.max_rate
         self.remedy = ''
         self._last: float | None = None  # seconds, of the last image within the rate
@@ -147,14 +146,9 @@ class ImageInput:
 
     def _check_stamp(self, stamp: int) -> None:
         """Count gaps of the stamps and missing images; restart after a jump back."""
-        if missing := self._period.see(stamp):
-            self._statistics.missing(missing)
-        ahead = self.stamps.see(stamp)
-        if ahead > 0:
-            self._statistics.gap(ahead)
-        elif ahead < 0:
-            self._period = PeriodWatch()
-            self._statistics.jump_back(-ahead)
+        ahead, missing = self.stamps.update(stamp)
+        self._statistics.stepped(ahead, missing)
+        if ahead < 0:
             self._last = None
             self._restart(f'the stamps of the images jumped back by {-ahead:.3f} s')
 

@@ -93,10 +93,7 @@ class History:
     def show(self, image: bytes) -> None:
         """Replace the match image."""
         self.image = image
-        with self._changed:
-            self._version += 1
-            self._parts['image'] = self._version, self._version
-            self._changed.notify_all()
+        self.set('image', self._version + 1)
 
     def since(self, version: int, timeout: float) -> tuple[int, dict[str, Any]]:
         """Return the newest version and what has changed since one; wait until there is any."""

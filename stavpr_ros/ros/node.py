@@ -351,8 +351,9 @@ class PlaceRecognitionNode(ManagedNode):
         if self.left_behind:
             self.get_logger().warning('a thread is still loading or compiling: it is abandoned')
         counts = self.statistics.counts()
-        drops = ''.join(f', {count} {cause}' for cause, count in sorted(counts.drops.items()))
+        drops = sorted(counts.dropped.total.items())
+        dropped = ''.join(f', {count} {cause}' for cause, count in drops)
         self.get_logger().info(
-            f'{counts.received} images received, {counts.answered} processed{drops}'
+            f'{counts.received.count} images received, {counts.answered.count} processed{dropped}'
         )
         super().destroy_node()
