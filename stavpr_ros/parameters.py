@@ -4,14 +4,12 @@
 The parameters of the node: one table for validation, launch arguments and documentation.
 
 ``python3 tools/parameter_files.py``, in a checkout, writes ``config/stavpr.yaml`` and
-``docs/parameters.md``. Launch files read this table: it imports the standard library and the
-table of the kinds of features, which loads as quickly.
+``docs/parameters.md``. Launch files read this table, so it imports nothing but the standard
+library.
 """
 
 from dataclasses import dataclass
 from typing import Any, Literal
-
-from stavpr_ros.features.registry import kinds
 
 WHEN = {
     'live': 'at any time',
@@ -101,8 +99,8 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'features',
             'gradient',
-            'Kind of the features of a map that is recorded without map_path.',
-            choices=kinds(from_images=True),
+            'Kind of the features of a map that is recorded without map_path: gradient, onnx, or '
+            'one that another package adds, such as densenet161_places365 of stavpr_lab.',
         ),
         NodeParameter(
             'exclude_places',

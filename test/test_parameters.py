@@ -10,7 +10,6 @@ import pytest
 from stavpr_ros.alignment.settings import STRATEGIES
 from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import MapFileError, SettingsError
-from stavpr_ros.features.registry import kinds
 from stavpr_ros.parameters import BY_NAME, PARAMETERS
 from stavpr_ros.pipeline import (
     node_settings,
@@ -52,7 +51,6 @@ def test_choices_are_those_of_library():
     library = {
         'operation': OPERATIONS,
         'mode': MODES,
-        'features': kinds(from_images=True),
         'geometric_check': ('none', *METHODS),
         'relative_pose': EDGE_METHODS,
         'backend': BACKENDS,

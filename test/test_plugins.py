@@ -1,18 +1,21 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Entry points of other packages: commands, stores, and one that cannot be imported."""
+"""Entry points of other packages: commands, features, stores, and one that is broken."""
 
 import pytest
 from stavpr_ros import plugins
 from stavpr_ros.commands import stavpr
 from stavpr_ros.errors import SettingsError
+from stavpr_ros.features.registry import backbone_class, kinds, settings_class
 from stavpr_ros.mapping.stores import is_address, store_of
 
 MODULE = """
 from stavpr_ros.commands import Command
+from stavpr_ros.features.registry import GradientSettings, Kind
 from stavpr_ros.mapping.stores import Store
 
 COMMANDS = {'hello': Command('plugged', 'greet'), 'node': Command('plugged', 'not this one')}
+KIND = Kind(GradientSettings, 'stavpr_ros.features.gradient:Gradient')
 STORE = Store(open_map=lambda address: address, upload=lambda *_: None)
 main = lambda arguments: len(arguments)
 """
@@ -20,6 +23,9 @@ ENTRY_POINTS = """
 [stavpr.commands]
 plugged = plugged:COMMANDS
 broken = plugged:MISSING
+
+[stavpr.features]
+plain = plugged:KIND
 
 [stavpr.stores]
 drawer = plugged:STORE
@@ -72,3 +78,15 @@ def test_unknown_scheme_lists_known_ones():
     assert not is_address('drawer:socks')
     with pytest.raises(SettingsError, match=r'drawer:socks is no address.*faiss:, qdrant:'):
         store_of('drawer:socks')
+
+
+def test_kind_of_features_of_another_package_is_listed_and_loaded(plugged):
+    assert 'plain' in kinds(from_images=True)
+    assert settings_class('plain').__name__ == 'GradientSettings'
+    assert backbone_class('plain').__name__ == 'Gradient'
+
+
+def test_kind_of_a_missing_package_names_it(monkeypatch):
+    monkeypatch.setattr(plugins, 'load', lambda group: {})
+    with pytest.raises(SettingsError, match='in the package stavpr_lab'):
+        settings_class('vgg16')

@@ -27,9 +27,6 @@ COMMANDS = {
     'map': Command(
         'stavpr_ros.commands.map', 'show, check, convert, export, merge and recover maps'
     ),
-    'weights': Command(
-        'stavpr_ros.commands.weights', 'download the published weights of a network'
-    ),
     'node': Command('stavpr_ros.commands.node', 'run the place-recognition node', True),
     'replay': Command(
         'stavpr_ros.commands.replay', 'publish a bag or a folder of images to the node', True

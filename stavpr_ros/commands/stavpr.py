@@ -13,6 +13,7 @@ from stavpr_ros.commands import Command, COMMANDS
 ROS_MODULES = ('rclpy', 'ament_index_python', 'stavpr_msgs')
 
 PACKAGES = {
+    'weights': 'stavpr_lab',
     'export_model': 'stavpr_lab',
     'evaluate': 'stavpr_lab',
     'experiments': 'stavpr_lab',

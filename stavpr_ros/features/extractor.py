@@ -184,7 +184,7 @@ class FeatureExtractor:
         Make the extractor with the settings of a map.
 
         :param model: file of the network or a folder with it, for kinds that have one, see
-            :func:`stavpr_ros.features.weights.find_model`; '' = as the settings state.
+            :func:`stavpr_ros.features.model_files.find_model`; '' = as the settings state.
         :raises FeatureMismatchError: the projection or the model gives other features.
         :raises UnavailableError: the model is not found.
         """
@@ -192,7 +192,7 @@ class FeatureExtractor:
         if isinstance(backbone, NetworkSettings):
             model = model or backbone.model
             if backbone.sha256:
-                from stavpr_ros.features.weights import find_model
+                from stavpr_ros.features.model_files import find_model
 
                 model = str(find_model(backbone.sha256, model))
             backbone = dataclasses.replace(backbone, model=model)

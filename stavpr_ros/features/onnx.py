@@ -18,9 +18,9 @@ import numpy as np
 from stavpr_ros.devices import choose_device
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.extractor import resize_square, TEST_SIDE
+from stavpr_ros.features.model_files import read_model
 from stavpr_ros.features.outputs import as_maps, as_vectors
 from stavpr_ros.features.registry import OnnxSettings
-from stavpr_ros.features.weights import read_model
 import torch
 
 FLOAT, FLOAT16 = 1, 10  # as ONNX numbers them

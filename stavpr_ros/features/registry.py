@@ -13,6 +13,7 @@ import importlib
 import json
 from typing import Any, ClassVar, Protocol, TYPE_CHECKING
 
+from stavpr_ros import plugins
 from stavpr_ros.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -24,9 +25,7 @@ RESIZE_METHODS = ('bilinear', 'area')
 POOLINGS = ('flatten', 'mean', 'gem')
 IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of R, G, B in 0..1: torchvision's networks are trained so
 IMAGENET_STD = (0.229, 0.224, 0.225)
-CACHED = 'cached'  # stands for a published file instead of a path
-_RESIZE_HELP = 'how images are resized: bilinear, or area (averages, no aliasing)'
-_HALF_HELP = 'float16 on a GPU: faster, nearly the same features; no effect on a CPU'
+RESIZE_HELP = 'how images are resized: bilinear, or area (averages, no aliasing)'
 
 
 def setting(
@@ -59,7 +58,7 @@ class GradientSettings:
     BEFORE: ClassVar[dict[str, Any]] = {'logarithm': False}
 
     size: int = setting(224, help='images are resized to size x size pixels first')
-    resize: str = setting('area', help=_RESIZE_HELP)
+    resize: str = setting('area', help=RESIZE_HELP)
     cell: int = setting(16, help='side of a cell in pixels; size must be a multiple of it')
     orientations: int = setting(8, help='number of orientation bins')
     signed: bool = setting(True, help='distinguish dark-to-bright from bright-to-dark')
@@ -92,7 +91,7 @@ class NetworkSettings:
 
     model: str = setting(help='file of the network', identity=False)
     size: int = setting(224, help='images are resized to size x size pixels')
-    resize: str = setting('bilinear', help=_RESIZE_HELP)
+    resize: str = setting('bilinear', help=RESIZE_HELP)
     sha256: str = setting('', help='expected hash of the file; empty: not checked')
     pooling: str = setting(
         'flatten',
@@ -158,33 +157,6 @@ class OnnxSettings(NetworkSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PublishedSettings(NetworkSettings):
-    """Settings of a network with published weights; its input is normalized as for ImageNet."""
-
-    LEAST_SIZE: ClassVar[int] = 32
-
-    model: str = setting(
-        CACHED,
-        help="file of the weights; 'cached': the published file, as `stavpr weights` downloads it",
-        identity=False,
-    )
-    half: bool = setting(False, help=_HALF_HELP, identity=False)
-
-
-@dataclass(frozen=True, kw_only=True)
-class NetVladSettings(NetworkSettings):
-    """Settings of NetVLAD; how its input is normalized is in the file, or as for ImageNet."""
-
-    LEAST_SIZE: ClassVar[int] = 32
-
-    model: str = setting(help='file of the weights, .mat or .pth.tar', identity=False)
-    size: int = setting(480, help='images are resized to size x size pixels')
-    whitening: bool = setting(
-        True, help='PCA whitening as in the file, 4096 dimensions in the published ones'
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
 class DescriptorSettings:
     """Settings of features that another program computed, read from arrays."""
 
@@ -206,16 +178,13 @@ class Kind:
     from_images: bool = True
 
 
+LAB = ('densenet161_places365', 'vgg16', 'vgg16_fc6', 'netvlad')
+"""Kinds of stavpr_lab, for the message where it is missing."""
+
 _FEATURES = 'stavpr_ros.features'
 KINDS = {
     'gradient': Kind(GradientSettings, f'{_FEATURES}.gradient:Gradient'),
     'onnx': Kind(OnnxSettings, f'{_FEATURES}.onnx:Onnx'),
-    'densenet161_places365': Kind(
-        PublishedSettings, f'{_FEATURES}.paper_networks:DenseNet161Places365'
-    ),
-    'vgg16': Kind(PublishedSettings, f'{_FEATURES}.paper_networks:VGG16Pool4'),
-    'vgg16_fc6': Kind(PublishedSettings, f'{_FEATURES}.paper_networks:VGG16Fc6'),
-    'netvlad': Kind(NetVladSettings, f'{_FEATURES}.netvlad:NetVlad'),
     'descriptors': Kind(
         DescriptorSettings, f'{_FEATURES}.descriptors:Descriptors', from_images=False
     ),
@@ -253,7 +222,14 @@ def kinds(*, from_images: bool = False) -> tuple[str, ...]:
 
     :param from_images: only those that are extracted from images.
     """
-    return tuple(name for name, kind in KINDS.items() if kind.from_images or not from_images)
+    return tuple(name for name, kind in _all().items() if kind.from_images or not from_images)
+
+
+def _all() -> dict[str, Kind]:
+    """Return the kinds of this package, and of those whose entry points add one."""
+    return KINDS | {
+        name: kind for name, kind in plugins.load(plugins.FEATURES).items() if name not in KINDS
+    }
 
 
 def settings_class(kind: str) -> Any:
@@ -267,9 +243,17 @@ def settings_class(kind: str) -> Any:
             "features 'torchscript' were removed: export the network to an ONNX file "
             '(docs/features.md) and take features onnx; build a map with it again'
         )
-    if kind not in KINDS:
-        raise SettingsError(f'features {kind!r} are unknown: take one of {", ".join(kinds())}')
-    return KINDS[kind].settings
+    return _kind(kind).settings
+
+
+def _kind(name: str) -> Kind:
+    found = KINDS.get(name) or _all().get(name)
+    if found is None:
+        remedy = f'take one of {", ".join(kinds())}'
+        if name in LAB:
+            remedy = 'they are in the package stavpr_lab, which is not installed'
+        raise SettingsError(f'features {name!r} are unknown: {remedy}')
+    return found
 
 
 def backbone_class(kind: str) -> Any:
@@ -279,7 +263,7 @@ def backbone_class(kind: str) -> Any:
     :raises SettingsError: no such kind.
     """
     settings_class(kind)
-    module, name = KINDS[kind].backbone.split(':')
+    module, name = _kind(kind).backbone.split(':')
     return getattr(importlib.import_module(module), name)
 
 

@@ -12,7 +12,7 @@ from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.devices import choose_backend, why_no_cuda
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.features.registry import settings_class, settings_from_json
+from stavpr_ros.features.registry import kinds, settings_class, settings_from_json
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.mapping.stores import is_address
 from stavpr_ros.parameters import BY_NAME
@@ -246,7 +246,7 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
     :raises UnavailableError: the backend is not available.
     """
     for name, value in values.items():
-        choices = BY_NAME[name].choices
+        choices = kinds(from_images=True) if name == 'features' else BY_NAME[name].choices
         if choices and value not in choices:
             raise SettingsError(f'{name} = {value!r} is unknown: take one of {", ".join(choices)}')
     values = {**values, 'threshold': None if values['threshold'] < 0 else values['threshold']}

@@ -5,6 +5,9 @@
 from stavpr_ros.commands import Command
 
 COMMANDS = {
+    'weights': Command(
+        'stavpr_lab.commands.weights', 'download the published weights of a network'
+    ),
     'export_model': Command(
         'stavpr_lab.commands.export_model', 'make one ONNX file of a network of vectors and maps'
     ),

@@ -17,10 +17,10 @@ from typing import Any
 import warnings
 
 import numpy as np
+from stavpr_lab.features.weights import last_line
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.onnx import BATCH, import_onnx, ON_CPU, TOLERANCE
 from stavpr_ros.features.outputs import as_maps, one_of
-from stavpr_ros.features.weights import last_line
 import torch
 from torch import nn
 

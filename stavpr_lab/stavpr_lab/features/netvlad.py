@@ -24,11 +24,13 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from stavpr_lab.features import NetVladSettings
+from stavpr_lab.features.preprocessing import BatchMaker
+from stavpr_lab.features.weights import expected_hash, read_checkpoint
 from stavpr_ros.devices import choose_device
 from stavpr_ros.errors import SettingsError, UnavailableError
-from stavpr_ros.features.preprocessing import BatchMaker
-from stavpr_ros.features.registry import IMAGENET_MEAN, IMAGENET_STD, NetVladSettings
-from stavpr_ros.features.weights import expected_hash, read_checkpoint, read_model
+from stavpr_ros.features.model_files import read_model
+from stavpr_ros.features.registry import IMAGENET_MEAN, IMAGENET_STD
 import torch
 from torch.nn.functional import conv2d, linear, max_pool2d, normalize, relu
 

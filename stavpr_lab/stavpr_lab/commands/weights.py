@@ -1,12 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run stavpr_ros weights``: download the published weights of a network."""
+"""``ros2 run stavpr_lab weights``: download the published weights of a network."""
 
 import sys
 
+from stavpr_lab.features import PublishedSettings
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features.registry import backbone_class, kinds, PublishedSettings, settings_class
+from stavpr_ros.features.registry import backbone_class, kinds, settings_class
 
 EPILOG = """
 Nothing else in this package goes online. The file is downloaded over https, compared with its
@@ -27,7 +28,8 @@ def main(args: list[str] | None = None) -> int:
             '--sha256', default='', help='hash of the file, 64 digits; known for vgg16'
         )
         arguments = parser.parse_args(args)
-        from stavpr_ros.features import weights
+        from stavpr_lab.features import weights
+        from stavpr_ros.features.model_files import cache_folder
 
         published = backbone_class(arguments.features).published
         sha256 = arguments.sha256.lower() or published.sha256
@@ -38,7 +40,7 @@ def main(args: list[str] | None = None) -> int:
             )
         if len(sha256) != 64 or set(sha256) - set('0123456789abcdef'):
             raise SettingsError(f'--sha256 {sha256}: expected 64 digits 0-9 a-f')
-        path = weights.cache_folder() / published.name
+        path = cache_folder() / published.name
         weights.download(published.address, path, sha256)
         print(f'{path}: sha256 {sha256}')
 

@@ -18,18 +18,18 @@ import re
 from typing import ClassVar
 
 import numpy as np
-from stavpr_ros.devices import choose_device
-from stavpr_ros.errors import UnavailableError
-from stavpr_ros.features.preprocessing import BatchMaker
-from stavpr_ros.features.registry import PublishedSettings
-from stavpr_ros.features.weights import (
+from stavpr_lab.features import PublishedSettings
+from stavpr_lab.features.preprocessing import BatchMaker
+from stavpr_lab.features.weights import (
     expected_hash,
     load_parameters,
     published_path,
     PublishedFile,
     read_checkpoint,
-    read_model,
 )
+from stavpr_ros.devices import choose_device
+from stavpr_ros.errors import UnavailableError
+from stavpr_ros.features.model_files import read_model
 import torch
 from torch import nn
 from torch.nn.functional import avg_pool2d, max_pool2d, relu

@@ -9,17 +9,17 @@ import cv2
 import networks
 import numpy as np
 import pytest
-from stavpr_ros.commands.feature_options import add_feature_options, make_extractor
-from stavpr_ros.errors import SettingsError, UnavailableError
-from stavpr_ros.features.paper_networks import (
+from stavpr_lab.features.paper_networks import (
     DenseNet161,
     DenseNet161Places365,
     VGG16,
     VGG16Fc6,
     VGG16Pool4,
 )
+from stavpr_lab.features.weights import load_parameters
+from stavpr_ros.commands.feature_options import add_feature_options, make_extractor
+from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.registry import backbone_class, settings_class
-from stavpr_ros.features.weights import load_parameters
 import torch
 from torch import nn
 
@@ -131,7 +131,7 @@ def small_vgg(vgg_file):
 
 
 def test_network_with_many_images_runs_in_passes(small_vgg, monkeypatch):
-    monkeypatch.setattr('stavpr_ros.features.paper_networks.PER_PASS', 2)
+    monkeypatch.setattr('stavpr_lab.features.paper_networks.PER_PASS', 2)
     images = smooth_images((32, 32), (40, 40), (50, 32), (32, 50), (64, 64))
     together = small_vgg.feature_maps(images)
     assert together.shape == (5, 512, 2, 2)

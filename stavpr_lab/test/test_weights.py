@@ -13,18 +13,15 @@ import threading
 from checkpoints import Call, Global, Hostile, OldPickle
 import numpy as np
 import pytest
-from stavpr_ros.errors import FeatureMismatchError, UnavailableError
-from stavpr_ros.features import weights
-from stavpr_ros.features.paper_networks import PublishedNetwork
-from stavpr_ros.features.registry import PublishedSettings
-from stavpr_ros.features.weights import (
-    cache_folder,
+from stavpr_lab.features import PublishedSettings, weights
+from stavpr_lab.features.paper_networks import PublishedNetwork
+from stavpr_lab.features.weights import (
     download,
-    find_model,
     PublishedFile,
     read_checkpoint,
-    read_model,
 )
+from stavpr_ros.errors import FeatureMismatchError, UnavailableError
+from stavpr_ros.features.model_files import cache_folder, find_model, read_model
 import torch
 from torch import nn
 
@@ -181,7 +178,7 @@ def test_published_hash_is_checked_in_full(server, cache, content, monkeypatch):
 
 
 def test_command_weights_needs_a_full_hash(cache, capsys, monkeypatch):
-    from stavpr_ros.commands.weights import main
+    from stavpr_lab.commands.weights import main
 
     fetched = []
     monkeypatch.setattr(weights, 'download', lambda *arguments: fetched.append(arguments))

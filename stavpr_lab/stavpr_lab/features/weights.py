@@ -1,22 +1,21 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of models: paths, downloads, hashes; and checkpoints into networks."""
+"""Published weights: downloads, hashes; and checkpoints into networks."""
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 import hashlib
 import http.client
-import io
-import os
 from pathlib import Path
 import re
 from typing import Any, BinaryIO, IO
 import urllib.request
 
 import numpy as np
-from stavpr_ros.errors import FeatureMismatchError, OutputError, UnavailableError
-from stavpr_ros.features.registry import CACHED
+from stavpr_lab.features import CACHED
+from stavpr_ros.errors import OutputError, UnavailableError
+from stavpr_ros.features.model_files import cache_folder
 from stavpr_ros.output_file import ANY, atomic_output, write_output
 from stavpr_ros.regular_file import open_regular
 import torch
@@ -45,40 +44,6 @@ class PublishedFile:
     def name(self) -> str:
         """Return the name of the file."""
         return self.address.rsplit('/', 1)[-1]
-
-
-def cache_folder() -> Path:
-    """Return the folder of downloads, ``$XDG_CACHE_HOME/stavpr_ros`` or below ``~/.cache``."""
-    return Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'stavpr_ros'
-
-
-def models_folder() -> Path:
-    """Return the folder of the user's models: ``$STAVPR_MODELS``, or below ``~/.local/share``."""
-    share = os.environ.get('XDG_DATA_HOME') or Path.home() / '.local' / 'share'
-    return Path(os.environ.get('STAVPR_MODELS') or Path(share) / 'stavpr_ros' / 'models')
-
-
-def find_model(sha256: str, stated: str) -> Path:
-    """
-    Find the model of a map, which is known by its hash only.
-
-    :param stated: a file, which is returned; or a folder to look in; '' = the models folder and
-        the cache of downloads.
-    :raises UnavailableError: none of the files there has this hash.
-    """
-    if stated and not Path(stated).is_dir():
-        return Path(stated)
-    folders = [Path(stated)] if stated else [models_folder(), cache_folder()]
-    files = [file for folder in folders if folder.is_dir() for file in sorted(folder.iterdir())]
-    for file in sorted(files, key=lambda file: sha256[:8] not in file.name):
-        if file.is_file() and os.access(file, os.R_OK):
-            with open_model(file) as content:
-                if hashlib.file_digest(content, 'sha256').hexdigest() == sha256:
-                    return file
-    raise UnavailableError(
-        f'the model with sha256 {sha256} is not in {" or ".join(map(str, folders))}: copy the '
-        'file that the map was built with there, or give its path as model_path'
-    )
 
 
 def published_path(model: str, published: PublishedFile) -> Path:
@@ -120,47 +85,6 @@ def expected_hash(path: Path, published: PublishedFile | None = None) -> str:
 
 def _hash_file(path: Path) -> Path:
     return path.with_name(path.name + '.sha256')
-
-
-def open_model(path: Path) -> io.BufferedReader:
-    """
-    Open the file of a model.
-
-    :raises UnavailableError: it cannot be read, or is no regular file.
-    """
-    try:
-        return io.BufferedReader(open_regular(path))
-    except OSError as error:
-        raise UnavailableError(f'model {str(path)!r} cannot be read: {error}') from error
-
-
-def read_model(path: Path, expected: str = '', required: str = '') -> tuple[BinaryIO, str]:
-    """
-    Read a model into memory and check its hash: what is checked is what is used.
-
-    :param expected: its hash, see :func:`expected_hash`, '' for any.
-    :param required: the hash that a map states, '' for any.
-    :returns: its content, as a file, and its sha256.
-    :raises UnavailableError: it cannot be read, or is damaged.
-    :raises FeatureMismatchError: it is another file than the required one.
-    """
-    try:
-        with open_model(path) as file:
-            content = file.read()
-    except OSError as error:
-        raise UnavailableError(f'model {str(path)!r} cannot be read: {error}') from error
-    digest = hashlib.sha256(content).hexdigest()
-    if expected and digest != expected:
-        raise UnavailableError(
-            f'{path} has sha256 {digest[:16]}, expected {expected[:16]}: it is damaged or '
-            'another file; delete it and get it again'
-        )
-    if required and digest != required:
-        raise FeatureMismatchError(
-            f'model {path} has sha256 {digest[:16]}, the settings require {required[:16]}: '
-            'give the file that the map was built with'
-        )
-    return io.BytesIO(content), digest
 
 
 def download(address: str, path: Path, sha256: str) -> None:
