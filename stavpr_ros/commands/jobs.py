@@ -98,7 +98,8 @@ def run_jobs(jobs: Sequence[Job], processes: int | None, ray: str | None) -> int
     with _processes(count) if ray is None else _cluster(ray) as submit:
         waiting = {submit(job): (job, RETRIES) for job in jobs}
         while waiting:
-            future = wait(waiting, return_when=FIRST_COMPLETED).done.pop()
+            wait(waiting, return_when=FIRST_COMPLETED)
+            future = next(filter(Future.done, waiting))
             job, retries = waiting.pop(future)
             error = future.exception()
             if error is not None and retries:

@@ -16,7 +16,7 @@ import subprocess
 import sys
 
 INTERFACES = {
-    folder.name: folder for folder in (Path(__file__).parent / 'data' / 'interfaces').iterdir()
+    folder.name: folder for folder in (Path(__file__).parents[1] / 'data' / 'interfaces').iterdir()
 }
 DEPENDENCIES = ('geometry_msgs', 'nav_msgs', 'sensor_msgs', 'std_msgs')
 CMAKE = """cmake_minimum_required(VERSION 3.20)
