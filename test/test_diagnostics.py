@@ -100,6 +100,7 @@ LOST = {'recent_drops': {'lost in transport': 1}}
 FULL = {'recent_drops': {'queue full': 120}}
 SLOW = FULL | {'times': {'work': (62.5, 80.0)}}
 NO_MATCH = {'statuses': {'no match': 100}}
+BLIND = {'status': 'no match', 'place': -1, 'reason': 'blind', 'distance': math.nan}
 PAPER = {'mode': 'paper', 'threshold': 0.125, 'nearest': 0.5}
 
 CASES = {
@@ -107,7 +108,7 @@ CASES = {
         (OK, STEADY, {}),
         (OK, 'waiting for the first image on /camera/image', NEW),
         (OK, 'waiting for the first image', NEW | REFUSED | {'publishers': 2}),
-        (OK, STEADY, {'age': 2.0}),
+        (OK, STEADY, {'age': 2.0, 'publishers': 0}),
         (WARN, 'no image for 2 s on /camera/image: 1 publisher there, but silent', {'age': 2.1}),
         (WARN, f'{NO_IMAGE}no publisher; find', NEVER | {'publishers': 0, 'uptime': 2.1}),
         (WARN, 'for 5 s on /camera/image: no pub', REFUSED | {'age': 5.0, 'publishers': 0}),
@@ -150,6 +151,7 @@ CASES = {
     'recognition': [
         (OK, '200 of 299 images matched in the last 10 s; last result: match, place 17', {}),
         (OK, 'distance 0.422 (too far)', {'status': 'no match', 'place': -1, 'reason': 'too far'}),
+        (OK, 'result: no match (blind)', BLIND),
         (OK, '1 of 2 images matched', {'recent_statuses': {'match': 1, 'no match': 1, 'x': 9}}),
         (OK, '0 of 0 images matched in the last 10 s', NEW),
         (OK, 'warming up: 7 of 20 images', {'window': 7}),
@@ -233,7 +235,8 @@ def test_input_without_an_image_that_could_be_decoded_is_an_error(others, level)
 
 def test_input_with_several_faults_lists_the_worst_first():
     drops = {'lost in transport': 1, 'invalid: size': 2}
-    status = statuses(ODOMETRY | {'recent_drops': drops, 'recent_statuses': {}})['input']
+    changes = {'recent_drops': drops, 'recent_statuses': {}, 'missing_images': 50}
+    status = statuses(ODOMETRY | changes)['input']
     assert status.level == ERROR
     assert [text.split()[0] for text in status.message.split('; ')] == ['all', '1', 'odometry,']
 
@@ -247,7 +250,7 @@ def test_value_of_odometry_states_whether_it_is_used(changes, value):
 
 
 def test_values_of_input_are_complete():
-    drops = {'invalid: cut off': 3, 'lost in transport': 4, 'no odometry': 5, 'max_rate': 6}
+    drops = {'invalid: Cut off': 3, 'lost in transport': 4, 'no odometry': 5, 'max_rate': 6}
     found = values(
         'input', drops=drops, recent_drops={'lost in transport': 1}, gaps=2, longest_gap=1.5
     )

@@ -84,7 +84,9 @@ def test_drops_are_counted_by_cause_ever_and_recently(clock, statistics):
     assert dropped.total == {'queue full': 3, 'lost in transport': 7, 'max_rate': 1}
     assert dropped.recent == {'queue full': 2, 'max_rate': 1}
     clock.now += 5.1
-    assert statistics.counts().dropped.recent == {'max_rate': 1}
+    statistics.dropped('lost in transport')
+    assert statistics.counts().dropped.recent == {'max_rate': 1, 'lost in transport': 1}
+    assert dropped.total['lost in transport'] == 7  # later events do not change counts
 
 
 def test_statuses_are_counted_in_lower_case_with_the_last_result(clock, statistics):
@@ -121,6 +123,8 @@ def test_stage_times_are_mean_and_maximum_of_recent_images(clock, statistics):
     assert list(times) == list(expected)
     for stage, mean_and_maximum in expected.items():
         assert times[stage] == pytest.approx(mean_and_maximum)
+    clock.now += RECENT
+    assert statistics.counts().times == {}
 
 
 def test_steps_of_the_stamps_are_counted_with_the_longest(clock, statistics):
