@@ -25,7 +25,7 @@ from results import commit, cpu_model, RESULTS, ROOT, table
 from scipy.signal import lfilter
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import PlaceMap, save_map
+from stavpr_ros.mapping import descriptor_map, save_map
 from stavpr_ros.mapping.builder import extract_features
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.robust import THRESHOLD
@@ -52,35 +52,9 @@ BEGIN, END = '<!-- written by benchmarks/city.py -->', '<!-- end -->'
 class HalfFeatures(LocalFeatures):
     """Features in float16, read as float32: a city's fit into memory."""
 
-    def __init__(self, half: torch.Tensor, like: LocalFeatures) -> None:
-        W, n, _ = half.shape
-        for name, value in (
-            ('half', half),
-            ('weights', torch.full((W, n), W**-0.5)),
-            ('settings', like.settings),
-            ('cells', like.cells),
-        ):
-            object.__setattr__(self, name, value)
-
-    half: torch.Tensor
-
-    def __len__(self) -> int:
-        return self.half.shape[1]
-
     def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
-        return LocalFeatures(
-            self.half[:, images].float(), self.weights[:, images], self.settings, self.cells
-        )
-
-    @property
-    def strips(self) -> torch.Tensor:
-        """Return the features as they are held, float16."""
-        return self.half
-
-    @property
-    def dimension(self) -> int:
-        """Return the number d of dimensions of a strip."""
-        return self.half.shape[2]
+        strips, weights = self.strips[:, images].float(), self.weights[:, images]
+        return LocalFeatures(strips, weights, self.settings, self.cells)
 
 
 def simulated(real: LocalFeatures, n: int, seed: int) -> Iterator[torch.Tensor]:
@@ -113,7 +87,8 @@ def city(real: LocalFeatures, n: int, seed: int) -> tuple[HalfFeatures, int]:
         low += strips.shape[1]
     first = int(AT * (n - m))
     half[:, first : first + m] = real.strips
-    return HalfFeatures(half, real), first
+    weights = torch.full((W, n), W**-0.5)
+    return HalfFeatures(half, weights, real.settings, real.cells), first
 
 
 def drive(
@@ -124,9 +99,8 @@ def drive(
 
     :param true: place of each image.
     """
-    n = len(features)
     settings = RecognizerSettings(THRESHOLD, mode='robust', time_budget_ms=budget)
-    place_map = PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
+    place_map = descriptor_map(features)
     began = time.perf_counter()
     recognizer = PlaceRecognizer(place_map, settings, 'cpu', 'int8')
     start, matches, wall, used = time.perf_counter() - began, [], [], []
@@ -163,7 +137,7 @@ def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dic
     query = query[shown]
     features, first = city(real, n, seed)
     if save is not None:
-        save_map(PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n), save, force=True)
+        save_map(descriptor_map(features), save, force=True)
     exact, stage = (
         drive(features, query, first + shown, tolerance, budget) for budget in (0, ALWAYS)
     )
@@ -189,17 +163,13 @@ def lines(found: list[dict[str, Any]]) -> list[str]:
     """Return the table of the results."""
     rows = []
     for one in found:
-        exact, stage = one['exact'], one['first_stage']
+        both = one['exact'], one['first_stage']
         rows.append([
-            one['case'],
-            f'{one["places"]:,}',
-            f'{exact["precision"]:.3f} / {exact["recall"]:.3f}',
-            f'{stage["precision"]:.3f} / {stage["recall"]:.3f}',
+            *(one['case'], f'{one["places"]:,}'),
+            *(f'{of["precision"]:.3f} / {of["recall"]:.3f}' for of in both),
             f'{one["statuses_changed"]}, {one["places_moved"]}',
-            f'{exact["processor_ms"]:.0f}',
-            f'{stage["processor_ms"]:.0f}',
-            f'{one["threads"]}',
-            f'{one["load"]:.1f}',
+            *(f'{of["processor_ms"]:.0f}' for of in both),
+            *(f'{one["threads"]}', f'{one["load"]:.1f}'),
         ])  # fmt: skip
     head = ('case', 'places', 'exact P / R', 'first stage P / R', 'statuses, places changed')
     return table((*head, 'exact ms', 'first stage ms', 'threads', 'load'), rows)
@@ -234,7 +204,9 @@ def node_lines(folder: Path) -> list[str]:
 
 def write_page(found: list[dict[str, Any]], page: Path) -> None:
     """Write the tables to a page."""
-    shown = [*lines(sorted(found, key=case_order)), '', *node_lines(RESULTS)]
+    cases = list(CASES)
+    found = sorted(found, key=lambda one: (one['places'], cases.index(one['case'])))
+    shown = [*lines(found), '', *node_lines(RESULTS)]
     written_between(page, BEGIN, END, shown)
 
 
@@ -243,11 +215,6 @@ def written_between(page: Path, begin: str, end: str, shown: list[str]) -> None:
     before, rest = page.read_text(encoding='utf-8').split(begin)
     text = '\n'.join(['', '', *shown]).rstrip()
     page.write_text(f'{before}{begin}{text}\n\n{end}{rest.split(end)[1]}', encoding='utf-8')
-
-
-def case_order(one: dict[str, Any]) -> tuple[int, int]:
-    """Return where a result stands in the table."""
-    return one['places'], list(CASES).index(one['case'])
 
 
 def main() -> None:

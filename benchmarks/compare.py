@@ -15,10 +15,11 @@ recognizer with one image, strips (W, 1, d), and returns place and distance.
 """
 
 import argparse
-import importlib.util
+from itertools import cycle, product
 import json
 import os
 from pathlib import Path
+import runpy
 import statistics
 import subprocess
 import sys
@@ -34,15 +35,15 @@ STRIPS, LENGTH, QUERIES = 7, 20, 40
 def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: str) -> Any:
     """Driver of this checkout, see the module's docstring."""
     from stavpr_ros.features import FeatureSettings, LocalFeatures
-    from stavpr_ros.mapping import PlaceMap
+    from stavpr_ros.mapping import descriptor_map
     from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
     import torch
 
     def features(strips: np.ndarray, weights: np.ndarray) -> LocalFeatures:
         return LocalFeatures(torch.from_numpy(strips), torch.from_numpy(weights), settings)
 
-    settings, n = FeatureSettings('synthetic', None), strips.shape[1]
-    place_map = PlaceMap(features(strips, weights), None, np.zeros(n, np.int64), ('',) * n)
+    settings = FeatureSettings('synthetic', None)
+    place_map = descriptor_map(features(strips, weights))
     recognizer = PlaceRecognizer(place_map, RecognizerSettings(1.0, mode=mode), 'cpu', precision)
 
     def update(strips: np.ndarray, weights: np.ndarray) -> tuple[int, float]:
@@ -64,36 +65,22 @@ def serve(driver: str) -> None:
     from stavpr_ros.threads import wait_passively
 
     wait_passively()
-    make = make_frame
-    if driver:
-        spec = importlib.util.spec_from_file_location('driver', driver)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        make = module.make_frame
+    make = runpy.run_path(driver)['make_frame'] if driver else make_frame
     for line in sys.stdin:
         request = json.loads(line)
         if 'frames' not in request:
             n, d, seed = request['n'], request['d'], request['seed']
-            weight, count = np.float32(STRIPS**-0.5), 0
-            places = random_strips(n, d, seed)
-            queries, shares = (
-                random_strips(QUERIES, d, seed + 1),
-                np.full((STRIPS, QUERIES), weight),
-            )
-            call = make(
-                places, np.full((STRIPS, n), weight), request['mode'], request['precision']
-            )
+            weights = np.full((STRIPS, n), STRIPS**-0.5, np.float32)
+            places = random_strips(n, d, seed), weights
+            queries = np.split(random_strips(QUERIES, d, seed + 1), QUERIES, axis=1)
+            call, following = make(*places, request['mode'], request['precision']), cycle(queries)
             request['frames'] = LENGTH
         taken, results = [], []
         for _ in range(request['frames']):
-            image = slice(count % QUERIES, count % QUERIES + 1)
-            strips, weights = queries[:, image].copy(), shares[:, image].copy()
+            strips = next(following).copy()
             began = time.perf_counter()
-            results.append(call(strips, weights))
+            results.append(call(strips, weights[:, :1].copy()))
             taken.append(time.perf_counter() - began)
-            count += 1
         print(json.dumps({'seconds': taken, 'results': results}), flush=True)
 
 
@@ -138,19 +125,18 @@ def compare(
     """
     for checkout in (this, other):
         checkout.run(**case)
-    pairs, medians, equal = [], ([], []), True
+    ours, theirs, equal = [], [], True
     for _ in range(rounds):
         # the first frame after the other process ran refills the caches: it does not count
         replies = [checkout.run(frames=frames + 1) for checkout in (this, other)]
-        ours, theirs = (statistics.median(reply['seconds'][1:]) for reply in replies)
+        for medians, reply in zip((ours, theirs), replies, strict=True):
+            medians.append(statistics.median(reply['seconds'][1:]))
         equal &= replies[0]['results'] == replies[1]['results']
-        pairs.append(ours / theirs)
-        medians[0].append(ours)
-        medians[1].append(theirs)
-    low, middle, high = statistics.quantiles(pairs, n=4, method='inclusive')
+    ratios = [one / twin for one, twin in zip(ours, theirs, strict=True)]
+    low, middle, high = statistics.quantiles(ratios, n=4, method='inclusive')
     return case | {
-        'this_s': statistics.median(medians[0]),
-        'other_s': statistics.median(medians[1]),
+        'this_s': statistics.median(ours),
+        'other_s': statistics.median(theirs),
         'ratio': middle,
         'ratio_quartiles': [low, high],
         'equal_results': equal,
@@ -166,7 +152,7 @@ def main(arguments: list[str] | None = None) -> int:
         '--sizes', type=int, nargs='+', default=[2_000, 20_000], metavar='N', help='places'
     )
     parser.add_argument('--dimensions', type=int, default=512, metavar='D')
-    parser.add_argument('--precisions', nargs='+', default=['float32', 'float16'], metavar='DTYPE')
+    parser.add_argument('--precisions', nargs='+', default=['float32', 'int8'], metavar='DTYPE')
     parser.add_argument('--rounds', type=int, default=15, help='pairs of runs (%(default)s)')
     parser.add_argument('--frames', type=int, default=20, help='frames of each run (%(default)s)')
     parser.add_argument('--allowed', type=float, default=1.05, help='largest ratio (%(default)s)')
@@ -177,27 +163,17 @@ def main(arguments: list[str] | None = None) -> int:
     if options.serve:
         serve(options.driver)
         return 0
-    cases = [
-        {
-            'mode': mode,
-            'n': n,
-            'd': options.dimensions,
-            'precision': precision,
-            'seed': options.seed,
-        }
-        for mode in ('robust', 'paper')
-        for n in options.sizes
-        for precision in options.precisions
-    ]
     this, other = Checkout(ROOT), Checkout(options.checkout.resolve(), options.driver)
     found = []
     head = ('mode', 'n', 'precision', 'this ms', 'other ms', 'ratio')
     print('{:8}{:>9} {:10}{:>9}{:>10}{:>7}  quartiles    results'.format(*head))
-    for case in cases:
+    for mode, n, precision in product(('robust', 'paper'), options.sizes, options.precisions):
+        case = {'mode': mode, 'n': n, 'precision': precision}
+        case |= {'d': options.dimensions, 'seed': options.seed}
         result = compare(this, other, case, options.rounds, options.frames)
         low, high = result['ratio_quartiles']
         print(
-            f'{case["mode"]:8}{case["n"]:>9,} {case["precision"]:10}{1e3 * result["this_s"]:>9.2f}'
+            f'{mode:8}{n:>9,} {precision:10}{1e3 * result["this_s"]:>9.2f}'
             f'{1e3 * result["other_s"]:>10.2f}{result["ratio"]:>7.3f}  {low:.3f} {high:.3f}  '
             f'{"equal" if result["equal_results"] else "DIFFERENT"}',
             flush=True,

@@ -64,17 +64,9 @@ def kernels() -> list[tuple[str, Any, Any]]:
 def assemble(ptx: str, arch: str) -> str:
     """Return the report of ptxas on one kernel."""
     with tempfile.TemporaryDirectory() as folder:
-        source = Path(folder, 'kernel.ptx')
-        source.write_text(ptx)
-        command = [
-            'ptxas',
-            '-v',
-            f'-arch=sm_{arch}',
-            str(source),
-            '-o',
-            str(Path(folder, 'kernel.cubin')),
-        ]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        Path(folder, 'kernel.ptx').write_text(ptx)
+        command = ['ptxas', '-v', f'-arch=sm_{arch}', 'kernel.ptx', '-o', 'kernel.cubin']
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
     if 'Unsupported .version' in done.stderr:
         raise MissingError(
             'ptxas is older than the compiler that numba-cuda uses: put a newer one on the PATH'
@@ -108,26 +100,17 @@ def report_on(function: Any, types: Any, arch: str) -> dict[str, int]:
     }
 
 
-def require_compilers() -> None:
-    """Check that numba-cuda and ptxas are installed."""
-    if importlib.util.find_spec('numba_cuda') is None:
-        raise MissingError("the package numba-cuda is missing: pip install 'numba-cuda[cu13]'")
-    if shutil.which('ptxas') is None:
-        raise MissingError('ptxas is not on the PATH: install the CUDA toolkit')
-
-
 def main() -> int:
     """Report on all kernels."""
-    parser = argparse.ArgumentParser(
-        description='Registers, stack and spills of the CUDA kernels.'
-    )
-    parser.add_argument(
-        '--arch', default='90', help='compute capability, 90 for H100 and H200 (90)'
-    )
+    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser.add_argument('--arch', default='90', help='compute capability (%(default)s)')
     parser.add_argument('--out', type=Path, help='write the JSON to this file as well')
     options = parser.parse_args()
     try:
-        require_compilers()
+        if importlib.util.find_spec('numba_cuda') is None:
+            raise MissingError("the package numba-cuda is missing: pip install 'numba-cuda[cu13]'")
+        if shutil.which('ptxas') is None:
+            raise MissingError('ptxas is not on the PATH: install the CUDA toolkit')
         results = {
             name: report_on(function, types, options.arch) for name, function, types in kernels()
         }

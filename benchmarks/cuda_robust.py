@@ -23,7 +23,7 @@ import torch
 
 W, DIMENSIONS = 7, 224
 STRIPS = W * DIMENSIONS
-MAP_BYTES = {'float32': 4 * STRIPS, 'float16': 2 * STRIPS, 'int8': STRIPS + 8 * STRIPS}
+MAP_BYTES = {'float32': 4 * STRIPS, 'int8': STRIPS + 8 * STRIPS}
 OTHER_BYTES = 396 + 60 + 243 + 286 + 60  # of a place: products, row, place filter
 BACKGROUND_BYTES = 40  # of a place, in loop closure
 WARM_UP = 25

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The stages before the matching: decoding of a message, extraction of gradient features."""
 
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import cycle
 from types import SimpleNamespace
@@ -20,7 +21,7 @@ from timing import timed
 import torch
 
 WIDTH, HEIGHT, BATCH = 640, 480, 16
-FULL_HD, FULL_HD_IMAGES = (1080, 1920), 8
+FULL_HD, FULL_HD_IMAGES = (1920, 1080), 8
 IMAGES = 64  # more memory than a cache holds, as a camera's
 
 
@@ -39,64 +40,42 @@ def by_torch(images: list[np.ndarray]) -> Any:
     return normalize(cut_strips(feature_maps_by_torch(torch.from_numpy(gray), s), 7))
 
 
+def raw_message(image: np.ndarray) -> Any:
+    """Return an image as a raw message."""
+    height, width, _ = image.shape
+    return SimpleNamespace(
+        height=height, width=width, encoding='rgb8', is_bigendian=False, step=3 * width,
+        data=image.reshape(-1),
+    )  # fmt: skip
+
+
 def extraction_stages(run: Run, seed: int) -> None:
-    """Measure decoding, and extraction of one image and of a batch."""
+    """Measure decoding, extraction of one image and of a batch, and both of images of 1080p."""
     images, extractor = make_images(seed), FeatureExtractor()
-    messages = cycle([
-        SimpleNamespace(
-            height=HEIGHT, width=WIDTH, encoding='rgb8', is_bigendian=False, step=3 * WIDTH,
-            data=image.reshape(-1),
-        )
-        for image in images
-    ])  # fmt: skip
-    size = images[0].nbytes
+    size, messages = images[0].nbytes, cycle([raw_message(image) for image in images])
     run.measure('decoding', (1, 0), lambda: decode_message(next(messages)), [Work(size, 0)])
-
-    def measure_batches(n: int) -> None:
+    for n in (1, BATCH):
         batches = [images[i : i + n] for i in range(0, IMAGES, n)]
-        ours, theirs = cycle(batches), cycle(batches)
-        job = timed(lambda: by_torch(next(theirs)))
+        call = partial(on_next, extractor.extract, cycle(batches))
+        job = timed(partial(on_next, by_torch, cycle(batches)))
         peer = Peer('torch operators', job, 'the same features, on all cores')
-        call, works = (lambda: extractor.extract(next(ours))), [Work(n * size, 0)]
-        run.measure('extraction', (n, 0), call, works, [peer])
+        run.measure('extraction', (n, 0), call, [Work(n * size, 0)], [peer])
 
-    measure_batches(1)
-    measure_batches(BATCH)
-    for kind in ('raw', 'JPEG'):
-        full_hd_stage(run, images, extractor, kind)
-
-
-def full_hd_stage(
-    run: Run, images: list[np.ndarray], extractor: FeatureExtractor, kind: str
-) -> None:
-    """Measure an image of 1920x1080 from the message to its features, beside a whole one."""
-    height, width = FULL_HD
-    large = [
-        cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC)
-        for image in images[:FULL_HD_IMAGES]
-    ]
-    if kind == 'raw':
-        messages = [
-            SimpleNamespace(
-                height=height, width=width, encoding='rgb8', is_bigendian=False, step=3 * width,
-                data=image.reshape(-1),
-            )
-            for image in large
-        ]  # fmt: skip
-    else:
-        messages = [
-            SimpleNamespace(format='jpeg', data=cv2.imencode('.jpg', image)[1]) for image in large
-        ]
-    size = extractor.settings.backbone.size
-
-    def features(least: tuple[int, int] | None, turn: Any) -> Any:
-        image = decode_message(next(turn), least)
+    def features(message: Any, least: tuple[int, int] | None = None) -> Any:
+        image = decode_message(message, least)
         small_gray(image)  # of the keyframes
         return extractor.extract([image])
 
-    ours, theirs = cycle(messages), cycle(messages)
-    peer = Peer('whole image', timed(lambda: features(None, theirs)))
-    call = partial(features, (size, size), ours)
-    run.measure(
-        f'1080p {kind} to features', (1, 0), call, [Work(messages[0].data.nbytes, 0)], [peer]
-    )
+    large = [cv2.resize(image, FULL_HD) for image in images[:FULL_HD_IMAGES]]
+    jpeg = [SimpleNamespace(format='jpeg', data=cv2.imencode('.jpg', one)[1]) for one in large]
+    side = extractor.settings.backbone.size
+    for kind, of_kind in (('raw', [raw_message(image) for image in large]), ('JPEG', jpeg)):
+        peer = Peer('whole image', timed(partial(on_next, features, cycle(of_kind))))
+        call = partial(on_next, partial(features, least=(side, side)), cycle(of_kind))
+        works = [Work(of_kind[0].data.nbytes, 0)]
+        run.measure(f'1080p {kind} to features', (1, 0), call, works, [peer])
+
+
+def on_next(function: Callable[[Any], Any], values: Iterator[Any]) -> Any:
+    """Apply a function to the next value."""
+    return function(next(values))

@@ -13,7 +13,7 @@ import sys
 
 from results import PeerTime, Row
 
-COLORS = {'float32': '#1f77b4', 'float16': '#2ca02c', 'int8': '#d62728'}
+COLORS = {'float32': '#1f77b4', 'int8': '#d62728'}
 PEERS = ('torch float32', 'faiss flat', 'prange')
 
 
@@ -46,11 +46,11 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             key=lambda row: row.n,
         )
         for precision, color in COLORS.items():
-            some = [row for row in own if row.precision == precision]
-            n = [row.n for row in some]
-            if some:
-                ms = [1e3 * row.median_s for row in some]
-                bound = [1e3 * row.lower_bound_s for row in some]
+            of_precision = [row for row in own if row.precision == precision]
+            n = [row.n for row in of_precision]
+            ms = [1e3 * row.median_s for row in of_precision]
+            bound = [1e3 * row.lower_bound_s for row in of_precision]
+            if n:
                 axes.plot(n, ms, 'o-', color=color, label=precision)
                 axes.plot(n, bound, ':', color=color, label=f'{precision}, lower bound')
         for name, style in zip(PEERS, ('s--', 'd--', '^--'), strict=True):
@@ -64,13 +64,11 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             if peers:
                 axes.plot(*zip(*peers, strict=True), style, color='gray', ms=4, label=name)
         if stage == 'image_distances':
-            first = [(row.n, 1e3 * row.median_s) for row in rows if row.stage == 'first_stage']
-            if first:
-                axes.plot(*zip(*first, strict=True), 'k*', ms=10, label='first stage')
+            for row in (row for row in rows if row.stage == 'first_stage'):
+                axes.plot(row.n, 1e3 * row.median_s, 'k*', ms=10, label='first stage')
         axes.set(xscale='log', yscale='log', title=title, xlabel='places', ylabel='ms')
         axes.grid(alpha=0.3)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=7)
+        axes.legend(fontsize=7)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 

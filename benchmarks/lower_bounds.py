@@ -3,13 +3,11 @@
 """Lower bounds: the least time of a stage, from its bytes, operations and the machine's peaks."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 from stavpr_ros.recognition.place_filter import BLOCK, FilterSettings
 
-ITEM_BYTES = {'float32': 4, 'bfloat16': 2, 'float16': 2}
-INT8_BYTES = 1
-BEYOND_CACHES = 2**28  # bytes; below, a stage may read faster than memory
+ITEM_BYTES = {'float32': 4, 'int8': 1}
 
 # Operations of one inner cell. LM-DTW: three sums x + S, two minima, two selections of the path's
 # length, its increment. Image distance: the factor of the diagonal besides. A comparison that also
@@ -44,12 +42,10 @@ class Work:
 
     :param bytes: read at least once.
     :param operations: an addition and a multiplication count as two.
-    :param dtype: precision whose peak applies.
     """
 
     bytes: float
     operations: float
-    dtype: str = 'float32'
 
 
 @dataclass(frozen=True)
@@ -58,61 +54,29 @@ class Peaks:
     Peaks of the machine, measured in the same run.
 
     :param bytes_per_s: read bandwidth.
-    :param operations_per_s: rate of the large matrix product, by precision.
-    :param sources: of ``read`` or a precision: the stage that showed more than its measurement.
+    :param operations_per_s: rate of the large matrix product in float32.
     """
 
     bytes_per_s: float
-    operations_per_s: dict[str, float]
-    sources: dict[str, str] = field(default_factory=dict)
-
-    def raised(self, work: Work, seconds: float, source: str) -> 'Peaks':
-        """
-        Return the peaks, raised to the rates that a stage has shown.
-
-        A shared machine may be busier while a peak is measured than later. Bytes count only beyond
-        the caches.
-
-        :param seconds: duration of the stage.
-        :param source: its name.
-        """
-        raised = self
-        operations, read = work.operations / seconds, work.bytes / seconds
-        if operations > self.operations_per_s[work.dtype]:
-            rates = self.operations_per_s | {work.dtype: operations}
-            raised = replace(
-                raised, operations_per_s=rates, sources=raised.sources | {work.dtype: source}
-            )
-        if work.bytes >= BEYOND_CACHES and read > self.bytes_per_s:
-            raised = replace(raised, bytes_per_s=read, sources=raised.sources | {'read': source})
-        return raised.widened()
-
-    def widened(self) -> 'Peaks':
-        """Raise each half precision to the rate of float32, to which it can be converted."""
-        least = self.operations_per_s['float32']
-        slower = {dtype: least for dtype, rate in self.operations_per_s.items() if rate < least}
-        sources = self.sources | dict.fromkeys(slower, 'float32')
-        return replace(self, operations_per_s=self.operations_per_s | slower, sources=sources)
+    operations_per_s: float
 
 
 def bound_seconds(works: Sequence[Work], peaks: Peaks) -> float:
     """Return the sum, over the works, of the longer of reading bytes and doing operations."""
     return sum(
-        max(work.bytes / peaks.bytes_per_s, work.operations / peaks.operations_per_s[work.dtype])
+        max(work.bytes / peaks.bytes_per_s, work.operations / peaks.operations_per_s)
         for work in works
     )
 
 
-def product(sizes: Sizes, dtype: str, frames: int = 1) -> Work:
+def product(sizes: Sizes, precision: str, frames: int = 1) -> Work:
     """
     Product of all pairs of strips of ``frames`` images with the map.
 
     In int8, reading the map alone: torch has no product whose rate could be a bound.
     """
-    if dtype == 'int8':
-        return Work(sizes.W * sizes.n * sizes.d * INT8_BYTES, 0)
-    map_bytes = sizes.W * sizes.n * sizes.d * ITEM_BYTES[dtype]
-    return Work(map_bytes, 2 * frames * sizes.W**2 * sizes.n * sizes.d, dtype)
+    operations = 2 * frames * sizes.W**2 * sizes.n * sizes.d if precision == 'float32' else 0
+    return Work(sizes.W * sizes.n * sizes.d * ITEM_BYTES[precision], operations)
 
 
 def spatial_alignment(sizes: Sizes, frames: int = 1) -> Work:

@@ -70,7 +70,7 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
         robust_stages(run, n, options.seed)
     for n in options.sizes:
         if n >= CITY:
-            run.skip('frame', n, 0, 'float32, float16 and mode paper: too large, see first_stage')
+            run.skip('frame', n, 0, 'float32 and mode paper: too large, see first_stage')
             city_stages(run, n, options.dimensions[0], options.seed)
             continue
         for d in options.dimensions:
@@ -104,7 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     from graphs import draw
-    from memory import CASES, measure_memory
+    from memory import CASES, measure_memory, TARGET
     from peaks import measure_peaks
     from report import report, target_section
     from results import environment, file_name, write
@@ -119,21 +119,20 @@ def main(arguments: list[str] | None = None) -> int:
     with_memory = options.device == 'cpu' and not options.no_memory
     memory = [measure_memory(*case) for case in CASES if with_memory]
     peaks = measure_peaks(options.device, options.seconds)
-    run = Run(options.device, options.seconds)
+    run = Run(options.device, peaks, options.seconds)
     measure_stages(run, options)
-    rows, peaks = run.finish(peaks)
     name = f'matching-{file_name(about["machine"])}{"-quick" if options.quick else ""}.json'
     document = about | {
         'peaks': asdict(peaks),
-        'rows': [row.to_json() for row in rows],
-        'memory': [measured.to_json() for measured in memory],
-        'skipped': [asdict(skipped) for skipped in run.skipped],
+        'rows': [asdict(row) | {'ratio_to_lower_bound': row.ratio} for row in run.rows],
+        'memory': [asdict(held) | {'ratio': held.ratio, 'wanted': TARGET} for held in memory],
+        'skipped': run.skipped,
     }
-    write(options.output / name, document, report(about, rows, memory, peaks, run.skipped))
+    write(options.output / name, document, report(about, run, memory))
     if importlib.util.find_spec('matplotlib'):
         documented = options.output == RESULTS and not options.quick and options.device == 'cpu'
-        draw(rows, GRAPH if documented else (options.output / name).with_suffix('.png'))
-    print('\n'.join(target_section(rows, options.device)))
+        draw(run.rows, GRAPH if documented else (options.output / name).with_suffix('.png'))
+    print('\n'.join(target_section(run.rows, options.device)))
     print(f'took {time.perf_counter() - began:.0f} s\nwrote {options.output / name} and its .md')
     return 0
 

@@ -10,7 +10,7 @@ both times.
 """
 
 import ctypes
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 import gc
 import os
 from pathlib import Path
@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 from types import SimpleNamespace
-from typing import Any, ClassVar, TYPE_CHECKING
+from typing import ClassVar, TYPE_CHECKING
 from unittest.mock import patch
 
 import numpy as np
@@ -35,7 +35,6 @@ SMALL = 100  # places of the tiny pipeline
 SIZES = {'localization': (20_000, 512), 'loop_closure': (800, 4_096)}
 CASES = (
     ('localization', 'robust', 'float32'),
-    ('localization', 'robust', 'float16'),
     ('localization', 'robust', 'int8'),
     ('loop_closure', 'robust', 'float32'),
 )
@@ -63,10 +62,6 @@ class Memory:
     def ratio(self) -> float:
         """Resident bytes over the bytes of the features."""
         return self.resident_bytes / self.feature_bytes
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields and the ratio."""
-        return asdict(self) | {'ratio': self.ratio, 'wanted': TARGET}
 
 
 @dataclass(frozen=True)
@@ -103,6 +98,7 @@ def measure_memory(operation: str, mode: str, precision: str, n: int = 0, d: int
     :param operation: ``localization`` or ``loop_closure``.
     :param n, d: places and dimensions; 0 = those of ``SIZES``.
     """
+    from lower_bounds import ITEM_BYTES
     import stavpr_ros
 
     n, d = n or SIZES[operation][0], d or SIZES[operation][1]
@@ -118,8 +114,8 @@ def measure_memory(operation: str, mode: str, precision: str, n: int = 0, d: int
         done = subprocess.run(
             command, env=os.environ | variables, stdout=subprocess.PIPE, text=True, check=True
         )
-    item = {'float32': 4, 'float16': 2, 'int8': 1}[precision]
-    return Memory(operation, mode, precision, n, d, item * n * d * STRIPS, int(done.stdout))
+    held = n * d * STRIPS * ITEM_BYTES[precision]
+    return Memory(operation, mode, precision, n, d, held, int(done.stdout))
 
 
 def _kind() -> 'Kind':
@@ -134,15 +130,14 @@ def _save_map(path: Path, n: int, d: int) -> None:
 
     from data import make_features
     from stavpr_ros.features import FeatureSettings
-    from stavpr_ros.mapping import PlaceMap, save_map
+    from stavpr_ros.mapping import descriptor_map, save_map
 
     features = make_features(n, d, STRIPS, 'cpu', seed=0)
     features = replace(
         features, settings=FeatureSettings('synthetic', SyntheticSettings(d)), cells=(1, 1)
     )
-    place_map = PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
     with patch.dict('stavpr_ros.features.registry.KINDS', synthetic=_kind()):
-        save_map(place_map, path)
+        save_map(descriptor_map(features), path)
 
 
 def resident_bytes() -> int:

@@ -1,16 +1,15 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The machine's peaks: read bandwidth, and the large matrix product in each precision."""
+"""The machine's peaks: read bandwidth, and the large matrix product in float32."""
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 
-from lower_bounds import ITEM_BYTES, Peaks
+from lower_bounds import Peaks
 import numpy as np
 from timing import best_seconds
 
 SIDE = 4096  # of the large matrix product
-PROBE_SIDE = 256  # of the product that decides whether a precision is worth a reference
 PIECES = 256  # of an array that threads read
 READ_MB = {'cpu': 1024, 'cuda': 8192}
 
@@ -52,36 +51,13 @@ def device_read_bandwidth(megabytes: int, seconds: float) -> float:
     return x.numel() * 4 / best
 
 
-def matrix_rate(device: str, dtype: str, side: int, seconds: float) -> float:
+def matrix_rate(device: str, side: int, seconds: float) -> float:
     """Return the operations per second of torch's product of two random square matrices."""
     import torch
 
-    left, right = (
-        torch.randn(side, side, device=device).to(getattr(torch, dtype)) for _ in range(2)
-    )
+    left, right = torch.randn(2, side, side, device=device)
     call = partial(torch.mm, left, right, out=torch.empty_like(left))
     return 2 * side**3 / best_seconds(call, device, seconds)
-
-
-@cache
-def slower_than_float32(device: str, dtype: str) -> str:
-    """Return why torch's product in a precision is no reference here; empty if it is one."""
-    if dtype == 'float32':
-        return ''
-    rate, wide = (matrix_rate(device, name, PROBE_SIDE, 0.02) for name in (dtype, 'float32'))
-    if rate >= wide:
-        return ''
-    from results import instruction_sets
-
-    native = [
-        name
-        for name in instruction_sets()
-        if name.startswith(('avx512_bf16', 'avx512_fp16', 'amx'))
-    ]
-    return (
-        f'torch product in {dtype}: {rate / 1e9:.1f} G operations/s, slower than float32 '
-        f'({wide / 1e9:.1f}); half-precision instructions here: {", ".join(native) or "none"}'
-    )
 
 
 def measure_peaks(device: str, seconds: float) -> Peaks:
@@ -90,17 +66,11 @@ def measure_peaks(device: str, seconds: float) -> Peaks:
 
     :param seconds: duration of each measurement.
     """
-    megabytes = READ_MB[device]
-    rates = dict.fromkeys(ITEM_BYTES, 0.0)
-    for dtype in ITEM_BYTES:
-        if not slower_than_float32(device, dtype):
-            # not every library is at its best with the larger matrix
-            rates[dtype] = max(
-                matrix_rate(device, dtype, size, seconds) for size in (SIDE, SIDE // 2)
-            )
+    # not every library is at its best with the larger matrix
+    rate = max(matrix_rate(device, side, seconds) for side in (SIDE, SIDE // 2))
     if device == 'cuda':
-        return Peaks(device_read_bandwidth(megabytes, seconds), rates).widened()
+        return Peaks(device_read_bandwidth(READ_MB[device], seconds), rate)
     import numba as nb
 
-    read = max(read_bandwidth(megabytes, n, seconds) for n in {1, nb.get_num_threads()})
-    return Peaks(read, rates).widened()
+    threads = {1, nb.get_num_threads()}
+    return Peaks(max(read_bandwidth(READ_MB[device], n, seconds) for n in threads), rate)

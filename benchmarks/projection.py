@@ -21,7 +21,7 @@ import numpy as np
 from results import RESULTS, ROOT, table
 from stavpr_lab.evaluation.evaluate import evaluate_on_map
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import descriptor_map, PlaceMap
 from stavpr_ros.mapping.builder import extract_features
 from stavpr_ros.mapping.reduction import STRIPS_A_DIRECTION, with_principal_components
 from stavpr_ros.recognition import RecognizerSettings
@@ -82,7 +82,7 @@ def rows(case: Case, kind: str, extractor: FeatureExtractor) -> Iterator[dict[st
         extract_features(source, extractor, progress=False) for source in (case.places, case.query)
     )
     n = len(places)
-    whole = PlaceMap(places, None, np.zeros(n, np.int64), ('',) * n)
+    whole = descriptor_map(places)
     settings = RecognizerSettings(THRESHOLD, mode='robust')
     for name, (projection, dimension, precision) in COLUMNS.items():
         limit = len(places.weights) * n // STRIPS_A_DIRECTION

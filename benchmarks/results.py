@@ -3,7 +3,8 @@
 """Results of a run: rows, the machine that they were measured on, JSON and Markdown."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+import contextlib
+from dataclasses import dataclass, field
 import datetime
 import importlib.metadata
 import json
@@ -75,55 +76,29 @@ class Row:
         """Median over the lower bound."""
         return self.median_s / self.lower_bound_s if self.lower_bound_s else None
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields and the ratio."""
-        return asdict(self) | {'ratio_to_lower_bound': self.ratio}
-
-
-@dataclass(frozen=True)
-class Skipped:
-    """A stage or a peer that is left out, and the reason."""
-
-    name: str
-    n: int
-    d: int
-    reason: str
-
-
-def _output(*command: str) -> str:
-    try:
-        return subprocess.run(
-            command, cwd=ROOT, capture_output=True, text=True, check=True
-        ).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return ''
-
 
 def commit() -> str:
     """Return the commit of the checkout, followed by ``+`` after changes; or ``unknown``."""
-    short = _output('git', 'rev-parse', '--short', 'HEAD')
     # the results themselves change nothing that is measured
-    changed = _output('git', 'status', '--porcelain', '--', '.', ':!benchmarks/results')
-    return short + ('+' if changed else '') if short else 'unknown'
+    status = 'git status --porcelain -- . :!benchmarks/results'
+    try:
+        short, changed = (
+            subprocess.check_output(words.split(), cwd=ROOT, text=True).strip()
+            for words in ('git rev-parse --short HEAD', status)
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return 'unknown'
+    return short + ('+' if changed else '')
 
 
 def _cpu_info(pattern: str) -> str:
-    try:
-        found = re.search(pattern, Path('/proc/cpuinfo').read_text(), re.MULTILINE)
-    except OSError:
-        return ''
+    found = re.search(pattern, Path('/proc/cpuinfo').read_text(), re.MULTILINE)
     return found[1].strip() if found else ''
 
 
 def cpu_model() -> str:
     """Return the name of the processor."""
-    return _cpu_info(r'^model name\s*: (.*)$') or platform.processor() or platform.machine()
-
-
-def instruction_sets() -> list[str]:
-    """Return the vector instruction sets of the processor, as Linux names them."""
-    flags = _cpu_info(r'^(?:flags|Features)\s*: (.*)$').split()
-    return [flag for flag in flags if INSTRUCTION_SETS.fullmatch(flag)]
+    return _cpu_info(r'^model name\s*: (.*)$') or platform.machine()
 
 
 def versions() -> dict[str, str]:
@@ -132,10 +107,8 @@ def versions() -> dict[str, str]:
 
     found = {'python': platform.python_version(), 'stavpr_ros': __version__}
     for package in PACKAGES:
-        try:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return found
 
 
@@ -145,10 +118,11 @@ def environment(device: str = 'cpu', named_commit: str = '') -> dict[str, Any]:
     from stavpr_ros.alignment.cpu.simd import LANES
     import torch
 
+    flags = _cpu_info(r'^(?:flags|Features)\s*: (.*)$').split()
     machine: dict[str, Any] = {
         'cpu': cpu_model(),
         'architecture': platform.machine(),
-        'instruction_sets': instruction_sets(),
+        'instruction_sets': [flag for flag in flags if INSTRUCTION_SETS.fullmatch(flag)],
         'vector_bits': 32 * LANES,  # of the kernels; less than there are by NUMBA_CPU_FEATURES
         'cores': len(os.sched_getaffinity(0)),
         'torch_threads': torch.get_num_threads(),
@@ -168,19 +142,22 @@ def environment(device: str = 'cpu', named_commit: str = '') -> dict[str, Any]:
 
 def heading(title: str, about: dict[str, Any]) -> list[str]:
     """Return the lines that open a report."""
-    machine = about['machine'] | {
-        'instruction_sets': ' '.join(about['machine']['instruction_sets'])
+    sets = ' '.join(about['machine']['instruction_sets'])
+    machine = {
+        name.replace('_', ' '): value
+        for name, value in (about['machine'] | {'instruction_sets': sets}).items()
+        if value != ''
     }
+    machine, versions = (
+        ', '.join(f'{name} {value}' for name, value in of.items())
+        for of in (machine, about['versions'])
+    )
     return [
         f'# {title}',
         '',
         f'Commit {about["commit"]}, {about["date"]}.',
-        'Machine: '
-        + ', '.join(f'{k.replace("_", " ")} {v}' for k, v in machine.items() if v != '')
-        + '.',
-        'Versions: '
-        + ', '.join(f'{name} {version}' for name, version in about['versions'].items())
-        + '.',
+        f'Machine: {machine}.',
+        f'Versions: {versions}.',
         'Method: benchmarks/README.md.',
         '',
     ]

@@ -1,15 +1,15 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One run: measurements are collected, and get their lower bounds once the peaks are known."""
+"""One run: measurements are collected, each with its lower bound and its peers."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 import sys
 from typing import Any
 
 from lower_bounds import bound_seconds, Peaks, Work
-from results import PeerTime, Row, Skipped
-from timing import Job, measure, synchronizer, timed
+from results import PeerTime, Row
+from timing import Job, measure, timed
 from tqdm import tqdm
 
 
@@ -35,13 +35,14 @@ class Run:
 
     :param device: ``cpu`` or ``cuda``.
     :param seconds: duration of the measurement of one stage and its peers.
-    :param rows: as measured so far, without lower bounds, and their work.
+    :param skipped: stages and peers that are left out: name, n, d, reason.
     """
 
     device: str
+    peaks: Peaks
     seconds: float = 0.5
-    rows: list[tuple[Row, Sequence[Work]]] = field(default_factory=list)
-    skipped: list[Skipped] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
+    skipped: list[dict[str, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._bar = tqdm(unit='stage', file=sys.stderr, disable=None)
@@ -55,43 +56,35 @@ class Run:
         peers: Sequence[Peer] = (),
         precision: str = 'float32',
         mode: str = '',
-        extra: Mapping[str, Any] | None = None,
+        cells: int = 0,
     ) -> None:
         """
         Measure a stage, interleaved with its peers.
 
         :param size: places n, dimensions d (0 for a stage that reads no features).
         :param works: for its lower bound.
+        :param cells: of a recursion, which it updates.
         """
-        n, d = size
-        self._bar.set_description(f'{stage} {mode} n={n:,} d={d} {precision}')
-        jobs = {'': timed(call, synchronizer(self.device))} | {p.name: p.job for p in peers}
+        self._bar.set_description(f'{stage} {mode} n={size[0]:,} d={size[1]} {precision}')
+        jobs = {'': timed(call, self.device)} | {peer.name: peer.job for peer in peers}
         timings = measure(jobs, self.seconds)
         own = timings['']
-        times = tuple(
-            PeerTime(p.name, t.median_s, t.spread_s, t.median_s / own.median_s, p.note, p.partial)
-            for p, t in ((peer, timings[peer.name]) for peer in peers)
-        )
-        row = Row(stage, mode, n, d, precision, own.median_s, own.spread_s, own.runs)
-        self.rows.append((replace(row, peers=times, extra=dict(extra or {})), works))
+        times = []
+        for peer in peers:
+            t = timings[peer.name]
+            ratio = t.median_s / own.median_s
+            times.append(
+                PeerTime(peer.name, t.median_s, t.spread_s, ratio, peer.note, peer.partial)
+            )
+        bound, extra = bound_seconds(works, self.peaks), {'cells': cells} if cells else {}
+        summary = own.median_s, own.spread_s, own.runs, bound, tuple(times), extra
+        self.rows.append(Row(stage, mode, *size, precision, *summary))
         self._bar.update()
 
     def skip(self, name: str, n: int, d: int, reason: str) -> None:
         """Record once that a stage or peer is left out, and print why; n = d = 0 for all sizes."""
-        skipped = Skipped(name, n, d, reason)
+        skipped = {'name': name, 'n': n, 'd': d, 'reason': reason}
         if skipped not in self.skipped:
             size = f', n = {n:,}, d = {d}' if n else ''
             self._bar.write(f'left out: {name}{size}: {reason}', file=sys.stderr)
             self.skipped.append(skipped)
-
-    def finish(self, peaks: Peaks) -> tuple[list[Row], Peaks]:
-        """Return the rows with their lower bounds, and the peaks as raised by stages."""
-        self._bar.close()
-        for row, works in self.rows:
-            if row.stage in ('image_distances', 'distance_matrix'):
-                # product and alignment are one pass
-                whole = replace(works[0], operations=sum(work.operations for work in works))
-                peaks = peaks.raised(whole, row.median_s, f'{row.stage}, n = {row.n:,}')
-        bounds = [bound_seconds(works, peaks) for _, works in self.rows]
-        rows = [row for row, _ in self.rows]
-        return [replace(row, lower_bound_s=b) for row, b in zip(rows, bounds, strict=True)], peaks

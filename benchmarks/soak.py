@@ -9,7 +9,8 @@ Run it where the package is built and sourced: ``make shell``, then ``python ben
 import argparse
 import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import cycle, islice
 import json
 import os
 from pathlib import Path
@@ -24,6 +25,8 @@ from results import commit, cpu_model, versions
 
 PLACES, WIDTH, HEIGHT = 2000, 640, 480
 STEP = 41  # pixels from one view to the next
+IMAGES = 30  # different ones
+SETTLED = 3.0  # seconds for the images on their way at the end
 
 
 def texture_route(count: int) -> Iterator[np.ndarray]:
@@ -85,59 +88,74 @@ class Latencies:
         }
 
 
-def image_messages() -> list[Any]:
-    """Return thirty images as messages."""
+def image_message(image: np.ndarray) -> Any:
+    """Return an image as a message."""
     from sensor_msgs.msg import Image
 
-    messages = []
-    for image in texture_route(30):
-        message = Image(height=HEIGHT, width=WIDTH, encoding='rgb8', step=WIDTH * 3)
-        message.data = array.array('B', image.tobytes())
-        messages.append(message)
-    return messages
+    height, width = image.shape[:2]
+    message = Image(height=height, width=width, encoding='rgb8', step=3 * width)
+    message.data = array.array('B', image.tobytes())
+    return message
 
 
-def soak(arguments: argparse.Namespace, pid: int) -> dict[str, Any]:
-    """Publish at the rate, record the matches, and return the figures."""
+def publish(
+    names: list[str],
+    topic: str,
+    qos: Any,
+    images: list[Any],
+    arguments: argparse.Namespace,
+    each_minute: Callable[[], None] = lambda: None,
+) -> tuple[list[dict[str, Any]], float]:
+    """
+    Publish images at ``arguments.rate`` for ``arguments.seconds``.
+
+    :param names: of the nodes that subscribe.
+    :returns: figures of each node; images per second.
+    """
     import rclpy
-    from rclpy.qos import qos_profile_sensor_data, QoSProfile
-    from sensor_msgs.msg import Image
+    from rclpy.qos import QoSProfile
     from stavpr_msgs.msg import PlaceMatch
     from stavpr_ros.ros.process import Discovery, ros_node, spin_until
 
-    matches = Latencies()
-    messages = image_messages()
+    found = [Latencies() for _ in names]
     total = round(arguments.seconds * arguments.rate)
-    with ros_node(lambda: rclpy.create_node('soak'), []) as node:
-        publisher = node.create_publisher(Image, 'image', qos_profile_sensor_data)
-        node.create_subscription(
-            PlaceMatch, '/stavpr/match', matches.on_match, QoSProfile(depth=1000)
-        )
-        spin_until(node, lambda: publisher.get_subscription_count() > 0)
-        discovery = Discovery(node, lambda: node.get_subscriptions_info_by_topic('/image'))
+    with ros_node(lambda: rclpy.create_node('camera'), []) as node:
+        for name, one in zip(names, found, strict=True):
+            node.create_subscription(
+                PlaceMatch, f'/{name}/match', one.on_match, QoSProfile(depth=1000)
+            )
+        publisher = node.create_publisher(type(images[0]), topic, qos)
+        spin_until(node, lambda: publisher.get_subscription_count() == len(names))
+        discovery = Discovery(node, lambda: node.get_subscriptions_info_by_topic(f'/{topic}'))
         spin_until(node, discovery.done)
-        memory_start, began = memory(pid), time.monotonic()
-        by_minute = [memory_start]
-        minute = node.create_timer(60.0, lambda: by_minute.append(memory(pid)))
+        began = time.monotonic()
+        each_minute()
+        node.create_timer(60.0, each_minute)
 
-        def publish(index: int) -> None:
-            message = messages[index % len(messages)]
-            stamp = 10**9 + index * 1000
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-            matches.sent[stamp] = time.monotonic()
+        def publish_next() -> None:
+            message, now = next(messages), time.time_ns()
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, 10**9)
+            for one in found:
+                one.sent[now] = time.monotonic()
             publisher.publish(message)
 
-        published = iter(range(total))
-        timer = node.create_timer(1 / arguments.rate, lambda: publish(next(published)))
-        spin_until(node, lambda: len(matches.sent) == total)
+        messages = islice(cycle(images), total)
+        timer = node.create_timer(1 / arguments.rate, publish_next)
+        spin_until(node, lambda: len(found[0].sent) == total)
         rate = total / (time.monotonic() - began)
         node.destroy_timer(timer)
-        node.destroy_timer(minute)
-        end = time.monotonic() + 2
-        spin_until(node, lambda: matches.statuses.total() == total or time.monotonic() > end)
-        figures = matches.figures(total, PlaceMatch.DROPPED)
-        figures |= {'rate_hz': rate, 'memory_mb_start': memory_start, 'memory_mb_end': memory(pid)}
-        return figures | {'memory_mb_by_minute': [round(value, 1) for value in by_minute]}
+        end = time.monotonic() + SETTLED
+        spin_until(
+            node,
+            lambda: all(one.statuses.total() == total for one in found) or time.monotonic() > end,
+        )
+        return [one.figures(total, PlaceMatch.DROPPED) for one in found], rate
+
+
+def about(load: float) -> dict[str, Any]:
+    """Return machine and versions of a run."""
+    machine = {'load_before': load, 'cpu': cpu_model(), 'cores': os.cpu_count()}
+    return machine | {'commit': commit(), **versions()}
 
 
 def main() -> None:
@@ -157,6 +175,7 @@ def main() -> None:
     )
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
+    from rclpy.qos import qos_profile_sensor_data
     from stavpr_lab.demonstration.live import executable, private_domain
     from stavpr_ros.ros.process import prepare_transport
 
@@ -171,20 +190,21 @@ def main() -> None:
         options = [word for parameter in parameters for word in ('-p', parameter)]
         command = [executable('node'), '--ros-args', *options]
         node = subprocess.Popen(command, env=environment)
+        resident: list[float] = []
+        images = [image_message(image) for image in texture_route(IMAGES)]
         try:
-            figures = soak(arguments, node.pid)
+            (figures,), rate = publish(
+                ['stavpr'], 'image', qos_profile_sensor_data, images, arguments,
+                lambda: resident.append(round(memory(node.pid), 1)),
+            )  # fmt: skip
+            figures |= {'rate_hz': rate, 'memory_mb_start': resident[0]}
+            figures['memory_mb_end'] = memory(node.pid)
         finally:
             node.send_signal(signal.SIGINT)
             node.wait()
     name = Path(arguments.map).name if arguments.map else f'{PLACES} places'
-    figures |= {'map': name, 'parameters': arguments.parameter}
-    figures |= {
-        'load_before': load,
-        'cpu': cpu_model(),
-        'cores': os.cpu_count(),
-        'commit': commit(),
-        **versions(),
-    }
+    figures |= {'memory_mb_by_minute': resident, 'map': name, 'parameters': arguments.parameter}
+    figures |= about(load)
     text = json.dumps(figures, indent=2)
     print(text)
     if arguments.output:

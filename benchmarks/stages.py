@@ -9,13 +9,13 @@ import gc
 from itertools import cycle
 from typing import Any
 
-from baselines import accumulated, PlainFilter, prange, sample
+from baselines import accumulated, prange, sample
 from data import free_bytes, make_features, make_window
 import lower_bounds as bounds
 from lower_bounds import ITEM_BYTES, Sizes
 import numba as nb
 import numpy as np
-from peaks import reader, slower_than_float32
+from peaks import reader
 from results import READING
 from run import Peer, Run
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
@@ -28,7 +28,7 @@ from stavpr_ros.alignment.lm_dtw import (
 )
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import descriptor_map, PlaceMap
 from stavpr_ros.pipeline import Pipeline, PipelineSettings
 from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
@@ -38,7 +38,7 @@ from stavpr_ros.recognition.place_filter import FilterSettings, PlaceFilter
 from stavpr_ros.recognition.robust import MeanCentering, z_normalized
 from stavpr_ros.recognition.sequence_search import SequenceBuffer
 from stavpr_ros.sources.frame import ImageRecord
-from timing import measure, synchronizer, timed
+from timing import best_seconds, timed
 import torch
 
 MODES = ('robust', 'paper')  # the default first
@@ -49,13 +49,13 @@ FRAMES = 20  # of the distance matrix
 MATRIX_PLACES = 20_000  # most places of the distance matrix
 LIBROSA_STARTS, ENDS_CHECKED = 500, 3
 PROJECTED, DRIVEN = 64, 1000  # dimensions, and images of the drive, of `process`
-CHECKED = 2000  # places among which a peer must find the nearest one
+SEARCHES = {'faiss': 'faiss', 'usearch': 'bench'}  # package: its requirements
 Call = Callable[[], Any]
 
 
 def memory_problem(n: int, d: int, device: str, limit: float) -> str:
     """Return why a map does not fit into memory; empty if it fits."""
-    # features, the recognizer's own, torch's product in both precisions, blocks of strip distances
+    # features, the recognizer's own, those of a peer, blocks of strip distances
     needed = 4 * n * d * STRIPS * 3.5 + 2 * 4 * FRAMES * STRIPS**2 * min(n, MATRIX_PLACES)
     limit = min(limit, 0.9 * free_bytes(device))
     return (
@@ -84,14 +84,13 @@ def robust_stages(run: Run, n: int, seed: int) -> None:
     lag = SEQUENCE.length - 1 - middle
     place_filter = PlaceFilter(n, lag, FILTER)
     speed_weights = np.ones(len(FILTER.speeds))
-    peer = _plain_filter(place_filter, window, speed_weights)
-    states = len(FILTER.levels) * len(FILTER.speeds)
+    for row in window:
+        place_filter.update(row, FILTER.weight, speed_weights)
     add(
         'filter_update',
         call=partial(place_filter.update, window[-1], FILTER.weight, speed_weights),
         works=[bounds.filter_update(sizes, FILTER)],
-        peers=[peer],
-        extra={'cells': n * states},
+        cells=n * len(FILTER.levels) * len(FILTER.speeds),
     )
 
     def belief() -> np.ndarray:
@@ -99,25 +98,6 @@ def robust_stages(run: Run, n: int, seed: int) -> None:
         return place_filter.way(found.ways[int(np.argmax(found.weights))], lag)
 
     add('filter_belief', call=belief, works=[bounds.filter_belief(sizes)])
-
-
-def _plain_filter(place_filter: PlaceFilter, rows: np.ndarray, speed_weights: np.ndarray) -> Peer:
-    """
-    Return the plain program of the filter as a peer; its probabilities must be ours.
-
-    :param place_filter: new; advanced by the rows.
-    """
-    plain = PlainFilter(rows.shape[1], FILTER)
-    for row in rows:
-        for each in (place_filter, plain):
-            each.update(row, FILTER.weight, speed_weights)
-    found, expected = place_filter.places_of_states(), plain.a.sum(axis=(0, 1))
-    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-7)
-    np.testing.assert_allclose(place_filter.off_map, plain.off.sum(), rtol=1e-3)
-    note = 'plain numba, all cores; the same probabilities up to rounding, without the ways back'
-    return Peer(
-        'prange', timed(partial(plain.update, rows[-1], FILTER.weight, speed_weights)), note
-    )
 
 
 # ------------------------------------------------ on windows of distances, mode paper
@@ -137,7 +117,7 @@ def paper_stages(run: Run, n: int, seed: int) -> None:
         call=kernel,
         works=[bounds.lm_dtw(sizes)],
         peers=sequence_peers(run, window, matches),
-        extra={'cells': n * SEQUENCE.length * SEQUENCE.k},
+        cells=n * SEQUENCE.length * SEQUENCE.k,
     )
     select = partial(best_match, matches, NMS_RADIUS)
     add('selection', call=select, works=[bounds.selection(sizes)])
@@ -208,7 +188,7 @@ def feature_stages(run: Run, n: int, d: int, precisions: Sequence[str], seed: in
     centered = partial(MeanCentering(places).next_query, queries.strips[:, 0])
     run.measure('mean_centering', size, centered, [bounds.mean_centering(sizes)], mode='robust')
     for precision in precisions:
-        peers = products(run, places, queries[:1], precision)
+        peers = references(run, places, queries[:1], precision)
         matcher = make_matcher(places, SPATIAL, run.device, precision)
         batch = queries.to(run.device)
         call = partial(matcher.distances, batch.strips[:, 0].contiguous(), batch.weights[:, 0])
@@ -218,7 +198,7 @@ def feature_stages(run: Run, n: int, d: int, precisions: Sequence[str], seed: in
             call = partial(matcher.distance_matrix, batch.strips, batch.weights)
             works = [bounds.product(sizes, precision, FRAMES)]
             works += [bounds.spatial_alignment(sizes, FRAMES)]
-            many = products(run, places, queries, precision)
+            many = [product(run, places, queries)]
             run.measure('distance_matrix', size, call, works, many, precision)
         del matcher, call
         for mode in MODES:
@@ -235,7 +215,7 @@ def map_reading(sizes: Sizes, precision: str, device: str) -> list[Peer]:
     """Return the reading of as many bytes as the map has, as a peer; none on a GPU."""
     if device != 'cpu':
         return []
-    content = np.ones(sizes.W * sizes.n * sizes.d * ITEM_BYTES.get(precision, 1) // 4, np.float32)
+    content = np.ones(sizes.W * sizes.n * sizes.d * ITEM_BYTES[precision] // 4, np.float32)
     call = partial(reader(nb.get_num_threads()), content)
     return [Peer(READING, timed(call), 'as many bytes read once, on all cores', partial=True)]
 
@@ -311,106 +291,78 @@ def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
 
     for _ in range(2 * SEQUENCE.length):
         process(0.5)
-    job = timed(partial(process, 1.0), synchronizer(run.device))
+    job = timed(partial(process, 1.0), run.device)
     peer = Peer('without matches', job, 'the same, but no image matches', partial=True)
     works = frame_works(Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k), 'robust', precision)
     run.measure('process', (n, d), partial(process, 0.5), works, [peer], precision, 'robust')
     assert accepted[0.5] > 0 == accepted[1.0]
 
 
-def products(
-    run: Run, places: LocalFeatures, queries: LocalFeatures, precision: str
+def references(
+    run: Run, places: LocalFeatures, query: LocalFeatures, precision: str
 ) -> list[Peer]:
-    """Return torch's product in float32, and in the map's precision unless that is slower."""
-    peers, d = [], places.strips.shape[2]
-    for dtype in dict.fromkeys(('float32' if precision == 'int8' else precision, 'float32')):
-        if reason := slower_than_float32(run.device, dtype):
-            run.skip(f'torch {dtype}', 0, 0, reason)
-            continue
-        kind, wait = getattr(torch, dtype), synchronizer(run.device)
-        rows = queries.strips.transpose(0, 1).reshape(-1, d).to(run.device, kind)
-        call, form = bare_product(rows, places.strips.to(kind), wait)
-        note = f'{form}, all pairs of strips, no alignment'
-        peers.append(Peer(f'torch {dtype}', timed(call, wait), note, partial=True))
-    if run.device == 'cpu' and precision == 'float32' and len(queries) == 1:
-        peers += faiss_peer(run, places, queries)
-    if run.device == 'cpu' and precision == 'int8' and len(queries) == 1:
-        peers += usearch_peer(run, places, queries)
-    return peers
+    """Return the peers of one image's distances: torch's product, a search for the nearest."""
+    found = [product(run, places, query)]
+    if run.device == 'cpu':
+        images, image = (each.strips.transpose(0, 1).flatten(1) for each in (places, query))
+        search = faiss_peer if precision == 'float32' else usearch_peer
+        try:
+            found.append(search(images.numpy(), image.numpy()))
+        except ImportError as error:
+            name = str(error.name).split('.', maxsplit=1)[0]
+            run.skip(name, 0, 0, f'not installed (requirements/{SEARCHES[name]}.txt)')
+    return found
 
 
-def faiss_peer(run: Run, places: LocalFeatures, queries: LocalFeatures) -> list[Peer]:
+def faiss_peer(images: np.ndarray, image: np.ndarray) -> Peer:
     """Return FAISS as a peer of the product: whole images as vectors, the nearest one of all."""
-    try:
-        import faiss  # type: ignore[import-not-found]
-    except ImportError:
-        run.skip('faiss', 0, 0, 'not installed (requirements/faiss.txt)')
-        return []
-    vectors = places.strips.transpose(0, 1).flatten(1).contiguous().numpy()
-    index = faiss.IndexFlatIP(vectors.shape[1])
-    index.add(vectors)
-    query = queries.strips.transpose(0, 1).flatten(1).contiguous().numpy()
+    import faiss  # type: ignore[import-not-found]
+
+    index = faiss.IndexFlatIP(images.shape[1])
+    index.add(images)
     note = 'IndexFlatIP, one product of whole images instead of 49 of strips'
-    return [Peer('faiss flat', timed(partial(index.search, query, 1)), note, partial=True)]
+    return Peer('faiss flat', timed(partial(index.search, image, 1)), note, partial=True)
 
 
-def usearch_peer(run: Run, places: LocalFeatures, queries: LocalFeatures) -> list[Peer]:
+def usearch_peer(images: np.ndarray, image: np.ndarray) -> Peer:
     """Return usearch as a peer of the product in int8: whole images as vectors, the nearest."""
-    try:
-        from usearch.index import MetricKind, search  # type: ignore[import-not-found]
-    except ImportError:
-        run.skip('usearch', 0, 0, 'not installed (requirements/bench.txt)')
-        return []
+    from usearch.index import MetricKind, search  # type: ignore[import-not-found]
+
     vectors, query = (
-        np.rint(images / np.abs(images).max(axis=1, keepdims=True) * 127).astype(np.int8)
-        for images in (
-            each.strips.transpose(0, 1).flatten(1).cpu().numpy() for each in (places, queries)
-        )
+        np.rint(each / np.abs(each).max(axis=1, keepdims=True) * 127).astype(np.int8)
+        for each in (images, image)
     )
-    some = vectors[:CHECKED].astype(np.float32)
-    cosines = some @ query[0].astype(np.float32) / np.linalg.norm(some, axis=1)
-    nearest = search(vectors[:CHECKED], query, 1, MetricKind.Cos, exact=True).keys[0]
-    np.testing.assert_allclose(cosines[nearest], cosines.max(), 1e-3)
     call = partial(search, vectors, query, 1, MetricKind.Cos, exact=True, threads=0)
     note = 'exact search in int8, one product of whole images instead of 49 of strips'
-    return [Peer('usearch int8', timed(call), note, partial=True)]
+    return Peer('usearch int8', timed(call), note, partial=True)
 
 
-def bare_product(
-    rows: torch.Tensor, places: torch.Tensor, synchronize: Callable[[], None]
-) -> tuple[Call, str]:
+def product(run: Run, places: LocalFeatures, queries: LocalFeatures) -> Peer:
     """
-    Return torch's product of queries with the map in its faster orientation, and the name of that.
+    Return torch's product of queries with the map in float32, in its faster orientation.
 
-    The faster orientation of a skinny product depends on the machine and the precision. The memory
-    of the result is allocated beforehand.
-
-    :param rows: shape (queries, d).
-    :param places: shape (W, n, d), of the same type and device.
+    The faster orientation of a skinny product depends on the machine. The memory of the result is
+    allocated beforehand.
     """
-    strips = places.reshape(-1, places.shape[2])
-    out = torch.empty(len(rows) * len(strips), dtype=rows.dtype, device=rows.device)
-    wide, tall = out.view(len(rows), len(strips)), out.view(len(strips), len(rows))
+    strips = places.strips.flatten(0, 1)
+    rows = queries.strips.transpose(0, 1).flatten(0, 1).to(strips.device)
+    out = torch.empty(len(rows) * len(strips), device=strips.device)
+    wide, tall = out.view(len(rows), -1), out.view(len(strips), -1)
     forms: dict[str, Call] = {
         'queries @ map.T': lambda: torch.mm(rows, strips.T, out=wide),
         'map @ queries.T': lambda: torch.mm(strips, rows.T, out=tall),
     }
-    taken = {
-        form: measure({'': timed(call, synchronize)}, 0)[''].median_s
-        for form, call in forms.items()
-    }
-    best = min(taken, key=taken.__getitem__)
-    return forms[best], best
+    form = min(forms, key=lambda name: best_seconds(forms[name], run.device, 0))
+    note = f'{form}, all pairs of strips, no alignment'
+    return Peer('torch float32', timed(forms[form], run.device), note, partial=True)
 
 
 def frame(
     places: LocalFeatures, queries: LocalFeatures, mode: str, precision: str, device: str
 ) -> Call:
     """Return a call that updates a recognizer, its window full, with the next image."""
-    n = len(places)
-    place_map = PlaceMap(places, None, np.zeros(n, np.int64), ('',) * n)
     settings = RecognizerSettings(1.0, SPATIAL, SEQUENCE, NMS_RADIUS, mode)
-    recognizer = PlaceRecognizer(place_map, settings, device, precision)
+    recognizer = PlaceRecognizer(descriptor_map(places), settings, device, precision)
     following = cycle([queries[i : i + 1] for i in range(len(queries))])
     for _ in range(SEQUENCE.length):
         recognizer.update(next(following))

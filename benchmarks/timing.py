@@ -18,55 +18,30 @@ SHORT_S = 0.01
 
 @dataclass(frozen=True)
 class Timing:
-    """
-    Summary of the runs of one job.
-
-    :param spread_s: interquartile range, seconds.
-    :param runs: number of runs, warm-up excluded.
-    """
+    """Median and interquartile range of the runs of one job, seconds, warm-up excluded."""
 
     median_s: float
     spread_s: float
     runs: int
 
-    @classmethod
-    def of(cls, seconds: list[float]) -> 'Timing':
-        """Summarize at least two runs."""
-        low, median, high = statistics.quantiles(seconds, n=4, method='inclusive')
-        return cls(median, high - low, len(seconds))
 
+def timed(call: Callable[[], Any], device: str = 'cpu') -> Job:
+    """Return a job that measures a call by the wall clock, results on the device complete."""
 
-def nothing() -> None:
-    """Return at once: calls on the CPU are complete when they return."""
+    def wait() -> None:
+        if device == 'cuda':
+            import torch
 
-
-def synchronizer(device: str) -> Callable[[], None]:
-    """Return a function that waits for all work queued on the device."""
-    if device == 'cpu':
-        return nothing
-    import torch
-
-    return torch.cuda.synchronize
-
-
-def timed(call: Callable[[], Any], synchronize: Callable[[], None] = nothing) -> Job:
-    """Return a job that measures a call by the wall clock, results complete."""
+            torch.cuda.synchronize()
 
     def job() -> float:
-        synchronize()
+        wait()
         began = time.perf_counter()
         call()
-        synchronize()
+        wait()
         return time.perf_counter() - began
 
     return job
-
-
-def rounds_for(round_s: float, seconds: float) -> int:
-    """Return the number of rounds of ``round_s`` seconds that fill ``seconds``, within limits."""
-    if round_s > SLOW_S:
-        return FEWEST_SLOW
-    return max(FEWEST, min(MOST, math.ceil(seconds / max(round_s, 1e-9))))
 
 
 def measure(jobs: Mapping[str, Job], seconds: float = 0.5) -> dict[str, Timing]:
@@ -88,17 +63,22 @@ def measure(jobs: Mapping[str, Job], seconds: float = 0.5) -> dict[str, Timing]:
             if last > SLOW_S:
                 break
         round_s += last
+    rounds = max(FEWEST, min(MOST, math.ceil(seconds / max(round_s, 1e-9))))
     taken: dict[str, list[float]] = {name: [] for name in jobs}
-    for _ in range(rounds_for(round_s, seconds)):
+    for _ in range(FEWEST_SLOW if round_s > SLOW_S else rounds):
         for name, job in jobs.items():
             first = job()
             taken[name].append(job() if first < SHORT_S else first)
-    return {name: Timing.of(values) for name, values in taken.items()}
+    found = {}
+    for name, values in taken.items():
+        low, median, high = statistics.quantiles(values, n=4, method='inclusive')
+        found[name] = Timing(median, high - low, len(values))
+    return found
 
 
 def best_seconds(call: Callable[[], Any], device: str, seconds: float) -> float:
     """Return the shortest of at least three runs that fill ``seconds``, after one to warm up."""
-    job = timed(call, synchronizer(device))
+    job = timed(call, device)
     job()
     end = time.perf_counter() + seconds
     taken = [job() for _ in range(3)]

@@ -22,78 +22,23 @@ import tempfile
 from typing import Any
 
 import cv2
-import numpy as np
-from results import commit, cpu_model, versions
-from soak import Latencies, make_map, texture_route
+from soak import about, image_message, make_map, publish, texture_route
 
 SIZES = {'640x480': (640, 480), '1920x1080': (1920, 1080)}
 KINDS = ('raw', 'compressed')
 RELIABILITIES = ('reliable', 'best effort')
 IMAGES = 20  # different ones
-SETTLED = 3.0  # seconds for the images on their way at the end
 
 
 def messages(kind: str, size: tuple[int, int]) -> list[Any]:
     """Return images of one size as messages."""
-    from sensor_msgs.msg import CompressedImage, Image
+    from sensor_msgs.msg import CompressedImage
 
-    found = []
-    for view in texture_route(IMAGES):
-        image = cv2.resize(view, size, interpolation=cv2.INTER_LINEAR)
-        if kind == 'raw':
-            height, width = image.shape[:2]
-            message = Image(height=height, width=width, encoding='rgb8', step=3 * width)
-            message.data = array.array('B', image.tobytes())
-        else:
-            message = CompressedImage(format='jpeg')
-            message.data = array.array('B', cv2.imencode('.jpg', image)[1].tobytes())
-        found.append(message)
-    return found
-
-
-def measure(
-    kind: str, reliability: str, images: list[Any], names: list[str], arguments: argparse.Namespace
-) -> list[dict[str, Any]]:
-    """Publish at the rate, and return the figures of each node."""
-    import time
-
-    import rclpy
-    from rclpy.qos import QoSProfile, ReliabilityPolicy
-    from stavpr_msgs.msg import PlaceMatch
-    from stavpr_ros.ros.process import Discovery, ros_node, spin_until
-
-    topic = 'image' if kind == 'raw' else 'image/compressed'
-    policy = getattr(ReliabilityPolicy, reliability.replace(' ', '_').upper())
-    total = round(arguments.seconds * arguments.rate)
-    found = [Latencies() for _ in names]
-    with ros_node(lambda: rclpy.create_node('camera'), []) as node:
-        for name, one in zip(names, found, strict=True):
-            node.create_subscription(
-                PlaceMatch, f'/{name}/match', one.on_match, QoSProfile(depth=1000)
-            )
-        qos = QoSProfile(depth=5, reliability=policy)
-        publisher = node.create_publisher(type(images[0]), topic, qos)
-        spin_until(node, lambda: publisher.get_subscription_count() == len(names))
-        discovery = Discovery(node, lambda: node.get_subscriptions_info_by_topic(f'/{topic}'))
-        spin_until(node, discovery.done)
-
-        def publish(index: int) -> None:
-            message, now = images[index % len(images)], time.time_ns()
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, 10**9)
-            for one in found:
-                one.sent[now] = time.monotonic()
-            publisher.publish(message)
-
-        numbers = iter(range(total))
-        timer = node.create_timer(1 / arguments.rate, lambda: publish(next(numbers)))
-        spin_until(node, lambda: len(found[0].sent) == total)
-        node.destroy_timer(timer)
-        end = time.monotonic() + SETTLED
-        spin_until(
-            node,
-            lambda: all(one.statuses.total() == total for one in found) or time.monotonic() > end,
-        )
-        return [one.figures(total, PlaceMatch.DROPPED) for one in found]
+    images = [cv2.resize(view, size) for view in texture_route(IMAGES)]
+    if kind == 'raw':
+        return [image_message(image) for image in images]
+    encoded = [cv2.imencode('.jpg', image)[1].tobytes() for image in images]
+    return [CompressedImage(format='jpeg', data=array.array('B', data)) for data in encoded]
 
 
 @contextmanager
@@ -138,6 +83,7 @@ def main() -> None:
     )
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
     from stavpr_lab.demonstration.live import private_domain
     from stavpr_ros.ros.process import prepare_transport
 
@@ -154,14 +100,16 @@ def main() -> None:
             names = [f'stavpr_{number}' for number in range(count)]
             with running(names, kind, map_path):
                 for (size, pixels), reliability in product(SIZES.items(), RELIABILITIES):
-                    nodes = measure(kind, reliability, messages(kind, pixels), names, arguments)
+                    policy = getattr(ReliabilityPolicy, reliability.replace(' ', '_').upper())
+                    qos = QoSProfile(depth=5, reliability=policy)
+                    topic = 'image' if kind == 'raw' else 'image/compressed'
+                    nodes, _ = publish(names, topic, qos, messages(kind, pixels), arguments)
                     results.append(
                         {'size': size, 'kind': kind, 'reliability': reliability, 'nodes': nodes}
                     )
                     print(row(results[-1]), flush=True)
     report = {'results': results, 'rate_hz': arguments.rate, 'seconds': arguments.seconds}
-    report |= {'large_segment': arguments.large_segment, 'load': np.round(os.getloadavg(), 1)[0]}
-    report |= {'cpu': cpu_model(), 'cores': os.cpu_count(), 'commit': commit(), **versions()}
+    report |= {'large_segment': arguments.large_segment, **about(os.getloadavg()[0])}
     if arguments.output:
         Path(arguments.output).write_text(json.dumps(report, indent=2) + '\n')
 

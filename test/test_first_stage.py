@@ -9,8 +9,7 @@ import pytest
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.mapping.place_map import Session
+from stavpr_ros.mapping import descriptor_map, Session
 from stavpr_ros.recognition import first_stage, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.first_stage import CHUNK, FirstStage
@@ -119,9 +118,9 @@ def test_distances_of_chunks_end_with_map():
 
 
 def recognizer(features, sessions=1, **changes):
-    n = len(features)
-    place_map = PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
+    place_map = descriptor_map(features)
     if sessions > 1:
+        n = len(features)
         index = (np.arange(n) * sessions // n).astype(np.int32)
         names = tuple(Session(str(i)) for i in range(sessions))
         place_map = replace(place_map, sessions=names, session_index=index)
@@ -141,18 +140,13 @@ def test_recognizer_over_time_budget_matches_as_exact_one(few, sessions):
     coarse = recognizer(features, sessions, time_budget_ms=1e-6)
     assert isinstance(coarse._matcher, FirstStage)
     assert isinstance(exact._matcher, CpuMatcher)
+    assert recognizer(features).stages == ''
     assert 'exact matching takes' in exact.stages
     assert 'with a first stage' in coarse.stages
     assert 'with a first stage' not in exact.stages
     found = matches(coarse, query)
     assert found == matches(exact, query)
     assert found[-1] == (True, 2029)
-
-
-def test_recognizer_without_time_budget_is_exact():
-    one = recognizer(random_features(50))
-    assert isinstance(one._matcher, CpuMatcher)
-    assert one.stages == ''
 
 
 @pytest.mark.parametrize(

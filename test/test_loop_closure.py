@@ -458,12 +458,12 @@ def test_loop_closer_on_unknown_backend_or_precision_is_rejected(laps, backend, 
     assert choose_loop_backend('auto') == choose_loop_backend('cpu') == 'cpu'
 
 
-@pytest.mark.parametrize(('precision', 'limit'), [('float16', None), ('int8', 90)])
-def test_settled_route_in_less_memory_matches_as_in_float32(laps, monkeypatch, precision, limit):
+@pytest.mark.parametrize('limit', [None, 90])
+def test_settled_route_in_int8_matches_as_in_float32(laps, monkeypatch, limit):
     """Rounded once, by the mean and the whitening of the day it settled; an eighth is evicted."""
     monkeypatch.setattr(route_features, 'SETTLED', 150)
     full = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit)
-    less = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit, precision=precision)
+    less = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit, precision='int8')
     matched, settled = 0, min(150, limit or 150)
     for i in range(len(laps)):
         one, other = less.update(laps[i : i + 1]), full.update(laps[i : i + 1])
@@ -471,9 +471,7 @@ def test_settled_route_in_less_memory_matches_as_in_float32(laps, monkeypatch, p
         if i + 1 < settled:
             same(one, other)
             continue
-        route = less._route
-        held = route.strips.values if precision == 'int8' else route.strips
-        assert held.dtype == (np.int8 if precision == 'int8' else torch.float16)
+        assert less._route.strips.values.dtype == np.int8
         assert one.status == other.status
         if other.accepted:
             matched += 1
@@ -481,17 +479,15 @@ def test_settled_route_in_less_memory_matches_as_in_float32(laps, monkeypatch, p
             assert one.probability == pytest.approx(other.probability, abs=0.05)
     assert matched > 100
     kept = laps[less.first :]
-    error = 1e-3 if precision == 'float16' else 0.05
-    torch.testing.assert_close(less.features().strips, kept.strips, atol=error, rtol=0)
+    torch.testing.assert_close(less.features().strips, kept.strips, atol=0.05, rtol=0)
     torch.testing.assert_close(less.features().weights, kept.weights)
 
 
-@pytest.mark.parametrize('precision', ['float16', 'int8'])
-def test_settled_route_holds_its_places_through_growth_and_eviction(laps, monkeypatch, precision):
+def test_settled_route_holds_its_places_through_growth_and_eviction(laps, monkeypatch):
     """Distances are those to the places' own features, rounded."""
     monkeypatch.setattr(route_features, 'SETTLED', 20)
     monkeypatch.setattr(route_features, 'ROOM', 16)
-    route = RouteFeatures(laps.settings, False, False, 75, precision)
+    route = RouteFeatures(laps.settings, False, False, 75, 'int8')
     matcher, evicted = CpuRouteMatcher(7, SpatialSettings()), 0
     for i in range(200):
         if route.count == 75:
@@ -501,7 +497,7 @@ def test_settled_route_holds_its_places_through_growth_and_eviction(laps, monkey
     held = laps[evicted:200]
     newest = route.newest
     found = matcher.to_oldest(route.strips, newest, route.count - 3)
-    expected = CpuMatcher(held, SpatialSettings(), precision).distances(
+    expected = CpuMatcher(held, SpatialSettings(), 'int8').distances(
         newest[:, 0], torch.ones(7)
     )
     torch.testing.assert_close(found, expected[:-3], atol=1e-6, rtol=0)

@@ -65,7 +65,7 @@ def answers(place_map, precision):
 
 
 @pytest.mark.parametrize('storage', ['float32', 'float16'])
-@pytest.mark.parametrize('precision', ['float32', 'float16', 'int8'])
+@pytest.mark.parametrize('precision', ['float32', 'int8'])
 def test_answers_with_statistics_are_those_without_bit_for_bit(
     place_map, tmp_path, storage, precision
 ):
@@ -222,7 +222,7 @@ def test_answers_of_codes_are_those_of_features_bit_for_bit(place_map, tmp_path,
         found.append([one.newest_row().tobytes(), [(m.probability, m.sequence) for m in matches]])
     assert found[0] == found[1]
     # other precisions take the features
-    assert answers(opened, 'float16') == answers(open_map(files[0]), 'float16')
+    assert answers(opened, 'float32') == answers(open_map(files[0]), 'float32')
 
 
 @pytest.mark.parametrize(

@@ -5,18 +5,18 @@
 from dataclasses import replace
 import os
 from pathlib import Path
-import subprocess
 import sys
 
-import numpy as np
 import pytest
 from stavpr_ros.errors import MapFileError
-from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.mapping import GrowingMap, load_map, open_map, PlaceMap, save_map, verify_map
+from stavpr_ros.mapping import GrowingMap, load_map, open_map, save_map, verify_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CACHE_LINE
 import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))
+
+import memory
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 # Resident bytes beside the features: the heap, the window, the filter and the whitening; a copy of
@@ -51,8 +51,9 @@ def test_features_read_from_a_file_begin_with_a_cache_line(path):
     assert open_map(path).features.strips.data_ptr() % CACHE_LINE == 0
 
 
-@pytest.mark.parametrize('mode', ['paper', 'robust'])
-@pytest.mark.parametrize('precision', ['float32', 'float16'])
+@pytest.mark.parametrize(
+    ('mode', 'precision'), [('paper', 'float32'), ('robust', 'float32'), ('robust', 'int8')]
+)
 def test_recognizer_on_an_opened_map_matches_as_on_a_loaded_one(path, mode, precision):
     settings = RecognizerSettings(1.0, mode=mode)
     opened, loaded = (
@@ -66,7 +67,7 @@ def test_recognizer_on_an_opened_map_matches_as_on_a_loaded_one(path, mode, prec
 
 def test_opened_map_saves_and_grows_bit_for_bit(path, small_map, tmp_path):
     opened = open_map(path)
-    PlaceRecognizer(opened, RecognizerSettings(1.0, mode='robust'), precision='float16')
+    PlaceRecognizer(opened, RecognizerSettings(1.0, mode='robust'), precision='int8')
     save_map(opened, tmp_path / 'copy')
     assert torch.equal(load_map(tmp_path / 'copy').features.strips, small_map.features.strips)
     grown = GrowingMap.from_map(opened, 100).snapshot()
@@ -113,93 +114,18 @@ def test_growing_map_may_leave_the_features_to_another_owner(small_map):
     assert growing.dimension == kept.dimension
 
 
-PROGRAM = """
-import ctypes
-import gc
-import sys
-from pathlib import Path
-import torch
-from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.mapping import GrowingMap, open_map
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.loop_closer import LoopCloser
-from stavpr_ros.threads import limit_threads
-
-limit_threads(1)
-owner, mode, precision, large, small = sys.argv[1:]
-settings = RecognizerSettings(1.0, mode=mode)
-
-def resident():
-    gc.collect()
-    if sys.platform == 'linux':  # what is freed may stay with the allocator
-        ctypes.CDLL(None).malloc_trim(0)
-    pages = int(Path('/proc/self/statm').read_text().split()[1])
-    return pages * 4096
-
-def held(path):
-    place_map = open_map(path)
-    if owner == 'recognizer':
-        one = PlaceRecognizer(place_map, settings, 'cpu', precision)
-    else:
-        # few places to match: matching takes time and no memory
-        exclude = len(place_map) * 3 // 4
-        one = LoopCloser(settings, exclude, place_map.settings, limit=len(place_map))
-        route = GrowingMap(place_map.settings, None, len(place_map), held_features=one.features)
-    features = place_map.features[:]
-    for i in range(21 if owner == 'recognizer' else len(features)):
-        one.update(features[i : i + 1])
-        if owner == 'closer':
-            route.add(features[i : i + 1])
-    return place_map, one
-
-held(small)  # loads libraries and kernels
-before = resident()
-place_map, one = held(large)
-size = 7 * len(place_map) * place_map.dimension * (2 if precision == 'float16' else 4)
-print(resident() - before, size)
-"""
-
-
-def random_map(path, places, dimension):
-    rng = np.random.default_rng(0)
-    strips = rng.standard_normal((7, places, dimension), np.float32)
-    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
-    weights = torch.full((7, places), 7**-0.5)
-    # 8 x 8 cells, one column a strip
-    settings = FeatureSettings('gradient', GradientSettings(128, orientations=dimension // 8))
-    features = LocalFeatures(torch.from_numpy(strips), weights, settings)
-    save_map(PlaceMap(features, None, np.zeros(places, np.int64), ('',) * places), path)
-    return str(path)
-
-
-@pytest.fixture(scope='module')
-def maps(tmp_path_factory):
-    """Save maps of 143 MB and 34 MB, and a small one."""
-    folder = tmp_path_factory.mktemp('maps')
-    return {
-        'recognizer': random_map(folder / 'places', 5000, 1024),
-        'closer': random_map(folder / 'route', 600, 2048),
-        'small': random_map(folder / 'small', 400, 64),
-    }
-
-
 @pytest.mark.skipif(
     not Path('/proc/self/statm').exists(), reason='resident memory is read from /proc'
 )
 @pytest.mark.parametrize(
-    ('owner', 'mode', 'precision'),
+    ('operation', 'mode', 'n', 'd'),
     [
-        ('recognizer', 'robust', 'float32'),
-        pytest.param('recognizer', 'robust', 'float16', marks=pytest.mark.long),
-        pytest.param('recognizer', 'paper', 'float32', marks=pytest.mark.long),
-        ('closer', 'robust', 'float32'),
+        ('localization', 'robust', 5000, 1024),
+        pytest.param('localization', 'paper', 5000, 1024, marks=pytest.mark.long),
+        ('loop_closure', 'robust', 600, 2048),
     ],
 )
-def test_resident_memory_is_that_of_the_features(maps, owner, mode, precision):
-    command = [sys.executable, '-c', PROGRAM, owner, mode, precision, maps[owner], maps['small']]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    resident, size = map(int, done.stdout.split())
-    print(f'{owner}, {mode}, {precision}: {resident} resident bytes, {size} of the features')
-    assert 0.9 * size < resident < size + ALLOWANCE
+def test_resident_memory_is_that_of_the_features(operation, mode, n, d):
+    found = memory.measure_memory(operation, mode, 'float32', n, d)
+    assert found.feature_bytes == 4 * 7 * n * d
+    assert 0.9 < found.ratio < 1 + ALLOWANCE / found.feature_bytes

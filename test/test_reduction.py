@@ -55,24 +55,18 @@ def test_more_directions_than_a_third_of_the_strips_are_rejected(whole):
         with_principal_components(few, 8)
 
 
-def test_query_of_reduced_map_is_projected_as_its_places(whole):
-    reduced = with_principal_components(whole, D)
+@pytest.mark.parametrize('before', [[], [12]])
+def test_query_of_reduced_map_is_projected_as_its_places(whole, before):
+    """Also where one reduction follows another."""
+    reduced = whole
+    for dimension in (*before, D):
+        reduced = with_principal_components(reduced, dimension)
+    assert reduced.projection.matrix.shape == (whole.dimension, D)
     query = reduced.extractor().extract(images(30)[7:8])
     query.require_same_settings(reduced.settings, 'the map')
     np.testing.assert_allclose(query.strips[:, 0], reduced.features.strips[:, 7], atol=1e-4)
-
-
-def test_second_reduction_follows_the_first(whole):
-    twice = with_principal_components(with_principal_components(whole, 12), D)
-    assert twice.projection.matrix.shape == (whole.dimension, D)
-    query = twice.extractor().extract(images(30)[3:4])
-    np.testing.assert_allclose(query.strips[:, 0], twice.features.strips[:, 3], atol=1e-4)
-
-
-def test_reduced_map_grows_with_its_basis(whole):
-    reduced = with_principal_components(whole, D)
     growing = GrowingMap.from_map(reduced, 100)
-    growing.add(reduced.extractor().extract(images(30)[:1]))
+    growing.add(query)
     assert len(growing) == 31
     assert growing.projection.identity == reduced.projection.identity
 
@@ -85,15 +79,14 @@ def test_reduction_to_other_dimension_is_rejected(whole, dimension):
 
 @pytest.fixture
 def folder(tmp_path):
-    (tmp_path / 'images').mkdir()
     for i, image in enumerate(images(30)):
-        cv2.imwrite(str(tmp_path / 'images' / f'{i:03}.png'), image)
+        cv2.imwrite(str(tmp_path / f'{i:03}.png'), image)
     return tmp_path
 
 
 def test_map_is_built_and_compacted_with_principal_components(folder, capsys):
-    source, built = str(folder / 'images'), str(folder / 'built.stavpr')
-    arguments = ['--input', source, '--output', built, '--projection', f'pca:{D}']
+    built = str(folder / 'built.stavpr')
+    arguments = ['--input', str(folder), '--output', built, '--projection', f'pca:{D}']
     assert build_map.main(arguments) == 0
     found = load_map(built)
     assert isinstance(found, PlaceMap)
@@ -115,6 +108,6 @@ def test_unknown_projection_is_rejected(folder, projection, capsys):
 
 
 def test_evaluation_of_images_refers_to_map_for_principal_components(folder, capsys):
-    source = str(folder / 'images')
+    source = str(folder)
     assert evaluate.main(['--map', source, '--query', source, '--projection', 'pca:4']) != 0
     assert 'build one by build_map' in capsys.readouterr().err

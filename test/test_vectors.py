@@ -14,7 +14,7 @@ from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.features.extractor import cut_strips
 from stavpr_ros.features.outputs import as_maps, one_of
 from stavpr_ros.features.registry import settings_class
-from stavpr_ros.mapping import build_map, load_map, PlaceMap, save_map
+from stavpr_ros.mapping import build_map, descriptor_map, load_map, save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.matcher import make_matcher
@@ -127,15 +127,9 @@ def extractor(path, layer='global', strips=None, **changes):
 
 
 def test_extractor_of_vectors_has_one_strip(network, route):
-    made = extractor(network)
-    features = made.extract(route[:3])
-    assert made.settings.strips == 1
+    features = extractor(network).extract(route[:3])
     assert features.strips.shape == (1, 3, 32)
-    assert features.cells == (1, 1)
-    with pytest.raises(SettingsError, match=r'vector of 32 numbers .* not 7 and flatten'):
-        extractor(network, strips=7)
-    with pytest.raises(SettingsError, match='not 1 and gem'):
-        extractor(network, pooling='gem')
+    assert (features.settings.strips, features.cells) == (1, (1, 1))
 
 
 def test_extractor_of_tokens_equals_that_of_their_map(network, route):
@@ -147,13 +141,22 @@ def test_extractor_of_tokens_equals_that_of_their_map(network, route):
     assert pooled.strips.shape == (7, 2, 16)
 
 
-def test_unusable_layers_are_rejected_before_any_image(network):
-    with pytest.raises(SettingsError, match='63 without the first 1'):
-        extractor(network, 'tokens')
-    with pytest.raises(InputError, match=r'Wf = 8 .*W = 9'):
-        extractor(network, 'map', 9)
-    with pytest.raises(SettingsError, match="pooling = 'max'"):
-        extractor(network, 'map', pooling='max')
+@pytest.mark.parametrize(
+    ('changes', 'text'),
+    [
+        ({'strips': 7}, r'vector of 32 numbers .* not 7 and flatten'),
+        ({'pooling': 'gem'}, 'not 1 and gem'),
+        ({'layer': 'tokens'}, '63 without the first 1'),
+        ({'layer': 'map', 'strips': 9}, r'Wf = 8 .*W = 9'),
+        ({'layer': 'map', 'pooling': 'max'}, "pooling = 'max'"),
+        ({'layer': 'map', 'vector': 'map'}, "vector = 'map' is what the strips are made of"),
+        ({'layer': 'map', 'vector': 'local'}, r"no layer 'local'.*its layers are conv, map"),
+        ({'layer': 'map', 'vector': 'conv'}, r"'conv'.*\(1, 16, 8, 8\).*expected one vector"),
+    ],
+)
+def test_unusable_layers_are_rejected_before_any_image(network, changes, text):
+    with pytest.raises((InputError, SettingsError), match=text):
+        extractor(network, **changes)
 
 
 def test_onnx_file_of_batch_one_is_run_image_by_image(network, tmp_path, route):
@@ -173,14 +176,12 @@ def test_onnx_file_of_batch_one_is_run_image_by_image(network, tmp_path, route):
     assert [batch.shape[0] for feed in calls for batch in feed.values()] == [1, 1, 1]
 
 
-@pytest.mark.parametrize('mode', ['robust', 'paper'])
-def test_map_of_vectors_localizes_in_the_pipeline(network, route, tmp_path, mode):
+def test_map_of_vectors_localizes_in_the_pipeline(network, route, tmp_path):
     frames = [Frame(image, i + 1, '') for i, image in enumerate(route)]
     path = tmp_path / 'vectors.stavpr'
     save_map(build_map(frames, extractor(network), progress=False), path)
     assert load_map(path).features.strips.shape == (1, 60, 32)
-    threshold = {'threshold': 0.5} if mode == 'paper' else {}
-    pipeline = localizing(str(path), mode=mode, model_path=str(network), **threshold)
+    pipeline = localizing(str(path), model_path=str(network))
     noise = np.random.default_rng(0)
     images = [
         np.clip(image + noise.normal(0, 10, image.shape), 0, 255).astype(np.uint8)
@@ -209,37 +210,31 @@ def vectors(n, d, seed=0):
     )
 
 
-@pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'none', 'vertical'])
-@pytest.mark.parametrize('precision', ['float32', 'float16'])
-def test_alignment_of_one_strip_is_the_cosine_distance(strategy, precision):
+@pytest.mark.parametrize(
+    ('strategy', 'precision', 'error'),
+    [
+        ('adaptive', 'float32', 1e-5),
+        ('vanilla', 'float32', 1e-5),
+        ('none', 'float32', 1e-5),
+        ('vertical', 'float32', 1e-5),
+        ('adaptive', 'int8', 0.02),
+    ],
+)
+def test_alignment_of_one_strip_is_the_cosine_distance(strategy, precision, error):
     vertical = strategy == 'vertical'
     spatial = SpatialSettings('adaptive' if vertical else strategy, vertical=vertical)
     features, queries = vectors(131, 515), vectors(3, 515, seed=1)
-    rounded = features.strips.to(getattr(torch, precision)).double()[0]
     matcher = make_matcher(features, spatial, 'cpu', precision)
     matrix = matcher.distance_matrix(queries.strips, queries.weights)
-    expected = 1 - queries.strips[0].double() @ rounded.T
-    torch.testing.assert_close(matrix.double(), expected, rtol=0, atol=1e-5)
+    expected = 1 - queries.strips[0] @ features.strips[0].T
+    torch.testing.assert_close(matrix, expected, rtol=0, atol=error)
     row = matcher.distances(queries.strips[:, 1], queries.weights[:, 1])
     assert torch.equal(row, matrix[1])
-
-
-def test_alignment_of_one_strip_in_int8_is_near_the_cosine_distance():
-    features, queries = vectors(131, 515), vectors(3, 515, seed=1)
-    matcher = make_matcher(features, SpatialSettings(), 'cpu', 'int8')
-    matrix = matcher.distance_matrix(queries.strips, queries.weights)
-    expected = 1 - queries.strips[0] @ features.strips[0].T
-    torch.testing.assert_close(matrix, expected, rtol=0, atol=0.02)
 
 
 def test_sliding_window_over_one_strip_is_rejected_with_the_map():
     with pytest.raises(InputError, match='W = 1 strips: the sliding window'):
         make_matcher(vectors(5, 4), SpatialSettings('sliding_window'), 'cpu', 'float32')
-
-
-def place_map(features):
-    n = len(features)
-    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n)
 
 
 @pytest.mark.parametrize('mode', ['robust', 'paper'])
@@ -250,7 +245,7 @@ def test_sequence_of_vectors_is_matched(mode):
     strips = strips / strips.norm(dim=2, keepdim=True)
     query = LocalFeatures(strips, torch.ones(1, 80), features.settings, features.cells)
     settings = RecognizerSettings(0.5, sequence=SequenceSettings(10), mode=mode)
-    recognizer = PlaceRecognizer(place_map(features), settings)
+    recognizer = PlaceRecognizer(descriptor_map(features), settings)
     matches = [recognizer.update(query[i : i + 1]) for i in range(20, 50)]
     assert {match.status for match in matches[15:]} == {Status.MATCH}
     for i, match in enumerate(matches[15:], 35):

@@ -57,16 +57,15 @@ def converted_blocks(
 def converted(
     features: LocalFeatures,
     convert: Callable[[torch.Tensor], torch.Tensor],
-    dtype: torch.dtype,
     see: Callable[[torch.Tensor], None] = lambda strips: None,
 ) -> LocalFeatures:
     """
-    Return new features of another type: those of one block after the other, converted.
+    Return new features: those of one block after the other, converted.
 
-    :param see: called with the strips of each block, before they become another type.
+    :param see: called with the strips of each converted block.
     """
     shape = (*features.weights.shape, features.dimension)
-    strips = torch.empty(shape, dtype=dtype, device=features.weights.device)
+    strips = torch.empty(shape, device=features.weights.device)
     for places, some in converted_blocks(features, lambda some: convert(some.strips)):
         see(some)
         strips[:, places] = some

@@ -71,10 +71,10 @@ class CpuMatcher:
                 )
             strips = cut_cells(strips, features.cells)
             self._cell_a = adaptive_weights(features.cells[0], spatial, np.dtype(np.float32))
-        strips = strips.to(getattr(torch, precision)).contiguous()
+        strips = strips.float().contiguous()
         if strips.data_ptr() % CACHE_LINE:
             strips = strips.clone()
-        self._map = (strips if precision == 'float32' else strips.view(torch.int16)).numpy()
+        self._map = strips.numpy()
 
     @property
     def places(self) -> int:
@@ -166,7 +166,7 @@ class CpuRouteMatcher:
                 dot.image_distances(rounded_map, rounded_query, self._a, self._band, out)
             return torch.from_numpy(out[0])
         assert isinstance(strips, torch.Tensor)
-        held = (strips if strips.dtype == torch.float32 else strips.view(torch.int16)).numpy()
+        held = strips.numpy()
         if is_vector:
             dot.cosine_distances(held[0], newest[0].numpy(), out)
         else:

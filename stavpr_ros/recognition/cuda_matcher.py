@@ -21,7 +21,7 @@ QUERIES = 32  # most images of a batch whose products are made at once
 AT_ONCE = 1024  # places of a route: the memory of products is the same for so many
 PLACES_IN_PIECES = (
     2**14
-)  # most places widened at a time, where the half-width product is not available
+)  # most places of int8 widened at a time
 
 
 class CudaMatcher:
@@ -33,9 +33,8 @@ class CudaMatcher:
 
     :param features: those of the map, on any device; unit norm, strips (W, n, d), weights (W, n).
     :param spatial: how two images are compared.
-    :param precision: ``float32``, or ``float16``: the map is held in half width and the query is
-        rounded to it; products are summed up in float32. ``int8``: both are rounded to it;
-        strip distances are those of the CPU, bit for bit.
+    :param precision: ``float32``, or ``int8``: map and query are rounded to it; strip distances
+        are those of the CPU, bit for bit.
     :raises UnavailableError: no CUDA device here, or the package numba-cuda is missing.
     :raises SettingsError: xi > W.
     :raises InputError: fewer strips than the sliding window has.
@@ -55,7 +54,7 @@ class CudaMatcher:
             lengths = features.strips.reciprocals[:, : len(features)]
             self._hold(features.strips.rounded().to(device), torch.from_numpy(lengths).to(device))
         else:
-            self._hold(features.strips.to(device, getattr(torch, precision)).contiguous(), None)
+            self._hold(features.strips.to(device, torch.float32).contiguous(), None)
         self._weights = features.weights.to(device)
         self._workspace: tuple[torch.Tensor, Any] | None = None
         self._choose_kernel(spatial)
@@ -65,11 +64,6 @@ class CudaMatcher:
     def _hold(self, strips: torch.Tensor, reciprocals: torch.Tensor | None) -> None:
         """Compare with these strips; reciprocal lengths are of int8."""
         self._strips, self._reciprocals = strips, reciprocals
-        self._half = strips.dtype != torch.float32
-        # products of whole numbers and their sums are exact in float32
-        self._in_pieces = reciprocals is not None or (
-            self._half and not self._runtime.half_products
-        )
 
     def _choose_kernel(self, spatial: SpatialSettings) -> None:
         from stavpr_ros.alignment.cuda import dtw
@@ -134,7 +128,7 @@ class CudaMatcher:
         W, n, _ = self._strips.shape
         vectors, lengths = self._rounded(queries)
         places = min(n, max(1, BLOCK_WORDS // (len(vectors) * W)))
-        if self._in_pieces:
+        if self._reciprocals is not None:
             places = min(places, PLACES_IN_PIECES)
         for first in range(0, n, places):
             last = min(first + places, n)
@@ -148,7 +142,7 @@ class CudaMatcher:
         """Return queries (Q, W, d) in the map's type, (Q W, d), and their reciprocal lengths."""
         rows, d = queries.shape[0] * queries.shape[1], queries.shape[2]
         if self._reciprocals is None:
-            return queries.reshape(rows, d).to(self._strips.dtype), None
+            return queries.reshape(rows, d), None
         whole, lengths = (
             torch.from_numpy(part).to(self._strips.device)
             for part in rounded_queries(queries.transpose(0, 1))
@@ -161,9 +155,8 @@ class CudaMatcher:
         """Multiply query strips by those of some places: (Q W, W, last - first), for kernels."""
         W, n, d = self._strips.shape
         rows = len(vectors)
-        if (
-            last - first == n and not self._in_pieces and self._strips.is_contiguous()
-        ):  # one product: the map is one matrix, read once
+        is_whole = last - first == n and self._reciprocals is None
+        if is_whole and self._strips.is_contiguous():  # the map is one matrix, read once
             block, view = self._space((rows, W, n), (0, 1, 2))
             self._multiply(
                 torch.mm, vectors, self._strips.view(W * n, d).T, block.view(rows, W * n)
@@ -187,31 +180,23 @@ class CudaMatcher:
     def _multiply(
         self, product: Any, left: torch.Tensor, right: torch.Tensor, out: torch.Tensor
     ) -> None:
-        """Multiply, in half width with a float32 result."""
-        if not self._half:
-            product(left, right, out=out)
-        elif self._in_pieces:  # exact products, summed up in float32: the same answers
-            product(left.float(), right.float(), out=out)
-        else:
-            product(left, right, out_dtype=torch.float32, out=out)
+        """Multiply; products of whole numbers and their sums are exact in float32."""
+        product(left.float(), right.float(), out=out)
 
     def _holistic(self, query: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Distances (n,) without alignment."""
-        if not self._half:
+        if self._reciprocals is None:
             return holistic_distances(query, weights, self._strips, self._weights)
         W, n, _ = self._strips.shape
         vectors, lengths = self._rounded(query[None])
-        vectors, places = vectors[:, :, None], n
+        assert lengths is not None
         similarity = torch.empty((W, n, 1), device=self._strips.device)
-        if self._in_pieces:
-            places = PLACES_IN_PIECES
-        for first in range(0, n, places):
-            piece = slice(first, first + places)
+        for first in range(0, n, PLACES_IN_PIECES):
+            piece = slice(first, first + PLACES_IN_PIECES)
             part = torch.empty_like(similarity[:, piece], memory_format=torch.contiguous_format)
-            self._multiply(torch.bmm, self._strips[:, piece], vectors, part)
+            self._multiply(torch.bmm, self._strips[:, piece], vectors[:, :, None], part)
             similarity[:, piece] = part
-        if self._reciprocals is not None and lengths is not None:
-            similarity.mul_(self._reciprocals[:, :, None]).mul_(lengths[:, None, None])
+        similarity.mul_(self._reciprocals[:, :, None]).mul_(lengths[:, None, None])
         return 1 - (similarity[:, :, 0] * weights[:, None] * self._weights).sum(dim=0)
 
 

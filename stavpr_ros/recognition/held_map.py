@@ -15,7 +15,7 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.map_container import errors_of
 from stavpr_ros.mapping.map_statistics import MapStatistics
 from stavpr_ros.mapping.stored_features import MappedFeatures, StoredFeatures
-from stavpr_ros.recognition.blocks import converted, converted_blocks, PlaceChanges
+from stavpr_ros.recognition.blocks import converted_blocks, PlaceChanges
 from stavpr_ros.recognition.int8_features import Int8Features, rounded
 from stavpr_ros.recognition.map_change import APART
 from stavpr_ros.recognition.robust import (
@@ -94,14 +94,11 @@ def _held(
     """Return the features for the matcher; those of a map are not copied."""
     if precision == 'int8':
         return rounded(features, centering.places if centering else lambda some: some, seen.add)
-    dtype = torch.float16 if precision == 'float16' else torch.float32
     if centering is not None:
-        return centering.places(features, dtype, seen.add)
-    if dtype == torch.float32:
-        held = features[:]
-        seen.add(held.strips)
-        return held
-    return converted(features, lambda strips: strips, dtype, seen.add)
+        return centering.places(features, seen.add)
+    held = features[:]
+    seen.add(held.strips)
+    return held
 
 
 def _of_codes(features: StoredFeatures) -> Int8Features:

@@ -64,8 +64,8 @@ class LoopCloser(SequenceRecognizer):
     :param exclude_seconds: places younger than so many seconds are not part of the map either.
     :param backend: see :func:`choose_loop_backend`. On ``cuda`` the route's features lie on the
         device; without the place filter, sequences are matched on the CPU.
-    :param precision: of the route's features once it is settled, ``float32``, ``float16`` or
-        ``int8``; see :mod:`stavpr_ros.recognition.route_features`.
+    :param precision: of the route's features once it is settled, ``float32`` or ``int8``; see
+        :mod:`stavpr_ros.recognition.route_features`.
     :raises SettingsError: invalid settings.
     :raises UnavailableError: no such backend here.
     """

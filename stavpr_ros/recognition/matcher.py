@@ -10,7 +10,7 @@ from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.int8_features import Int8Features
 import torch
 
-PRECISIONS = ('float32', 'float16', 'int8')
+PRECISIONS = ('float32', 'int8')
 
 
 class Matcher(Protocol):
@@ -51,11 +51,10 @@ def make_matcher(
 
     :param backend: ``cpu`` or ``cuda``.
     :param features: of the map; rounded already, for ``int8``, or not.
-    :param precision: of the map's features in memory: ``float32``, or ``float16``, half the memory
-        and half the time to read it; sums are float32 in both. The query's features are rounded as
-        well on ``cuda``. Image distances of the backends differ by 1e-5 at most, except where a
-        tie of two strips is decided otherwise. ``int8``: a quarter, the query's features rounded
-        as well (:mod:`stavpr_ros.alignment.cpu.int8`); strip distances of the backends are equal.
+    :param precision: of the map's features in memory: ``float32``; image distances of the backends
+        differ by 1e-5 at most, except where a tie of two strips is decided otherwise. ``int8``: a
+        quarter of the memory, the query's features rounded as well
+        (:mod:`stavpr_ros.alignment.cpu.int8`); strip distances of the backends are equal.
     :raises SettingsError: no such precision, or settings that do not fit the map (xi > W), the
         backend or the precision.
     :raises InputError: vertical alignment of features whose cells are not known.
@@ -69,7 +68,7 @@ def make_matcher(
     if backend == 'cuda' and spatial.vertical:
         raise SettingsError("backend 'cuda' has no vertical alignment: take 'cpu'")
     if precision == 'int8' and spatial.vertical:
-        raise SettingsError("precision 'int8' has no vertical alignment: take float32 or float16")
+        raise SettingsError("precision 'int8' has no vertical alignment: take float32")
     if backend == 'cuda':
         from stavpr_ros.recognition.cuda_matcher import CudaMatcher
 

@@ -313,8 +313,8 @@ class PlaceRecognizer(SequenceRecognizer):
     :param settings: see :class:`RecognizerSettings`.
     :param backend: where it is computed: ``cpu``, ``cuda``, or ``auto``. On ``cuda``, mode robust
         requires its place filter; of other options, LM-DTW runs on the CPU.
-    :param precision: of the map's features in the matcher, ``float32``, ``float16`` or ``int8``;
-        see :func:`stavpr_ros.recognition.matcher.make_matcher`.
+    :param precision: of the map's features in the matcher, ``float32`` or ``int8``; see
+        :func:`stavpr_ros.recognition.matcher.make_matcher`.
     :raises UnavailableError: no such backend here.
     :raises SettingsError: settings that do not fit the map (xi > W).
     :raises InputError: features of the map are not finite.

@@ -290,15 +290,14 @@ class MeanCentering:
     def places(
         self,
         features: LocalFeatures,
-        dtype: torch.dtype = torch.float32,
         see: Callable[[torch.Tensor], None] = lambda strips: None,
     ) -> LocalFeatures:
         """
         Return features of the map, or of single images, less the map's mean, whitened.
 
-        :param see: called with the strips of each block in float32.
+        :param see: called with the strips of each block.
         """
-        return converted(features, lambda strips: self._converted(strips, self.mean), dtype, see)
+        return converted(features, lambda strips: self._converted(strips, self.mean), see)
 
     def _converted(self, strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
         if strips.shape[1] == 1 and not strips.is_cuda:

@@ -3,7 +3,7 @@
 """
 Features of a route that grows by one place at a time, centered and whitened, in memory once.
 
-In float16 and int8 they are float32 until the route is settled and whitening is not learned again.
+In int8 they are float32 until the route is settled and whitening is not learned again.
 From then on they are rounded, and the mean is updated only when as many images have come as there
 are places, so that a place is seldom rounded again.
 """
@@ -145,9 +145,7 @@ class RouteFeatures:
             self._learn(0)
             self._next_mean = int(self.count * GROWTH) + 1
         if settles:
-            self.strips = rounded_strips(
-                self._floats, self.count, self._precision, self._on_device
-            )
+            self.strips = rounded_strips(self._floats, self.count, self._on_device)
             self._is_settled, self._since_mean = True, 0
         return grows
 

@@ -3,8 +3,8 @@
 """
 Strips of a route that grows by one place at a time, on the CPU or on a CUDA device.
 
-Strips are a tensor (W, room, d), float32 or float16, or one of the classes below, int8. All return
-``strips[:, places]`` as float32 or float16 of unit norm.
+Strips are a tensor (W, room, d), float32, or one of the classes below, int8. All return
+``strips[:, places]`` as float32 of unit norm.
 """
 
 import numpy as np
@@ -98,17 +98,12 @@ def move_up(values: torch.Tensor, count: int, last: int) -> None:
         values[:, first - count : end - count] = values[:, first:end]
 
 
-def rounded_strips(
-    strips: torch.Tensor, count: int, precision: str, on_device: bool
-) -> RouteStrips:
+def rounded_strips(strips: torch.Tensor, count: int, on_device: bool) -> RouteStrips:
     """
-    Return float32 strips (W, room, d), of which ``count`` places are known, in less memory.
+    Return float32 strips (W, room, d), of which ``count`` places are known, in int8.
 
-    :param precision: ``float16`` or ``int8``.
     :param on_device: of the kind that kernels of a CUDA device take.
     """
-    if precision == 'float16':
-        return strips.half()
     W, room, d = strips.shape
     held: Int8Route | DeviceInt8Route = (
         DeviceInt8Route(W, room, d, strips.device) if on_device else Int8Route(W, room, d)

@@ -190,7 +190,7 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     budget = 'for an image; a coarse first stage where it takes longer; 0 = exact (%(default)g)'
     add('--time-budget-ms', type=float, default=0.0, metavar='MS', help=budget)
     precision = 'of the map (%(default)s)'
-    add('--precision', choices=('float32', 'float16', 'int8'), default='float32', help=precision)
+    add('--precision', choices=('float32', 'int8'), default='float32', help=precision)
 
 
 def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:

@@ -4,15 +4,13 @@
 The cosine distances of one image's strips to all strips of the map.
 
 A map's features are read once, a block of images at a time, and stay in the cache until the
-block's images are aligned: one frame costs little more than reading the map. In half width
-(float16) that is half as much; products and sums are float32 all the same. In int8 it is a quarter
-(:mod:`stavpr_ros.alignment.cpu.int8`).
+block's images are aligned: one frame costs little more than reading the map. In int8 that is a
+quarter (:mod:`stavpr_ros.alignment.cpu.int8`).
 """
 
-from llvmlite import ir
 import numba as nb
 from numba.core import types
-from numba.extending import intrinsic, overload
+from numba.extending import overload
 import numpy as np
 from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.alignment.cpu.dtw import align_lanes, SLOT
@@ -23,27 +21,6 @@ import torch
 TILE = 7  # query strips whose sums stay in registers: all of them, with the paper's W
 IMAGES = 256  # map images a thread takes at a time; a multiple of LANES
 FEW_IMAGES = 64  # likewise, where the distances of all cells are kept
-
-
-@intrinsic
-def _from_half(typing, bits):
-    """Convert the bits of a float16 number, an int16, to float32: one instruction a vector."""
-
-    def generate(context, builder, signature, arguments):
-        return builder.fpext(builder.bitcast(arguments[0], ir.HalfType()), ir.FloatType())
-
-    return types.float32(bits), generate
-
-
-def widened(x):
-    """Return a float32 number as it is, the bits of a float16 number as float32."""
-
-
-@overload(widened)
-def _overload_widened(x):
-    if x is types.int16:
-        return lambda x: _from_half(x)  # noqa: PLW0108 numba asks for a function
-    return lambda x: x
 
 
 def tiled(queries: torch.Tensor) -> np.ndarray:
@@ -67,7 +44,7 @@ def _dots(y, q, sums):
     q0, q1, q2, q3, q4, q5, q6 = q[0], q[1], q[2], q[3], q[4], q[5], q[6]
     s0 = s1 = s2 = s3 = s4 = s5 = s6 = np.float32(0)
     for t in range(y.shape[0]):
-        value = widened(y[t])
+        value = y[t]
         s0 += q0[t] * value
         s1 += q1[t] * value
         s2 += q2[t] * value
@@ -83,7 +60,7 @@ def _dot(y, q):
     """Multiply a vector of the map (d,) by one of the query (d,)."""
     total = np.float32(0)
     for t in range(y.shape[0]):
-        total += q[t] * widened(y[t])
+        total += q[t] * y[t]
     return total
 
 
@@ -92,7 +69,7 @@ def cosine_distances(features, queries, out):
     """
     Distances 1 - <x, y> of images that are one vector each (W = 1).
 
-    :param features: the map's unit-norm vectors, shape (n, d), float32 or the bits of float16.
+    :param features: the map's unit-norm vectors, shape (n, d), float32.
     :param queries: those of Q images, shape (Q, d), float32.
     :param out: shape (Q, m), written; m <= n: only so many map images are looked at.
     """
@@ -131,8 +108,7 @@ def strip_distances(features, query, d):
     """
     Distances d[i, j, y] = 1 - <x_i, y_j>.
 
-    :param features: the map's unit-norm local features, shape (W, n, d), float32, or int16 that
-        hold the bits of float16 numbers.
+    :param features: the map's unit-norm local features, shape (W, n, d), float32.
     :param query: those of one image, shape (R, d), float32; R is W rounded up to whole TILEs,
         zeros there.
     :param d: shape (R, W, n), written.
@@ -205,7 +181,7 @@ def vertical_image_distances(features, queries, cell_weights, weights, xi, out):
     The distance of two strips is that of their cells, aligned from top to bottom.
 
     :param features: unit-norm cells of the map, shape (W H, n, c), strip by strip, each from the
-        top; float32 or the bits of float16.
+        top; float32.
     :param queries: those of Q images, shape (Q, R, c), float32; R is W H rounded up to whole
         TILEs.
     :param cell_weights: a for each ``|I_c - c|`` of the H cells, shape (H,).

@@ -90,8 +90,6 @@ class Device:
             raise UnavailableError(f"backend 'cuda': {why_no_cuda()}; take 'cpu' or 'auto'")
         torch.cuda.init()
         self.torch_device = torch.device('cuda', torch.cuda.current_device())
-        # torch 2.8 and later: products of half-width matrices with a float32 result
-        self.half_products = hasattr(torch.ops.aten.mm, 'dtype_out')
         self._launches: dict[tuple[Any, ...], Any] = {}
 
     def array(self, tensor: torch.Tensor) -> Any:
@@ -135,7 +133,6 @@ class Simulator:
     """Numba's simulator: kernels in Python over torch's CPU tensors, methods of a device."""
 
     torch_device = torch.device('cpu')
-    half_products = False
 
     def array(self, tensor: torch.Tensor) -> Any:
         """Return the tensor as kernels take it: the same memory, of any strides."""
