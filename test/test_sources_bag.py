@@ -152,6 +152,15 @@ def test_bag_without_metadata_is_read(tmp_path, storage):
         open_source(tmp_path / 'bag')
 
 
+def test_list_of_bag_that_states_too_many_messages_reserves_no_memory_for_them(tmp_path):
+    write_bag(tmp_path / 'bag', '/image', records())
+    metadata = tmp_path / 'bag' / 'metadata.yaml'
+    text = metadata.read_text().replace('message_count: 5', f'message_count: {2**60}')
+    metadata.write_text(text)
+    with pytest.raises(SourceError, match='ends early: 5 of'):
+        list(open_source(tmp_path / 'bag'))
+
+
 def listing(folder):
     return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.iterdir()}
 
@@ -203,7 +212,7 @@ def test_bag_with_damaged_bytes_fails_or_reads(bag_file):
         damaged[at] = rng.integers(0, 256, 20)
         file.write_bytes(damaged.tobytes())
         try:
-            outcomes.add(sum(1 for _ in open_source(file, '/raw')))
+            outcomes.add(len(list(open_source(file, '/raw'))))
         except (SourceError, ImageError) as error:
             outcomes.add(type(error))
     assert SourceError in outcomes

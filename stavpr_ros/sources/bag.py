@@ -18,6 +18,7 @@ COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 SECOND = 1_000_000_000
 LATE = SECOND // 2  # messages may be out of order by so much; more is a clock that jumped back
+LEAST_MESSAGE = 16  # bytes of a message in a bag, with its entry in the index
 Item = TypeVar('Item')
 
 
@@ -48,10 +49,16 @@ class BagSource:
             topics = _topics(bag)
         self.topic = _choose(self.path, topics, topic)
         self.message_type, self._count = topics[self.topic]
+        files = self.path.iterdir() if self.path.is_dir() else [self.path]
+        self._most = sum(file.stat().st_size for file in files) // LEAST_MESSAGE
 
     def __len__(self) -> int:
-        """Return the number of the topic's messages, decodable or not, as stated by the bag."""
-        return self._count
+        """
+        Return the number of the topic's messages, decodable or not, as stated by the bag.
+
+        At most as many as its files have room for: list() reserves memory for so many.
+        """
+        return min(max(self._count, 0), self._most)
 
     def __iter__(self) -> Iterator[Frame]:
         """Decode one image after the other."""
