@@ -10,20 +10,20 @@ import numpy as np
 import oracle
 import pytest
 from stavpr_ros.alignment import (
-    align_sequence,
     aligned_index,
     best_match,
     match_sequence,
     SequenceDistances,
     SequenceSettings,
 )
+from stavpr_ros.alignment.path import trace_sequence
 
 DTYPES = [np.float32, np.float64]
 INF = math.inf
 
 
-def path_of(aligned):
-    return [tuple(cell) for cell in aligned.path.tolist()]
+def path_of(D, start, settings):
+    return [tuple(cell) for cell in trace_sequence(D, start, settings.k).tolist()]
 
 
 def check_every_start(D, length, beta):
@@ -66,16 +66,14 @@ def test_match_sequence_by_hand(dtype):
     assert matches.distances.tolist() == [2, 1, 0.5, 7]
     assert matches.lengths.tolist() == [3, 2, 1, 1]
     assert matches.lengths.dtype == np.int32
-    aligned = align_sequence(D, 0, sequence)
-    assert aligned.distance == 2
-    assert path_of(aligned) == [(0, 0), (0, 1), (1, 2)]
-    assert path_of(align_sequence(D, 3, sequence)) == [(0, 3), (1, 3)]
+    assert path_of(D, 0, sequence) == [(0, 0), (0, 1), (1, 2)]
+    assert path_of(D, 3, sequence) == [(0, 3), (1, 3)]
 
 
 def test_first_of_equal_ends_and_starts_wins():
     # a map of zeros: every q_x is 0, so m = 1, and every start is equal, so start 0
     matches = match_sequence(np.zeros((3, 8)), SequenceSettings(length=3))
-    path = path_of(align_sequence(np.zeros((3, 8)), 0, SequenceSettings(length=3)))
+    path = path_of(np.zeros((3, 8)), 0, SequenceSettings(length=3))
     assert path == [(0, 0), (1, 0), (2, 0)]
     assert matches.lengths.tolist() == [1] * 8
     best = best_match(matches, 3)
@@ -155,16 +153,12 @@ def test_matches_and_paths_equal_oracle(seed, length, n, beta, dtype, levels, ba
     assert best.second_best_index == expected.second_best_index
     np.testing.assert_equal(best.second_best_distance, expected.second_best_distance)
     for start in {best.first, int(np.flatnonzero(np.isfinite(matches.distances))[-1])}:
-        aligned, plain = (
-            align_sequence(D, start, sequence),
-            oracle.align_sequence(D, start, beta, dtype),
-        )
-        assert path_of(aligned) == plain.path
-        assert (aligned.distance, aligned.accumulated) == (plain.distance, plain.accumulated)
-        assert (aligned.cost, aligned.weight) == (plain.cost, 1)
-        assert aligned.distance == matches.distances[start]
+        plain = oracle.align_sequence(D, start, beta, dtype)
+        assert path_of(D, start, sequence) == plain.path
+        assert plain.distance == matches.distances[start]
+        path = trace_sequence(D, start, sequence.k)
         for frame in range(length):
-            assert aligned_index(aligned.path, frame) == oracle.aligned_index(plain.path, frame)
+            assert aligned_index(path, frame) == oracle.aligned_index(plain.path, frame)
 
 
 @pytest.mark.parametrize('n', [7, 8, 9, 31, 33, 65, 129, 257])
@@ -179,5 +173,5 @@ def test_match_sequence_of_any_memory_layout_changes_nothing():
     expected = match_sequence(D, sequence).distances
     for same in (np.asfortranarray(D), np.repeat(D, 2, axis=1)[:, ::2]):
         np.testing.assert_array_equal(match_sequence(same, sequence).distances, expected)
-    align_sequence(D, 3, sequence)
+    trace_sequence(D, 3, sequence.k)
     np.testing.assert_array_equal(D, before)
