@@ -35,6 +35,7 @@ class OpenBag:
         ``nav_msgs`` are read, equal in every distribution: no definition in the bag is needed.
     """
 
+    path: Path
     reader: Ros1Reader | Ros2Reader
     deserialize: Callable[[bytes, str], Any]
 
@@ -44,16 +45,15 @@ class OpenBag:
         return list(self.reader.connections)
 
     def messages(
-        self, path: Path, connections: list[Connection], start: float, duration: float
+        self, connections: list[Connection], start: float = 0.0, duration: float = math.inf
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """
         Yield the messages of some connections, with their times of recording, ns, in order.
 
-        :param path: of the bag, for errors.
         :param start: seconds after the start of the bag.
         :param duration: seconds from there on.
         """
-        with reading(path):
+        with reading(self.path):
             first = self.reader.start_time + round(start * SECOND)
             last = None if math.isinf(duration) else first + round(duration * SECOND)
             yield from self.reader.messages(connections, first if start else None, last)
@@ -96,7 +96,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
                 deserialize = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
             reader.open()
         try:
-            yield OpenBag(reader, deserialize)
+            yield OpenBag(path, reader, deserialize)
         finally:
             reader.close()
 

@@ -48,7 +48,7 @@ def read_messages(
     with open_bag(path) as bag:
         wanted = [each for each in bag.connections if each.topic in topics]
         convert = _Ros1() if isinstance(bag.reader, Ros1Reader) else None
-        for connection, time_ns, raw in bag.messages(path, wanted, start, duration):
+        for connection, time_ns, raw in bag.messages(wanted, start, duration):
             kind = message_type(connection)
             content = raw if convert is None else convert(kind, raw)
             yield MessageRecord(time_ns, connection.topic, bytes(content))
