@@ -74,19 +74,17 @@ def test_settings_out_of_range_are_rejected(settings, arguments, named):
         settings(**arguments)
 
 
-def test_band_wider_than_image_is_rejected():
-    with pytest.raises(SettingsError, match=r'6.*5'):
-        image_distances(np.zeros((5, 5, 2)), SpatialSettings(xi=6))
-
-
-def test_sliding_window_wider_than_image_is_rejected():
-    with pytest.raises(InputError, match='3'):
-        image_distances(np.zeros((3, 3, 2)), WINDOW)
-
-
-def test_image_distances_without_alignment_are_rejected():
-    with pytest.raises(SettingsError, match='none'):
-        image_distances(np.zeros((7, 7, 2)), SpatialSettings(strategy='none'))
+@pytest.mark.parametrize(
+    ('W', 'spatial', 'error', 'named'),
+    [
+        (5, SpatialSettings(xi=6), SettingsError, r'6.*5'),
+        (3, WINDOW, InputError, 'W = 3'),
+        (7, SpatialSettings(strategy='none'), SettingsError, 'none'),
+    ],
+)
+def test_settings_that_do_not_fit_the_strips_are_rejected(W, spatial, error, named):
+    with pytest.raises(error, match=named):
+        image_distances(np.zeros((W, W, 2)), spatial)
 
 
 def test_aligned_index_of_row_not_on_path_is_rejected():

@@ -17,8 +17,8 @@ from stavpr_ros.alignment import (
     SequenceSettings,
 )
 from stavpr_ros.alignment.path import trace_sequence
+from test_spatial import DTYPES, random_distances
 
-DTYPES = [np.float32, np.float64]
 INF = math.inf
 
 
@@ -35,17 +35,6 @@ def check_every_start(D, length, beta):
     finite = np.isfinite(q)  # where every path is banned there is no length
     np.testing.assert_array_equal(matches.lengths[finite], m[finite])
     return matches
-
-
-def random_distances(seed, length, n, dtype, levels, banned):
-    """Return distances of few levels, with many ties, or any (levels = 0); a share is banned."""
-    rng = np.random.default_rng(seed)
-    if levels == 0:
-        D = rng.uniform(-0.05, 1.5, (length, n))
-    else:
-        D = rng.integers(-1, levels + 1, (length, n)) / levels
-    D[rng.random((length, n)) < banned] = INF
-    return D.astype(dtype)
 
 
 # ------------------------------------------------ by hand
@@ -140,7 +129,7 @@ def test_aligned_index_is_floor_of_middle():
     nms_radius=st.integers(0, 5),
 )
 def test_matches_and_paths_equal_oracle(seed, length, n, beta, dtype, levels, banned, nms_radius):
-    D = random_distances(seed, length, n, dtype, levels, banned)
+    D = random_distances(seed, (length, n), dtype, levels, banned)
     sequence = SequenceSettings(length=length, beta=beta)
     matches = check_every_start(D, length, beta)
     best = best_match(matches, nms_radius)
@@ -163,12 +152,12 @@ def test_matches_and_paths_equal_oracle(seed, length, n, beta, dtype, levels, ba
 
 @pytest.mark.parametrize('n', [7, 8, 9, 31, 33, 65, 129, 257])
 def test_match_sequence_at_block_borders_equals_oracle(n):
-    check_every_start(random_distances(n, 3, n, np.float32, 2, 0.05), 3, 2.0)
-    check_every_start(random_distances(n, 2, n, np.float64, 2, 0.0), 2, 1.5)
+    check_every_start(random_distances(n, (3, n), np.float32, 2, 0.05), 3, 2.0)
+    check_every_start(random_distances(n, (2, n), np.float64, 2, 0.0), 2, 1.5)
 
 
 def test_match_sequence_of_any_memory_layout_changes_nothing():
-    D = random_distances(5, 4, 80, np.float32, 3, 0.1)
+    D = random_distances(5, (4, 80), np.float32, 3, 0.1)
     before, sequence = D.copy(), SequenceSettings(length=4)
     expected = match_sequence(D, sequence).distances
     for same in (np.asfortranarray(D), np.repeat(D, 2, axis=1)[:, ::2]):

@@ -97,11 +97,8 @@ def test_bag_raw_and_compressed_images_are_equal(tmp_path, ros1):
         ):
             np.testing.assert_array_equal(frame.image, original.data.reshape(6, 8, 3))
             assert frame.stamp == record.stamp_ns == i * 1_000_000_000 + 5
-            assert (record.time_ns, record.encoding, record.frame_id) == (
-                original.time_ns,
-                'rgb8',
-                'camera',
-            )
+            assert record.time_ns == original.time_ns
+            assert (record.encoding, record.frame_id) == ('rgb8', 'camera')
 
 
 def test_bag_with_ambiguous_or_wrong_topic_lists_topics(tmp_path):

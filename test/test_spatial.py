@@ -24,7 +24,7 @@ def one(d, spatial):
     return result[0]
 
 
-def random_distances(seed, W, n, dtype, levels, banned=0.0):
+def random_distances(seed, shape, dtype, levels, banned=0.0):
     """
     Return distances of few levels, with many ties, or any (levels = 0); a share of them +inf.
 
@@ -32,10 +32,10 @@ def random_distances(seed, W, n, dtype, levels, banned=0.0):
     """
     rng = np.random.default_rng(seed)
     if levels == 0:
-        d = rng.uniform(-0.05, 1.5, (W, W, n))
+        d = rng.uniform(-0.05, 1.5, shape)
     else:
-        d = rng.integers(-1, levels + 1, (W, W, n)) / levels
-    d[rng.random((W, W, n)) < banned] = np.inf
+        d = rng.integers(-1, levels + 1, shape) / levels
+    d[rng.random(shape) < banned] = np.inf
     return d.astype(dtype)
 
 
@@ -165,11 +165,11 @@ def test_image_distances_equal_oracle(
     if strategy == 'sliding_window':
         W = max(W, 4)
     xi = None if restriction == 0 else min(restriction, W)
-    check(random_distances(seed, W, n, dtype, levels, banned), strategy, sigma, xi)
+    check(random_distances(seed, (W, W, n), dtype, levels, banned), strategy, sigma, xi)
 
 
 @pytest.mark.parametrize('n', BLOCK_BORDERS)
 @pytest.mark.parametrize('strategy', ['adaptive', 'sliding_window'])
 def test_image_distances_at_block_borders_equal_oracle(n, strategy):
-    check(random_distances(n, 5, n, np.float32, 3), strategy)
-    check(random_distances(n, 4, n, np.float64, 3), strategy, xi=3)
+    check(random_distances(n, (5, 5, n), np.float32, 3), strategy)
+    check(random_distances(n, (4, 4, n), np.float64, 3), strategy, xi=3)

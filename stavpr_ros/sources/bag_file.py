@@ -131,10 +131,9 @@ def _stage(path: Path, scratch: Path) -> Path:
     rosbags opens databases as immutable: it writes nothing, but ignores the logs of SQLite; and it
     does not quote file names. A staged copy avoids both.
     """
-    if path.is_file():
-        return _stage_file(path, scratch / f'bag{path.suffix}')
-    if not (path / METADATA).exists():
-        return _stage_file(_only_storage_file(path), scratch)
+    if path.is_file() or not (path / METADATA).exists():
+        file = path if path.is_file() else _only_storage_file(path)
+        return _stage_file(file, scratch / f'bag{file.suffix}')
     folder = scratch / 'bag'
     folder.mkdir()
     for file in path.iterdir():
@@ -158,8 +157,6 @@ def _only_storage_file(folder: Path) -> Path:
 
 def _stage_file(file: Path, target: Path) -> Path:
     require_regular(file)  # a pipe would never end
-    if target.is_dir():
-        target /= f'bag{file.suffix}'
     logs = [
         log
         for end in LOG_SUFFIXES
