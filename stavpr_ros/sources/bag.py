@@ -138,12 +138,13 @@ def _stamp(message: Any) -> int:
 
 def _topics(bag: OpenBag) -> dict[str, tuple[str, int]]:
     """Topic to (type, messages); the publishers of one topic added up."""
-    types: dict[str, set[str]] = {}
-    counts: dict[str, int] = {}
-    for connection in bag.connections:
-        types.setdefault(connection.topic, set()).add(message_type(connection))
-        counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
-    return {topic: (' and '.join(sorted(types[topic])), counts[topic]) for topic in sorted(types)}
+    return {
+        name: (
+            ' and '.join(sorted({message_type(each) for each in info.connections})),
+            info.msgcount,
+        )
+        for name, info in bag.reader.topics.items()
+    }
 
 
 def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -> str:

@@ -101,10 +101,6 @@ _FROM_BGR = partial(convert, cv2.COLOR_BGR2RGB)
 _FROM_RGBA = partial(convert, cv2.COLOR_RGBA2RGB)
 _FROM_BGRA = partial(convert, cv2.COLOR_BGRA2RGB)
 _FROM_GRAY = partial(convert, cv2.COLOR_GRAY2RGB)
-_FROM_RGGB = partial(demosaic, cv2.COLOR_BayerRGGB2RGB)
-_FROM_BGGR = partial(demosaic, cv2.COLOR_BayerBGGR2RGB)
-_FROM_GBRG = partial(demosaic, cv2.COLOR_BayerGBRG2RGB)
-_FROM_GRBG = partial(demosaic, cv2.COLOR_BayerGRBG2RGB)
 _FROM_UYVY = partial(convert, cv2.COLOR_YUV2RGB_UYVY)
 _FROM_YUYV = partial(convert, cv2.COLOR_YUV2RGB_YUYV)
 
@@ -127,14 +123,13 @@ ENCODINGS: dict[str, Encoding] = {
     '16UC1': Encoding(1, 2, _FROM_GRAY),
     '16UC3': Encoding(3, 2, _FROM_BGR),
     '16UC4': Encoding(4, 2, _FROM_BGRA),
-    'bayer_rggb8': Encoding(1, 1, _FROM_RGGB),
-    'bayer_bggr8': Encoding(1, 1, _FROM_BGGR),
-    'bayer_gbrg8': Encoding(1, 1, _FROM_GBRG),
-    'bayer_grbg8': Encoding(1, 1, _FROM_GRBG),
-    'bayer_rggb16': Encoding(1, 2, _FROM_RGGB),
-    'bayer_bggr16': Encoding(1, 2, _FROM_BGGR),
-    'bayer_gbrg16': Encoding(1, 2, _FROM_GBRG),
-    'bayer_grbg16': Encoding(1, 2, _FROM_GRBG),
+    **{
+        f'bayer_{pattern}{8 * value_bytes}': Encoding(
+            1, value_bytes, partial(demosaic, getattr(cv2, f'COLOR_Bayer{pattern.upper()}2RGB'))
+        )
+        for value_bytes in (1, 2)
+        for pattern in ('rggb', 'bggr', 'gbrg', 'grbg')
+    },
     'uyvy': Encoding(2, 1, _FROM_UYVY, block=(1, 2)),
     'yuv422': Encoding(2, 1, _FROM_UYVY, block=(1, 2)),
     'yuyv': Encoding(2, 1, _FROM_YUYV, block=(1, 2)),
