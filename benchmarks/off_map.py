@@ -43,7 +43,7 @@ COARSER = 4  # of --quick: so many times coarser steps, every fourth pair of flo
 START_IMAGES, SMALL_MAP = 30, 40
 TOWER = 'tower'
 WARPED = (DAY, 'walk_day', NIGHT, 'walk_night_map')
-SETS = (*WARPED, 'corridor', 'nordland', TOWER)
+SETS = (*WARPED, 'corridor', 'nordland')
 STANDING = 200  # places of a standstill in a map
 LONG_STOP = 'stop 1000'  # not pooled: so many images of one probability
 CHANGES = ('same', '0.5x', 'varying', '2x', '3x', 'stop 30', 'stop 100', 'drop 0.3', LONG_STOP)
@@ -310,7 +310,7 @@ class Measurement:
 
 
 def opened(
-    folder: Path, feature: str, making: FeatureExtractor, sets: Sequence[str] = SETS
+    folder: Path, feature: str, making: FeatureExtractor
 ) -> Iterator[tuple[Pair | None, dict[str, PlaceMap]]]:
     """Yield the pairs of the data sets, and at last the floors; features are extracted once."""
     kept: dict[int, tuple[Any, PlaceMap]] = {}  # with its source, so that its id stays its own
@@ -320,20 +320,17 @@ def opened(
             kept[id(source)] = source, build_map(source, making, thumbnails=False, progress=False)
         return kept[id(source)][1]
 
-    cases = [*short_cases(folder), *long_cases(folder, feature)]
-    for case in (case for case in cases if case.name in sets):
+    for case in (*short_cases(folder), *long_cases(folder, feature)):
+        if case.name not in SETS:
+            continue
         places, query = features(case.places), features(case.query)
         yield Pair(case.name, places, query, case.truth(len(query), len(places))), {}
     kept.clear()
-    if TOWER not in sets:
-        return
     paths = sorted(path for path in (folder / TOWER).iterdir() if path.is_dir())
     yield None, {path.name: features(open_source(path)) for path in paths}
 
 
-def measure(
-    folder: Path, chosen: Sequence[str], sets: Sequence[str] = SETS, coarser: int = 1
-) -> Results:
+def measure(folder: Path, chosen: Sequence[str], coarser: int) -> Results:
     """Return all rows; print what is left out."""
     results: Results = {}
     for feature in chosen:
@@ -343,7 +340,7 @@ def measure(
             print(f'left out: {FEATURES[feature]}: {error}', file=sys.stderr)
             continue
         measurement = Measurement(feature, coarser)
-        for pair, floors in opened(folder, feature, making, sets):
+        for pair, floors in opened(folder, feature, making):
             print(f'{FEATURES[feature]}: {TOWER if pair is None else pair.name}', file=sys.stderr)
             if pair is not None:
                 measurement.pair(pair)
@@ -359,11 +356,8 @@ def main(arguments: list[str] | None = None) -> int:
     add = parser.add_argument
     add('--quick', action='store_true', help='gradient features, coarser steps; not into docs/')
     add('--features', nargs='+', choices=tuple(FEATURES), default=tuple(FEATURES))
-    add('--sets', nargs='+', choices=SETS, default=SETS, metavar='NAME', help=', '.join(SETS))
-    add('--steps', type=int, default=1, metavar='N', help='steps N times as coarse (1)')
     add('--commit', default='', help='name of the measured commit, outside a git checkout')
     add('--output', type=Path, default=RESULTS, help='folder of the JSON (%(default)s)')
-    add('--page', type=Path, default=ROOT / 'docs/off_map.md', help='the page (%(default)s)')
     options = parser.parse_args(arguments)
     try:
         folder = data_folder()
@@ -371,10 +365,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(f'off_map: {error}', file=sys.stderr)
         return 2
     about, began = environment(named_commit=options.commit), time.perf_counter()
-    chosen, steps = (('g',), COARSER) if options.quick else (options.features, options.steps)
-    results = measure(folder, chosen, options.sets, steps)
+    chosen, steps = (('g',), COARSER) if options.quick else (options.features, 1)
+    results = measure(folder, chosen, steps)
     path = options.output / f'off_map{"-quick" if options.quick else ""}.json'
-    page = path.with_suffix('.md') if options.quick else options.page
+    page = path.with_suffix('.md') if options.quick else ROOT / 'docs/off_map.md'
     path.parent.mkdir(parents=True, exist_ok=True)
     about |= {'steps': steps}
     path.write_text(

@@ -24,8 +24,8 @@ from stavpr_ros.alignment.lm_dtw import (
     match_padded,
     padded_width,
     SequenceDistances,
-    trace_sequence,
 )
+from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import descriptor_map, PlaceMap

@@ -6,18 +6,15 @@ import math
 import re
 
 import numpy as np
-import oracle
 import pytest
 from stavpr_ros.alignment import (
-    align_images,
-    align_sequence,
     aligned_index,
     image_distances,
     match_sequence,
     SequenceSettings,
     SpatialSettings,
 )
-from stavpr_ros.errors import InputError, SettingsError, StavprError
+from stavpr_ros.errors import InputError, SettingsError
 
 ADAPTIVE = SpatialSettings()
 VANILLA = SpatialSettings(strategy='vanilla')
@@ -29,9 +26,7 @@ THREE = SequenceSettings(length=3)
     ('call', 'shapes'),
     [
         (lambda d: image_distances(d, ADAPTIVE), [(7, 7), (7, 6, 3), (0, 0, 3)]),
-        (lambda d: align_images(d, ADAPTIVE), [(7, 7, 3), (7, 6), (0, 0)]),
         (lambda D: match_sequence(D, THREE), [(4, 9), (2, 9), (3,), (3, 9, 1)]),
-        (lambda D: align_sequence(D, 0, THREE), [(4, 9), (3,)]),
     ],
 )
 def test_distances_of_other_shape_are_rejected(call, shapes):
@@ -54,9 +49,7 @@ def test_distances_with_nan_are_rejected(value):
     d[3, 2, 77] = D[1, 77] = value
     for call in (
         *(lambda s=s: image_distances(d, s) for s in (ADAPTIVE, VANILLA, WINDOW)),
-        lambda: align_images(d[:, :, 77], VANILLA),
         lambda: match_sequence(D, THREE),
-        lambda: align_sequence(D, 76, THREE),
     ):
         with pytest.raises(InputError):
             call()
@@ -81,32 +74,17 @@ def test_settings_out_of_range_are_rejected(settings, arguments, named):
         settings(**arguments)
 
 
-def test_band_wider_than_image_is_rejected():
-    for call in (
-        lambda: image_distances(np.zeros((5, 5, 2)), SpatialSettings(xi=6)),
-        lambda: align_images(np.zeros((5, 5)), SpatialSettings(xi=6)),
-    ):
-        with pytest.raises(StavprError, match=r'6.*5'):
-            call()
-
-
-def test_sliding_window_wider_than_image_is_rejected():
-    with pytest.raises(StavprError, match='3'):
-        image_distances(np.zeros((3, 3, 2)), WINDOW)
-
-
-def test_align_images_by_strategy_without_path_is_rejected():
-    for strategy in ('sliding_window', 'none'):
-        with pytest.raises(StavprError, match=strategy):
-            align_images(oracle.GOLDEN, SpatialSettings(strategy=strategy))
-    with pytest.raises(StavprError, match='none'):
-        image_distances(np.zeros((7, 7, 2)), SpatialSettings(strategy='none'))
-
-
-@pytest.mark.parametrize('start', [-1, 9])
-def test_align_sequence_from_start_outside_map_is_rejected(start):
-    with pytest.raises(InputError, match=rf'{start}.*9'):
-        align_sequence(np.ones((3, 9)), start, THREE)
+@pytest.mark.parametrize(
+    ('W', 'spatial', 'error', 'named'),
+    [
+        (5, SpatialSettings(xi=6), SettingsError, r'6.*5'),
+        (3, WINDOW, InputError, 'W = 3'),
+        (7, SpatialSettings(strategy='none'), SettingsError, 'none'),
+    ],
+)
+def test_settings_that_do_not_fit_the_strips_are_rejected(W, spatial, error, named):
+    with pytest.raises(error, match=named):
+        image_distances(np.zeros((W, W, 2)), spatial)
 
 
 def test_aligned_index_of_row_not_on_path_is_rejected():

@@ -89,17 +89,21 @@ def test_update_and_answers_equal_those_of_the_cpu(cuda_filter, gaps):
 
 
 def test_z_normalized_on_device_equals_that_of_the_cpu(cuda_filter):
-    row = np.random.default_rng(0).uniform(0.2, 1, 50).astype(np.float32)
-    row[7] = np.inf
-    for values in (row, np.full(5, 0.5, np.float32), np.full(3, np.inf, np.float32)):
-        found = cuda_filter.z_normalized_on_device(torch.from_numpy(values))
-        np.testing.assert_allclose(found, z_normalized(values), rtol=1e-4, atol=1e-5)
+    row = np.random.default_rng(0).uniform(0.2, 1, 150).astype(np.float32)
+    row[[7, 149]] = np.inf
+    flat, banned = np.full(5, 0.5, np.float32), np.full(3, np.inf, np.float32)
+    for values in (row, row[:5], flat, banned, row[:0]):
+        given = torch.from_numpy(values)
         counted = np.arange(len(values)) % 3 > 0
-        found = cuda_filter.z_normalized_on_device(
-            torch.from_numpy(values), counted=torch.from_numpy(counted)
-        )
-        expected = z_normalized(values, counted=counted)
-        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+        for found, expected in (
+            (cuda_filter.z_normalized_on_device(given), z_normalized(values)),
+            (cuda_filter.z_normalized_on_device(given, 30), z_normalized(values, 30)),
+            (
+                cuda_filter.z_normalized_on_device(given, counted=torch.from_numpy(counted)),
+                z_normalized(values, counted=counted),
+            ),
+        ):
+            np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(('sessions', 'precision'), [(False, 'int8'), (True, 'float32')])

@@ -30,10 +30,7 @@ import torch
 
 SIMULATOR = os.environ.get('NUMBA_ENABLE_CUDASIM') == '1'
 INF = math.inf
-FILES = (
-    *('test_cuda_kernels.py', 'test_cuda_matcher.py', 'test_cuda_filter.py'),
-    'test_cuda_loop_closure.py',
-)
+FILES = [f'test_cuda_{name}.py' for name in ('kernels', 'matcher', 'filter', 'loop_closure')]
 
 
 @pytest.fixture(scope='module')
@@ -134,11 +131,9 @@ def expected_images(products, strategy, sigma=1.0, xi=None):
 def random_products(seed, queries, W, n, levels=None):
     rng = np.random.default_rng(seed)
     products = rng.random((queries, W, W, n), np.float32)
-    return (
-        products
-        if levels is None
-        else np.round(products * levels).astype(np.float32) / np.float32(levels)
-    )
+    if levels is None:
+        return products
+    return np.round(products * levels).astype(np.float32) / np.float32(levels)
 
 
 @pytest.mark.parametrize('strategy', ['adaptive', 'sliding_window'])
@@ -221,11 +216,8 @@ def check_sequences(runtime, D, beta, apart=3, **launch):
     assert (answer is None) == (twin is None) == (found.start == -1)
     if answer is None:
         return
-    assert (found.start, found.length, found.distance) == (
-        answer.start,
-        answer.length,
-        answer.distance,
-    )
+    assert (found.start, found.length) == (answer.start, answer.length)
+    assert found.distance == answer.distance
     if answer.second_best_index == -1:
         assert found.second_best_start == twin.second_best_index == -1
     else:
@@ -268,21 +260,14 @@ def test_sequences_equal_oracle(runtime, l, n, beta, levels, banned, apart, bloc
     check_sequences(runtime, D, beta, apart, block=block, columns=columns)
 
 
-@pytest.mark.parametrize('columns', [None, 0])  # staged or not
-def test_sequences_of_33_rows_equal_oracle(runtime, columns):
-    check_sequences(runtime, random_window(33, 33, 6, 3, 0.1), 1.2, block=4, columns=columns)
-
-
 def test_sequences_from_any_row_and_repeated_are_equal(runtime):
     D = random_window(17, 3, 12)
     once = run_sequences(runtime, D, 6, 2, block=4)
     again = run_sequences(runtime, D, 6, 2, block=4, columns=0, first=3, launches=2)
     for a, b in zip((*once[:2], once[2].cells), (*again[:2], again[2].cells), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert (once[2].start, once[2].second_best_start) == (
-        again[2].start,
-        again[2].second_best_start,
-    )
+    assert once[2].start == again[2].start
+    assert once[2].second_best_start == again[2].second_best_start
 
 
 def test_staged_columns_fit_into_shared_memory():

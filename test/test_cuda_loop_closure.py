@@ -12,7 +12,6 @@ from stavpr_ros.features.extractor import FeatureSettings
 from stavpr_ros.recognition import RecognizerSettings, route_features, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.place_filter import PlaceFilter
-from stavpr_ros.recognition.robust import z_normalized
 from stavpr_ros.recognition.sequence_search import SequenceBuffer
 from test_cuda_filter import assert_equal_answers, SMALL
 import torch
@@ -61,14 +60,6 @@ def test_filter_of_growing_places_equals_that_of_the_cpu(cuda_filter):
         cuda.update(torch.from_numpy(z).to(cuda._device), 0.5, weights)
         answered += assert_equal_answers(cuda, cpu, n, min(image, lag)) is not None
     assert answered > 6
-
-
-def test_background_on_device_equals_that_of_the_cpu(cuda_filter):
-    row = np.random.default_rng(0).uniform(0.2, 1, 150).astype(np.float32)
-    row[[7, 149]] = np.inf
-    for values in (row, row[:5], np.full(3, np.inf, np.float32), row[:0]):
-        found = cuda_filter.z_normalized_on_device(torch.from_numpy(values), 30)
-        np.testing.assert_allclose(found, z_normalized(values, 30), rtol=1e-4, atol=1e-5)
 
 
 def laps(count):

@@ -13,7 +13,6 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.extractor import cut_strips, normalize
 from stavpr_ros.features.gradient import (
     _on_threads,
-    _to_polar,
     feature_maps_by_torch,
     FLOOR,
     Gradient,
@@ -109,28 +108,6 @@ def test_gradient_of_any_image_size_equals_definition(settings, height, width, s
     assert_same_features(
         Gradient(settings).feature_maps([image])[0], reference_maps(square, settings)
     )
-
-
-@pytest.mark.parametrize('signed', [True, False])
-@pytest.mark.parametrize('bins', [2, 8, 9])
-def test_to_polar_of_every_gradient_is_exact(bins, signed):
-    """All 511 x 511 differences of gray levels: angles to 1e-6 of a turn, lengths exactly."""
-    dx = np.arange(-255, 256)
-    here = np.zeros(3 * dx.size, np.uint8)  # pixels 0 and 2 of each three make one difference
-    here[0::3], here[2::3] = np.maximum(0, -dx), np.maximum(0, dx)
-    period = 1.0 if signed else 0.5
-    position, magnitude = (np.empty(here.size - 2, np.float32) for _ in range(2))
-    for dy in range(-255, 256):
-        above, below = np.full_like(here, max(0, -dy)), np.full_like(here, max(0, dy))
-        _to_polar(
-            above, here, below, np.float32(period), np.float32(bins / period), position, magnitude
-        )
-        turns = position[::3].astype(float) / bins * period
-        wrong = (turns - np.arctan2(dy, dx) / (2 * np.pi)) / period
-        assert np.abs((wrong - np.round(wrong))[(dx != 0) | (dy != 0)]).max() < 1e-6
-        assert turns.min() >= 0
-        assert turns.max() <= period
-        np.testing.assert_array_equal(magnitude[::3], np.hypot(dx, dy).astype(np.float32))
 
 
 @pytest.fixture

@@ -7,15 +7,12 @@ import os
 from pathlib import Path
 import pickle
 import shutil
-import subprocess
 
 from map_files import changed, network
-from processes import node_process, Process, SECOND
+from processes import node_process, Process
 import pytest
-from robot import image_message, PARAMETERS
+from robot import PARAMETERS
 from stavpr_msgs.srv import LoadMap, SaveMap
-from stavpr_ros.mapping import load_map
-from stavpr_ros.mapping.journal import journals, recover
 
 
 @pytest.fixture
@@ -80,48 +77,3 @@ def test_running_node_refuses_hostile_files_and_goes_on(nodes, robot, route, map
     assert robot.does(LoadMap, 'load_map', path='good').success
     assert len(robot.drive(route[:3])) == 3
     assert node.stop() == 0
-
-
-@pytest.mark.long
-def test_two_nodes_with_one_save_path_that_end_together_keep_both_maps(
-    nodes, robot, route, tmp_path
-):
-    path = tmp_path / 'route.stavpr'
-    files = {'operation': 'mapping', 'save_path': path, 'maps_folder': tmp_path}
-    both = [nodes('-r', f'__node:=node{i}', **files) for i in range(2)]
-    robot.until(lambda: robot.publisher.get_subscription_count() == 2, 'both nodes')
-    for i, image in enumerate(route[:5], 1):
-        robot.publisher.publish(image_message(image, i * SECOND))
-    robot.until(lambda: len(journals(path)) == 2, 'a place of each')
-    for node in both:
-        node.popen.send_signal(2)
-    assert [node.wait() for node in both] == [0, 0]
-    saved = sorted(tmp_path.glob('route*.stavpr'))
-    assert [file.name for file in saved] == ['route-2.stavpr', 'route.stavpr']
-    assert all(len(load_map(file)) for file in saved)
-    assert journals(path) == []
-
-
-def test_node_on_a_small_file_system_that_is_full_keeps_the_journal(nodes, robot, route, tmp_path):
-    """A file system of its own, where the rights allow it."""
-    disk = tmp_path / 'disk'
-    disk.mkdir()
-    mount = ['mount', '-t', 'tmpfs', '-o', 'size=256k', 'tmpfs', str(disk)]
-    if subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip('file systems cannot be mounted here')
-    try:
-        path = disk / 'route.stavpr'
-        node = nodes(operation='mapping', save_path=path, maps_folder=disk)
-        robot.wait_for_node()
-        robot.drive(route[:8])
-        robot.until(lambda: bool(journals(path)), 'the journal')
-        free = os.statvfs(disk)
-        (disk / 'other').write_bytes(bytes(free.f_bavail * free.f_frsize))
-        robot.drive(route[8:10])
-        assert node.stop() == 1
-        assert 'the map is not saved: ' in node.output()
-        assert f'stay in {path}.journal' in node.output()
-        (disk / 'other').unlink()
-        assert recover(journals(path)[0], tmp_path / 'recovered').places >= 8
-    finally:
-        subprocess.run(['umount', '-l', str(disk)], check=True)

@@ -10,20 +10,20 @@ import numpy as np
 import oracle
 import pytest
 from stavpr_ros.alignment import (
-    align_sequence,
     aligned_index,
     best_match,
     match_sequence,
     SequenceDistances,
     SequenceSettings,
 )
+from stavpr_ros.alignment.path import trace_sequence
+from test_spatial import DTYPES, random_distances
 
-DTYPES = [np.float32, np.float64]
 INF = math.inf
 
 
-def path_of(aligned):
-    return [tuple(cell) for cell in aligned.path.tolist()]
+def path_of(D, start, settings):
+    return [tuple(cell) for cell in trace_sequence(D, start, settings.k).tolist()]
 
 
 def check_every_start(D, length, beta):
@@ -35,17 +35,6 @@ def check_every_start(D, length, beta):
     finite = np.isfinite(q)  # where every path is banned there is no length
     np.testing.assert_array_equal(matches.lengths[finite], m[finite])
     return matches
-
-
-def random_distances(seed, length, n, dtype, levels, banned):
-    """Return distances of few levels, with many ties, or any (levels = 0); a share is banned."""
-    rng = np.random.default_rng(seed)
-    if levels == 0:
-        D = rng.uniform(-0.05, 1.5, (length, n))
-    else:
-        D = rng.integers(-1, levels + 1, (length, n)) / levels
-    D[rng.random((length, n)) < banned] = INF
-    return D.astype(dtype)
 
 
 # ------------------------------------------------ by hand
@@ -66,16 +55,14 @@ def test_match_sequence_by_hand(dtype):
     assert matches.distances.tolist() == [2, 1, 0.5, 7]
     assert matches.lengths.tolist() == [3, 2, 1, 1]
     assert matches.lengths.dtype == np.int32
-    aligned = align_sequence(D, 0, sequence)
-    assert aligned.distance == 2
-    assert path_of(aligned) == [(0, 0), (0, 1), (1, 2)]
-    assert path_of(align_sequence(D, 3, sequence)) == [(0, 3), (1, 3)]
+    assert path_of(D, 0, sequence) == [(0, 0), (0, 1), (1, 2)]
+    assert path_of(D, 3, sequence) == [(0, 3), (1, 3)]
 
 
 def test_first_of_equal_ends_and_starts_wins():
     # a map of zeros: every q_x is 0, so m = 1, and every start is equal, so start 0
     matches = match_sequence(np.zeros((3, 8)), SequenceSettings(length=3))
-    path = path_of(align_sequence(np.zeros((3, 8)), 0, SequenceSettings(length=3)))
+    path = path_of(np.zeros((3, 8)), 0, SequenceSettings(length=3))
     assert path == [(0, 0), (1, 0), (2, 0)]
     assert matches.lengths.tolist() == [1] * 8
     best = best_match(matches, 3)
@@ -142,7 +129,7 @@ def test_aligned_index_is_floor_of_middle():
     nms_radius=st.integers(0, 5),
 )
 def test_matches_and_paths_equal_oracle(seed, length, n, beta, dtype, levels, banned, nms_radius):
-    D = random_distances(seed, length, n, dtype, levels, banned)
+    D = random_distances(seed, (length, n), dtype, levels, banned)
     sequence = SequenceSettings(length=length, beta=beta)
     matches = check_every_start(D, length, beta)
     best = best_match(matches, nms_radius)
@@ -155,29 +142,25 @@ def test_matches_and_paths_equal_oracle(seed, length, n, beta, dtype, levels, ba
     assert best.second_best_index == expected.second_best_index
     np.testing.assert_equal(best.second_best_distance, expected.second_best_distance)
     for start in {best.first, int(np.flatnonzero(np.isfinite(matches.distances))[-1])}:
-        aligned, plain = (
-            align_sequence(D, start, sequence),
-            oracle.align_sequence(D, start, beta, dtype),
-        )
-        assert path_of(aligned) == plain.path
-        assert (aligned.distance, aligned.accumulated) == (plain.distance, plain.accumulated)
-        assert (aligned.cost, aligned.weight) == (plain.cost, 1)
-        assert aligned.distance == matches.distances[start]
+        plain = oracle.align_sequence(D, start, beta, dtype)
+        assert path_of(D, start, sequence) == plain.path
+        assert plain.distance == matches.distances[start]
+        path = trace_sequence(D, start, sequence.k)
         for frame in range(length):
-            assert aligned_index(aligned.path, frame) == oracle.aligned_index(plain.path, frame)
+            assert aligned_index(path, frame) == oracle.aligned_index(plain.path, frame)
 
 
 @pytest.mark.parametrize('n', [7, 8, 9, 31, 33, 65, 129, 257])
 def test_match_sequence_at_block_borders_equals_oracle(n):
-    check_every_start(random_distances(n, 3, n, np.float32, 2, 0.05), 3, 2.0)
-    check_every_start(random_distances(n, 2, n, np.float64, 2, 0.0), 2, 1.5)
+    check_every_start(random_distances(n, (3, n), np.float32, 2, 0.05), 3, 2.0)
+    check_every_start(random_distances(n, (2, n), np.float64, 2, 0.0), 2, 1.5)
 
 
 def test_match_sequence_of_any_memory_layout_changes_nothing():
-    D = random_distances(5, 4, 80, np.float32, 3, 0.1)
+    D = random_distances(5, (4, 80), np.float32, 3, 0.1)
     before, sequence = D.copy(), SequenceSettings(length=4)
     expected = match_sequence(D, sequence).distances
     for same in (np.asfortranarray(D), np.repeat(D, 2, axis=1)[:, ::2]):
         np.testing.assert_array_equal(match_sequence(same, sequence).distances, expected)
-    align_sequence(D, 3, sequence)
+    trace_sequence(D, 3, sequence.k)
     np.testing.assert_array_equal(D, before)

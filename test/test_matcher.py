@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from stavpr_ros.alignment import (
-    align_sequence,
     best_match,
     holistic_distances,
     image_distances,
@@ -16,6 +15,7 @@ from stavpr_ros.alignment import (
     SpatialSettings,
     strip_distances,
 )
+from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
@@ -118,8 +118,8 @@ def test_lm_dtw_search_equals_plain_functions(n):
             matches = match_sequence(window, SequenceSettings(5))
             expected = best_match(matches, 3)
             assert repr(found.nearest) == repr(expected)  # a second best's distance may be NaN
-            aligned = align_sequence(window, expected.first, SequenceSettings(5))
-            np.testing.assert_array_equal(found.path, aligned.path)
+            path = trace_sequence(window, expected.first, SequenceSettings(5).k)
+            np.testing.assert_array_equal(found.path, path)
             for one, other in zip(
                 found.sequences(), (matches.distances, matches.middles), strict=True
             ):

@@ -92,17 +92,12 @@ def test_features_that_are_not_finite_are_rejected(saved):
         ({'layer': 'fire'}, SettingsError, r"no layer 'fire'.*y"),
         ({'channels': 'hsv'}, SettingsError, 'must be'),
         ({'sha256': '0' * 64}, FeatureMismatchError, 'sha256'),
+        ({'path': Path(__file__)}, UnavailableError, 'no usable ONNX model'),
     ],
 )
 def test_wrong_settings_are_rejected_by_name(saved, changes, error, named):
     with pytest.raises(error, match=named):
-        extractor(saved(), **changes)
-
-
-def test_other_file_is_rejected(tmp_path):
-    (tmp_path / 'broken.onnx').write_bytes(b'no model')
-    with pytest.raises(UnavailableError, match='no usable ONNX model'):
-        extractor(tmp_path / 'broken.onnx')
+        extractor(**{'path': saved()} | changes)
 
 
 @pytest.mark.parametrize('batch', ['b', 1, 4])

@@ -8,12 +8,12 @@ import numpy as np
 from places import recognize_all
 import pytest
 from stavpr_ros.alignment import (
-    align_sequence,
     best_match,
     match_sequence,
     SequenceSettings,
     SpatialSettings,
 )
+from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
@@ -59,7 +59,7 @@ def test_recognizer_by_image_equals_whole_matrix_at_once(small_map, strategy):
         expected = best_match(match_sequence(window, SHORT), 5)
         assert answers[end].sequence == expected
         np.testing.assert_array_equal(
-            answers[end].path, align_sequence(window, expected.first, SHORT).path
+            answers[end].path, trace_sequence(window, expected.first, SHORT.k)
         )
 
 

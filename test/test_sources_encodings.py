@@ -71,9 +71,7 @@ def test_decode_image_without_last_padding_is_exact():
         ({'height': 0}, 'size', 'expected at least 1x1'),
         ({'width': 0}, 'size', 'expected at least 1x1'),
         ({'step': 11}, 'step', 'step of 11 bytes is too small'),
-        ({'step': 0}, 'step', 'step of 0 bytes is too small'),
         ({'data': b''}, 'cut off', '0 bytes of data'),
-        ({'height': 2**32 - 1}, 'cut off', 'cut off'),
         ({'height': 2**32 - 1, 'width': 2**32 - 1, 'step': 2**34}, 'cut off', 'cut off'),
         ({'step': 2**32 - 1}, 'cut off', 'cut off'),
         ({'encoding': 'rgb16', 'step': 23}, 'step', 'expected 24'),
@@ -81,7 +79,6 @@ def test_decode_image_without_last_padding_is_exact():
         ({'encoding': 'uyvy', 'width': 3}, 'size', r'3x3 .*multiple of 2 and .* multiple of 1'),
         ({'encoding': 'yuyv', 'step': 7}, 'step', 'expected 8'),
         ({'encoding': 'nv12'}, 'size', r'4x3 pixels: .*multiple of 2 and .* multiple of 2'),
-        ({'encoding': 'nv21', 'height': 2, 'width': 3}, 'size', '3x2 pixels'),
         (
             {'encoding': 'nv12', 'height': 4, 'step': 4, 'data': bytes(23)},
             'cut off',
@@ -97,11 +94,7 @@ def test_decode_image_without_last_padding_is_exact():
             'cut off',
             'expected 24',
         ),
-        ({'encoding': 'bayer_rggb16', 'step': 7}, 'step', 'expected 8'),
-        ({'encoding': '32FC1x'}, 'encoding', "'32FC1x' is not supported"),
-        ({'encoding': '8UC2'}, 'encoding', "'8UC2' is not supported"),
         ({'encoding': 'bayer_rggb9'}, 'encoding', 'is not supported: expected one of rgb8'),
-        ({'encoding': ''}, 'encoding', 'is not supported'),
     ],
 )
 def test_decode_image_with_wrong_header_is_rejected(change, kind, text):

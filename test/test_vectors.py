@@ -3,7 +3,6 @@
 """Features that are one vector an image (W = 1), tokens, several outputs, pooled strips."""
 
 from collections import OrderedDict
-import math
 
 import numpy as np
 from pipelines import localizing, process
@@ -14,7 +13,7 @@ from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.features.extractor import cut_strips
 from stavpr_ros.features.outputs import as_maps, one_of
 from stavpr_ros.features.registry import settings_class
-from stavpr_ros.mapping import build_map, descriptor_map, load_map, save_map
+from stavpr_ros.mapping import build_map, load_map, save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.matcher import make_matcher
@@ -78,10 +77,6 @@ def test_cut_strips_pooled_equals_plain_loops(pooling):
                 if pooling == 'gem':
                     expected = (sum(max(v, 1e-6) ** 3 for v in cells) / 10) ** (1 / 3)
                 assert float(strips[w, n, c]) == pytest.approx(expected, abs=1e-6)
-
-
-def test_pooled_map_of_a_transformer_has_strips_of_its_channels():
-    assert cut_strips(torch.zeros(1, 768, 23, 23), 7, 'mean').shape == (7, 1, 768)
 
 
 # ------------------------------------------------ extraction
@@ -237,22 +232,6 @@ def test_sliding_window_over_one_strip_is_rejected_with_the_map():
         make_matcher(vectors(5, 4), SpatialSettings('sliding_window'), 'cpu', 'float32')
 
 
-@pytest.mark.parametrize('mode', ['robust', 'paper'])
-def test_sequence_of_vectors_is_matched(mode):
-    features = vectors(80, 64)
-    noise = torch.from_numpy(np.random.default_rng(2).normal(0, 0.08, (1, 80, 64))).float()
-    strips = features.strips + noise
-    strips = strips / strips.norm(dim=2, keepdim=True)
-    query = LocalFeatures(strips, torch.ones(1, 80), features.settings, features.cells)
-    settings = RecognizerSettings(0.5, sequence=SequenceSettings(10), mode=mode)
-    recognizer = PlaceRecognizer(descriptor_map(features), settings)
-    matches = [recognizer.update(query[i : i + 1]) for i in range(20, 50)]
-    assert {match.status for match in matches[15:]} == {Status.MATCH}
-    for i, match in enumerate(matches[15:], 35):
-        assert abs(match.place_index - (i - 5)) <= 1
-        assert math.isfinite(match.distance)
-
-
 def test_loop_of_vectors_is_closed():
     """The same curve twice, the second time with noise."""
     features = vectors(60, 64)
@@ -288,15 +267,6 @@ def test_extractor_of_vector_and_strips_equals_both_alone(network, route):
     assert torch.equal(joined.vectors, both.vectors)
     bare = extractor(network, 'map').extract(route[:1])
     assert LocalFeatures.concatenate([both, bare]).vectors is None
-
-
-def test_unusable_vectors_are_rejected_before_any_image(network):
-    with pytest.raises(SettingsError, match="vector = 'map' is what the strips are made of"):
-        extractor(network, 'map', vector='map')
-    with pytest.raises(SettingsError, match=r"no layer 'local'.*its layers are conv, map"):
-        extractor(network, 'map', vector='local')
-    with pytest.raises(SettingsError, match=r"'conv'.*\(1, 16, 8, 8\).*expected one vector"):
-        extractor(network, 'map', vector='conv')
 
 
 def test_query_without_vector_on_map_with_vectors_is_rejected(network, route):

@@ -3,30 +3,26 @@
 """The paper's mathematics: distances of two images, and of a window to every place of a map."""
 
 from stavpr_ros.alignment.lm_dtw import (
-    align_sequence,
     best_match,
     match_sequence,
     SequenceDistances,
     SequenceMatch,
 )
-from stavpr_ros.alignment.path import aligned_index, Alignment
+from stavpr_ros.alignment.path import aligned_index
 from stavpr_ros.alignment.settings import (
     SequenceSettings,
     SpatialSettings,
     STRATEGIES,
 )
 from stavpr_ros.alignment.similarity import holistic_distances, strip_distances
-from stavpr_ros.alignment.spatial import align_images, image_distances
+from stavpr_ros.alignment.spatial import image_distances
 
 __all__ = [
     'STRATEGIES',
-    'Alignment',
     'SequenceDistances',
     'SequenceMatch',
     'SequenceSettings',
     'SpatialSettings',
-    'align_images',
-    'align_sequence',
     'aligned_index',
     'best_match',
     'holistic_distances',

@@ -5,7 +5,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from stavpr_ros.alignment.path import Alignment, trace
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.checks import float_array, no_nan
 from stavpr_ros.errors import InputError
@@ -52,16 +51,6 @@ class SequenceMatch:
     second_best_index: int
     second_best_distance: float
 
-    @property
-    def start(self) -> int:
-        """Return the start s, 0-based: the same as ``first``."""
-        return self.first
-
-    @property
-    def length(self) -> int:
-        """Return the number of map images m."""
-        return self.last - self.first + 1
-
 
 def padded_width(n: int, k: int) -> int:
     """Return the kernel's columns for n starts: whole vectors, and the last start's k images."""
@@ -84,15 +73,6 @@ def match_padded(window: np.ndarray, n: int, k: int) -> SequenceDistances:
     return SequenceDistances(distances[:n], lengths[:n])
 
 
-def _checked(distances: np.ndarray, settings: SequenceSettings) -> np.ndarray:
-    D = float_array(distances, 'image distances', 2)
-    if D.shape[0] != settings.length:
-        raise InputError(
-            f'image distances have shape {D.shape}: expected l = {settings.length} rows'
-        )
-    return no_nan(D, 'image distances')
-
-
 def match_sequence(distances: np.ndarray, settings: SequenceSettings) -> SequenceDistances:
     """
     Find the best map sequence from every start.
@@ -102,35 +82,15 @@ def match_sequence(distances: np.ndarray, settings: SequenceSettings) -> Sequenc
     :returns: distance and length for each of the n starts.
     :raises InputError: wrong shape or type, NaN.
     """
-    D = _checked(distances, settings)
+    D = no_nan(float_array(distances, 'image distances', 2), 'image distances')
     l, n = D.shape
+    if l != settings.length:
+        raise InputError(
+            f'image distances have shape {D.shape}: expected l = {settings.length} rows'
+        )
     window = np.full((l, padded_width(n, settings.k)), np.inf, D.dtype)
     window[:, :n] = D
     return match_padded(window, n, settings.k)
-
-
-def align_sequence(distances: np.ndarray, start: int, settings: SequenceSettings) -> Alignment:
-    """
-    Return the warping path of one start.
-
-    :param distances: image distances D, shape (l, n).
-    :param start: 0-based start s.
-    :returns: path of (query index, map index), both 0-based, map index counted from the map's
-        start.
-    :raises InputError: wrong shape or type, NaN, a start outside the map.
-    """
-    D = _checked(distances, settings)
-    if not 0 <= start < D.shape[1]:
-        raise InputError(f'start {start} is outside the map of {D.shape[1]} places')
-    return trace_sequence(D, start, settings.k)
-
-
-def trace_sequence(window: np.ndarray, start: int, k: int) -> Alignment:
-    """Trace the path of one start in a checked window (see :func:`align_sequence`)."""
-    costs = np.ascontiguousarray(window[:, start : start + k])
-    alignment = trace(costs, 1.0, sum(costs.shape), free_end=True)
-    alignment.path[:, 1] += start
-    return alignment
 
 
 def best_match(matches: SequenceDistances, nms_radius: int) -> SequenceMatch | None:

@@ -3,7 +3,6 @@
 """Spatial alignment: the distance of two images from those of their strips (section 2)."""
 
 import numpy as np
-from stavpr_ros.alignment.path import Alignment, trace
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.checks import float_array, no_nan
 from stavpr_ros.errors import InputError, SettingsError
@@ -22,15 +21,6 @@ def adaptive_weights(W: int, settings: SpatialSettings, dtype: np.dtype) -> np.n
     return np.sqrt(dtype.type(1) + dtype.type(settings.sigma) * np.arange(W).astype(dtype))
 
 
-def _checked(d: np.ndarray, ndim: int) -> np.ndarray:
-    d = float_array(d, 'strip distances', ndim)
-    if d.shape[0] != d.shape[1] or d.shape[0] == 0:
-        raise InputError(
-            f'strip distances have shape {d.shape}: expected W x W with W >= 1 on the first axes'
-        )
-    return no_nan(d, 'strip distances')
-
-
 def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
     """
     Distances of one query image to n map images.
@@ -46,8 +36,13 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
     from stavpr_ros.alignment.cpu import dtw
     from stavpr_ros.alignment.cpu.simd import LANES
 
-    d = _checked(d, 3)
-    W, _, n = d.shape
+    d = float_array(d, 'strip distances', 3)
+    W, columns, n = d.shape
+    if columns != W or W == 0:
+        raise InputError(
+            f'strip distances have shape {d.shape}: expected W x W with W >= 1 on the first axes'
+        )
+    d = no_nan(d, 'strip distances')
     band = settings.band(W)
     if settings.strategy == 'none':
         raise SettingsError("strategy 'none' compares whole images: call holistic_distances")
@@ -64,24 +59,3 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
     out = np.empty(d.shape[2], d.dtype)
     dtw.spatial_dtw(d, adaptive_weights(W, settings, d.dtype), band, out)
     return out[:n]
-
-
-def align_images(d: np.ndarray, settings: SpatialSettings) -> Alignment:
-    """
-    Align the strips of two images and return the path (strategies ``adaptive`` and ``vanilla``).
-
-    :param d: strip distances of one pair, shape (W, W), row = query strip.
-    :raises InputError: wrong shape or type, NaN.
-    :raises SettingsError: xi > W, or a strategy without a path.
-    """
-    d = _checked(d, 2)
-    W = d.shape[0]
-    band = settings.band(W)
-    if settings.strategy not in ('adaptive', 'vanilla'):
-        raise SettingsError(
-            f'strategy {settings.strategy!r} has no warping path: take adaptive or vanilla'
-        )
-    c = (W + 1) // 2 - 1  # the central strip, ceil(W / 2), 0-based
-    low, high = max(0, c - band + 1), min(W, c + band)
-    nearest = low + int(np.argmin(d[c, low:high]))
-    return trace(d, adaptive_weights(W, settings, d.dtype)[abs(nearest - c)], band)

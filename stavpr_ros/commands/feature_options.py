@@ -24,10 +24,7 @@ def _numbers(text: str) -> tuple[float, ...]:
     return tuple(float(part) for part in text.split(','))
 
 
-def _converter(example: Any) -> Any:
-    if isinstance(example, bool):
-        return _boolean
-    return _numbers if isinstance(example, tuple) else type(example)
+CONVERTERS = {bool: _boolean, tuple: _numbers}
 
 
 def _projection(text: str) -> int | str:
@@ -63,7 +60,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
             default = 'required' if required else str(example).strip('()') or 'none'
             group.add_argument(
                 _option(kind, row.name),
-                type=_converter(example),
+                type=CONVERTERS.get(type(example), type(example)),
                 metavar=row.name.upper(),
                 help=f'{row.metadata["help"]} ({default})'.replace('%', '%%'),
             )
@@ -127,22 +124,22 @@ def _backbone_settings(arguments: argparse.Namespace) -> Any:
 
     :raises SettingsError: an option of this kind is missing, or one of another kind was given.
     """
-    kind = arguments.features
-    rows = dataclasses.fields(settings_class(kind))
-    own = {_option(kind, row.name) for row in rows}
-    for option, value in kind_options(arguments).items():
-        if value is not None and option not in own:
-            other = next(other for other in kinds() if option.startswith(f'--{other}-'))
-            raise SettingsError(
-                f'{option} was given with --features {kind}: give --features {other}'
-            )
-    values = {row.name: getattr(arguments, f'{kind}_{row.name}') for row in rows}
+    kind, given = arguments.features, {}
+    for other in kinds():
+        for row in dataclasses.fields(settings_class(other)):
+            value = getattr(arguments, f'{other}_{row.name}')
+            if value is not None and other != kind:
+                raise SettingsError(
+                    f'{_option(other, row.name)} was given with --features {kind}: give '
+                    f'--features {other}'
+                )
+            if value is not None:
+                given[row.name] = value
     missing = [
         _option(kind, row.name)
-        for row in rows
-        if row.default is dataclasses.MISSING and values[row.name] is None
+        for row in dataclasses.fields(settings_class(kind))
+        if row.default is dataclasses.MISSING and row.name not in given
     ]
     if missing:
         raise SettingsError(f'--features {kind} needs {" and ".join(missing)}')
-    given = {name: value for name, value in values.items() if value is not None}
     return settings_class(kind)(**given)

@@ -70,7 +70,9 @@ class Gradient:
         maps = np.empty((len(images), *self._shape), np.float32)
 
         def extract(i: int) -> None:
-            gradient_maps(self._prepare(images[i]), s.cell, s.signed, FLOOR, maps[i])
+            gray = self._prepare(images[i])
+            padded = cv2.copyMakeBorder(gray, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+            _feature_maps(padded, s.cell, F(1.0 if s.signed else 0.5), F(FLOOR), maps[i])
 
         _on_threads(extract, len(images))
         return torch.from_numpy(maps)
@@ -113,11 +115,6 @@ def feature_maps_by_torch(gray: torch.Tensor, settings: GradientSettings) -> tor
     :param gray: shape (n, size, size), uint8.
     :returns: shape (n, orientations, cells, cells), float32.
     """
-    return _normalize_by_torch(_histograms(gray, settings))
-
-
-def _histograms(gray: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
-    """Pool the gradients over cells that overlap by half, (n, bins, cells, cells)."""
     padded = pad(gray[:, None].float() / 255, (1, 1, 1, 1), mode='replicate')
     dx = padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]
     dy = padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]
@@ -129,34 +126,23 @@ def _histograms(gray: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
     # linear between two bins
     share = torch.clamp_(1 - torch.minimum(offset, bins - offset), min=0)
     cell = settings.cell
-    return avg_pool2d(share.mul_(torch.hypot(dx, dy)), 2 * cell, stride=cell, padding=cell // 2)
-
-
-def _normalize_by_torch(histograms: torch.Tensor) -> torch.Tensor:
-    """Multiply each cell by the mean of 1 / norm over the four 2 x 2 blocks around it."""
+    share.mul_(torch.hypot(dx, dy))
+    # cells overlap by half; each is multiplied by the mean of 1 / norm of its four blocks
+    histograms = avg_pool2d(share, 2 * cell, stride=cell, padding=cell // 2)
     energy = pad((histograms**2).sum(dim=1, keepdim=True), (1, 1, 1, 1), mode='replicate')
     scale = torch.rsqrt(4 * avg_pool2d(energy, 2, stride=1) + FLOOR)
     return histograms * avg_pool2d(scale, 2, stride=1)
 
 
-def gradient_maps(
-    gray: np.ndarray, cell: int, signed: bool, floor: float, maps: np.ndarray
-) -> None:
+@kernel
+def _feature_maps(padded: np.ndarray, cell: int, period: F, floor: F, maps: np.ndarray) -> None:
     """
     Compute the feature maps of one image.
 
-    :param gray: shape (size, size), uint8.
-    :param cell: side of a cell in pixels.
-    :param signed: orientations cover the whole turn, else half of it.
-    :param floor: squared gradient (intensities 0..1) below which a block counts as flat.
+    :param padded: shape (size + 2, size + 2), uint8.
+    :param period: what the orientations cover: 1 turn, or half of it.
     :param maps: output, shape (orientations, cells, cells), float32.
     """
-    padded = cv2.copyMakeBorder(gray, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-    _feature_maps(padded, cell, F(1.0 if signed else 0.5), F(floor), maps)
-
-
-@kernel
-def _feature_maps(padded: np.ndarray, cell: int, period: F, floor: F, maps: np.ndarray) -> None:
     orientations, cells = maps.shape[:2]
     chunks = np.empty((cells + 1, orientations, cells + 1), F)
     _sum_over_chunks(padded, cell, period, chunks)

@@ -238,15 +238,15 @@ def settings_class(kind: str) -> Any:
 
     :raises SettingsError: no such kind.
     """
-    if kind == 'torchscript':
-        raise SettingsError(
-            "features 'torchscript' were removed: export the network to an ONNX file "
-            '(docs/features.md) and take features onnx; build a map with it again'
-        )
     return _kind(kind).settings
 
 
 def _kind(name: str) -> Kind:
+    if name == 'torchscript':
+        raise SettingsError(
+            "features 'torchscript' were removed: export the network to an ONNX file "
+            '(docs/features.md) and take features onnx; build a map with it again'
+        )
     found = KINDS.get(name) or _all().get(name)
     if found is None:
         remedy = f'take one of {", ".join(kinds())}'
@@ -262,7 +262,6 @@ def backbone_class(kind: str) -> Any:
 
     :raises SettingsError: no such kind.
     """
-    settings_class(kind)
     module, name = _kind(kind).backbone.split(':')
     return getattr(importlib.import_module(module), name)
 

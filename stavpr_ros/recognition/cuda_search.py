@@ -5,7 +5,8 @@
 from typing import Any
 
 from stavpr_ros.alignment.cuda.compilation import runtime
-from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch, trace_sequence
+from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch
+from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.recognition.sequence_search import SequenceBuffer, WindowMatch
 from stavpr_ros.recognition.sessions import Sequences
@@ -68,7 +69,7 @@ class CudaLmDtwSearch:
         found = self._selection.fetch()
         if found.start < 0:
             return WindowMatch(sequences=self._sequences)
-        path = trace_sequence(found.cells, 0, self.buffer.k).path
+        path = trace_sequence(found.cells, 0, self.buffer.k)
         path[:, 1] += found.start
         second_best = found.second_best_start >= 0
         middle = (2 * found.second_best_start + found.second_best_length - 1) // 2

@@ -11,9 +11,8 @@ from stavpr_ros.alignment.lm_dtw import (
     match_padded,
     padded_width,
     SequenceMatch,
-    trace_sequence,
 )
-from stavpr_ros.alignment.path import NO_PATH
+from stavpr_ros.alignment.path import NO_PATH, trace_sequence
 from stavpr_ros.recognition.sequence_search import SequenceBuffer, WindowMatch
 from stavpr_ros.recognition.sessions import Sequences
 
@@ -40,7 +39,7 @@ class LmDtwSearch:
         nearest = best_match(matches, nms_radius)
         path = NO_PATH
         if nearest is not None:
-            path = trace_sequence(window[:, :n], nearest.first, k).path
+            path = trace_sequence(window[:, :n], nearest.first, k)
         return _renumbered(
             nearest, path, lambda: (matches.distances, matches.middles + first), first
         )

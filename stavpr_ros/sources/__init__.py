@@ -29,20 +29,16 @@ def open_source(
         skipped; without it the error is raised.
     :raises SourceError: it cannot be read, or the topic is ambiguous.
     """
-    path = Path(path)
-    try:
-        there = path.exists()
-    except OSError as error:
-        raise SourceError(
-            f'{path} cannot be read: {error}; check its name and permissions'
-        ) from error
-    if not there:
-        raise SourceError(f'{path} does not exist: expected a folder of images or a bag')
     # imported on use: rosbags and OpenCV load slowly
     from stavpr_ros.sources.bag import BagSource
-    from stavpr_ros.sources.bag_file import is_bag
+    from stavpr_ros.sources.bag_file import is_bag, reading
     from stavpr_ros.sources.folder import FolderSource
 
+    path = Path(path)
+    with reading(path):
+        exists = path.exists()
+    if not exists:
+        raise SourceError(f'{path} does not exist: expected a folder of images or a bag')
     if is_bag(path):
         return BagSource(path, topic, on_error)
     if not path.is_dir():

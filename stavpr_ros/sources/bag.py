@@ -18,6 +18,7 @@ COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 SECOND = 1_000_000_000
 LATE = SECOND // 2  # messages may be out of order by so much; more is a clock that jumped back
+LEAST_MESSAGE = 16  # bytes of a message in a bag, with its entry in the index
 Item = TypeVar('Item')
 
 
@@ -48,10 +49,16 @@ class BagSource:
             topics = _topics(bag)
         self.topic = _choose(self.path, topics, topic)
         self.message_type, self._count = topics[self.topic]
+        files = self.path.iterdir() if self.path.is_dir() else [self.path]
+        self._most = sum(file.stat().st_size for file in files) // LEAST_MESSAGE
 
     def __len__(self) -> int:
-        """Return the number of the topic's messages, decodable or not, as stated by the bag."""
-        return self._count
+        """
+        Return the number of the topic's messages, decodable or not, as stated by the bag.
+
+        At most as many as its files have room for: list() reserves memory for so many.
+        """
+        return min(max(self._count, 0), self._most)
 
     def __iter__(self) -> Iterator[Frame]:
         """Decode one image after the other."""
@@ -95,7 +102,7 @@ class BagSource:
         with open_bag(self.path) as bag:
             index = -1
             wanted = [each for each in bag.connections if each.topic == self.topic]
-            messages = bag.messages(self.path, wanted, start, duration)
+            messages = bag.messages(wanted, start, duration)
             for index, (_, time_ns, raw) in enumerate(messages):
                 try:
                     item = finish(index, time_ns, self._message(bag, raw))
@@ -131,12 +138,13 @@ def _stamp(message: Any) -> int:
 
 def _topics(bag: OpenBag) -> dict[str, tuple[str, int]]:
     """Topic to (type, messages); the publishers of one topic added up."""
-    types: dict[str, set[str]] = {}
-    counts: dict[str, int] = {}
-    for connection in bag.connections:
-        types.setdefault(connection.topic, set()).add(message_type(connection))
-        counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
-    return {topic: (' and '.join(sorted(types[topic])), counts[topic]) for topic in sorted(types)}
+    return {
+        name: (
+            ' and '.join(sorted({message_type(each) for each in info.connections})),
+            info.msgcount,
+        )
+        for name, info in bag.reader.topics.items()
+    }
 
 
 def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -> str:
@@ -184,12 +192,12 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
     path = Path(path)
     stamps, poses = [], []
     with open_bag(path) as bag:
-        wanted = _connections(bag, path, topic)
-        with reading(path):
-            for connection, time_ns, raw in bag.reader.messages(wanted):
-                message = bag.deserialize(raw, message_type(connection))
-                stamps.append(_stamp(message) or time_ns)
-                poses.append(_pose(message.pose.pose))
+        for _, time_ns, raw in bag.messages(_connections(bag, path, topic)):
+            with reading(path):
+                message = bag.deserialize(raw, ODOMETRY)
+            stamps.append(_stamp(message) or time_ns)
+            p, q = message.pose.pose.position, message.pose.pose.orientation
+            poses.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
     if not stamps:
         raise SourceError(f'odometry {topic!r} of {path} has no messages: expected at least one')
     when, where = np.array(stamps, np.int64), np.array(poses, np.float64)
@@ -199,27 +207,13 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
 
 
 def _connections(bag: OpenBag, path: Path, topic: str) -> list[Any]:
-    found = [
-        connection
-        for connection in bag.connections
-        if connection.topic.strip('/') == topic.strip('/')
-    ]
-    kinds = {message_type(connection) for connection in found}
-    if kinds == {ODOMETRY}:
-        return found
-    where = (
-        f'is of type {" and ".join(sorted(kinds))}, not {ODOMETRY}, in' if kinds else 'is not in'
-    )
-    others = {
-        connection.topic for connection in bag.connections if message_type(connection) == ODOMETRY
-    }
-    listed = ', '.join(sorted(others)) or 'none'
+    topics = _topics(bag)
+    name = next((name for name in topics if name.strip('/') == topic.strip('/')), None)
+    if name is not None and topics[name][0] == ODOMETRY:
+        return [each for each in bag.connections if each.topic == name]
+    where = 'is not in' if name is None else f'is of type {topics[name][0]}, not {ODOMETRY}, in'
+    listed = ', '.join(other for other in topics if topics[other][0] == ODOMETRY) or 'none'
     raise SourceError(f'odometry topic {topic!r} {where} {path}: topics of that type are {listed}')
-
-
-def _pose(pose: Any) -> tuple[float, ...]:
-    p, q = pose.position, pose.orientation
-    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
 def _require_one_run(stamps: np.ndarray, name: str) -> None:

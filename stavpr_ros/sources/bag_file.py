@@ -35,6 +35,7 @@ class OpenBag:
         ``nav_msgs`` are read, equal in every distribution: no definition in the bag is needed.
     """
 
+    path: Path
     reader: Ros1Reader | Ros2Reader
     deserialize: Callable[[bytes, str], Any]
 
@@ -44,16 +45,15 @@ class OpenBag:
         return list(self.reader.connections)
 
     def messages(
-        self, path: Path, connections: list[Connection], start: float, duration: float
+        self, connections: list[Connection], start: float = 0.0, duration: float = math.inf
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """
         Yield the messages of some connections, with their times of recording, ns, in order.
 
-        :param path: of the bag, for errors.
         :param start: seconds after the start of the bag.
         :param duration: seconds from there on.
         """
-        with reading(path):
+        with reading(self.path):
             first = self.reader.start_time + round(start * SECOND)
             last = None if math.isinf(duration) else first + round(duration * SECOND)
             yield from self.reader.messages(connections, first if start else None, last)
@@ -96,7 +96,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
                 deserialize = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
             reader.open()
         try:
-            yield OpenBag(reader, deserialize)
+            yield OpenBag(path, reader, deserialize)
         finally:
             reader.close()
 
@@ -131,10 +131,9 @@ def _stage(path: Path, scratch: Path) -> Path:
     rosbags opens databases as immutable: it writes nothing, but ignores the logs of SQLite; and it
     does not quote file names. A staged copy avoids both.
     """
-    if path.is_file():
-        return _stage_file(path, scratch / f'bag{path.suffix}')
-    if not (path / METADATA).exists():
-        return _stage_file(_only_storage_file(path), scratch)
+    if path.is_file() or not (path / METADATA).exists():
+        file = path if path.is_file() else _only_storage_file(path)
+        return _stage_file(file, scratch / f'bag{file.suffix}')
     folder = scratch / 'bag'
     folder.mkdir()
     for file in path.iterdir():
@@ -158,8 +157,6 @@ def _only_storage_file(folder: Path) -> Path:
 
 def _stage_file(file: Path, target: Path) -> Path:
     require_regular(file)  # a pipe would never end
-    if target.is_dir():
-        target /= f'bag{file.suffix}'
     logs = [
         log
         for end in LOG_SUFFIXES

@@ -23,13 +23,13 @@ def list_topics(path: Path) -> dict[str, RecordedTopic]:
     :raises SourceError: the bag cannot be read.
     """
     with open_bag(path) as bag:
-        found: dict[str, RecordedTopic] = {}
-        for each in bag.connections:
-            if each.msgcount:
-                known = found.get(each.topic)
-                latched = _is_latched(each) or (known is not None and known.latched)
-                found[each.topic] = RecordedTopic(each.topic, message_type(each), latched)
-        return found
+        return {
+            name: RecordedTopic(
+                name, message_type(info.connections[0]), any(map(_is_latched, info.connections))
+            )
+            for name, info in bag.reader.topics.items()
+            if info.msgcount
+        }
 
 
 def read_messages(
@@ -48,7 +48,7 @@ def read_messages(
     with open_bag(path) as bag:
         wanted = [each for each in bag.connections if each.topic in topics]
         convert = _Ros1() if isinstance(bag.reader, Ros1Reader) else None
-        for connection, time_ns, raw in bag.messages(path, wanted, start, duration):
+        for connection, time_ns, raw in bag.messages(wanted, start, duration):
             kind = message_type(connection)
             content = raw if convert is None else convert(kind, raw)
             yield MessageRecord(time_ns, connection.topic, bytes(content))

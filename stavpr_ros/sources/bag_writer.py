@@ -6,10 +6,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
-from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
-from rosbags.typesys.store import Typestore
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.output_file import atomic_folder
 from stavpr_ros.sources.bag import RAW, SECOND
@@ -42,6 +40,7 @@ def write_bag(
     if plugin is None:
         raise SettingsError(f'storage {storage!r}: expected one of {", ".join(STORAGES)}')
     typestore = get_typestore(Stores.ROS2_JAZZY)
+    types = typestore.types
     count = 0
     with (
         atomic_folder(path) as folder,
@@ -60,24 +59,17 @@ def write_bag(
             if isinstance(record, MessageRecord):
                 writer.write(connections[record.topic], record.time_ns, record.content)
                 continue
-            _write(writer, connection, typestore, record)
+            seconds, nanoseconds = divmod(record.stamp_ns, SECOND)
+            stamp = types['builtin_interfaces/msg/Time'](sec=seconds, nanosec=nanoseconds)
+            message = types[RAW](
+                header=types['std_msgs/msg/Header'](stamp=stamp, frame_id=record.frame_id),
+                height=record.height,
+                width=record.width,
+                encoding=record.encoding,
+                is_bigendian=int(record.is_bigendian),
+                step=record.step,
+                data=np.frombuffer(record.data, np.uint8),
+            )
+            writer.write(connection, record.time_ns, typestore.serialize_cdr(message, RAW))
             count += 1
     return count
-
-
-def _write(
-    writer: Writer, connection: Connection, typestore: Typestore, record: ImageRecord
-) -> None:
-    types = typestore.types
-    seconds, nanoseconds = divmod(record.stamp_ns, SECOND)
-    stamp = types['builtin_interfaces/msg/Time'](sec=seconds, nanosec=nanoseconds)
-    message = types[RAW](
-        header=types['std_msgs/msg/Header'](stamp=stamp, frame_id=record.frame_id),
-        height=record.height,
-        width=record.width,
-        encoding=record.encoding,
-        is_bigendian=int(record.is_bigendian),
-        step=record.step,
-        data=np.frombuffer(record.data, np.uint8),
-    )
-    writer.write(connection, record.time_ns, typestore.serialize_cdr(message, RAW))

@@ -50,19 +50,8 @@ class Encoding:
 
 
 def convert(code: int, pixels: np.ndarray) -> np.ndarray:
-    """
-    Convert with one of OpenCV's codes.
-
-    :param code: ``cv2.COLOR_...2RGB``.
-    :param pixels: uint8, shape (rows, width, channels); rows may be apart.
-    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
-    """
+    """Convert with one of OpenCV's codes, ``cv2.COLOR_...2RGB``; rows may be apart."""
     return np.asarray(cv2.cvtColor(pixels, code))
-
-
-def copy(pixels: np.ndarray) -> np.ndarray:
-    """Copy RGB pixels out of the message."""
-    return np.array(pixels, order='C')
 
 
 def keep(pixels: np.ndarray) -> np.ndarray:
@@ -74,12 +63,8 @@ def demosaic(code: int, mosaic: np.ndarray) -> np.ndarray:
     """
     Interpolate (bilinear) the two missing colors of each pixel behind a Bayer filter.
 
-    ROS names a mosaic by its top-left 2x2 pixels in reading order, as OpenCV's codes of four
-    letters do; codes of two letters (``BayerBG``) name the 2x2 pixels from (1, 1).
-
-    :param code: ``cv2.COLOR_Bayer....2RGB``.
+    :param code: of OpenCV with four letters: the top-left 2x2 pixels, as ROS names a mosaic.
     :param mosaic: uint8, shape (height, width) or (height, width, 1); rows may be apart.
-    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
     :raises ImageError: fewer than 2 rows or columns: some color is missing.
     """
     height, width = mosaic.shape[:2]
@@ -93,7 +78,7 @@ def demosaic(code: int, mosaic: np.ndarray) -> np.ndarray:
         return convert(code, mosaic)
     # OpenCV returns black below 3x3; mirroring by two keeps the colors of the pattern in place
     larger = cv2.copyMakeBorder(mosaic, 2, 2, 2, 2, cv2.BORDER_REFLECT_101)
-    return copy(convert(code, larger)[2:-2, 2:-2])
+    return np.ascontiguousarray(convert(code, larger)[2:-2, 2:-2])
 
 
 def nv24_to_rgb(planes: np.ndarray) -> np.ndarray:
@@ -116,10 +101,6 @@ _FROM_BGR = partial(convert, cv2.COLOR_BGR2RGB)
 _FROM_RGBA = partial(convert, cv2.COLOR_RGBA2RGB)
 _FROM_BGRA = partial(convert, cv2.COLOR_BGRA2RGB)
 _FROM_GRAY = partial(convert, cv2.COLOR_GRAY2RGB)
-_FROM_RGGB = partial(demosaic, cv2.COLOR_BayerRGGB2RGB)
-_FROM_BGGR = partial(demosaic, cv2.COLOR_BayerBGGR2RGB)
-_FROM_GBRG = partial(demosaic, cv2.COLOR_BayerGBRG2RGB)
-_FROM_GRBG = partial(demosaic, cv2.COLOR_BayerGRBG2RGB)
 _FROM_UYVY = partial(convert, cv2.COLOR_YUV2RGB_UYVY)
 _FROM_YUYV = partial(convert, cv2.COLOR_YUV2RGB_YUYV)
 
@@ -142,14 +123,13 @@ ENCODINGS: dict[str, Encoding] = {
     '16UC1': Encoding(1, 2, _FROM_GRAY),
     '16UC3': Encoding(3, 2, _FROM_BGR),
     '16UC4': Encoding(4, 2, _FROM_BGRA),
-    'bayer_rggb8': Encoding(1, 1, _FROM_RGGB),
-    'bayer_bggr8': Encoding(1, 1, _FROM_BGGR),
-    'bayer_gbrg8': Encoding(1, 1, _FROM_GBRG),
-    'bayer_grbg8': Encoding(1, 1, _FROM_GRBG),
-    'bayer_rggb16': Encoding(1, 2, _FROM_RGGB),
-    'bayer_bggr16': Encoding(1, 2, _FROM_BGGR),
-    'bayer_gbrg16': Encoding(1, 2, _FROM_GBRG),
-    'bayer_grbg16': Encoding(1, 2, _FROM_GRBG),
+    **{
+        f'bayer_{pattern}{8 * value_bytes}': Encoding(
+            1, value_bytes, partial(demosaic, getattr(cv2, f'COLOR_Bayer{pattern.upper()}2RGB'))
+        )
+        for value_bytes in (1, 2)
+        for pattern in ('rggb', 'bggr', 'gbrg', 'grbg')
+    },
     'uyvy': Encoding(2, 1, _FROM_UYVY, block=(1, 2)),
     'yuv422': Encoding(2, 1, _FROM_UYVY, block=(1, 2)),
     'yuyv': Encoding(2, 1, _FROM_YUYV, block=(1, 2)),
@@ -197,7 +177,7 @@ def decode_image(
     row = width * layout.channels * layout.value_bytes
     rows = height + int(height * layout.chroma_rows)
     _check_header(height, width, encoding, step, row)
-    flat = flat_bytes(data)
+    flat = files.flat_bytes(data)
     needed = (rows - 1) * step + row
     if flat.size < needed:
         raise ImageError(
@@ -213,7 +193,7 @@ def decode_image(
         strides = (step, layout.channels, 1)
         pixels: np.ndarray = np.ndarray((rows, width, layout.channels), np.uint8, flat, 0, strides)
         image = files.reduce(layout.to_rgb(pixels), least)
-        return copy(image) if image is pixels else image
+        return np.array(image, order='C') if image is pixels else image
     # the more significant byte lies first if big-endian
     pairs: np.ndarray = np.ndarray((rows, values, 2), np.uint8, flat, 0, (step, 2, 1))
     high = cv2.extractChannel(pairs, 0 if is_bigendian else 1)
@@ -245,21 +225,6 @@ def decode_message(message: Any, least: tuple[int, int] | None = None) -> np.nda
     )
 
 
-def decode_compressed(data: Any) -> np.ndarray:
-    """
-    Decode the bytes of an image file: JPEG, PNG, BMP, TIFF, PNM, WebP.
-
-    Gray, 16 bit and transparent images become RGB uint8 too; a rotation in the EXIF data is
-    applied.
-
-    :param data: the file's bytes: anything with the buffer protocol.
-    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
-    :raises ImageError: not such a file, damaged, cut off, or of more than
-        :data:`stavpr_ros.sources.files.MAX_PIXELS` pixels.
-    """
-    return files.decode_file(flat_bytes(data))
-
-
 def decode_compressed_message(message: Any, least: tuple[int, int] | None = None) -> np.ndarray:
     """
     Decode a ``sensor_msgs/CompressedImage``.
@@ -270,7 +235,7 @@ def decode_compressed_message(message: Any, least: tuple[int, int] | None = None
     :param message: anything with ``format`` and ``data``.
     :param least: see :func:`decode_message`.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
-    :raises ImageError: a depth image, or see :func:`decode_compressed`.
+    :raises ImageError: a depth image, or see :func:`stavpr_ros.sources.files.decode_file`.
     """
     original = message.format.partition(';')[0].strip()
     if 'compresseddepth' in message.format.lower() or _MEASUREMENTS.fullmatch(original):
@@ -280,7 +245,7 @@ def decode_compressed_message(message: Any, least: tuple[int, int] | None = None
             kind='depth',
         )
     try:
-        return files.decode_file(flat_bytes(message.data), _demosaic_of(message.format), least)
+        return files.decode_file(message.data, _demosaic_of(message.format), least)
     except ImageError as error:
         raise ImageError(f'format {message.format!r}: {error}', kind=error.kind) from error
 
@@ -298,14 +263,6 @@ def _demosaic_of(transport: str) -> Callable[[np.ndarray], np.ndarray] | None:
     if layout is None or not compressed or target.strip() not in {'', original.strip()}:
         return None
     return layout.to_rgb
-
-
-def flat_bytes(data: Any) -> np.ndarray:
-    """View any buffer as bytes, shape (size,); an array that is not contiguous is copied."""
-    if isinstance(data, np.ndarray):
-        return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
-    view = memoryview(data)
-    return np.frombuffer(view, np.uint8) if view.nbytes else np.empty(0, np.uint8)
 
 
 def _layout(encoding: str) -> Encoding:

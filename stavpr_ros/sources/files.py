@@ -5,6 +5,7 @@
 from collections.abc import Callable
 from io import BytesIO
 import re
+from typing import Any
 
 import cv2
 import numpy as np
@@ -68,15 +69,26 @@ def reduce(image: np.ndarray, least: tuple[int, int] | None) -> np.ndarray:
     return image
 
 
+def flat_bytes(data: Any) -> np.ndarray:
+    """View any buffer as bytes, shape (size,); an array that is not contiguous is copied."""
+    if isinstance(data, np.ndarray):
+        return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
+    view = memoryview(data)
+    return np.frombuffer(view, np.uint8) if view.nbytes else np.empty(0, np.uint8)
+
+
 def decode_file(
-    flat: np.ndarray,
+    data: Any,
     demosaic: Callable[[np.ndarray], np.ndarray] | None = None,
     least: tuple[int, int] | None = None,
 ) -> np.ndarray:
     """
-    Decode a file.
+    Decode the bytes of an image file: JPEG, PNG, BMP, TIFF, PNM, WebP.
 
-    :param flat: the file's bytes, shape (size,), uint8.
+    Gray, 16 bit and transparent images become RGB uint8 too; a rotation in the EXIF data is
+    applied.
+
+    :param data: the file's bytes: anything with the buffer protocol.
     :param demosaic: converts a gray image (height, width), a Bayer mosaic, to RGB; not called if
         the file has color.
     :param least: rows and columns that are needed of a large image, which is reduced then; None =
@@ -85,6 +97,7 @@ def decode_file(
     :raises ImageError: not such a file, damaged, cut off, or of more than :data:`MAX_PIXELS`
         pixels.
     """
+    flat = flat_bytes(data)
     header = _check_file(flat)
     mode, flag = header.mode, cv2.IMREAD_COLOR
     if header.format in JPEG_FORMATS:

@@ -10,7 +10,7 @@ import re
 
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, SourceError
-from stavpr_ros.sources.encodings import decode_compressed
+from stavpr_ros.sources.files import decode_file
 from stavpr_ros.sources.frame import Frame, ImageRecord
 
 SUFFIXES = frozenset({'.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'})
@@ -106,7 +106,7 @@ def _is_image(file: Path) -> bool:
 
 def _read(file: Path) -> np.ndarray:
     try:
-        return decode_compressed(file.read_bytes())
+        return decode_file(file.read_bytes())
     except OSError as error:
         raise ImageError(
             f'{text_of(file)} cannot be read: {error.strerror}; check its permissions',

@@ -30,7 +30,6 @@ GOLDEN: Array = np.array(
         [0.60, 0.57, 0.45, 0.33, 0.22, 0.37, 0.47],
     ]
 )
-GOLDEN_PATH: Cells = [(0, 0), (1, 0), (2, 0), (3, 1), (4, 2), (5, 3), (6, 4), (6, 5), (6, 6)]
 
 
 @dataclass
@@ -43,13 +42,10 @@ class Grid:
 
 
 class Aligned(NamedTuple):
-    """One warping path from (1, 1) to its end cell, and what it costs."""
+    """One warping path from (1, 1) to its end cell, and its S / C."""
 
     distance: Any
     path: Cells
-    accumulated: Any  # S at the end
-    cost: Any  # C at the end
-    weight: Any
 
 
 class Answer(NamedTuple):
@@ -194,15 +190,15 @@ def restrict(d: Array, xi: int | None) -> Array:
     return banned
 
 
-def adaptive_weight(d: Array, sigma: float, dtype: type) -> tuple[Any, int]:
-    """Return a = sqrt(1 + sigma |I_c - c|) and I_c (0-based) of a restricted d."""
+def adaptive_weight(d: Array, sigma: float, dtype: type) -> Any:
+    """Return a = sqrt(1 + sigma |I_c - c|) of a restricted d."""
     W = d.shape[0]
     c = math.ceil(W / 2) - 1  # c = ceil(W / 2), 1-based
     nearest = 0
     for j in range(W):
         if d[c, j] < d[c, nearest]:  # the first minimum stays
             nearest = j
-    return np.sqrt(dtype(1) + dtype(sigma) * dtype(abs(nearest - c))), nearest
+    return np.sqrt(dtype(1) + dtype(sigma) * dtype(abs(nearest - c)))
 
 
 def align_images(
@@ -211,13 +207,12 @@ def align_images(
     sigma: float = 1.0,
     xi: int | None = None,
     dtype: type = np.float64,
-) -> Aligned:
-    """Align one pair d (W, W) with 'adaptive' or 'vanilla' DTW; the end is (W, W)."""
+) -> Any:
+    """Return S / C of one pair d (W, W) by 'adaptive' or 'vanilla' DTW; the end is (W, W)."""
     d = restrict(d.astype(dtype), xi)
-    a = adaptive_weight(d, sigma, dtype)[0] if strategy == 'adaptive' else dtype(1)
+    a = adaptive_weight(d, sigma, dtype) if strategy == 'adaptive' else dtype(1)
     grid = accumulate(d, a, dtype)
-    S, C = grid.S[-1][-1], grid.C[-1][-1]
-    return Aligned(S / C, trace(grid, d.shape[0] - 1, d.shape[1] - 1), S, C, a)
+    return grid.S[-1][-1] / grid.C[-1][-1]
 
 
 def sliding_window(d: Array, xi: int | None = None, dtype: type = np.float64) -> Any:
@@ -246,7 +241,7 @@ def image_distances(
         if strategy == 'sliding_window':
             result[y] = sliding_window(d[:, :, y], xi, dtype)
         else:
-            result[y] = align_images(d[:, :, y], strategy, sigma, xi, dtype).distance
+            result[y] = align_images(d[:, :, y], strategy, sigma, xi, dtype)
     return result
 
 
@@ -269,7 +264,7 @@ def align_sequence(D: Array, start: int, beta: float, dtype: type = np.float64) 
         if q < best:  # the first minimum stays
             best, m = q, x
     path = [(i, start + j) for i, j in trace(grid, length - 1, m)]
-    return Aligned(best, path, grid.S[-1][m], grid.C[-1][m], dtype(1))
+    return Aligned(best, path)
 
 
 def match_sequence(D: Array, beta: float, dtype: type = np.float64) -> tuple[Array, Array]:
@@ -283,17 +278,12 @@ def match_sequence(D: Array, beta: float, dtype: type = np.float64) -> tuple[Arr
     return q, m
 
 
-def middle(first: int, last: int) -> int:
-    """Midpoint of first..last: floor((first + last) / 2)."""
-    return (first + last) // 2
-
-
 def best_match(q: Array, m: Array, nms_radius: int) -> Answer | None:
     """Return the nearest start (lowest on a tie) and the best one outside its nms_radius."""
     best = _first_minimum(q, range(len(q)))
     if best is None:
         return None
-    middles = [middle(s, s + int(m[s]) - 1) for s in range(len(q))]
+    middles = [(2 * s + int(m[s]) - 1) // 2 for s in range(len(q))]
     others = [s for s in range(len(q)) if abs(middles[s] - middles[best]) > nms_radius]
     second = _first_minimum(q, others)
     return Answer(
@@ -318,7 +308,7 @@ def _first_minimum(q: Array, starts: Any) -> int | None:
 def aligned_index(path: Cells, query_index: int) -> int:
     """Map frame aligned with one query frame; of several the middle one."""
     frames = [j for i, j in path if i == query_index]
-    return middle(min(frames), max(frames))
+    return (min(frames) + max(frames)) // 2
 
 
 # ------------------------------------------------ the filter of mode robust

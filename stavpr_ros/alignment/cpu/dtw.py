@@ -168,31 +168,25 @@ def sliding_window(d, width, xi, out):
 
 
 @kernel
-def accumulate(d, weight, xi, S, C, step):
+def accumulate(d, S, C, step):
     """
-    Fill the whole tables of one pair, for its warping path.
+    Fill the whole tables of one sequence, for its warping path; diagonal steps have a = 1.
 
     :param d: distances, shape (rows, columns).
-    :param weight: the adaptive weight a of a diagonal step.
-    :param xi: half width of the band; at least rows + columns for none.
     :param S, C, step: shape of d, written: accumulated distance, path cost, the step into each
-        cell.
+        cell but the first.
     """
     rows, columns = d.shape
-    S[:] = np.inf
-    C[:] = 1
     for i in range(rows):
         for j in range(columns):
-            if abs(i - j) >= xi:
-                continue
             if i == 0 and j == 0:
-                S[0, 0] = d[0, 0]
+                S[0, 0], C[0, 0] = d[0, 0], 1
                 continue
             vertical = d[i, j] + S[i - 1, j] if i > 0 else math.inf
             horizontal = d[i, j] + S[i, j - 1] if j > 0 else math.inf
-            diagonal = weight * d[i, j] + S[i - 1, j - 1] if i > 0 and j > 0 else math.inf
+            diagonal = d[i, j] + S[i - 1, j - 1] if i > 0 and j > 0 else math.inf
             if diagonal < vertical and diagonal < horizontal:
-                S[i, j], C[i, j], step[i, j] = diagonal, C[i - 1, j - 1] + weight, DIAGONAL
+                S[i, j], C[i, j], step[i, j] = diagonal, C[i - 1, j - 1] + 1, DIAGONAL
             elif i > 0 and (j == 0 or vertical <= horizontal):
                 S[i, j], C[i, j], step[i, j] = vertical, C[i - 1, j] + 1, VERTICAL
             else:
