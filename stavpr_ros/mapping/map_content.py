@@ -55,8 +55,9 @@ def map_content(file: MapFile) -> PlaceMap:
     """
     manifest, sections = file.manifest, file.manifest['sections']
     settings = _settings(manifest['settings'])
+    known = {n for n, one in sections.items() if one['version'] <= KNOWN_SECTIONS.get(n, 0)}
     described = {name: part for name, part in file.parts.items() if name in PARTS}
-    if not _is_known(sections, STATISTICS):
+    if STATISTICS not in known:
         described = {n: part for n, part in described.items() if not n.startswith(STATISTICS)}
     _require_parts(file.parts, sections)
     sizes = _sizes(described, settings)
@@ -80,7 +81,7 @@ def map_content(file: MapFile) -> PlaceMap:
         content = arrays['ids'].tobytes()
         ids = [content[a:b].decode() for a, b in zip([0, *ends], ends, strict=False)]
     features = StoredFeatures(file, torch.from_numpy(weights), settings, cells)
-    if _is_known(sections, STATISTICS):
+    if STATISTICS in known:
         features.statistics = statistics_of(file, arrays)
         features.has_stale_statistics = features.statistics is None
     return PlaceMap(
@@ -92,24 +93,17 @@ def map_content(file: MapFile) -> PlaceMap:
         thumbnails=_thumbnails(file, arrays.get('thumbnail_ends')),
         sessions=tuple(Session(**session) for session in manifest['sessions']),
         session_index=arrays.get('session'),
-        camera=_camera(sections),
+        camera=_camera(sections['intrinsics']['data']) if 'intrinsics' in known else None,
         same_as=arrays.get('same_places/same_as'),
         map_id=file.map_id,
     )
 
 
-def _camera(sections: dict[str, Any]) -> Camera | None:
-    """Return the camera of section intrinsics, None without one that is known."""
-    if not _is_known(sections, 'intrinsics'):
-        return None
-    data = sections['intrinsics']['data']
+def _camera(data: Any) -> Camera:
+    """Return the camera of section intrinsics."""
     INTRINSICS(data, 'section intrinsics')
-    return Camera.from_json(data)
-
-
-def _is_known(sections: dict[str, Any], name: str) -> bool:
-    """Return whether a map has a section, and this program knows its version."""
-    return name in sections and sections[name]['version'] <= KNOWN_SECTIONS.get(name, 0)
+    values: dict[str, Any] = {k: tuple(v) if type(v) is list else v for k, v in data.items()}
+    return Camera(**values)
 
 
 def _settings(content: dict[str, Any]) -> FeatureSettings:

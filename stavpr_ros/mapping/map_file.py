@@ -58,7 +58,7 @@ def save_map(
 def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str, Any]:
     data: dict[str, Any] = {}
     if place_map.camera is not None:
-        data['intrinsics'] = place_map.camera.to_json()
+        data['intrinsics'] = asdict(place_map.camera)
     if place_map.same_as is not None:
         data['same_places'] = None
     if place_map.features.vectors is not None:
