@@ -162,19 +162,6 @@ def test_unknown_section_is_ignored_unless_it_is_required(saved, example, requir
 # ------------------------------------------------------------------------------------- the file
 
 
-def test_save_map_that_fails_keeps_old_file(example, saved, monkeypatch):
-    before = saved.read_bytes()
-
-    def full_disk(*_):
-        raise OSError(28, 'No space left on device')
-
-    monkeypatch.setattr(os, 'fsync', full_disk)
-    with pytest.raises(OutputError, match='untouched'):
-        save_map(example, saved, force=True)
-    assert saved.read_bytes() == before
-    assert [path.name for path in saved.parent.iterdir()] == [saved.name]
-
-
 def test_what_could_not_be_read_again_is_not_saved(example, tmp_path):
     for change, text in (
         ({'thumbnails': (b'no image',) * 24}, 'thumbnail of place 0'),
