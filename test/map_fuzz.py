@@ -3,8 +3,8 @@
 """
 Damaged and hand-made map files: each is rejected by our own error, or loads and works.
 
-A few hundred are part of the tests; ``python3 test/map_fuzz.py MUTATED HAND_MADE`` tries many,
-and prints the longest time and the most memory that one took.
+A few hundred are part of the tests; ``python3 test/map_fuzz.py MUTATED HAND_MADE``, with
+test/shared on PYTHONPATH, tries many, and prints the longest time and the most memory of one.
 """
 
 from collections.abc import Callable, Iterator

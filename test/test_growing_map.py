@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The growing map: places added and evicted, memory that doubles, errors without effect."""
+"""The growing map: places added and evicted, errors without effect."""
 
 import dataclasses
 
@@ -67,18 +67,8 @@ def assert_holds(made, numbers):
         assert made.thumbnails[place] == (b'' if i % 2 else thumbnail(i))
 
 
-def test_growing_map_memory_doubles_up_to_limit():
-    made, rooms = GrowingMap(EXTRACTOR.settings, None, 18), []
-    for i in range(18):
-        rooms.append(made.memory)
-        assert add(made, i) == i
-    place = W * (D + 1) * 4 + 8 + 7 * 8
-    texts = [
-        sum(len(f'place {j}') + len(thumbnail(j)) * (j % 2 == 0) for j in range(i))
-        for i in range(18)
-    ]
-    places = [(room - text) / place for room, text in zip(rooms, texts, strict=True)]
-    assert places == [0, *[4] * 4, *[8] * 4, *[16] * 8, 18]
+def test_growing_map_at_its_limit_is_full():
+    made = grown(18, 18)
     with pytest.raises(InputError, match=r'full, it has 18 places: raise its limit, evict'):
         add(made, 18)
     assert_holds(made, range(18))
@@ -129,15 +119,9 @@ def test_from_map_keeps_all_parts_up_to_its_limit(small_map):
     np.testing.assert_array_equal(snapshot.poses, small_map.poses)
     with pytest.raises(InputError, match='60 places does not fit into a limit of 59'):
         GrowingMap.from_map(small_map, 59)
-
-
-def test_from_map_without_extras_continues(small_map):
-    plain = dataclasses.replace(small_map, poses=None, thumbnails=())
-    made = GrowingMap.from_map(plain, 100)
-    assert np.isnan(made.poses).all()
-    assert made.snapshot().thumbnails == ()
-    made.add(small_map.features[0:1], thumbnail=b'x')
-    assert made.thumbnails == [*[b''] * 60, b'x']
+    plain = GrowingMap.from_map(dataclasses.replace(small_map, poses=None, thumbnails=()), 60)
+    assert plain.snapshot().poses is None
+    assert plain.thumbnails == [b''] * 60
 
 
 def test_forget_of_more_places_than_there_are_is_rejected():
@@ -189,16 +173,11 @@ def test_add_with_error_changes_nothing(count, arguments, error, words):
     with pytest.raises(error, match=words):
         made.add(*arguments)
     if count:
+        with pytest.raises(InputError, match='6 dimensions: the map has 14'):
+            made.add(features(2, d=6))
         assert_holds(made, range(count))
     assert add(made, count) == count
     assert_holds(made, range(count + 1))
-
-
-def test_add_of_other_dimension_is_rejected():
-    made = grown(2)
-    with pytest.raises(InputError, match='6 dimensions: the map has 14'):
-        made.add(features(2, d=6))
-    assert_holds(made, range(2))
 
 
 def test_growing_map_with_wrong_settings_is_rejected(small_map):

@@ -76,22 +76,6 @@ def test_selector_distance_or_angle_suffices():
     assert 'm of' not in selector(where=pose(), angle=10).too_soon(0, pose(5, 9))
 
 
-def test_selector_motion_without_pose_rejects():
-    for made in (KeyframeSelector(KeyframeSettings(angle=5)), selector(where=pose(), distance=1)):
-        assert 'no odometry' in made.too_soon(20 * SECOND, None)
-    # the rule came on after the last keyframe, of which no pose is known
-    assert selector(distance=1).too_soon(20 * SECOND, pose()) == ''
-
-
-def test_selector_change_by_hand(route):
-    made = selector(image=route[0], change=0.1)
-    assert 'differs by 0.0000 from the last keyframe: less than 0.1' in made.too_alike(route[0])
-    assert made.too_alike(route[9]) == ''
-    made.accept(0, None, route[9])
-    assert made.too_alike(route[9])
-    assert made.too_alike(route[0]) == ''
-
-
 def test_selector_with_new_settings_keeps_keyframe(route):
     """The last keyframe is kept, with the values that only later rules need."""
     made = selector(where=pose(), image=route[0])
@@ -99,7 +83,8 @@ def test_selector_with_new_settings_keeps_keyframe(route):
         made.settings = KeyframeSettings(**rules)
         assert made.too_soon(10 * SECOND, pose())
     made.settings = KeyframeSettings(change=0.1)
-    assert made.too_alike(route[0])
+    reason = made.too_alike(route[0])
+    assert 'differs by 0.0000 from the last keyframe: less than 0.1' in reason
     made.reset()
     assert made.too_alike(route[0]) == ''
     made.settings = KeyframeSettings(interval=1, distance=1)
@@ -115,14 +100,6 @@ def test_selector_with_invalid_pose_changes_nothing():
         with pytest.raises(InputError):
             call(np.full(7, np.nan))
     assert made.too_soon(1, pose(0.5))
-
-
-def test_selector_copies_its_input(route):
-    where, image = pose(), route[0].copy()
-    made = selector(where=where, image=image, distance=1, change=0.1)
-    where[0], image[:] = 50, route[9]
-    assert made.too_soon(0, pose(0.5))
-    assert made.too_alike(route[0])
 
 
 STEPS = st.tuples(
@@ -174,13 +151,6 @@ def test_selector_equals_plain_loop(steps, rules):
 
 
 # ------------------------------------------------------------------------------------------ views
-
-
-def test_small_gray_of_red_image():
-    image = np.full((480, 640, 3), (255, 0, 0), np.uint8)
-    small = small_gray(image)
-    assert (small.shape, small.dtype) == ((24, 32), np.float32)
-    np.testing.assert_allclose(small, 76, atol=1)  # 0.299 of red
 
 
 def test_image_change_by_hand():

@@ -8,12 +8,7 @@ import threading
 import cv2
 import numpy as np
 import pytest
-from stavpr_ros.errors import (
-    FeatureMismatchError,
-    ImageError,
-    InputError,
-    SettingsError,
-)
+from stavpr_ros.errors import ImageError, InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import (
     build_map,
@@ -24,27 +19,6 @@ from stavpr_ros.mapping import (
 from stavpr_ros.sources.frame import Frame
 
 SECOND = 10**9
-
-
-def test_recognizer_with_other_features_rejects_them(small_map, route):
-    from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-
-    recognizer = PlaceRecognizer(small_map, RecognizerSettings(threshold=1.0))
-    for other in (
-        FeatureExtractor(projection=64, seed=1),
-        FeatureExtractor(),
-        FeatureExtractor(projection=64, strips=6),
-    ):
-        with pytest.raises(FeatureMismatchError) as caught:
-            recognizer.update(other.extract(route[:1]))
-        assert small_map.settings.to_json() in str(caught.value)
-        assert other.settings.to_json() in str(caught.value)
-    assert recognizer.window_fill == 0
-
-
-def test_build_map_of_no_images_fails():
-    with pytest.raises(InputError, match='no images'):
-        build_map([], FeatureExtractor(), progress=False)
 
 
 @pytest.mark.parametrize('value', [np.nan, np.inf])
@@ -102,6 +76,8 @@ def test_build_map_with_wrong_poses_fails(route):
         poses[7] = bad
         with pytest.raises(InputError, match=r"image 7 '7': pose \[1.0, 2.0"):
             build_map(frames, extractor, poses, progress=False)
+    with pytest.raises(InputError, match='no images'):
+        build_map([], extractor, progress=False)
     with pytest.raises(SettingsError, match='without poses'):
         build_map(frames, extractor, progress=False, keyframes=KeyframeSettings(angle=1))
     nowhere = Trajectory()
@@ -117,11 +93,8 @@ def test_build_map_scales_thumbnails(route):
     built = build_map(traverse([image]), FeatureExtractor(), progress=False, thumbnail_width=320)
     assert built.thumbnail(0).shape == (240, 320, 3)
     assert built.thumbnails[0] == encode_thumbnail(image, 320)
-    assert build_map(traverse([image]), FeatureExtractor(), progress=False).thumbnail(0).shape == (
-        144,
-        192,
-        3,
-    )
+    narrow = build_map(traverse([image]), FeatureExtractor(), progress=False)
+    assert narrow.thumbnail(0).shape == (144, 192, 3)
     with pytest.raises(SettingsError, match='width 0'):
         build_map(traverse([image]), FeatureExtractor(), progress=False, thumbnail_width=0)
 

@@ -17,17 +17,15 @@ from pipelines import (
     MIN_PROBABILITY,
     process,
     recorded,
-    save,
     SECOND,
     settings_of,
     stamps_of,
     statuses,
 )
 import pytest
-from stavpr_ros.alignment import SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.mapping import save_map
 from stavpr_ros.pipeline import OPERATIONS, Pipeline, read_map
 from stavpr_ros.recognition import PlaceRecognizer, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
@@ -106,19 +104,6 @@ def test_mapping_stops_at_max_places(route):
     assert statuses(matches) == [Status.MAPPED] * 100 + [Status.NOT_READY] * 3
     assert matches[-1].cause == 'map full'
     assert (pipeline.map_state, stamps_of(pipeline.places)) == ('full', list(range(1, 101)))
-
-
-def test_mapping_extends_a_map(map_file, small_map, route, tmp_path):
-    pipeline = Pipeline(settings_of(), 'mapping')
-    pipeline.change(loaded=read_map(map_file, pipeline.settings))
-    (match,) = process(pipeline, route[:1], first=60)
-    assert (match.status, match.image_index) == (Status.MAPPED, 60)
-    save(pipeline, tmp_path / 'extended.stavpr')
-    places = load_map(tmp_path / 'extended.stavpr')
-    assert stamps_of(places) == list(range(1, 62))
-    assert places.ids[:60] == small_map.ids
-    strips = places.features.strips[:, :60]
-    torch.testing.assert_close(strips, small_map.features.strips, atol=0, rtol=0)
 
 
 @pytest.mark.parametrize('exclude_seconds', [0.0, 30.0])
@@ -271,44 +256,19 @@ def test_change_of_operation_that_fails_changes_nothing(map_file, route):
     pipeline = localizing(map_file, max_places=50)  # less than the map: it cannot be extended
     process(pipeline, route[:LENGTH])
     places = pipeline.places
-    for name, error, words in (
-        ('teleport', SettingsError, 'localization, mapping, loop_closure'),
-        ('mapping', InputError, 'a map of 60 places does not fit'),
+    loaded = read_map(map_file, pipeline.settings)
+    for name, places_of, error, words in (
+        ('teleport', None, SettingsError, 'localization, mapping, loop_closure'),
+        ('mapping', None, InputError, 'a map of 60 places does not fit'),
+        ('mapping', loaded, InputError, 'a map of 60 places does not fit'),
     ):
         with pytest.raises(error, match=words):
-            pipeline.change(replace(pipeline.settings, min_probability=0.9), name)
+            pipeline.change(replace(pipeline.settings, min_probability=0.9), name, places_of)
         assert (pipeline.operation, pipeline.places) == ('localization', places)
         assert (pipeline.window_fill, pipeline.threshold) == (LENGTH, 1 - MIN_PROBABILITY)
     assert process(pipeline, route[5:6], first=5)[0].newest_index == 5
     pipeline.change(operation='localization')  # the current one: the window stays
     assert process(pipeline, route[6:7], first=6)[0].newest_index == 6
-
-
-@pytest.mark.parametrize('operation', OPERATIONS)
-def test_change_to_a_map_that_does_not_fit_changes_nothing(
-    operation, small_map, map_file, route, tmp_path
-):
-    """More places than max_places (mapping); three strips with xi = 5 (the others)."""
-    pipeline = recorded(route, spatial=SpatialSettings(xi=5), max_places=50)
-    path = map_file
-    if operation != 'mapping':
-        pipeline.change(operation=operation)
-        path = str(tmp_path / 'bad.stavpr')
-        features = FeatureExtractor(strips=3).extract(route)
-        save_map(replace(small_map, features=features, projection=None), path)
-    if operation == 'localization':
-        process(pipeline, route[:LENGTH])
-
-    def state():
-        places = pipeline.places
-        return places, len(places), pipeline.extractor, pipeline.window_fill, pipeline.path
-
-    before, loaded = state(), read_map(path, pipeline.settings)
-    with pytest.raises((InputError, SettingsError)):
-        pipeline.change(loaded=loaded)
-    assert state() == before
-    expected = dict(zip(OPERATIONS, ('MATCH', 'MAPPED', 'WARMING_UP'), strict=True))
-    assert process(pipeline, route[5:6], first=5)[0].status.name == expected[operation]
 
 
 def test_loop_closure_takes_the_kind_of_features_of_the_map(map_file, route):

@@ -52,19 +52,6 @@ def test_min_probability_and_candidates_change_with_a_full_window(operation, rou
     assert pipeline.process(message(route[9]), 10, list_candidates=False).candidates == ()
 
 
-def test_live_settings_keep_a_growing_map_and_the_last_keyframe(route):
-    """In mode paper without a threshold, which mapping does not need."""
-    settings = settings_of(mode='paper', keyframes=KeyframeSettings(change=0.01))
-    pipeline = Pipeline(settings, 'mapping')
-    process(pipeline, route[:3])
-    growing = pipeline.places
-    for threshold in (None, 0.2, 0.3, None):
-        pipeline.change(replace(pipeline.settings, threshold=threshold, candidates=3))
-        assert pipeline.places is growing
-        assert statuses(process(pipeline, route[2:3], first=2)) == [Status.SKIPPED]
-    assert pipeline.unsaved == len(growing) == 3
-
-
 def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
     pipeline = localizing(map_file, keyframes=KeyframeSettings(change=0.01))
     matches = process(pipeline, [route[0]] * 3 + route[1:LENGTH], poses=True)

@@ -151,20 +151,3 @@ def test_mark_saved_in_any_order_counts_the_places_of_each_snapshot(mapping, rou
     for snapshot in reversed(snapshots):
         snapshot.mark_saved(path)
     assert mapping.unsaved == 1
-
-
-def test_save_recorded_map_beside_one_saved_by_another_node_takes_a_numbered_name(
-    small_map, route, tmp_path
-):
-    """Two nodes have loaded one map, extend it, and end: both save to its file."""
-    path = str(tmp_path / 'route.stavpr')
-    save_map(small_map, path)
-    first, second = nodes = [Pipeline(settings_of(), 'mapping') for _ in range(2)]
-    for node, images in zip(nodes, (route[:2], route[:3]), strict=True):
-        node.change(loaded=read_map(path, node.settings))
-        process(node, images)
-    assert at_the_end(first, path)[-1][1] == f'62 places written to {path}'
-    assert at_the_end(second, path)[-1][1].endswith(
-        '63 places written to ' + path[:-7] + '-2.stavpr'
-    )
-    assert (len(load_map(path)), len(load_map(tmp_path / 'route-2.stavpr'))) == (62, 63)

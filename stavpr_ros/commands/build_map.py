@@ -23,11 +23,17 @@ from stavpr_ros.output_file import MAP, require_replaceable
 
 if TYPE_CHECKING:
     import numpy as np
-    from stavpr_ros.mapping import KeyframeSettings, PlaceMap, Trajectory
+    from stavpr_ros.mapping import PlaceMap, Trajectory
     from stavpr_ros.sources.bag import BagSource
     from stavpr_ros.sources.folder import FolderSource
     from stavpr_ros.sources.frame import Frame
 
+RULES = {  # fields of KeyframeSettings
+    'interval': ('S', 'seconds since the last place; for bags'),
+    'distance': ('M', 'meters from the last place; needs --odometry or --poses'),
+    'angle': ('DEG', 'degrees from the last place; needs --odometry or --poses'),
+    'change': ('C', 'change of the image, 0 to 2; a standing camera stays below 0.004'),
+}
 MOST_SUGGESTED = 20_000  # places of a map that a threshold of mode paper is suggested for
 
 EPILOG = """
@@ -109,12 +115,7 @@ def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
         'Only images that differ enough from the last place become places. All rules must be met; '
         'distance and angle are one rule, met by either. 0: off.',
     )
-    for name, metavar, text in (
-        ('interval', 'S', 'seconds since the last place; for bags'),
-        ('distance', 'M', 'meters from the last place; needs --odometry or --poses'),
-        ('angle', 'DEG', 'degrees from the last place; needs --odometry or --poses'),
-        ('change', 'C', 'change of the image, 0 to 2; a standing camera stays below 0.004'),
-    ):
+    for name, (metavar, text) in RULES.items():
         group.add_argument(
             f'--keyframe-{name}', type=float, default=0.0, metavar=metavar, help=text
         )
@@ -165,17 +166,6 @@ def _check(arguments: argparse.Namespace) -> None:
     require_replaceable(arguments.output, MAP, arguments.force)
 
 
-def _keyframes(arguments: argparse.Namespace) -> 'KeyframeSettings':
-    from stavpr_ros.mapping import KeyframeSettings
-
-    return KeyframeSettings(
-        arguments.keyframe_interval,
-        arguments.keyframe_distance,
-        arguments.keyframe_angle,
-        arguments.keyframe_change,
-    )
-
-
 def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajectory | None':
     """Read the poses of all images of the source, or the odometry."""
     from stavpr_ros.mapping import Trajectory
@@ -201,6 +191,7 @@ def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajecto
 def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     """Return the map, and the journal that it is in."""
     from stavpr_ros.commands.feature_options import make_extractor, principal_dimension
+    from stavpr_ros.mapping import KeyframeSettings
     from stavpr_ros.mapping.builder import build_journal
     from stavpr_ros.mapping.journal_map import journal_map
     from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
@@ -214,7 +205,8 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
         print(f'skipped: {error}', file=sys.stderr)
 
     _check(arguments)
-    keyframes, projection = _keyframes(arguments), arguments.projection
+    keyframes = KeyframeSettings(*(getattr(arguments, f'keyframe_{rule}') for rule in RULES))
+    projection = arguments.projection
     learned = isinstance(projection, str)
     plain = argparse.Namespace(**vars(arguments) | ({'projection': None} if learned else {}))
     extractor = make_extractor(plain)
@@ -256,9 +248,8 @@ def _build_of_descriptors(arguments: argparse.Namespace) -> 'PlaceMap':
 
     require_replaceable(arguments.output, MAP, arguments.force)
     require_descriptors_alone(arguments, arguments.input)
-    images = ('topic', 'odometry', 'thumbnail_width', 'skip_bad_images')
-    keyframes = tuple(f'keyframe_{rule}' for rule in ('interval', 'distance', 'angle', 'change'))
-    for name in (*images, *keyframes):
+    keyframes = (f'keyframe_{rule}' for rule in RULES)
+    for name in ('topic', 'odometry', 'thumbnail_width', 'skip_bad_images', *keyframes):
         if getattr(arguments, name):
             raise SettingsError(
                 f'--{name.replace("_", "-")}: {arguments.input} holds descriptors, not images; '

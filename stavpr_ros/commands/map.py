@@ -42,35 +42,38 @@ def _parser() -> argparse.ArgumentParser:
     )
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
 
-    def add(name: str, text: str, *files: str, output: bool = False) -> argparse.ArgumentParser:
+    def add(
+        name: str, work: Callable[..., int | None], text: str, *files: str, force: str = ''
+    ) -> argparse.ArgumentParser:
         action = actions.add_parser(name, help=text, description=text)
+        action.set_defaults(work=work)
         for file in files:
             action.add_argument(file, metavar=file.upper())
-        if output:
-            action.add_argument(
-                '--force', action='store_true', help='replace an existing output file'
-            )
+        if force:
+            action.add_argument('--force', action='store_true', help=force)
         return action
 
-    action = add('info', 'Show what a map holds.', 'map')
+    def add_storage(action: argparse.ArgumentParser, default: str, text: str) -> None:
+        storages = ('float32', 'float16')
+        action.add_argument('--storage', choices=storages, default=default, help=text)
+
+    force = 'replace an existing output file'
+    halves = 'of the features; float16 halves the file (as it is; float32 for a merged map)'
+    action = add('info', _info, 'Show what a map holds.', 'map', force='replace an existing plot')
     action.add_argument(
         '--plot',
         metavar='PNG',
         help='also draw the route with its poses, thumbnails, and the distances of places to '
         'each other',
     )
-    action.add_argument('--force', action='store_true', help='replace an existing plot')
-    action = add('verify', 'Compare all of a map with its hashes, and check every value.')
+    action = add('verify', _verify, 'Compare all of a map with its hashes, and check every value.')
     action.add_argument('maps', nargs='+', metavar='MAP')
-    action = add('convert', 'Write a map in the present format.', 'map', 'output', output=True)
-    _add_storage(action)
-    action = add('compact', 'Write a map in less memory.', 'map', 'output', output=True)
-    action.add_argument(
-        '--storage',
-        choices=('float32', 'float16'),
-        default='float16',
-        help='of the features; float16 is half of float32 (%(default)s)',
-    )
+    text = 'Write a map in the present format.'
+    add_storage(add('convert', _convert, text, 'map', 'output', force=force), '', halves)
+    text = 'Write a map in less memory.'
+    action = add('compact', _compact, text, 'map', 'output', force=force)
+    text = 'of the features; float16 is half of float32 (%(default)s)'
+    add_storage(action, 'float16', text)
     action.add_argument(
         '--pca',
         type=int,
@@ -93,9 +96,9 @@ def _parser() -> argparse.ArgumentParser:
         action='store_true',
         help='also as precision int8 holds them, for its fastest start; of 1,000 places or more',
     )
-    add('export', 'Write the arrays of a map for NumPy.', 'map', 'output', output=True)
-    action = add('merge', 'Make one map of several: each is a session of it.', output=True)
-    action.add_argument('output', metavar='OUTPUT')
+    add('export', _export, 'Write the arrays of a map for NumPy.', 'map', 'output', force=force)
+    text = 'Make one map of several: each is a session of it.'
+    action = add('merge', _merge, text, 'output', force=force)
     action.add_argument('maps', nargs='+', metavar='MAP')
     action.add_argument(
         '--align',
@@ -109,33 +112,22 @@ def _parser() -> argparse.ArgumentParser:
         help='do not look for places that several sessions show; it takes the time of driving '
         'each session once on a map of those before it',
     )
-    _add_storage(action)
-    action = add(
-        'sessions', 'Write some sessions of a map to another map.', 'map', 'output', output=True
-    )
+    add_storage(action, '', halves)
+    text = 'Write some sessions of a map to another map.'
+    action = add('sessions', _sessions, text, 'map', 'output', force=force)
     chosen = action.add_mutually_exclusive_group(required=True)
     chosen.add_argument('--keep', metavar='ID', help='only the places of this session')
     chosen.add_argument('--remove', metavar='ID', help='all places but those of this session')
-    action = add('upload', 'Write a map to the home of a fleet, docs/fleet.md.', 'map')
+    text = 'Write a map to the home of a fleet, docs/fleet.md.'
+    action = add('upload', _upload, text, 'map', force='replace what is there')
     action.add_argument(
         'address',
         metavar='ADDRESS',
         help='faiss:FILE, qdrant:FOLDER, or qdrant://HOST:PORT/COLLECTION',
     )
-    action.add_argument('--force', action='store_true', help='replace what is there')
-    map_recover.add_arguments(
-        add('recover', 'Make a map of the journal of an interrupted recording.')
-    )
+    text = 'Make a map of the journal of an interrupted recording.'
+    map_recover.add_arguments(add('recover', _recover, text))
     return parser
-
-
-def _add_storage(action: argparse.ArgumentParser) -> None:
-    action.add_argument(
-        '--storage',
-        choices=('float32', 'float16'),
-        default='',
-        help='of the features; float16 halves the file (as it is; float32 for a merged map)',
-    )
 
 
 def _info(arguments: argparse.Namespace) -> None:
@@ -224,24 +216,27 @@ def _verify(arguments: argparse.Namespace) -> int:
     return 1 if bad else 0
 
 
-def _convert(arguments: argparse.Namespace) -> None:
+def _verified(path: str) -> 'PlaceMap':
+    """Open a map, and compare all of it with its hashes."""
     from stavpr_ros.mapping import open_map, verify_map
 
-    place_map = open_map(arguments.map)
+    place_map = open_map(path)
     verify_map(place_map)
-    _write(place_map, arguments)
+    return place_map
+
+
+def _convert(arguments: argparse.Namespace) -> None:
+    _write(_verified(arguments.map), arguments)
 
 
 def _compact(arguments: argparse.Namespace) -> None:
     from dataclasses import replace
 
-    from stavpr_ros.mapping import open_map, verify_map
     from stavpr_ros.mapping.reduction import with_principal_components
     from stavpr_ros.mapping.stored_features import StoredFeatures
     from stavpr_ros.recognition.near_duplicates import without_duplicates
 
-    place_map = open_map(arguments.map)
-    verify_map(place_map)
+    place_map = _verified(arguments.map)
     assert isinstance(place_map.features, StoredFeatures)
     stored, n = place_map.features.storage, len(place_map)
     if arguments.drop_duplicates:
@@ -260,12 +255,10 @@ def _compact(arguments: argparse.Namespace) -> None:
 
 
 def _merge(arguments: argparse.Namespace) -> None:
-    from stavpr_ros.mapping import merge_maps, open_map, verify_map
+    from stavpr_ros.mapping import merge_maps
     from stavpr_ros.recognition.same_places import with_same_places
 
-    maps = [open_map(path) for path in arguments.maps]
-    for place_map in maps:
-        verify_map(place_map)
+    maps = [_verified(path) for path in arguments.maps]
     if arguments.align:
         align = _tool('align')
         maps[1:] = [align(place_map, maps[0]) for place_map in maps[1:]]
@@ -276,10 +269,9 @@ def _merge(arguments: argparse.Namespace) -> None:
 
 
 def _sessions(arguments: argparse.Namespace) -> None:
-    from stavpr_ros.mapping import open_map, select_session, verify_map
+    from stavpr_ros.mapping import select_session
 
-    place_map, keep = open_map(arguments.map), arguments.keep is not None
-    verify_map(place_map)
+    place_map, keep = _verified(arguments.map), arguments.keep is not None
     _write(select_session(place_map, arguments.keep or arguments.remove, keep), arguments)
 
 
@@ -323,12 +315,10 @@ def _recover(arguments: argparse.Namespace) -> int:
 
 
 def _upload(arguments: argparse.Namespace) -> None:
-    from stavpr_ros.mapping import open_map, verify_map
     from stavpr_ros.mapping.stores import store_of
 
     store = store_of(arguments.address)
-    place_map = open_map(arguments.map)
-    verify_map(place_map)
+    place_map = _verified(arguments.map)
     store.upload(place_map, arguments.address, arguments.force)
     print(f'{arguments.address}: {len(place_map)} places')
 
@@ -353,12 +343,8 @@ def main(args: list[str] | None = None) -> int:
     def work() -> int | None:
         arguments = _parser().parse_args(args)
         _check_output(arguments)
-        actions = {
-            'info': _info, 'verify': _verify, 'convert': _convert, 'export': _export,
-            'compact': _compact, 'merge': _merge, 'sessions': _sessions, 'recover': _recover,
-            'upload': _upload,
-        }  # fmt: skip
-        return actions[arguments.action](arguments)
+        exit_code: int | None = arguments.work(arguments)
+        return exit_code
 
     return run_program('map', work)
 

@@ -30,11 +30,12 @@ BATCH = 16  # images extracted at a time
 
 
 class _Place(NamedTuple):
-    """An image that becomes a place, its number in the source, and its pose if that is known."""
+    """An image that becomes a place, and its number in the source."""
 
     number: int
-    frame: Frame
-    pose: np.ndarray | None
+    image: np.ndarray
+    known: Place
+    thumbnail: bytes
 
 
 def extract_features(
@@ -74,24 +75,21 @@ def build_map(
     :raises InputError: no images, no places, or poses that do not fit.
     :raises SettingsError: a rule of motion without poses.
     """
-    work = _Work(extractor, poses, keyframes, thumbnails, thumbnail_width)
     features: list[LocalFeatures] = []
-    found: list[tuple[int, str, np.ndarray | None, bytes]] = []
-    with closing(_extracted(frames, work, progress)) as batches:
+    found: list[tuple[Place, bytes]] = []
+    options = keyframes, thumbnail_width if thumbnails else None
+    with closing(_extracted(frames, extractor, poses, *options, progress)) as batches:
         for batch, extracted in batches:
             features.append(extracted)
-            for place in batch:
-                frame = place.frame
-                found.append(
-                    (frame.stamp, plain_text(frame.identifier), place.pose, work.thumbnail(place))
-                )
-    stamps, ids, known, encoded = zip(*found, strict=True)
+            found += [(place.known, place.thumbnail) for place in batch]
+    places, encoded = zip(*found, strict=True)
+    rows = np.array([np.full(7, np.nan) if each.pose is None else each.pose for each in places])
     return PlaceMap(
         features=LocalFeatures.concatenate(features).to('cpu'),
         projection=extractor.projection,
-        stamps=np.array(stamps, np.int64),
-        ids=ids,
-        poses=_rows(known),
+        stamps=np.array([each.stamp for each in places], np.int64),
+        ids=tuple(each.identifier for each in places),
+        poses=None if np.isnan(rows).all() else rows,
         thumbnails=encoded if thumbnails else (),
     )
 
@@ -118,10 +116,10 @@ def build_journal(
     :returns: the journal, complete.
     :raises JournalError: the journal is of another work, in use, or cannot be written.
     """
-    work = _Work(extractor, poses, keyframes, thumbnails, thumbnail_width)
     writer, last = _resumed(Path(f'{target}{SUFFIX}'), extractor, source)
+    options = keyframes, thumbnail_width if thumbnails else None
     try:
-        with closing(_extracted(frames, work, progress, last)) as batches:
+        with closing(_extracted(frames, extractor, poses, *options, progress, last)) as batches:
             for batch, extracted in batches:
                 features = extracted.to('cpu')
                 if writer is None:
@@ -129,10 +127,8 @@ def build_journal(
                         features[:1], extractor.projection, np.zeros(1, np.int64), ('',)
                     )
                     writer = JournalWriter.create(target, Base(), template, _ignore, source)
-                for i, place in enumerate(batch):
-                    writer.append(
-                        _journal_place(place, features[i : i + 1], work.thumbnail(place))
-                    )
+                for i, (number, _, known, thumbnail) in enumerate(batch):
+                    writer.append(JournalPlace.of(number, known, features[i : i + 1], thumbnail))
                 if writer.failed:
                     raise JournalError(
                         f'{writer.path} cannot be written: make room, and run the same again: it '
@@ -165,47 +161,30 @@ def _ignore(error: str) -> None:
     """Leave an error of the journal to :func:`build_journal`."""
 
 
-def _journal_place(place: _Place, features: LocalFeatures, thumbnail: bytes) -> JournalPlace:
-    known = Place(place.frame.stamp, plain_text(place.frame.identifier), place.pose)
-    return JournalPlace.of(place.number, known, features, thumbnail)
-
-
-class _Work:
+def _extracted(
+    frames: Iterable[Frame],
+    extractor: FeatureExtractor,
+    poses: np.ndarray | Trajectory | None,
+    keyframes: KeyframeSettings | None,
+    thumbnail_width: int | None,
+    progress: bool,
+    last: int = -1,
+) -> Generator[tuple[list[_Place], LocalFeatures], None, None]:
     """
-    What becomes a place, and what is kept of it; see :func:`build_map`.
+    Yield batches of places behind the image of number ``last``, with their features.
 
+    :param thumbnail_width: None = no thumbnails.
     :raises SettingsError: a rule of motion without poses, or no width of thumbnails.
     """
-
-    def __init__(
-        self,
-        extractor: FeatureExtractor,
-        poses: np.ndarray | Trajectory | None,
-        keyframes: KeyframeSettings | None,
-        thumbnails: bool,
-        thumbnail_width: int,
-    ) -> None:
-        self.extractor, self.poses = extractor, poses
-        self.keyframes = keyframes or KeyframeSettings()
-        if self.keyframes.needs_poses and poses is None:
-            raise SettingsError(
-                'keyframe distance or angle without poses: give poses, or leave them out'
-            )
-        if thumbnail_width < 1:
-            raise SettingsError(f'thumbnail width {thumbnail_width} must be at least 1 pixel')
-        self._width = thumbnail_width if thumbnails else 0
-
-    def thumbnail(self, place: _Place) -> bytes:
-        """Return the thumbnail of a place; empty without thumbnails."""
-        return encode_thumbnail(place.frame.image, self._width) if self._width else b''
-
-
-def _extracted(
-    frames: Iterable[Frame], work: _Work, progress: bool, last: int = -1
-) -> Generator[tuple[list[_Place], LocalFeatures], None, None]:
-    """Yield batches of places behind the image of number ``last``, with their features."""
-    places = _places(frames, work.poses, work.keyframes, last)
+    selector = KeyframeSelector(keyframes or KeyframeSettings())
+    if selector.settings.needs_poses and poses is None:
+        raise SettingsError(
+            'keyframe distance or angle without poses: give poses, or leave them out'
+        )
+    if thumbnail_width is not None and thumbnail_width < 1:
+        raise SettingsError(f'thumbnail width {thumbnail_width} must be at least 1 pixel')
     total = len(frames) if isinstance(frames, Sized) else None
+    places = _places(_with_poses(frames, poses), selector, thumbnail_width, last)
     with (
         closing(_batches_ahead(places)) as batches,
         tqdm(
@@ -213,7 +192,7 @@ def _extracted(
         ) as bar,
     ):
         for batch in batches:
-            yield batch, work.extractor.extract([place.frame.image for place in batch])
+            yield batch, extractor.extract([place.image for place in batch])
             bar.update(batch[-1].number + 1 - bar.n)
 
 
@@ -235,27 +214,28 @@ def _batches_ahead(places: Generator[_Place, None, None]) -> Generator[list[_Pla
 
 
 def _places(
-    frames: Iterable[Frame],
-    poses: np.ndarray | Trajectory | None,
-    keyframes: KeyframeSettings,
+    frames: Iterable[tuple[Frame, np.ndarray | None]],
+    selector: KeyframeSelector,
+    thumbnail_width: int | None,
     last: int,
 ) -> Generator[_Place, None, None]:
     """Choose the images that become places, behind the last place of an earlier run, -1 = none."""
-    selector = KeyframeSelector(keyframes)
     images, places, reason = 0, int(last >= 0), ''
-    for number, (frame, pose) in enumerate(_with_poses(frames, poses)):
+    for number, (frame, pose) in enumerate(frames):
         images += 1
-        if number <= last:
-            if number == last and keyframes.any:
-                selector.accept(frame.stamp, pose, frame.image)
+        if number < last:
             continue
-        reason = selector.too_soon(frame.stamp, pose) or selector.too_alike(frame.image)
-        if reason:
-            continue
-        if keyframes.any:
+        if number > last:
+            reason = selector.too_soon(frame.stamp, pose) or selector.too_alike(frame.image)
+            if reason:
+                continue
+        if selector.settings.any:
             selector.accept(frame.stamp, pose, frame.image)
-        places += 1
-        yield _Place(number, frame, pose)
+        if number > last:
+            places += 1
+            known = Place(frame.stamp, plain_text(frame.identifier), pose)
+            thumbnail = encode_thumbnail(frame.image, thumbnail_width) if thumbnail_width else b''
+            yield _Place(number, frame.image, known, thumbnail)
     if not images:
         raise InputError('no images to build a map from: the source is empty')
     if not places:
@@ -287,10 +267,3 @@ def _pose(row: np.ndarray, name: str) -> np.ndarray | None:
         return checked_pose(row)
     except InputError as error:
         raise InputError(f'{name}: {error}') from error
-
-
-def _rows(poses: Iterable[np.ndarray | None]) -> np.ndarray | None:
-    """Return poses as rows, NaN where unknown; None if all are unknown."""
-    rows = [np.full(7, np.nan) if pose is None else pose for pose in poses]
-    table = np.array(rows, np.float64)
-    return None if np.isnan(table).all() else table

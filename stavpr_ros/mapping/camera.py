@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The camera of a map: its intrinsics, and where it is on the robot."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 import math
-from typing import Any
 
 import cv2
 import numpy as np
@@ -54,23 +53,6 @@ class Camera:
                 f'one of {", ".join(MODELS)}'
             )
         object.__setattr__(self, 'mount', tuple(checked_pose(np.array(self.mount)).tolist()))
-
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> 'Camera':
-        """
-        Return the camera of :meth:`to_json`.
-
-        :raises InputError: see the class.
-        """
-        tuples = ('focal', 'center', 'distortion', 'mount')
-        return cls(**{**data, **{name: tuple(data[name]) for name in tuples}})
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields as JSON values, tuples as lists."""
-        return {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in asdict(self).items()
-        }
 
     def require_fitting(self, width: int, height: int) -> None:
         """

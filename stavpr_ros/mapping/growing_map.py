@@ -56,11 +56,8 @@ class GrowingMap:
         self._cells, self._held_features = cells, held_features
         self.dimension = 0  # d of a strip, once there is a place
         self.first = self._count = 0
-        self._strips = np.empty((settings.strips, 0, 0), np.float32)
-        self._weights = np.empty((settings.strips, 0), np.float32)
-        self._vectors: np.ndarray | None = None  # (room, D), once there is a place with one
-        self._stamps = np.empty(0, np.int64)
-        self._poses = np.empty((0, 7))
+        # a row for each place, and for those to come; strips (room, W, d) once there is a place
+        self._rows = {'stamps': np.empty(0, np.int64), 'poses': np.empty((0, 7))}
         self.camera: Camera | None = None  # of the images, None = unknown
         self.sessions: tuple[Session, ...] = ()  # of the map that is continued
         self._session_index: np.ndarray | None = None
@@ -83,17 +80,13 @@ class GrowingMap:
         features = place_map.features
         growing = cls(place_map.settings, place_map.projection, limit, features.cells)
         growing.dimension = features.dimension
-        growing._vectors = _room_of(features[:1])
-        growing._make_room(max(n, min(ROOM, limit)))
+        growing._make_room(max(n, min(ROOM, limit)), _rows_of(features[:1]))
         for low in range(0, n, ROOM):  # they may be in the map's file
             places = slice(low, min(low + ROOM, n))
-            some = features[places]
-            growing._strips[:, places] = some.strips.cpu().numpy()
-            if growing._vectors is not None and some.vectors is not None:
-                growing._vectors[places] = some.vectors.cpu().numpy()
-        growing._weights[:, :n] = features.weights.cpu().numpy()
-        growing._stamps[:n] = place_map.stamps
-        growing._poses[:n] = np.nan if place_map.poses is None else place_map.poses
+            for name, rows in _rows_of(features[places]).items():
+                growing._rows[name][places] = rows
+        growing._rows['stamps'][:n] = place_map.stamps
+        growing._rows['poses'][:n] = np.nan if place_map.poses is None else place_map.poses
         growing.sessions, growing._session_index = place_map.sessions, place_map.session_index
         growing.camera = place_map.camera
         growing._same_as = place_map.same_as
@@ -117,45 +110,36 @@ class GrowingMap:
 
         Where another object holds the features, a copy.
         """
-        n = self._count
-        vectors = None if self._vectors is None else torch.from_numpy(self._vectors[:n])
+        known = {name: torch.from_numpy(rows[: self._count]) for name, rows in self._rows.items()}
+        vectors = known.get('vectors')
         if self._held_features is not None:
             vectors = None if vectors is None else vectors.clone()
             return dataclasses.replace(self._held_features(), vectors=vectors)
-        strips, weights = (
-            torch.from_numpy(self._strips[:, :n]),
-            torch.from_numpy(self._weights[:, :n]),
-        )
+        W = self.settings.strips
+        strips = known.get('strips', torch.empty(0, W, 0)).transpose(0, 1)
+        weights = known.get('weights', torch.empty(0, W)).transpose(0, 1)
         return LocalFeatures(strips, weights, self.settings, self._cells, vectors)
 
     @property
     def stamps(self) -> np.ndarray:
         """Stamp of each place, ns, 0 = unknown: a view, shape (n,), int64."""
-        return self._stamps[: self._count]
+        return self._rows['stamps'][: self._count]
 
     @property
     def poses(self) -> np.ndarray:
         """Pose of each place, a row of NaN = unknown: a view, shape (n, 7), float64."""
-        return self._poses[: self._count]
+        return self._rows['poses'][: self._count]
 
     def place(self, index: int) -> Place:
         """Return stamp, identifier and pose of a place; counted as by :meth:`add`."""
         i = index - self.first
-        pose = self._poses[i]
+        pose = self.poses[i]
         known = pose.copy() if np.isfinite(pose).all() else None
-        return Place(int(self._stamps[i]), self.ids[i], known)
+        return Place(int(self.stamps[i]), self.ids[i], known)
 
     def thumbnail(self, index: int) -> np.ndarray | None:
         """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None; counted likewise."""
         return decode_thumbnail(self.thumbnails[index - self.first])
-
-    @property
-    def memory(self) -> int:
-        """Bytes held, the room for places to come included."""
-        arrays = (self._strips, self._weights, self._stamps, self._poses)
-        texts = sum(map(len, self.thumbnails)) + sum(map(len, self.ids))
-        vectors = 0 if self._vectors is None else self._vectors.nbytes
-        return sum(array.nbytes for array in arrays) + vectors + texts
 
     def add(
         self,
@@ -176,19 +160,18 @@ class GrowingMap:
         :raises FeatureMismatchError: features with other settings.
         :raises InputError: the map is full; not one image; values that are not finite.
         """
-        strips, weights, vector = self._checked(features)
-        row = np.full(7, np.nan) if pose is None else checked_pose(pose)
-        n = self._count
-        self.dimension = self.dimension or strips.shape[1]
-        if self._vectors is None and not n:
-            self._vectors = _room_of(features, len(self._stamps))
-        if n == len(self._stamps):
-            self._make_room(min(max(2 * n, ROOM), self.limit))
-        if self._held_features is None:
-            self._strips[:, n], self._weights[:, n] = strips, weights
-        if self._vectors is not None:
-            self._vectors[n] = vector
-        self._stamps[n], self._poses[n] = stamp, row
+        rows, n = self._checked(features), self._count
+        added = {
+            'stamps': np.array([stamp], np.int64),
+            'poses': np.full((1, 7), np.nan) if pose is None else checked_pose(pose)[None],
+        }
+        if self._held_features is not None:
+            rows = {name: rows[name] for name in rows if name == 'vectors'}
+        if n == len(self._rows['stamps']) or not n:
+            self._make_room(min(max(2 * n, ROOM), self.limit), rows)
+        self.dimension = features.dimension
+        for name, row in (rows | added).items():
+            self._rows[name][n] = row[0]
         if not n and not self.first and self._cells is None:
             self._cells = features.cells
         self.ids.append(identifier)
@@ -205,10 +188,8 @@ class GrowingMap:
         n = self._count
         if not 0 <= count <= n:
             raise InputError(f'{count} places cannot be evicted: expected 0 to {n}')
-        features = (*self._strips, *self._weights) if self._held_features is None else ()
-        vectors = () if self._vectors is None else (self._vectors,)
-        for array in (*features, *vectors, self._stamps, self._poses):
-            array[: n - count] = array[count:n]
+        for rows in self._rows.values():
+            rows[: n - count] = rows[count:n]
         del self.ids[:count], self.thumbnails[:count]
         self.first, self._count = self.first + count, n - count
 
@@ -247,10 +228,8 @@ class GrowingMap:
         added = np.full(self._count - len(index), len(self.sessions), np.int32)
         return (*self.sessions, recorded), np.concatenate([index, added])
 
-    def _checked(
-        self, features: LocalFeatures
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Return the strips (W, d), weights (W,) and vector (D,) of an image that fits."""
+    def _checked(self, features: LocalFeatures) -> dict[str, np.ndarray]:
+        """Return the rows of the features of an image that fits."""
         features.require_same_settings(self.settings, 'the map')
         if len(features) != 1:
             raise InputError(f'features of {len(features)} images: expected those of one')
@@ -260,40 +239,35 @@ class GrowingMap:
                 'places or '
                 'save it and start another'
             )
-        strips, weights = features.strips[:, 0].cpu().numpy(), features.weights[:, 0].cpu().numpy()
-        d = self.dimension
-        if d and strips.shape[1] != d:
-            raise InputError(f'strips of {strips.shape[1]} dimensions: the map has {d}')
-        vector = None if features.vectors is None else features.vectors[0].cpu().numpy()
-        if self._vectors is not None and (
-            vector is None or vector.shape != self._vectors.shape[1:]
-        ):
-            found = 'no vector' if vector is None else f'a vector of {len(vector)} dimensions'
-            raise InputError(f'{found}: places of the map have one of {self._vectors.shape[1]}')
-        for values in (strips, weights) if vector is None else (strips, weights, vector):
-            if not np.isfinite(values).all():
-                raise InputError('the features are not finite: check the network and its input')
-        return strips, weights, vector
+        added = _rows_of(features)
+        if self.dimension not in (0, d := features.dimension):
+            raise InputError(f'strips of {d} dimensions: the map has {self.dimension}')
+        if 'vectors' in self._rows:
+            found = added['vectors'].shape[1] if 'vectors' in added else 0
+            if found != (expected := self._rows['vectors'].shape[1]):
+                vector = f'a vector of {found} dimensions' if found else 'no vector'
+                raise InputError(f'{vector}: places of the map have one of {expected}')
+        if not all(np.isfinite(values).all() for values in added.values()):
+            raise InputError('the features are not finite: check the network and its input')
+        return added
 
-    def _make_room(self, room: int) -> None:
-        """Reallocate every array with a capacity of ``room`` places; all or none."""
-        n, W = self._count, self.settings.strips
-        stamps, poses = np.empty(room, np.int64), np.empty((room, 7))
-        stamps[:n], poses[:n] = self._stamps[:n], self._poses[:n]
-        if self._held_features is None:
-            strips = np.empty((W, room, self.dimension), np.float32)
-            weights = np.empty((W, room), np.float32)
-            if n:
-                strips[:, :n], weights[:, :n] = self._strips[:, :n], self._weights[:, :n]
-            self._strips, self._weights = strips, weights
-        if self._vectors is not None:
-            vectors = np.empty((room, self._vectors.shape[1]), np.float32)
-            vectors[:n] = self._vectors[:n]
-            self._vectors = vectors
-        self._stamps, self._poses = stamps, poses
+    def _make_room(self, room: int, rows: dict[str, np.ndarray]) -> None:
+        """Reallocate every array with a capacity of ``room`` places, of such rows; all or none."""
+        made = {
+            name: np.empty((room, *one.shape[1:]), one.dtype)
+            for name, one in (rows | self._rows).items()
+        }
+        for name, one in self._rows.items():
+            made[name][: self._count] = one[: self._count]
+        self._rows = made
 
 
-def _room_of(features: LocalFeatures, room: int = 0) -> np.ndarray | None:
-    """Return room for the vectors of places as these, None if they have none."""
-    vectors = features.vectors
-    return None if vectors is None else np.empty((room, vectors.shape[1]), np.float32)
+def _rows_of(features: LocalFeatures) -> dict[str, np.ndarray]:
+    """Return the features of n images: strips (n, W, d), weights (n, W), vectors (n, D) if any."""
+    rows = {
+        'strips': features.strips.transpose(0, 1).cpu().numpy(),
+        'weights': features.weights.T.cpu().numpy(),
+    }
+    if features.vectors is not None:
+        rows['vectors'] = features.vectors.cpu().numpy()
+    return rows

@@ -6,7 +6,7 @@ An open map file: manifest, and parts that are read by their position.
 Nothing is mapped into memory: a mapped file that another program shortens ends the process.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 import hashlib
@@ -37,22 +37,29 @@ BUILD_AGAIN = 'get it from a backup, or build it again'
 @dataclass(frozen=True)
 class Part:
     """
-    An array in the file.
+    An array in a file, or one to be written.
 
     :param dtype: key of :data:`DTYPES`.
     :param start: its first byte in the file.
     :param hashes: SHA-256 of every ``PIECE`` bytes.
+    :param content: what to write: contiguous arrays, one after the other.
     """
 
     dtype: str
     shape: tuple[int, ...]
-    start: int
-    hashes: list[str]
+    start: int = 0
+    hashes: Sequence[str] = ()
+    content: Iterable[np.ndarray] = ()
 
     @property
     def size(self) -> int:
         """Return the number of bytes."""
         return math.prod(self.shape) * np.dtype(DTYPES[self.dtype]).itemsize
+
+    @property
+    def pieces(self) -> int:
+        """Return the number of hashes."""
+        return -(-self.size // PIECE)
 
 
 class MapFile:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parts of a map file, checked against each other and the manifest, as a map."""
 
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -13,7 +13,7 @@ from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.jpeg import jpeg_pixels, MOST_PIXELS
 from stavpr_ros.mapping.map_container import MapFile, Part
-from stavpr_ros.mapping.map_schema import identity_fields, INTRINSICS, Object
+from stavpr_ros.mapping.map_schema import identity_fields, INTRINSICS, record
 from stavpr_ros.mapping.map_statistics import CHANGES, STATISTICS, statistics_of
 from stavpr_ros.mapping.map_version2 import KNOWN_SECTIONS
 from stavpr_ros.mapping.place_map import PlaceMap, Session
@@ -53,13 +53,15 @@ def map_content(file: MapFile) -> PlaceMap:
     :raises ValueError: names what is wrong with it, and the part.
     :raises StavprError: likewise.
     """
-    manifest = file.manifest
+    manifest, sections = file.manifest, file.manifest['sections']
     settings = _settings(manifest['settings'])
-    described = file.parts.keys() & PARTS.keys()
-    if not _is_known(manifest['sections'], STATISTICS):
-        described = {name for name in described if not name.startswith(f'{STATISTICS}/')}
-    sizes = _require_shapes(file.parts, described, settings, manifest['sections'])
-    arrays = {name: file.read(name) for name in sorted(described.difference(LARGE))}
+    known = {n for n, one in sections.items() if one['version'] <= KNOWN_SECTIONS.get(n, 0)}
+    described = {name: part for name, part in file.parts.items() if name in PARTS}
+    if STATISTICS not in known:
+        described = {n: part for n, part in described.items() if not n.startswith(STATISTICS)}
+    _require_parts(file.parts, sections)
+    sizes = _sizes(described, settings)
+    arrays = {name: file.read(name) for name in described if name not in LARGE}
     if (manifest['projection'] is None) is ('projection' in arrays):
         raise ValueError('the manifest and the parts disagree on whether there is a projection')
     projection = None
@@ -79,7 +81,7 @@ def map_content(file: MapFile) -> PlaceMap:
         content = arrays['ids'].tobytes()
         ids = [content[a:b].decode() for a, b in zip([0, *ends], ends, strict=False)]
     features = StoredFeatures(file, torch.from_numpy(weights), settings, cells)
-    if _is_known(manifest['sections'], STATISTICS):
+    if STATISTICS in known:
         features.statistics = statistics_of(file, arrays)
         features.has_stale_statistics = features.statistics is None
     return PlaceMap(
@@ -91,62 +93,52 @@ def map_content(file: MapFile) -> PlaceMap:
         thumbnails=_thumbnails(file, arrays.get('thumbnail_ends')),
         sessions=tuple(Session(**session) for session in manifest['sessions']),
         session_index=arrays.get('session'),
-        camera=_camera(manifest['sections']),
+        camera=_camera(sections['intrinsics']['data']) if 'intrinsics' in known else None,
         same_as=arrays.get('same_places/same_as'),
         map_id=file.map_id,
     )
 
 
-def _camera(sections: dict[str, Any]) -> Camera | None:
-    """Return the camera of section intrinsics, None without one that is known."""
-    if not _is_known(sections, 'intrinsics'):
-        return None
-    section = sections['intrinsics']
-    INTRINSICS.check(section['data'], 'section intrinsics')
-    return Camera.from_json(section['data'])
+def _camera(data: Any) -> Camera:
+    """Return the camera of section intrinsics."""
+    INTRINSICS(data, 'section intrinsics')
+    values: dict[str, Any] = {k: tuple(v) if type(v) is list else v for k, v in data.items()}
+    return Camera(**values)
 
 
-def _is_known(sections: dict[str, Any], name: str) -> bool:
-    """Return whether a map has a section, and this program knows its version."""
-    return name in sections and sections[name]['version'] <= KNOWN_SECTIONS.get(name, 0)
-
-
-def _settings(record: dict[str, Any]) -> FeatureSettings:
+def _settings(content: dict[str, Any]) -> FeatureSettings:
     """Build the settings of the features; the location of a model is unknown to a map."""
-    kind = record['kind']
+    kind = content['kind']
     rows = identity_fields(kind)
     # settings that there were none of when the map was made
-    values = getattr(settings_class(kind), 'BEFORE', {}) | record['backbone']
-    Object(rows).check(values, f'settings of features {kind}')
+    values = getattr(settings_class(kind), 'BEFORE', {}) | content['backbone']
+    record(rows)(values, f'settings of features {kind}')
     if 'sha256' in rows and not values['sha256']:
         raise ValueError(f'settings of features {kind} lack the sha256 of the model')
     located = {row.name for row in fields(settings_class(kind))} & {'model'}
     backbone = settings_class(kind)(**values, **dict.fromkeys(located, ''))
-    return FeatureSettings(**{**record, 'backbone': backbone})
+    return FeatureSettings(**{**content, 'backbone': backbone})
 
 
-def _require_shapes(
-    parts: dict[str, Part],
-    described: Collection[str],
-    settings: FeatureSettings,
-    sections: Collection[str],
-) -> dict[str, int]:
-    """Check which parts there are, and what is described; return the sizes W, n, d and D."""
+def _require_parts(parts: dict[str, Part], sections: dict[str, Any]) -> None:
+    """Check which parts there are."""
     for name in ('strips', 'weights', 'stamps'):
         if name not in parts:
             raise ValueError(f'part {name} is missing')
     for one, other in _TOGETHER:
         if (one in parts) is not (other in parts):
             raise ValueError(f'of the parts {one} and {other}, one is missing')
-    sizes: dict[str, int] = {'W': settings.strips}
     for name in parts:
         section, slash, _ = name.partition('/')
         if (slash or name not in PARTS) and section not in sections:
             raise ValueError(f'part {name[:80]} is {"of no section" if slash else "unknown"}')
-    for name, (types, axes) in PARTS.items():
-        if name not in described:
-            continue
-        dtype, shape = parts[name].dtype, parts[name].shape
+
+
+def _sizes(parts: dict[str, Part], settings: FeatureSettings) -> dict[str, int]:
+    """Return the sizes W, n, d and D, by which the shapes of all parts agree."""
+    sizes: dict[str, int] = {'W': settings.strips}
+    for name in sorted(parts, key=list(PARTS).index):
+        (types, axes), dtype, shape = PARTS[name], parts[name].dtype, parts[name].shape
         if dtype not in types or len(shape) != len(axes):
             raise ValueError(
                 f'part {name} is {dtype} {shape}: expected {" or ".join(types)} {axes}'
@@ -186,7 +178,7 @@ def _ends(ends: np.ndarray, size: int, name: str) -> list[int]:
     return ends.tolist()
 
 
-def _thumbnails(file: MapFile, ends: np.ndarray | None) -> 'StoredThumbnails | tuple[()]':
+def _thumbnails(file: MapFile, ends: np.ndarray | None) -> Sequence[bytes]:
     """Check the headers of all thumbnails, some megabytes at a time."""
     if ends is None:
         return ()

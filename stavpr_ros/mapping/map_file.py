@@ -7,18 +7,18 @@ docs/map_format.md defines the format. Nothing in a file is executed.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile
+from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
 from stavpr_ros.mapping.map_content import map_content, PARTS, require_jpegs
 from stavpr_ros.mapping.map_schema import identity_fields
 from stavpr_ros.mapping.map_statistics import MapStatistics, STATISTICS
-from stavpr_ros.mapping.map_version2 import MOST_HEADER, NewPart, read_version2, write_version2
+from stavpr_ros.mapping.map_version2 import MOST_HEADER, read_header, write_parts
 from stavpr_ros.mapping.place_map import PlaceMap
 from stavpr_ros.mapping.stored_features import MappedFeatures, StoredFeatures
 from stavpr_ros.output_file import atomic_output, Force, MAP
@@ -48,26 +48,23 @@ def save_map(
     :raises OutputError: the file is there already, or cannot be written.
     :raises SettingsError: no such storage.
     """
-    manifest, parts = _manifest(place_map), _parts(place_map, storage)
+    manifest, parts = _manifest(place_map, statistics), _parts(place_map, storage)
     if statistics is not None:
-        data = {'method': statistics.method, 'features': '0' * 64}  # the writer knows their hash
-        manifest['sections'][STATISTICS] = {'version': 1, 'required': False, 'data': data}
-        for name, array in statistics.parts().items():
-            dtype = PARTS[name][0][0]
-            parts[name] = NewPart(dtype, array.shape, [array.astype(DTYPES[dtype], copy=False)])
+        parts |= {name: _part(name, array) for name, array in statistics.parts().items()}
     with atomic_output(path, MAP, force) as file:
-        return write_version2(file, manifest, parts)
+        return write_parts(file, manifest, parts)
 
 
-def _manifest(place_map: PlaceMap) -> dict[str, Any]:
-    sections: dict[str, Any] = {}
+def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str, Any]:
+    data: dict[str, Any] = {}
     if place_map.camera is not None:
-        data = place_map.camera.to_json()
-        sections['intrinsics'] = {'version': 1, 'required': False, 'data': data}
+        data['intrinsics'] = asdict(place_map.camera)
     if place_map.same_as is not None:
-        sections['same_places'] = {'version': 1, 'required': False, 'data': None}
+        data['same_places'] = None
     if place_map.features.vectors is not None:
-        sections['vectors'] = {'version': 1, 'required': False, 'data': None}
+        data['vectors'] = None
+    if statistics is not None:  # the writer knows the hash of the features
+        data[STATISTICS] = {'method': statistics.method, 'features': '0' * 64}
     settings, projection = place_map.settings, place_map.projection
     backbone = {name: getattr(settings.backbone, name) for name in identity_fields(settings.kind)}
     return {
@@ -80,63 +77,54 @@ def _manifest(place_map: PlaceMap) -> dict[str, Any]:
         },
         'cells': place_map.features.cells,
         'projection': projection.name if projection else None,
-        'sessions': [
-            {row.name: getattr(session, row.name) for row in fields(session)}
-            for session in place_map.sessions
-        ],
-        'sections': sections,
+        'sessions': [asdict(session) for session in place_map.sessions],
+        'sections': {
+            name: {'version': 1, 'required': False, 'data': each} for name, each in data.items()
+        },
     }
 
 
-def _parts(place_map: PlaceMap, storage: str) -> dict[str, NewPart]:
-    features, n = place_map.features, len(place_map)
+def _part(name: str, array: np.ndarray, dtype: str = '') -> Part:
+    dtype = dtype or PARTS[name][0][0]
+    return Part(dtype, array.shape, content=[array.astype(DTYPES[dtype], copy=False)])
+
+
+def _parts(place_map: PlaceMap, storage: str) -> dict[str, Part]:
+    features, projection, n = place_map.features, place_map.projection, len(place_map)
     stored = features.storage if isinstance(features, StoredFeatures) else 'float32'
     if (storage or stored) not in STORAGE:
         raise SettingsError(f'storage {storage!r} is unknown: take one of {", ".join(STORAGE)}')
     dtype = STORAGE[storage or stored]
     shape = (place_map.settings.strips, n, features.dimension)
     strips = _strips(features, np.dtype(DTYPES[dtype]))
-    parts = {'strips': NewPart(dtype, shape, strips)}
-
-    def add(name: str, array: np.ndarray, dtype: str = '') -> None:
-        dtype = dtype or PARTS[name][0][0]
-        parts[name] = NewPart(dtype, array.shape, [array.astype(DTYPES[dtype], copy=False)])
+    parts = {'strips': Part(dtype, shape, content=strips)}
 
     def add_texts(name: str, ends: str, texts: Sequence[bytes]) -> None:
         lengths = [len(text) for text in texts]
-        parts[name] = NewPart('U8', (sum(lengths),), (np.frombuffer(t, np.uint8) for t in texts))
-        add(ends, np.cumsum(lengths, dtype=np.int64))
+        content = (np.frombuffer(text, np.uint8) for text in texts)
+        parts[name] = Part('U8', (sum(lengths),), content=content)
+        parts[ends] = _part(ends, np.cumsum(lengths, dtype=np.int64))
 
-    add('weights', features.weights.cpu().numpy())
-    add('stamps', place_map.stamps)
-    if place_map.poses is not None:
-        add('poses', place_map.poses)
-    if place_map.projection is not None:
-        add('projection', place_map.projection.matrix)
+    arrays = {
+        'weights': features.weights.cpu().numpy(),
+        'stamps': place_map.stamps,
+        'poses': place_map.poses,
+        'projection': projection.matrix if projection else None,
+        'session': place_map.session_index,
+        'same_places/same_as': place_map.same_as,
+    }
+    parts |= {name: _part(name, array) for name, array in arrays.items() if array is not None}
     if any(place_map.ids):
         add_texts('ids', 'id_ends', [identifier.encode() for identifier in place_map.ids])
     if len(place_map.thumbnails):
-        _require_thumbnails(place_map.thumbnails)
+        for first in range(0, n, THUMBNAILS_AT_ONCE):
+            some = place_map.thumbnails[first : first + THUMBNAILS_AT_ONCE]
+            ends = np.cumsum([len(content) for content in some])
+            require_jpegs(np.frombuffer(b''.join(some), np.uint8), ends, first)
         add_texts('thumbnails', 'thumbnail_ends', place_map.thumbnails)
-    if place_map.session_index is not None:
-        add('session', place_map.session_index)
-    if place_map.same_as is not None:
-        add('same_places/same_as', place_map.same_as)
     if (vectors := features.vectors) is not None:
-        add('vectors/vectors', vectors.cpu().numpy(), dtype)
+        parts['vectors/vectors'] = _part('vectors/vectors', vectors.cpu().numpy(), dtype)
     return parts
-
-
-def _require_thumbnails(thumbnails: Sequence[bytes]) -> None:
-    """
-    Reject thumbnails that could not be read again.
-
-    :raises InputError: names the place.
-    """
-    for first in range(0, len(thumbnails), THUMBNAILS_AT_ONCE):
-        some = thumbnails[first : first + THUMBNAILS_AT_ONCE]
-        ends = np.cumsum([len(content) for content in some])
-        require_jpegs(np.frombuffer(b''.join(some), np.uint8), ends, first)
 
 
 def _strips(features: LocalFeatures, dtype: np.dtype) -> Iterator[np.ndarray]:
@@ -177,7 +165,7 @@ def open_map(path: str | Path) -> PlaceMap:
     with errors_of(path):
         file = MapFile(open_regular(path), path)
         file.require_whole()
-        read_version2(file)
+        read_header(file)
         return map_content(file)
 
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from stavpr_ros.mapping.map_container import MapFile
-from stavpr_ros.mapping.map_schema import Object, SHA256, Text
+from stavpr_ros.mapping.map_schema import record, SHA256, text
 from stavpr_ros.mapping.map_version2 import features_key
 
 STATISTICS = 'statistics'  # name of the section
-DATA = Object({'method': Text(128), 'features': Text(64, SHA256)})
+DATA = record({'method': text(128), 'features': text(64, SHA256)})
 CHANGES = 5  # places apart, at most, whose changes are kept
 LIMITS = {  # of the values in each part; norms may be 1.01, see LONGEST
     'mean': (-1.01, 1.01),
@@ -58,7 +58,7 @@ def statistics_of(file: MapFile, arrays: dict[str, np.ndarray]) -> MapStatistics
     :raises ValueError: names what is wrong with them.
     """
     data = file.manifest['sections'][STATISTICS]['data']
-    DATA.check(data, f'section {STATISTICS}')
+    DATA(data, f'section {STATISTICS}')
     found = []
     for name, (least, most) in LIMITS.items():
         part = f'{STATISTICS}/{name}'

@@ -2,46 +2,31 @@
 # SPDX-License-Identifier: Apache-2.0
 """Format version 2: a safetensors file with a manifest; docs/map_format.md defines it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 import hashlib
 import json
-import math
-from typing import Any, IO, NamedTuple
+from typing import Any, IO
 
 import numpy as np
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping.map_container import DTYPES, MapFile, Part, PIECE, read_json
-from stavpr_ros.mapping.map_schema import Int, ListOf, MANIFEST, Object, Text
+from stavpr_ros.mapping.map_schema import integer, list_of, MANIFEST, record, text
 
 FORMAT, VERSION = 'stavpr-map', 2
 MOST_HEADER = 2**20  # bytes: parsing takes at most 25 times as much memory
 # name: highest known version
 KNOWN_SECTIONS = {'intrinsics': 1, 'same_places': 1, 'statistics': 1, 'vectors': 1}
-_TEXT = Text(MOST_HEADER)
-_METADATA = Object({'format': _TEXT, 'version': _TEXT, 'manifest': _TEXT, 'sha256': _TEXT})
-_TENSOR = Object(
+_METADATA = record(dict.fromkeys(('format', 'version', 'manifest', 'sha256'), text(MOST_HEADER)))
+_TENSOR = record(
     {
-        'dtype': Text(8),
-        'shape': ListOf(Int(0, 2**40), 0, 4),
-        'data_offsets': ListOf(Int(0, 2**62), 2, 2),
+        'dtype': text(8),
+        'shape': list_of(integer(0, 2**40), 0, 4),
+        'data_offsets': list_of(integer(0, 2**62), 2, 2),
     }
 )
 
 
-class NewPart(NamedTuple):
-    """A part to be written: its content comes in contiguous arrays, one after the other."""
-
-    dtype: str
-    shape: tuple[int, ...]
-    content: Iterable[np.ndarray]
-
-    @property
-    def size(self) -> int:
-        """Return the number of bytes."""
-        return math.prod(self.shape) * np.dtype(DTYPES[self.dtype]).itemsize
-
-
-def read_version2(file: MapFile) -> None:
+def read_header(file: MapFile) -> None:
     """
     Read and check header and manifest.
 
@@ -57,9 +42,9 @@ def read_version2(file: MapFile) -> None:
     length = int.from_bytes(head, 'little')
     if file.size < 8 or not 2 <= length <= min(MOST_HEADER, file.size - 8):
         raise file.foreign(f'its header would have {length} of {file.size} bytes')
-    text = file.bytes_at(8, length)
+    content = file.bytes_at(8, length)
     try:
-        header = read_json(text, 'the header')
+        header = read_json(content, 'the header')
         metadata = header.pop('__metadata__')
         if metadata['format'] != FORMAT:
             raise ValueError(f'another format than {FORMAT}')
@@ -71,19 +56,24 @@ def read_version2(file: MapFile) -> None:
             f'{file.path} has format version {str(version)[:20]}, this program reads {VERSION}: '
             'update it'
         )
-    _METADATA.check(metadata, 'the metadata')
+    _METADATA(metadata, 'the metadata')
     manifest = metadata['manifest'].encode()
     digest = hashlib.sha256(manifest).hexdigest()
     if digest != metadata['sha256']:
         raise ValueError('bytes 8 on, the manifest in the header, do not match their hash')
     file.map_id = digest[:16]
     file.manifest = read_json(manifest, 'the manifest')
-    MANIFEST.check(file.manifest, 'manifest')
+    MANIFEST(file.manifest, 'manifest')
     file.parts = _parts(header, file.manifest['parts'], 8 + length, file.size)
-    _require_known_sections(file.manifest['sections'])
+    for name, section in file.manifest['sections'].items():
+        if section['required'] and section['version'] > KNOWN_SECTIONS.get(name, 0):
+            raise ValueError(
+                f'it requires section {name}, version {section["version"]}, which this program '
+                'does not know: update it'
+            )
 
 
-def features_key(hashes: list[str]) -> str:
+def features_key(hashes: Sequence[str]) -> str:
     """Return the hash of features by those of their pieces."""
     return hashlib.sha256(''.join(hashes).encode()).hexdigest()
 
@@ -97,7 +87,7 @@ def _parts(
         raise ValueError(f'tensor {name[:80]!r} is in the {where}')
     parts, end = {}, begin
     for name, tensor in header.items():
-        _TENSOR.check(tensor, f'tensor {name}')
+        _TENSOR(tensor, f'tensor {name}')
     for name in sorted(header, key=lambda name: header[name]['data_offsets']):
         tensor, entry = header[name], listed[name]
         if (tensor['dtype'], tensor['shape']) != (entry['dtype'], entry['shape']):
@@ -111,25 +101,15 @@ def _parts(
             raise ValueError(
                 f'tensor {name}: bytes {first} to {last}, expected {start} to {end}, by its shape'
             )
-        if len(entry['sha256']) != -(-part.size // PIECE):
-            raise ValueError(f'tensor {name} has {len(entry["sha256"])} hashes')
+        if len(part.hashes) != part.pieces:
+            raise ValueError(f'tensor {name} has {len(part.hashes)} hashes')
         parts[name] = part
     if end != size:
         raise ValueError(f'its tensors end at byte {end}, the file at byte {size}')
     return parts
 
 
-def _require_known_sections(sections: dict[str, Any]) -> None:
-    for name, section in sections.items():
-        known = KNOWN_SECTIONS.get(name, 0)
-        if section['required'] and section['version'] > known:
-            raise ValueError(
-                f'it requires section {name}, version {section["version"]}, which this program '
-                'does not know: update it'
-            )
-
-
-def write_version2(file: IO[bytes], manifest: dict[str, Any], parts: dict[str, NewPart]) -> str:
+def write_parts(file: IO[bytes], manifest: dict[str, Any], parts: dict[str, Part]) -> str:
     """
     Write a map to a new file that can be positioned; returns its id.
 
@@ -138,81 +118,66 @@ def write_version2(file: IO[bytes], manifest: dict[str, Any], parts: dict[str, N
     """
     # the widest numbers first: each tensor begins at a multiple of the size of its numbers
     names = sorted(parts, key=lambda n: (-np.dtype(DTYPES[parts[n].dtype]).itemsize, n))
-    hashes = {name: ['0' * 64] * -(-parts[name].size // PIECE) for name in names}
-    length = len(_header(manifest, parts, names, hashes)[0])
+    parts = {name: parts[name] for name in names}
+    length = len(_header(manifest, parts, {n: ['0' * 64] * parts[n].pieces for n in names})[0])
     if length > 8 + MOST_HEADER:
         raise MapFileError(
             f'the manifest has {length} bytes, at most {MOST_HEADER} can be read: make two maps'
         )
     file.write(bytes(length))
-    for name in names:
-        hasher = _PieceHasher()
-        for array in parts[name].content:
-            if array.size:
-                view = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
-                hasher.update(view)
-                file.write(view)
-        hashes[name] = hasher.hashes()
+    hashes = {name: _write(file, part.content) for name, part in parts.items()}
     if 'statistics' in manifest['sections']:
         manifest['sections']['statistics']['data']['features'] = features_key(hashes['strips'])
-    header, map_id = _header(manifest, parts, names, hashes)
+    header, map_id = _header(manifest, parts, hashes)
     file.seek(0)
     file.write(header)
     return map_id
 
 
+def _write(file: IO[bytes], arrays: Iterable[np.ndarray]) -> list[str]:
+    """Write arrays one after the other; return the hash of every ``PIECE`` bytes."""
+    hashes, digest, room = [], hashlib.sha256(), PIECE
+    for array in arrays:
+        if not array.size:
+            continue
+        view = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
+        while len(view):
+            piece, view = view[:room], view[room:]
+            file.write(piece)
+            digest.update(piece)
+            room -= len(piece)
+            if not room:
+                hashes.append(digest.hexdigest())
+                digest, room = hashlib.sha256(), PIECE
+    return hashes if room == PIECE else [*hashes, digest.hexdigest()]
+
+
 def _header(
-    manifest: dict[str, Any],
-    parts: dict[str, NewPart],
-    names: list[str],
-    hashes: dict[str, list[str]],
+    manifest: dict[str, Any], parts: dict[str, Part], hashes: dict[str, list[str]]
 ) -> tuple[bytes, str]:
     """Return the first bytes of the file, a multiple of eight, and the id of the map."""
-    listed = {
-        name: {'dtype': parts[name].dtype, 'shape': parts[name].shape, 'sha256': hashes[name]}
-        for name in names
-    }
-    text = _json({**manifest, 'parts': listed})
-    digest = hashlib.sha256(text.encode()).hexdigest()
-    tensors: dict[str, Any] = {
-        '__metadata__': {
-            'format': FORMAT,
-            'version': str(VERSION),
-            'manifest': text,
-            'sha256': digest,
-        }
-    }
+    header: dict[str, Any] = {}
+    listed: dict[str, Any] = {}
     end = 0
-    for name in names:
-        start, end = end, end + parts[name].size
-        dtype, shape, _ = parts[name]
-        tensors[name] = {'dtype': dtype, 'shape': shape, 'data_offsets': [start, end]}
-    header = _json(tensors).encode()
-    header += b' ' * (-len(header) % 8)
-    return len(header).to_bytes(8, 'little') + header, digest[:16]
+    for name, part in parts.items():
+        start, end = end, end + part.size
+        described = {'dtype': part.dtype, 'shape': part.shape}
+        header[name] = described | {'data_offsets': [start, end]}
+        listed[name] = described | {'sha256': hashes[name]}
+    content = _json({**manifest, 'parts': listed})
+    digest = hashlib.sha256(content.encode()).hexdigest()
+    header['__metadata__'] = {
+        'format': FORMAT,
+        'version': str(VERSION),
+        'manifest': content,
+        'sha256': digest,
+    }
+    encoded = _json(header).encode()
+    encoded += b' ' * (-len(encoded) % 8)
+    return len(encoded).to_bytes(8, 'little') + encoded, digest[:16]
 
 
 def _json(value: Any) -> str:
     return json.dumps(
         value, sort_keys=True, ensure_ascii=False, allow_nan=False, separators=(',', ':')
     )
-
-
-class _PieceHasher:
-    """Hashes a stream in pieces."""
-
-    def __init__(self) -> None:
-        self._done: list[str] = []
-        self._hash, self._room = hashlib.sha256(), PIECE
-
-    def update(self, view: memoryview) -> None:
-        while len(view):
-            self._hash.update(view[: self._room])
-            taken = min(len(view), self._room)
-            view, self._room = view[taken:], self._room - taken
-            if not self._room:
-                self._done.append(self._hash.hexdigest())
-                self._hash, self._room = hashlib.sha256(), PIECE
-
-    def hashes(self) -> list[str]:
-        return self._done + ([self._hash.hexdigest()] if self._room < PIECE else [])

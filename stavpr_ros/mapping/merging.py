@@ -39,7 +39,23 @@ def merge_maps(maps: Sequence[PlaceMap], names: Sequence[str]) -> PlaceMap:
         index.append(numbers + np.int32(len(sessions)))
         for session in own:
             sessions.append(replace(session, id=_free_id(session.id, sessions)))
-    return _joined(maps, tuple(sessions), np.concatenate(index), _joined_same_as(maps))
+    poses = [
+        np.full((len(each), 7), np.nan) if each.poses is None else each.poses for each in maps
+    ]
+    thumbnails = [content for each in maps for content in each.thumbnails or [b''] * len(each)]
+    return PlaceMap(
+        features=LocalFeatures.concatenate([each.features for each in maps]),
+        projection=maps[0].projection,
+        stamps=np.concatenate([each.stamps for each in maps]),
+        ids=tuple(identifier for each in maps for identifier in each.ids),
+        poses=np.concatenate(poses) if any(each.has_poses for each in maps) else None,
+        thumbnails=tuple(thumbnails) if any(len(each.thumbnails) for each in maps) else (),
+        sessions=tuple(sessions),
+        session_index=np.concatenate(index),
+        # one section for the whole map
+        camera=maps[0].camera if len({each.camera for each in maps}) == 1 else None,
+        same_as=_joined_same_as(maps),
+    )
 
 
 def select_session(place_map: PlaceMap, session_id: str, keep: bool = True) -> PlaceMap:
@@ -107,30 +123,3 @@ def _joined_same_as(maps: Sequence[PlaceMap]) -> np.ndarray | None:
         joined.append(own + first)
         first += len(each)
     return np.concatenate(joined).astype(np.int32)
-
-
-def _joined(
-    maps: Sequence[PlaceMap],
-    sessions: tuple[Session, ...],
-    index: np.ndarray,
-    same_as: np.ndarray | None,
-) -> PlaceMap:
-    poses = [
-        np.full((len(each), 7), np.nan) if each.poses is None else each.poses for each in maps
-    ]
-    thumbnails = [list(each.thumbnails) or [b''] * len(each) for each in maps]
-    return PlaceMap(
-        features=LocalFeatures.concatenate([each.features for each in maps]),
-        projection=maps[0].projection,
-        stamps=np.concatenate([each.stamps for each in maps]),
-        ids=tuple(identifier for each in maps for identifier in each.ids),
-        poses=np.concatenate(poses) if any(each.has_poses for each in maps) else None,
-        thumbnails=tuple(content for each in thumbnails for content in each)
-        if any(len(each.thumbnails) for each in maps)
-        else (),
-        sessions=sessions,
-        session_index=index,
-        # one section for the whole map
-        camera=maps[0].camera if len({each.camera for each in maps}) == 1 else None,
-        same_as=same_as,
-    )

@@ -108,13 +108,8 @@ class PlaceMap:
             raise InputError(
                 f'{len(self.thumbnails)} thumbnails for {n} places: expected all or none'
             )
-        if (
-            n
-            and not -MOST_SECONDS
-            <= self.stamps.min() // 10**9
-            <= (self.stamps.max() // 10**9)
-            < MOST_SECONDS
-        ):
+        seconds = self.stamps // 10**9
+        if n and not -MOST_SECONDS <= seconds.min() <= seconds.max() < MOST_SECONDS:
             raise InputError('a stamp is out of range: expected ns of at most 2**31 seconds')
         _require_texts(self.ids)
         _require_sessions(self.sessions, self.session_index, n)

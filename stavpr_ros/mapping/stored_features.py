@@ -170,22 +170,16 @@ class StoredFeatures(LocalFeatures):
     ) -> None:
         """Read the rows of some places of a part; ``first`` is the row of place 0."""
         dtype = np.dtype(DTYPES[part.dtype])
-        # runs of neighbors, each read at once
-        ends = np.append(np.flatnonzero(np.diff(places) != 1) + 1, len(places))
-        runs = [(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True) if a < b]
-        pieces = [
-            (c, min(c + PLACES_AT_ONCE, b)) for a, b in runs for c in range(a, b, PLACES_AT_ONCE)
-        ]
+        runs = np.split(np.arange(len(places)), np.flatnonzero(np.diff(places) != 1) + 1)
+        starts = [(run, at) for run in runs for at in range(0, len(run), PLACES_AT_ONCE)]
         with errors_of(self.file.path):
-            for a, b in pieces:
-                target, place = out[a:b], int(places[a])
-                start = part.start + (first + place) * part.shape[-1] * dtype.itemsize
-                if dtype == np.float32:
-                    self.file.fill(target.numpy(), start)
-                else:
-                    half = torch.empty(target.shape, dtype=torch.float16)
-                    self.file.fill(half.numpy(), start)
-                    target.copy_(half)
+            for run, at in starts:  # neighbors are read at once
+                rows = run[at : at + PLACES_AT_ONCE]
+                target, place = out[rows[0] : rows[-1] + 1], int(places[rows[0]])
+                block = target.numpy() if dtype == np.float32 else np.empty(target.shape, dtype)
+                self.file.fill(block, part.start + (first + place) * block[0].nbytes)
+                if dtype != np.float32:
+                    target.copy_(torch.from_numpy(block))
                 _require_normalized(target, name, place)
 
 

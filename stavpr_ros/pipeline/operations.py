@@ -3,7 +3,6 @@
 """The three operations: each updates its places, its recognizer, or both with one image."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
@@ -34,7 +33,6 @@ class Observation:
 class Localization:
     """Recognizes places of a fixed map."""
 
-    name: ClassVar[str] = 'localization'
     extractor: FeatureExtractor
     places: PlaceMap
     recognizer: SequenceRecognizer
@@ -48,7 +46,6 @@ class Localization:
 class Mapping:
     """Adds every image to a growing map as a place, with its thumbnail if it has one."""
 
-    name: ClassVar[str] = 'mapping'
     extractor: FeatureExtractor
     places: GrowingMap
     recognizer: None = None
@@ -67,7 +64,6 @@ class LoopClosing:
     :param places: the route, with the places of the recognizer.
     """
 
-    name: ClassVar[str] = 'loop_closure'
     extractor: FeatureExtractor
     places: GrowingMap
     recognizer: LoopCloser

@@ -46,7 +46,8 @@ class Pipeline:
     :param open_journal: of recorded places; None = they are in memory only.
     :raises StavprError: invalid settings, or a missing model.
 
-    ``settings`` and ``threshold`` (None = not set) are those in force; :meth:`change` sets them.
+    ``operation``, ``settings`` and ``threshold`` (None = not set) are those in force;
+    :meth:`change` sets them.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class Pipeline:
         self._map: PlaceMap | None = None
         self._extractor: FeatureExtractor | None = None
         self._operation: Operation | None = None
-        self._name = operation
+        self.operation = operation
         self.threshold = settings.applied_threshold
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._verifier = PlaceVerifier(settings.geometric) if settings.geometric else None
@@ -74,11 +75,6 @@ class Pipeline:
         self._map_save_state = self.save_state
         self.contrast = math.nan  # of the last image
         self._start(operation, settings, None)
-
-    @property
-    def operation(self) -> str:
-        """Return the name of the operation."""
-        return self._name
 
     @property
     def places(self) -> PlaceMap | GrowingMap | None:
@@ -105,7 +101,7 @@ class Pipeline:
     @property
     def map_state(self) -> str:
         """Return one of ``none``, ``loaded``, ``growing`` or ``full``."""
-        if self._name == 'localization':
+        if self.operation == 'localization':
             return 'loaded' if self._map is not None else 'none'
         return 'full' if self._is_full(self._operation) else 'growing'
 
@@ -124,9 +120,9 @@ class Pipeline:
     @property
     def missing(self) -> str:
         """Return why no match is possible yet; empty when nothing is missing."""
-        if self._name == 'localization' and self._map is None:
+        if self.operation == 'localization' and self._map is None:
             return NO_MAP
-        if self._name != 'mapping' and self.threshold is None:
+        if self.operation != 'mapping' and self.threshold is None:
             return NO_THRESHOLD
         return ''
 
@@ -155,10 +151,10 @@ class Pipeline:
         :raises InputError: unsaved places would be lost.
         :raises StavprError: an unknown operation, or invalid settings.
         """
-        settings, name = settings or self.settings, operation or self._name
+        settings, name = settings or self.settings, operation or self.operation
         settings.require_operation(name)
         threshold, before = settings.applied_threshold, self.threshold
-        if loaded is not None or name != self._name:
+        if loaded is not None or name != self.operation:
             self._require_no_loss(name, loaded)
             self._start(name, settings, loaded)
         elif self._operation is not None and self._operation.recognizer and threshold is not None:
@@ -192,7 +188,7 @@ class Pipeline:
         """
         kept = []
         for state in {self.save_state, self._map_save_state}:
-            is_route = self._name == 'loop_closure' and state is self.save_state
+            is_route = self.operation == 'loop_closure' and state is self.save_state
             path = str(state.journal.path) if state.journal and state.unsaved else ''
             state.close_journal(delete=delete_route and is_route)
             if path and not (delete_route and is_route):
@@ -217,7 +213,7 @@ class Pipeline:
         """
         if self.missing:
             raise InputError(self.missing)
-        if self._name == 'mapping':
+        if self.operation == 'mapping':
             raise InputError(
                 'operation mapping recognizes no places: set_operation localization first'
             )
@@ -363,7 +359,7 @@ class Pipeline:
         """
         if self._verifier is None or match.sequence is None:
             return match
-        weighed = match.relative and self._name == 'localization'
+        weighed = match.relative and self.operation == 'localization'
         checked = self._evidence.wants(match.probability) if weighed else match.accepted
         if not checked or query is None:
             return match
@@ -394,7 +390,7 @@ class Pipeline:
         before = {self.save_state, self._map_save_state}
         # in mapping, the growing map holds it
         self._map = None if name == 'mapping' else place_map
-        self._operation, self._name = operation, name
+        self._operation, self.operation = operation, name
         length = settings.sequence.length
         self._thumbnails = deque(maxlen=length - (length - 1) // 2)
         self._poses = deque(maxlen=length)
@@ -407,14 +403,15 @@ class Pipeline:
 
     def _require_no_loss(self, name: str, loaded: LoadedMap | None) -> None:
         """Reject the loss of unsaved places; loading a map in localization discards them."""
-        leaves = name == 'loop_closure' != self._name  # its route replaces the recorded map
-        replaces = loaded is not None and self._name == 'mapping'
+        leaves = name == 'loop_closure' != self.operation  # its route replaces the recorded map
+        replaces = loaded is not None and self.operation == 'mapping'
         if self.unsaved and (leaves or replaces):
             raise InputError(
                 f'the map has {self.unsaved} places that are not saved: save_map first (or '
                 'discard them by load_map, in operation localization)'
             )
-        if loaded is not None and self._name == name == 'loop_closure' and len(self.places or ()):
+        is_route = self.operation == name == 'loop_closure'
+        if loaded is not None and is_route and len(self.places or ()):
             raise InputError(
                 'the recorded route would be lost: save_map, then set_operation localization'
             )
