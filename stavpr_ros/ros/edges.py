@@ -9,7 +9,7 @@ import threading
 import traceback
 
 from rclpy.logging import get_logger
-from stavpr_msgs.msg import AlignedPlaces, LoopClosure
+from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
@@ -22,8 +22,8 @@ MOST_WAITING = 64  # closures; while there are more, edges are aligned only
 
 
 @dataclass(frozen=True)
-class _Closure:
-    """A closure that waits for its edge."""
+class Closure:
+    """A closure that waits for its edge; cameras: None = unknown."""
 
     message: LoopClosure
     pair: MatchedPair
@@ -75,19 +75,9 @@ class EdgePublisher:
             return align(pair)
         return Edge(Source.NONE, f'parameter relative_pose is {self._estimator.method}')
 
-    def put(
-        self,
-        message: LoopClosure,
-        pair: MatchedPair,
-        query_camera: Camera | None,
-        place_camera: Camera | None,
-    ) -> None:
-        """
-        Publish a closure when its edge is ready.
-
-        :param query_camera, place_camera: None = unknown.
-        """
-        self._worker.put(_Closure(message, pair, query_camera, place_camera))
+    def put(self, closure: Closure) -> None:
+        """Publish a closure when its edge is ready."""
+        self._worker.put(closure)
 
     def flush(self) -> None:
         """Publish the waiting closures, aligned only."""
@@ -102,7 +92,7 @@ class EdgePublisher:
         """End the thread; return whether it has ended."""
         return self._worker.stop()
 
-    def _complete(self, closure: _Closure, in_time: bool = True) -> None:
+    def _complete(self, closure: Closure, in_time: bool = True) -> None:
         in_time = in_time and self._worker.waiting < MOST_WAITING
         try:
             edge = self._estimator.estimate(
@@ -115,11 +105,5 @@ class EdgePublisher:
         self._reason = edge.reason
         message = closure.message
         message.has_relative_pose = edge.source is not Source.NONE
-        pair = AlignedPlaces(
-            query_index=message.query_index,
-            query_stamp=message.query_stamp,
-            place_index=message.place_index,
-            place_stamp=message.place_stamp,
-        )
-        message.relative_pose = relative_pose_message(edge, pair, message.pose_child_frame)
+        message.relative_pose = relative_pose_message(edge, message, message.pose_child_frame)
         self._publish(message)
