@@ -14,15 +14,13 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
-from stavpr_ros.parameters import PARAMETERS
+from stavpr_ros.parameters import EXPECTED, PARAMETERS
 
 PACKAGE = 'stavpr_ros'
 TYPES: dict[str, type] = {row.name: type(row.default) for row in PARAMETERS} | {
     'use_sim_time': bool
 }
-EXPECTED: dict[type, str] = {bool: 'true or false', int: 'an integer', float: 'a number'}
-CAMERA = '{camera}'
-"""In a text, the name of each of several cameras."""
+CAMERA = '{camera}'  # in a text, the name of each of several cameras
 
 
 def remappings() -> list[tuple[str, Any]]:

@@ -82,12 +82,9 @@ class PlaceRecognitionNode(ManagedNode):
         )
         self._start: Timer | None = None
         if self.settings.autostart:
-            self._start = self.create_timer(
-                0.0,
-                self._on_start,
-                callback_group=MutuallyExclusiveCallbackGroup(),
-                clock=Clock(clock_type=ClockType.STEADY_TIME),
-            )
+            group = MutuallyExclusiveCallbackGroup()
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            self._start = self.create_timer(0.0, self._on_start, callback_group=group, clock=clock)
 
     @property
     def runtime(self) -> Runtime:
@@ -302,8 +299,7 @@ class PlaceRecognitionNode(ManagedNode):
         self._verbosity = verbosity
 
     def _on_clock_jump(self, jump: Any) -> None:
-        runtime = self._runtime
-        if runtime is not None:
+        if (runtime := self._runtime) is not None:
             runtime.restart(f'the clock jumped back by {-jump.delta.nanoseconds / 1e9:.3f} s')
 
     def _health(self) -> Health:
@@ -345,8 +341,7 @@ class PlaceRecognitionNode(ManagedNode):
                 self._lock.release()
         else:
             self.left_behind = True
-            runtime = self._runtime
-            if runtime is not None:
+            if (runtime := self._runtime) is not None:
                 runtime.save_at_end()
         if self.left_behind:
             self.get_logger().warning('a thread is still loading or compiling: it is abandoned')

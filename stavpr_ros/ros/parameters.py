@@ -3,6 +3,7 @@
 """Declaration of the parameters on a node, and the rules for their changes."""
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 import difflib
 from pathlib import Path
 from typing import Any
@@ -11,18 +12,13 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.parameter import Parameter
 from stavpr_ros.errors import OutputError, SettingsError
 from stavpr_ros.output_file import require_room
-from stavpr_ros.parameters import BY_NAME, NodeParameter, PARAMETERS
+from stavpr_ros.parameters import BY_NAME, EXPECTED, NodeParameter, PARAMETERS
 from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 _FILES = ('map_path', 'save_path', 'model_path')
-_TYPES = {
-    bool: 'true or false',
-    int: 'an integer',
-    float: 'a number',
-    str: """text; quote a number or a truth value twice: "'2'\"""",
-}
+_TEXT = """text; quote a number or a truth value twice: "'2'\""""
 _CHANGED_BY_SERVICE = {'map_path': 'load_map', 'operation': 'set_operation'}
 
 
@@ -37,11 +33,9 @@ def descriptor(row: NodeParameter) -> ParameterDescriptor:
     if row.bounds is not None:
         low, high = row.bounds
         if isinstance(row.default, int):
-            result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
+            result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
         else:
-            result.floating_point_range = [
-                FloatingPointRange(from_value=low, to_value=high, step=0.0)
-            ]
+            result.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
     return result
 
 
@@ -57,7 +51,8 @@ def typed(parameter: Parameter) -> Parameter:
     if isinstance(row.default, float) and type(value) is int:
         return Parameter(row.name, value=float(value))
     raise SettingsError(
-        f'{row.name} = {value!r} has the wrong type: expected {_TYPES[type(row.default)]}'
+        f'{row.name} = {value!r} has the wrong type: '
+        f'expected {EXPECTED.get(type(row.default), _TEXT)}'
     )
 
 
@@ -117,18 +112,15 @@ def inside_maps_folder(
 
     A name that leads out of the folder stays as it is, for :func:`require_inside` to reject.
     """
-    return [_with_path(parameter, node, folder) for parameter in parameters]
-
-
-def _with_path(parameter: Parameter, node: ManagedNode, folder: Path) -> Parameter:
-    name, value = parameter.name, parameter.value
-    known = name in _FILES and isinstance(value, str) and value
-    if not known or value == node.get_parameter(name).value:
-        return parameter
-    try:
-        return Parameter(name, value=inside(folder, value))
-    except SettingsError:
-        return parameter
+    result = []
+    for given in parameters:
+        name, value = given.name, given.value
+        is_path = name in _FILES and isinstance(value, str) and value
+        result.append(given)
+        if is_path and value != node.get_parameter(name).value:
+            with suppress(SettingsError):
+                result[-1] = Parameter(name, value=inside(folder, value))
+    return result
 
 
 def require_inside(changes: Mapping[str, Any], folder: Path) -> None:
