@@ -174,6 +174,7 @@ def test_failed_odometry_subscription_is_the_problem(make_node, map_file):
 
 def test_odometry_is_subscribed_while_it_is_needed(make_node, map_file):
     node = activated(make_node(map_path=map_file, relative_pose='none', odometry_error=0.0))
+    assert node.count_subscribers('/odom') == 0
     for distance, count in ((1.0, 1), (2.0, 1), (0.0, 0)):
         assert set_parameter(node, 'keyframe_distance', distance).successful
         assert node.count_subscribers('/odom') == count

@@ -253,10 +253,13 @@ class Worker:
                     return
                 call = self._calls.popleft() if self._calls else None
                 item = None if call else self._items.popleft()
-            if call is None:
-                self._process_safely(item)
-            else:
+            if call is not None:
                 self._call(*call)
+                continue
+            try:
+                self._process(item)
+            except Exception:  # must not end the thread, and with it all later items
+                get_logger('stavpr_worker').error(f'an item was lost: {traceback.format_exc()}')
 
     def _call(self, future: Future[Any], function: Callable[[], Any]) -> None:
         self._running = future
@@ -266,10 +269,3 @@ class Worker:
             except Exception as error:
                 future.set_exception(error)
         self._running = None
-
-    def _process_safely(self, item: Any) -> None:
-        """Process an item; an error must not end the thread, and with it all later items."""
-        try:
-            self._process(item)
-        except Exception:
-            get_logger('stavpr_worker').error(f'an item was lost: {traceback.format_exc()}')

@@ -53,7 +53,13 @@ def node_launch(
     arguments = [*own, *_arguments(image, odom, fixed)]
     actions = [other for other in others if other not in own]
     check = _check([argument.name for argument in arguments])
-    return LaunchDescription([*arguments, check, _nodes(cameras, fixed), *actions])
+
+    def start(context: LaunchContext) -> list[Node]:
+        names = [''] if cameras is None else cameras.perform(context).replace(' ', '').split(',')
+        texts = {n: LaunchConfiguration(n).perform(context) for n in TYPES if n not in fixed}
+        return [_node(texts, fixed, camera) for camera in names]
+
+    return LaunchDescription([*arguments, check, OpaqueFunction(function=start), *actions])
 
 
 def unknown_arguments(given: Iterable[str], known: Iterable[str]) -> list[str]:
@@ -120,17 +126,6 @@ def _arguments(image: str, odom: str, fixed: dict[str, object]) -> list[DeclareL
             if name not in fixed
         ),
     ]
-
-
-def _nodes(cameras: LaunchConfiguration | None, fixed: dict[str, object]) -> OpaqueFunction:
-    """Start a node for each camera with the given arguments; the file has the others."""
-
-    def start(context: LaunchContext) -> list[Node]:
-        names = [''] if cameras is None else cameras.perform(context).replace(' ', '').split(',')
-        texts = {n: LaunchConfiguration(n).perform(context) for n in TYPES if n not in fixed}
-        return [_node(texts, fixed, camera) for camera in names]
-
-    return OpaqueFunction(function=start)
 
 
 def _node(texts: dict[str, str], fixed: dict[str, object], camera: str) -> Node:

@@ -29,7 +29,6 @@ from stavpr_ros.ros.parameters import (
     declare_parameters,
     inside_maps_folder,
     require_changeable,
-    require_inside,
     require_writable,
     typed,
     unknown_parameters,
@@ -67,8 +66,6 @@ class PlaceRecognitionNode(ManagedNode):
         self.problem = ''  # why the last transition failed
         self._map_info = MapInfoPublisher(self)
         self._served = Services(self, lambda: self.runtime, self.load_map, self.set_operation)
-        folder = self.settings.maps_path
-        self.add_pre_set_parameters_callback(lambda given: inside_maps_folder(given, self, folder))
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         backwards = JumpThreshold(
@@ -217,7 +214,9 @@ class PlaceRecognitionNode(ManagedNode):
         """Set parameters, all or none, one thread at a time."""
         try:
             with self._lock:
-                return super().set_parameters_atomically([typed(row) for row in parameters])
+                folder = self.settings.maps_path
+                given = [inside_maps_folder(typed(row), self, folder) for row in parameters]
+                return super().set_parameters_atomically(given)
         except SettingsError as error:
             return self._rejected(error)
 
@@ -270,7 +269,6 @@ class PlaceRecognitionNode(ManagedNode):
         changes = {name: value for name, value in values.items() if value != current[name]}
         if self._runtime is not None:
             require_changeable(changes, self.state)
-        require_inside(changes, self.settings.maps_path)
         settings = self._settings_with(changes)
         if settings.save_path != self.settings.save_path:
             require_writable(settings.save_path)

@@ -3,7 +3,6 @@
 """Declaration of the parameters on a node, and the rules for their changes."""
 
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 import difflib
 from pathlib import Path
 from typing import Any
@@ -104,43 +103,27 @@ def require_changeable(changes: Mapping[str, Any], state: str) -> None:
         )
 
 
-def inside_maps_folder(
-    parameters: list[Parameter], node: ManagedNode, folder: Path
-) -> list[Parameter]:
+def inside_maps_folder(parameter: Parameter, node: ManagedNode, folder: Path) -> Parameter:
     """
-    Return parameters that are set after the start, with absolute paths of the files they name.
+    Return a parameter that is set after the start, with the absolute path of the file it names.
 
-    A name that leads out of the folder stays as it is, for :func:`require_inside` to reject.
+    :raises SettingsError: a file outside the maps folder: anyone on the ROS graph may set
+        parameters; names the parameter.
     """
-    result = []
-    for given in parameters:
-        name, value = given.name, given.value
-        is_path = name in _FILES and isinstance(value, str) and value
-        result.append(given)
-        if is_path and value != node.get_parameter(name).value:
-            with suppress(SettingsError):
-                result[-1] = Parameter(name, value=inside(folder, value))
-    return result
-
-
-def require_inside(changes: Mapping[str, Any], folder: Path) -> None:
-    """
-    Reject files outside the maps folder: anyone on the ROS graph may set parameters.
-
-    :param changes: name to value, those that differ from the current values.
-    :raises SettingsError: names the parameter.
-    """
-    for name in _FILES:
-        if changes.get(name):
-            try:
-                inside(folder, changes[name])
-            except SettingsError as error:
-                raise SettingsError(f'{name}: {error}') from error
-    if '"model"' in changes.get('feature_settings', ''):
+    name, value = parameter.name, parameter.value
+    if name not in BY_NAME or not value or value == node.get_parameter(name).value:
+        return parameter
+    if name == 'feature_settings' and '"model"' in value:
         raise SettingsError(
             'feature_settings: the file of a network is not set after the start by "model", but '
             'by parameter model_path'
         )
+    if name not in _FILES:
+        return parameter
+    try:
+        return Parameter(name, value=inside(folder, value))
+    except SettingsError as error:
+        raise SettingsError(f'{name}: {error}') from error
 
 
 def require_writable(save_path: str) -> None:

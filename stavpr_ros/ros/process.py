@@ -198,15 +198,13 @@ class Discovery:
             if not info.node_name.startswith('_NODE_NAME_UNKNOWN')
         }
         for name in names - self._responses.keys():
-            self._request(name)
+            if name not in self._clients:
+                service = f'{name}/get_parameters'
+                self._clients[name] = self._node.create_client(GetParameters, service)
+            if self._clients[name].service_is_ready():
+                self._responses[name] = self._clients[name].call_async(GetParameters.Request())
         requested = [self._responses[name] for name in names if name in self._responses]
         waited = time.monotonic() - self._start
         if not all(response.done() for response in requested):
             return waited > self._timeout
         return (bool(names) and len(requested) == len(names)) or waited > SERVICE_SECONDS
-
-    def _request(self, name: str) -> None:
-        if name not in self._clients:
-            self._clients[name] = self._node.create_client(GetParameters, f'{name}/get_parameters')
-        if self._clients[name].service_is_ready():
-            self._responses[name] = self._clients[name].call_async(GetParameters.Request())

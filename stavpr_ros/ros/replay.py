@@ -180,12 +180,10 @@ class Replayer:
         """
         playback = self.playback
         keys = {' ': self._toggle, 's': playback.step, '\x1b[C': playback.step}
-        first = True
         with keyboard(keys) as self._poll:
-            for record in records:
-                if first:
+            for i, record in enumerate(records):
+                if i == 0:
                     playback.start(record.time_ns)
-                    first = False
                 self._send(record)
         self._poll = lambda: None
 
