@@ -25,7 +25,7 @@ from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.relative_pose.pair import MatchedPair
 from stavpr_ros.ros.camera import CameraInput
-from stavpr_ros.ros.edges import Closure, EdgePublisher
+from stavpr_ros.ros.edges import WaitingClosure, EdgePublisher
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import ImageInput, InputStatus, STOP_TIMEOUT, Worker
 from stavpr_ros.ros.map_info import map_info_message
@@ -409,7 +409,7 @@ class Runtime:
         )
         if message is not None:
             place_camera = places.camera if is_map else camera
-            self._edges.put(Closure(message, pair, camera, place_camera))
+            self._edges.put(WaitingClosure(message, pair, camera, place_camera))
 
     def _publish_route(self) -> None:
         """Publish the route for a new subscriber, in the frame of the last image if it grows."""
