@@ -25,7 +25,7 @@ from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.relative_pose.pair import MatchedPair
 from stavpr_ros.ros.camera import CameraInput
-from stavpr_ros.ros.edges import WaitingClosure, EdgePublisher
+from stavpr_ros.ros.edges import EdgePublisher, WaitingClosure
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import ImageInput, InputStatus, STOP_TIMEOUT, Worker
 from stavpr_ros.ros.map_info import map_info_message
