@@ -22,15 +22,10 @@ HEAD = 4096  # first bytes of a file, enough to recognize its kind
 
 @dataclass(frozen=True)
 class FileKind:
-    """
-    A kind of output file.
+    """A kind of output file."""
 
-    :param name: in error messages.
-    :param matches: whether a file that begins with these bytes, at most ``HEAD``, is of this kind.
-    """
-
-    name: str
-    matches: Callable[[bytes], bool]
+    name: str  # in error messages
+    matches: Callable[[bytes], bool]  # whether a file that begins with these bytes is of this kind
 
 
 MAP = FileKind('map', lambda head: head[8:9] == b'{' and b'"stavpr-map"' in head)
@@ -60,11 +55,10 @@ class FileVersion(NamedTuple):
     @classmethod
     def of(cls, path: str | Path) -> 'FileVersion | None':
         """Return the version of the file that is there now, None = none."""
-        try:
+        with suppress(OSError):
             there = os.stat(path)
-        except OSError:
-            return None
-        return cls(there.st_dev, there.st_ino, there.st_mtime_ns)
+            return cls(there.st_dev, there.st_ino, there.st_mtime_ns)
+        return None
 
 
 Force = bool | FileVersion  # whether to replace a file of the kind; a version: that file only
@@ -147,27 +141,22 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     """
     target = Path(os.path.abspath(path))
     with _explained(path):
-        _require_new(target, path)
+        require_room(target.parent / f'{target.name}.new')
+        if os.path.lexists(target):
+            raise OutputTakenError(
+                f'{path} exists already: expected a new folder; remove it or choose another name'
+            )
         temporary, lock = create_temporary(target, is_folder=True)
         made = temporary / target.name
         try:
             yield made
             for each in (*made.iterdir(), made):
                 sync_folder(each)
-            _require_new(target, path)
-            os.rename(made, target)
+            os.rename(made, target)  # fails where a file, or a folder with content, came meanwhile
             sync_folder(target.parent)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
             os.close(lock)
-
-
-def _require_new(target: Path, path: str | Path) -> None:
-    require_room(target.parent / f'{target.name}.new')
-    if os.path.lexists(target):
-        raise OutputTakenError(
-            f'{path} exists already: expected a new folder; remove it or choose another name'
-        )
 
 
 def require_room(path: str | Path) -> None:

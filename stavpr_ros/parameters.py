@@ -11,6 +11,7 @@ library.
 from dataclasses import dataclass
 from typing import Any, Literal
 
+EXPECTED: dict[type, str] = {bool: 'true or false', int: 'an integer', float: 'a number'}
 WHEN = {
     'live': 'at any time',
     'unconfigured': 'while the node is unconfigured',
@@ -24,11 +25,8 @@ class NodeParameter:
     One row of the table.
 
     :param default: its type is the type of the parameter.
-    :param sentence: description, one or two sentences.
-    :param unit: of the value, '' = none.
-    :param when: the parameter can be set at any time, while the node is unconfigured, or at its
-        start only.
-    :param bounds: smallest and largest value, or None.
+    :param when: it can be set, see ``WHEN``.
+    :param bounds: smallest and largest value.
     :param choices: the allowed values of a string, empty = any.
     """
 

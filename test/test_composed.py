@@ -12,29 +12,13 @@ import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from robot import image_message, PARAMETERS, parameters_of
+from robot import image_message
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import load_map
-from stavpr_ros.ros.node import PlaceRecognitionNode
 from stavpr_ros.threads import limit_threads
 import torch
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
-
-
-@pytest.fixture
-def make(context):
-    """Make a node; it is destroyed with the test."""
-    made = []
-
-    def make(**parameters):
-        overrides = parameters_of(PARAMETERS | {'autostart': False} | parameters)
-        made.append(PlaceRecognitionNode(context=context, parameter_overrides=overrides))
-        return made[-1]
-
-    yield make
-    for node in made:
-        node.destroy_node()
 
 
 def set_parameter(node, name, value):
@@ -70,9 +54,9 @@ def until_processed(node, count):
     ],
     ids=['reset', 'deactivate'],
 )
-def test_waiting_images_are_dropped(make, map_file, route, monkeypatch, act, cause):
+def test_waiting_images_are_dropped(make_node, map_file, route, monkeypatch, act, cause):
     """Images that came before a reset or the deactivation do not fill the window after it."""
-    node = activated(make(map_path=map_file, queue_size=10))
+    node = activated(make_node(map_path=map_file, queue_size=10))
     worker, free = node.runtime.worker, threading.Event()
 
     def run(function):
@@ -89,9 +73,9 @@ def test_waiting_images_are_dropped(make, map_file, route, monkeypatch, act, cau
 
 
 def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(
-    make, route, monkeypatch
+    make_node, route, monkeypatch
 ):
-    node = activated(make(operation='mapping'))
+    node = activated(make_node(operation='mapping'))
     with monkeypatch.context() as defect:
         defect.setattr(node.runtime.pipeline.extractor, 'extract', lambda images: 1 / 0)
         enqueue(node, route[:1])
@@ -105,10 +89,10 @@ def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(
     assert min(longest for _, longest in counts.times.values()) > 0
 
 
-def test_shutdown_of_ros_before_the_node_saves_the_map(make, context, route, tmp_path):
+def test_shutdown_of_ros_before_the_node_saves_the_map(make_node, context, route, tmp_path):
     """As with plain `rclpy.spin` and an interrupt; no thread is left."""
     path = tmp_path / 'route.stavpr'
-    node = activated(make(operation='mapping', save_path=str(path), queue_size=100))
+    node = activated(make_node(operation='mapping', save_path=str(path), queue_size=100))
     enqueue(node, route[:20])
     while not len(node.runtime.pipeline.places):
         node.runtime.worker.run(lambda: None)
@@ -118,9 +102,9 @@ def test_shutdown_of_ros_before_the_node_saves_the_map(make, context, route, tmp
     assert not [thread for thread in threading.enumerate() if thread.name == 'recognition']
 
 
-def test_integer_where_a_number_is_expected_is_converted(make):
+def test_integer_where_a_number_is_expected_is_converted(make_node):
     """As in `threshold: 1` of a parameter file, and in `ros2 param set NODE threshold 1`."""
-    node = make(mode='paper', threshold=1)
+    node = make_node(mode='paper', threshold=1)
     assert repr(node.settings.pipeline.threshold) == '1.0'
     assert set_parameter(node, 'threshold', 2).successful
     assert repr(node.get_parameter('threshold').value) == '2.0'
@@ -135,15 +119,15 @@ def test_integer_where_a_number_is_expected_is_converted(make):
         ('robot_id', 2, 'robot_id = 2 has the wrong type: expected text'),
     ],
 )
-def test_parameter_of_the_wrong_type_is_rejected_by_name(make, name, value, expected):
+def test_parameter_of_the_wrong_type_is_rejected_by_name(make_node, name, value, expected):
     with pytest.raises(SettingsError, match=expected):
-        make(**{name: value})
-    result = set_parameter(make(), name, value)
+        make_node(**{name: value})
+    result = set_parameter(make_node(), name, value)
     assert (result.successful, expected in result.reason) == (False, True)
 
 
-def test_parameters_that_are_rejected_change_nothing(make, map_file):
-    node = make(map_path=map_file)
+def test_parameters_that_are_rejected_change_nothing(make_node, map_file):
+    node = make_node(map_path=map_file)
     assert node.trigger_configure() == SUCCESS
     before = node.settings
     for name, value, words in (
@@ -167,8 +151,8 @@ def test_parameters_that_are_rejected_change_nothing(make, map_file):
     assert node.runtime.pipeline.settings.candidates == 3
 
 
-def test_operation_of_the_service_lasts_until_the_next_configuration(make, map_file):
-    node = make(map_path=map_file)
+def test_operation_of_the_service_lasts_until_the_next_configuration(make_node, map_file):
+    node = make_node(map_path=map_file)
     assert node.trigger_configure() == SUCCESS
     node.set_operation('mapping')
     assert set_parameter(node, 'candidates', 3).successful
@@ -177,17 +161,20 @@ def test_operation_of_the_service_lasts_until_the_next_configuration(make, map_f
     assert node.settings.operation == node.runtime.pipeline.operation == 'localization'
 
 
-def test_failed_odometry_subscription_is_the_problem(make, map_file):
+def test_failed_odometry_subscription_is_the_problem(make_node, map_file):
     """Live parameters are applied; the error is logged and in the diagnostics."""
     topic = {'qos_overrides./odom.subscription.reliability': 'certain'}
-    node = activated(make(map_path=map_file, relative_pose='none', odometry_error=0.0, **topic))
+    node = activated(
+        make_node(map_path=map_file, relative_pose='none', odometry_error=0.0, **topic)
+    )
     assert set_parameter(node, 'keyframe_distance', 1.0).successful
     assert 'correct qos_overrides./odom.subscription' in node.runtime.problem
     assert node.runtime.pipeline.settings.keyframes.distance == 1
 
 
-def test_odometry_is_subscribed_while_it_is_needed(make, map_file):
-    node = activated(make(map_path=map_file, relative_pose='none', odometry_error=0.0))
+def test_odometry_is_subscribed_while_it_is_needed(make_node, map_file):
+    node = activated(make_node(map_path=map_file, relative_pose='none', odometry_error=0.0))
+    assert node.count_subscribers('/odom') == 0
     for distance, count in ((1.0, 1), (2.0, 1), (0.0, 0)):
         assert set_parameter(node, 'keyframe_distance', distance).successful
         assert node.count_subscribers('/odom') == count
@@ -195,23 +182,23 @@ def test_odometry_is_subscribed_while_it_is_needed(make, map_file):
     assert node.count_subscribers('/odom') == 1
 
 
-def test_odometry_is_subscribed_for_edges_to_a_map_with_poses(make, map_file):
-    node = activated(make(relative_pose='aligned'))
+def test_odometry_is_subscribed_for_edges_to_a_map_with_poses(make_node, map_file):
+    node = activated(make_node(relative_pose='aligned'))
     assert node.count_subscribers('/odom') == 0
     node.load_map(map_file)
     assert node.count_subscribers('/odom') == 1
 
 
-def test_restart_removes_the_poses_of_the_odometry(make, map_file):
-    node = activated(make(map_path=map_file, keyframe_distance=1.0))
+def test_restart_removes_the_poses_of_the_odometry(make_node, map_file):
+    node = activated(make_node(map_path=map_file, keyframe_distance=1.0))
     trajectory = node.runtime.odometry.trajectory
     trajectory.add(SECOND, np.array([0, 0, 0, 0, 0, 0, 1.0]))
     node.runtime.restart('the stamps jumped back')
     assert len(trajectory) == 0
 
 
-def test_place_has_the_pose_at_the_stamp_of_its_image(make, route):
-    node = activated(make(operation='mapping', keyframe_distance=0.1))
+def test_place_has_the_pose_at_the_stamp_of_its_image(make_node, route):
+    node = activated(make_node(operation='mapping', keyframe_distance=0.1))
     for seconds in (1, 2):
         pose = np.array([10 * seconds, 0, 0, 0, 0, 0, 1.0])
         node.runtime.odometry.trajectory.add(seconds * SECOND, pose)
@@ -220,9 +207,9 @@ def test_place_has_the_pose_at_the_stamp_of_its_image(make, route):
     assert node.runtime.pipeline.places.poses[0][0] == 12.5
 
 
-def test_save_path_that_cannot_be_written_is_rejected(make, tmp_path):
+def test_save_path_that_cannot_be_written_is_rejected(make_node, tmp_path):
     path = str(tmp_path / 'missing' / 'route.stavpr')
-    node = make(operation='mapping', save_path=path, maps_folder=str(tmp_path))
+    node = make_node(operation='mapping', save_path=path, maps_folder=str(tmp_path))
     assert node.trigger_configure() != SUCCESS
     assert (node.state, 'save_path' in node.problem) == ('unconfigured', True)
     assert not set_parameter(node, 'save_path', str(tmp_path)).successful
@@ -230,11 +217,11 @@ def test_save_path_that_cannot_be_written_is_rejected(make, tmp_path):
     assert node.trigger_configure() == SUCCESS
 
 
-def test_limit_of_threads_can_be_removed(make):
+def test_limit_of_threads_can_be_removed(make_node):
     """The limit of OpenCV holds for the process, that of torch for the worker."""
     limit_threads(0)
     before = torch.get_num_threads(), cv2.getNumThreads()
-    node = make(threads=1)
+    node = make_node(threads=1)
     for threads, expected in ((1, (1, 1)), (0, before)):
         assert set_parameter(node, 'threads', threads).successful
         assert node.trigger_configure() == SUCCESS
@@ -243,7 +230,7 @@ def test_limit_of_threads_can_be_removed(make):
         assert node.trigger_cleanup() == SUCCESS
 
 
-def test_misspelled_parameter_is_logged(make, capfd):
-    make(sequence_lenght=5)
+def test_misspelled_parameter_is_logged(make_node, capfd):
+    make_node(sequence_lenght=5)
     words = "parameter 'sequence_lenght' is unknown: did you mean sequence_length?"
     assert words in capfd.readouterr().err

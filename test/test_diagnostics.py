@@ -265,9 +265,8 @@ def test_values_of_input_are_complete():
 
 
 def test_values_of_map_are_complete():
-    assert ' '.join(values('map', map_path='')) == (
-        'state=loaded path=none places=1000 max_places=20000 features=gradient'
-    )
+    found = ' '.join(values('map', map_path=''))
+    assert found == 'state=loaded path=none places=1000 max_places=20000 features=gradient'
 
 
 def test_values_of_recognition_are_complete():

@@ -13,7 +13,6 @@ import re
 import sys
 from types import ModuleType, SimpleNamespace
 
-from ament_index_python.packages import get_package_share_directory
 from processes import executable
 import pytest
 from stavpr_ros.parameters import BY_NAME
@@ -56,15 +55,11 @@ class StandIn(ModuleType):
         return vars(self).setdefault(name, type(name, (Recorded,), {}))
 
 
-STAND_INS = (
-    'launch',
-    'launch.actions',
-    'launch.substitutions',
-    'launch_ros',
-    'launch_ros.actions',
-    'launch_ros.parameter_descriptions',
-    'launch_ros.substitutions',
-)
+STAND_INS = [
+    package + module
+    for package in ('launch', 'launch_ros')
+    for module in ('', '.actions', '.parameter_descriptions', '.substitutions')
+]
 
 
 class Context(dict):
@@ -116,11 +111,8 @@ def words(value):
     return f'${{{value.first}}}' if isinstance(value, Recorded) else value
 
 
-def test_launch_files_are_all_installed():
+def test_launch_files_are_those_tested_here():
     assert sorted(FIXED) == NAMES
-    folder = Path(get_package_share_directory('stavpr_ros')) / 'launch'
-    for path in FILES:
-        assert (folder / path.name).read_text() == path.read_text()
 
 
 def test_launching_imports_nothing_heavy():

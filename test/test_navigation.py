@@ -11,7 +11,6 @@ import numpy as np
 from pipelines import at, LENGTH, localizing, message, SECOND
 import pytest
 from scipy.spatial.transform import Rotation
-from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.mapping.transforms import matrices
 from stavpr_ros.ros.navigation import map_to_odometry, Navigation, planar
 from stavpr_ros.ros.output import pose_message
@@ -118,18 +117,3 @@ def test_node_with_publish_tf_without_tf2_msgs_explains_it(robot, start, monkeyp
     start(wait=False, publish_tf=True)
     robot.until_logged('publish_tf requires the package tf2_msgs: install it')
     robot.until_state('unconfigured')
-
-
-def test_node_publishes_the_initial_pose_and_subscribes_to_no_odometry(robot, start, route):
-    start(publish_initialpose=True, relative_pose='none', odometry_error=0.0)
-    poses = robot.listen(PoseWithCovarianceStamped, '/initialpose')
-    robot.until(lambda: robot.node.count_publishers('/initialpose') == 1, 'the publisher')
-    shown = iter(route)
-
-    def matched():
-        return robot.show(next(shown)).status == PlaceMatch.MATCH
-
-    robot.until(matched, 'a match')
-    robot.until(lambda: poses, 'the initial pose')
-    assert poses[0].header.frame_id == 'map'
-    assert robot.odometry.get_subscription_count() == 0

@@ -124,9 +124,9 @@ def test_images_do_not_wait_for_edges(closing, monkeypatch):
     monkeypatch.setattr(EdgeEstimator, '_pnp', slow)
     seen, put = [], EdgePublisher.put
 
-    def noting(self, message, pair, query_camera, place_camera):
-        seen.append(query_camera)
-        put(self, message, pair, query_camera, place_camera)
+    def noting(self, closure):
+        seen.append(closure.query_camera)
+        put(self, closure)
         if len(seen) == 5:
             free.set()
 

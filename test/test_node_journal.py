@@ -9,32 +9,27 @@ import resource
 from processes import Process, SECOND
 import pytest
 from rclpy.lifecycle import TransitionCallbackReturn
-from robot import image_message, PARAMETERS, parameters_of
+from robot import image_message, PARAMETERS
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import OutputError
 from stavpr_ros.mapping import load_map
 from stavpr_ros.mapping.journal import journals, recover
 from stavpr_ros.pipeline import saving
-from stavpr_ros.ros.node import PlaceRecognitionNode
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
 @pytest.fixture
-def make(context, tmp_path):
-    """Make and activate a node that records into the maps folder; it ends with the test."""
-    made = []
+def make(make_node, tmp_path):
+    """Make and activate a node that records into the maps folder."""
 
     def make(**parameters):
-        values = {'autostart': False, 'operation': 'mapping', 'maps_folder': str(tmp_path)}
-        overrides = parameters_of(PARAMETERS | values | parameters)
-        made.append(PlaceRecognitionNode(context=context, parameter_overrides=overrides))
-        assert made[-1].trigger_configure() == made[-1].trigger_activate() == SUCCESS
-        return made[-1]
+        values = {'operation': 'mapping', 'maps_folder': str(tmp_path)}
+        node = make_node(**values | parameters)
+        assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+        return node
 
-    yield make
-    for node in made:
-        node.destroy_node()
+    return make
 
 
 def record(node, images, first=0):

@@ -8,8 +8,8 @@ A test of upstream that fails means that its workaround can go.
 
 from concurrent.futures import Future, ThreadPoolExecutor
 import threading
-from unittest.mock import Mock
-import warnings
+from types import SimpleNamespace
+from unittest.mock import call, Mock
 
 import pytest
 import rclpy
@@ -71,7 +71,16 @@ def test_multi_threaded_executor_of_upstream_submits_a_waiting_callback_again(
     executor.shutdown()
 
 
-def test_prompt_executor_of_a_waiting_callback_submits_it_once(node, context, monkeypatch):
+@pytest.fixture
+def prompt(node, context):
+    executor = PromptExecutor(2, context=context)
+    executor.add_node(node)
+    yield executor
+    executor.finish(10.0)
+    executor.shutdown()
+
+
+def test_prompt_executor_of_a_waiting_callback_submits_it_once(node, prompt, monkeypatch):
     ran, submissions, submit = [], [], ThreadPoolExecutor.submit
 
     def counted(pool, function, *arguments):
@@ -79,55 +88,36 @@ def test_prompt_executor_of_a_waiting_callback_submits_it_once(node, context, mo
         return submit(pool, function, *arguments)
 
     monkeypatch.setattr(ThreadPoolExecutor, 'submit', counted)
-    executor = PromptExecutor(2, context=context)
-    executor.add_node(node)
     node.create_timer(0.0, lambda: ran.append(1))
     for _ in range(20):
-        executor.spin_once(timeout_sec=0.05)
-    executor.finish(10.0)
+        prompt.spin_once(timeout_sec=0.05)
+    prompt.finish(10.0)
     assert len(submissions) == len(ran) > 0
-    executor.shutdown()
 
 
-def test_prompt_executor_with_a_blocked_callback_runs_others(node, context):
+def test_prompt_executor_with_a_blocked_callback_runs_others(node, prompt):
     blocked, ran = threading.Event(), threading.Event()
-    executor = PromptExecutor(2, context=context)
-    executor.add_node(node)
     group = ReentrantCallbackGroup()
     once = node.create_timer(0.0, lambda: (once.cancel(), blocked.wait(60)), callback_group=group)
     node.create_timer(0.0, ran.set, callback_group=group)
     try:
-        spin_until(executor, ran.is_set)
+        spin_until(prompt, ran.is_set)
     finally:
         blocked.set()
-    executor.finish(10.0)
-    executor.shutdown()
 
 
-def test_prompt_executor_after_a_failing_callback_goes_on(node, context, capfd):
-    executor = PromptExecutor(1, context=context)
-    executor.add_node(node)
-
-    def fail():
-        raise ValueError('defect')
-
-    node.create_timer(0.0, fail)
+def test_prompt_executor_after_a_failing_callback_goes_on(node, prompt, capfd):
+    node.create_timer(0.0, Mock(side_effect=ValueError('defect')))
     for _ in range(3):
-        executor.spin_once(timeout_sec=0.05)
-    executor.finish(10.0)
-    executor.shutdown()
+        prompt.spin_once(timeout_sec=0.05)
+    prompt.finish(10.0)
     assert 'ValueError: defect' in capfd.readouterr().err
 
 
-def test_prompt_executor_meeting_a_destroyed_entity_goes_on(context, monkeypatch):
-    executor = PromptExecutor(1, context=context)
-
-    def raise_invalid_handle(*arguments):
-        raise rclpy_implementation.InvalidHandle('destroyed')
-
-    monkeypatch.setattr(executor, 'wait_for_ready_callbacks', raise_invalid_handle)
-    executor.spin_once(0.1)
-    executor.shutdown()
+def test_prompt_executor_meeting_a_destroyed_entity_goes_on(prompt, monkeypatch):
+    destroyed = Mock(side_effect=rclpy_implementation.InvalidHandle('destroyed'))
+    monkeypatch.setattr(prompt, 'wait_for_ready_callbacks', destroyed)
+    prompt.spin_once(0.1)
 
 
 # responses to clients that are not matched yet
@@ -182,61 +172,45 @@ def test_service_with_an_unmatched_client_repeats_the_response(lost_response, mo
     assert len(lost_response(repeat_responses)) > 2
 
 
-class FakeService:
-    """A service that fails to send its first responses."""
-
-    def __init__(self, failures, fail):
-        self.failures, self.fail, self.sent = failures, fail, []
-
-    def send_response(self, response, header):
-        self.sent.append((response, header))
-        if len(self.sent) <= self.failures:
-            self.fail()
+def raised_within_c(error):
+    """Return what Python raises for an error in a C function that returns a result."""
+    outer = SystemError('returned a result with an exception set')
+    outer.__cause__ = error
+    return outer
 
 
-def warn():
-    warnings.warn(LOST, RuntimeWarning, stacklevel=1)
-
-
-def warn_within_c():
-    """Raise as Python does for a warning, made an error, in a C function that returns a result."""
-    try:
-        warn()
-    except RuntimeWarning as error:
-        raise SystemError('returned a result with an exception set') from error
-
-
-@pytest.mark.parametrize('fail', [warn, warn_within_c])
+@pytest.mark.parametrize('error', [RuntimeWarning(LOST), raised_within_c(RuntimeWarning(LOST))])
 @pytest.mark.parametrize('failures', [0, 1, 5])
-def test_service_whose_client_is_matched_late_sends_the_response(
-    fail, failures, recwarn, monkeypatch
-):
+def test_service_whose_client_is_matched_late_sends_the_response(error, failures, monkeypatch):
     monkeypatch.setattr(rclpy_workarounds, 'RESPONSE_PAUSE', 0.001)
-    service = FakeService(failures, fail)
+    send = Mock(side_effect=[error] * failures + [None])
+    service = SimpleNamespace(send_response=send)
     repeat_responses(service)
     service.send_response('yes', 7)
-    assert service.sent == [('yes', 7)] * (failures + 1)
-    assert not recwarn.list
+    assert send.call_args_list == [call('yes', 7)] * (failures + 1)
 
 
 def test_service_with_another_error_raises_it_at_once():
-    def fail():
-        raise SystemError('something else')
-
-    service = FakeService(1, fail)
+    send = Mock(side_effect=SystemError('something else'))
+    service = SimpleNamespace(send_response=send)
     repeat_responses(service)
     with pytest.raises(SystemError, match='something else'):
         service.send_response('yes', 7)
-    assert len(service.sent) == 1
+    send.assert_called_once()
 
 
-def test_services_of_a_managed_node_repeat_responses(context):
+@pytest.fixture
+def managed(context):
     node = ManagedNode('managed', context=context)
-    names = {service.srv_name.rpartition('/')[2] for service in node.services}
-    assert {'change_state', 'get_state', 'set_parameters'} <= names
-    for service in node.services:
-        assert service.send_response.__name__ == 'send_repeatedly', service.srv_name
+    yield node
     node.destroy_node()
+
+
+def test_services_of_a_managed_node_repeat_responses(managed):
+    names = {service.srv_name.rpartition('/')[2] for service in managed.services}
+    assert {'change_state', 'get_state', 'set_parameters'} <= names
+    for service in managed.services:
+        assert service.send_response.__name__ == 'send_repeatedly', service.srv_name
 
 
 # the life cycle
@@ -249,13 +223,11 @@ def test_lifecycle_node_of_upstream_raises_at_an_invalid_transition(context):
     node.destroy_node()
 
 
-def test_managed_node_at_an_invalid_transition_stays_in_its_state(context):
-    node = ManagedNode('managed', context=context)
-    assert not node.advance(node.trigger_activate)
-    assert node.state == 'unconfigured'
-    assert node.advance(node.trigger_configure)
-    assert node.state == 'inactive'
-    node.destroy_node()
+def test_managed_node_at_an_invalid_transition_stays_in_its_state(managed):
+    assert not managed.advance(managed.trigger_activate)
+    assert managed.state == 'unconfigured'
+    assert managed.advance(managed.trigger_configure)
+    assert managed.state == 'inactive'
 
 
 def test_managed_node_destroyed_before_a_transition_logs_no_error(context, capfd):

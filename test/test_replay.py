@@ -59,24 +59,13 @@ def subscribe():
         yield partial(Subscriber, node)
 
 
-def start_replay(*arguments):
-    return subprocess.Popen(
-        [*COMMAND, *map(str, arguments)],
-        env=environment(),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
 def replay(*arguments):
-    process = start_replay(*arguments)
-    try:
-        output, errors = process.communicate(timeout=TIMEOUT)
-    finally:
-        process.kill()
-    assert 'Traceback' not in errors, errors
-    return process.returncode, output, errors
+    command = [*COMMAND, *map(str, arguments)]
+    done = subprocess.run(
+        command, env=environment(), capture_output=True, text=True, timeout=TIMEOUT, check=False
+    )
+    assert 'Traceback' not in done.stderr, done.stderr
+    return done.returncode, done.stdout, done.stderr
 
 
 def make_bag(path, count=20, gap_ms=20, stamped=True, size=(6, 8)):
@@ -169,7 +158,9 @@ def test_replay_without_a_subscriber_fails(tmp_path):
 def test_replay_after_a_signal_ends_at_once(tmp_path, subscribe, sent):
     bag, _ = make_bag(tmp_path / 'bag', count=5, gap_ms=60_000)
     subscriber = subscribe()
-    process = start_replay(bag)
+    process = subprocess.Popen(
+        [*COMMAND, str(bag)], env=environment(), stderr=subprocess.PIPE, text=True
+    )
     try:
         lines = iter(process.stderr.readline, '')
         assert any('the next image is due in 60 s' in line for line in lines)

@@ -36,10 +36,6 @@ def interrupted_at(monkeypatch):
     return at
 
 
-def test_time_left_without_a_signal_is_all():
-    assert signals.time_left(30.0) == 30.0
-
-
 @pytest.mark.parametrize(
     ('seconds', 'most', 'least', 'left'),
     [
@@ -53,6 +49,7 @@ def test_time_left_without_a_signal_is_all():
 def test_time_left_after_a_signal_ends_with_the_time_of_all(
     interrupted_at, seconds, most, least, left
 ):
+    assert signals.time_left(most, least) == most  # before the signal
     interrupted_at(seconds)
     assert signals.time_left(most, least) == pytest.approx(left)
 

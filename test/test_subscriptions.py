@@ -61,22 +61,14 @@ class Setup:
         self.until(lambda: all(word in self.subscription.choice for word in words))
 
     def until_matched(self, *publishers):
-        """Wait until exactly one subscription is left, and it has discovered these publishers."""
+        """Wait until exactly one subscription is left, and a probe of each publisher arrives."""
 
-        def matched():
-            counts = [publisher.get_subscription_count() for publisher in publishers]
-            return counts == [1] * len(counts) and not self.sent_and_pending(publishers)
-
-        self.until(matched)
-
-    def sent_and_pending(self, publishers):
-        """Return whether some publisher's images do not arrive yet: probe until each does."""
-        for publisher in publishers:
+        def arrives(publisher):
             self.publish(publisher)
             self.executor.spin_once(timeout_sec=0.05)
-            if self.received[-1:] != [self.sent]:
-                return True
-        return False
+            return publisher.get_subscription_count() == 1 and self.received[-1:] == [self.sent]
+
+        self.until(lambda: all(map(arrives, publishers)))
 
     def close(self):
         self.subscription.close()

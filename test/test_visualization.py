@@ -12,6 +12,7 @@ from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Time
 import cv2
 from fixtures import route_images
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 import numpy as np
 from pipelines import LENGTH, localizing, message, process, recorded, SECOND
@@ -298,9 +299,12 @@ def test_node_publishes_the_route_for_a_late_subscriber_without_an_image(robot, 
     assert routes[0].header.frame_id == 'map'
 
 
-def test_node_publishes_for_viewers(robot, start, route):
-    start()
-    received = robot.listen(MarkerArray, '/stavpr/markers')
+def test_node_publishes_for_viewers_and_navigation(robot, start, route):
+    start(publish_initialpose=True)
+    markers = robot.listen(MarkerArray, '/stavpr/markers')
+    poses = robot.listen(PoseWithCovarianceStamped, '/initialpose')
+    robot.until(lambda: robot.node.count_publishers('/initialpose') == 1, 'the publisher')
     shown = iter(route)
     robot.until(lambda: robot.show(next(shown)).status == PlaceMatch.MATCH, 'a match')
-    robot.until(lambda: bool(received), 'the markers')
+    robot.until(lambda: markers and poses, 'the markers and the initial pose')
+    assert poses[0].header.frame_id == 'map'

@@ -30,8 +30,7 @@ def resolve(python: str) -> dict[str, Any]:
     command += ['--report', '-', '-c', str(FOLDER / 'constraints.txt')]
     for name in (*BASE, *LOCKED_EXTRAS):
         command += ['-r', str(FOLDER / f'{name}.txt')]
-    result = subprocess.run(command, stdout=subprocess.PIPE, check=True)
-    report: dict[str, Any] = json.loads(result.stdout)
+    report: dict[str, Any] = json.loads(subprocess.check_output(command))
     return report
 
 
@@ -87,10 +86,8 @@ def locked(reports: dict[str, dict[str, Any]], names: dict[str, set[str]]) -> st
 
 def main(pythons: list[str]) -> None:
     """Write all lock files."""
-    reports = {}
-    for python in pythons:
-        report = resolve(python)
-        reports[report['environment']['python_version']] = report
+    found = map(resolve, pythons)
+    reports = {report['environment']['python_version']: report for report in found}
     base = {version: closure(requirements(*BASE), report) for version, report in reports.items()}
     folder = FOLDER / 'locked'
     folder.mkdir(exist_ok=True)

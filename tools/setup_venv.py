@@ -66,13 +66,7 @@ class SetupError(Exception):
 
 
 def python_problem(version: str, implementation: str) -> str:
-    """
-    Explain why an interpreter is not supported.
-
-    :param version: major and minor version, such as ``3.12``.
-    :param implementation: such as ``CPython``.
-    :returns: the reason and the remedy; empty for a supported interpreter.
-    """
+    """Explain why an interpreter, such as CPython 3.12, is not supported; empty if it is."""
     if version in SUPPORTED and implementation == 'CPython':
         return ''
     return (
@@ -134,12 +128,7 @@ def clean_environment() -> dict:
 
 
 def run_logged(name: str, title: str, command: list) -> None:
-    """
-    Run a command with its output in ``log/setup/NAME.log``.
-
-    :param title: the action, for the terminal.
-    :raises SetupError: with the end of the log.
-    """
+    """Run a command with its output in ``log/setup/NAME.log``; the title is for the terminal."""
     log = ROOT / 'log' / 'setup' / f'{name}.log'
     log.parent.mkdir(parents=True, exist_ok=True)
     print(f'{title} (log: {log.relative_to(ROOT)}) ...', end='', flush=True)
@@ -164,28 +153,13 @@ def run_logged(name: str, title: str, command: list) -> None:
 
 
 def digest(paths: list) -> str:
-    """
-    Hash the names and contents of files.
-
-    :param paths: files, and folders with all that is in them; missing ones are skipped.
-    :returns: SHA-256, hexadecimal.
-    """
-    folders = [path for path in paths if path.is_dir()]
-    found = [*paths, *(path for folder in folders for path in folder.rglob('*'))]
+    """Hash the names and contents of files and folders; missing ones are skipped."""
     total = hashlib.sha256()
-    for file in sorted(found):
+    for file in sorted(file for path in paths for file in (path, *path.rglob('*'))):
         if file.is_file() and '__pycache__' not in file.parts:
             content = hashlib.sha256(file.read_bytes()).hexdigest()
             total.update(f'{file.relative_to(ROOT)} {content}\n'.encode())
     return total.hexdigest()
-
-
-def read_stamp(path: Path) -> dict:
-    """Read the inputs of the finished installation; empty if none was finished."""
-    try:
-        return dict(json.loads(path.read_text()))
-    except (FileNotFoundError, ValueError):
-        return {}
 
 
 def relocate_wheels() -> None:
@@ -204,14 +178,14 @@ def install(extras: list, torch_index: str) -> None:
     """
     Install the requirements into ``.venv``, unless this was finished with the same inputs.
 
-    Extras and an index of torch that were requested before are kept.
-
-    :param extras: names of :data:`EXTRAS`.
-    :param torch_index: package index to take torch from; empty for the default one.
+    Extras and a package index of torch that were requested before are kept.
     """
     venv = (ROOT / '.venv').resolve()
     stamp = venv / 'setup.json'
-    before = read_stamp(stamp)
+    try:
+        before = json.loads(stamp.read_text())
+    except (FileNotFoundError, ValueError):
+        before = {}  # no installation was finished
     place = {
         'python': PYTHON_VERSION,
         'prefix': sys.base_prefix,
@@ -285,18 +259,13 @@ def build() -> None:
 
 def run(command: list) -> None:
     """Replace this process by a command that finds the built packages."""
-    # No `set -u`: colcon's file reads variables that may be unset.
-    script = 'source "$0" && exec "$@"'
     setup_file = str(ROOT / 'install' / 'local_setup.bash')
-    os.execvpe('bash', ['bash', '--norc', '-c', script, setup_file, *command], clean_environment())
+    shell = ['bash', '--norc', '-c', 'source "$0" && exec "$@"', setup_file]
+    os.execvpe('bash', [*shell, *command], clean_environment())
 
 
 def main(arguments: list) -> int:
-    """
-    Run one command of the command line.
-
-    :returns: exit status: 0, 1 after a failure, 130 after an interruption.
-    """
+    """Run one command; return 0, 1 after a failure, or 130 after an interruption."""
     try:
         problem = python_problem(PYTHON_VERSION, platform.python_implementation())
         if problem:

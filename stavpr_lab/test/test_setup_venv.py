@@ -34,22 +34,17 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 class Recorder:
-    """
-    Replaces ``run_logged``: records the commands instead of running them.
-
-    :ivar failure: raised by the command of the name ``fails``.
-    """
+    """Replaces ``run_logged``: records the commands; that of the name ``fails`` is interrupted."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self.commands: dict[str, str] = {}
         self.fails = ''
-        self.failure: BaseException = setup_venv.SetupError('failed on request')
 
     def __call__(self, name: str, title: str, command: list) -> None:
         self.commands[name] = ' '.join(map(str, command))
         if name == self.fails:
-            raise self.failure
+            raise KeyboardInterrupt
         if name == 'venv':
             (self.root / '.venv').mkdir(exist_ok=True)
             (self.root / '.venv' / 'pyvenv.cfg').write_text(f'home = {sys.base_prefix}')
@@ -130,7 +125,7 @@ def test_changed_requirement_is_installed_in_place(recorder, checkout):
     (checkout / 'requirements' / 'torch.txt').write_text('fake==2\n')
     assert recorder.run('build') == ['torch', 'pip']
     (checkout / 'requirements' / 'locked' / 'base.txt').write_text('fake==2\n')
-    assert recorder.run('build') == ['torch', 'pip', 'stavpr_msgs', 'stavpr_ros']
+    assert recorder.run('build') == ['torch', 'pip', *setup_venv.SOURCES]
     (checkout / 'requirements' / 'locked' / 'onnx.txt').write_text('fake==2\n')
     assert recorder.run('build') == []
 
@@ -157,11 +152,10 @@ def test_changed_source_builds_its_package_from_nothing(recorder, checkout):
     recorder.run('build')
     (checkout / 'stavpr_ros' / 'x.py').touch()
     stale = [checkout / folder / 'stavpr_ros' / 'stale' for folder in ('build', 'install')]
-    for file in stale:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.touch()
+    for folder in stale:
+        folder.mkdir(parents=True)
     assert recorder.run('build') == ['stavpr_ros']
-    assert not any(file.exists() for file in stale)
+    assert not any(folder.exists() for folder in stale)
 
 
 def test_torch_index_is_for_torch_alone_and_is_kept(recorder):
@@ -176,16 +170,10 @@ def test_torch_index_is_for_torch_alone_and_is_kept(recorder):
 
 
 @pytest.mark.parametrize('changed', ['python', 'prefix', 'folder'])
-def test_changed_interpreter_or_folder_starts_anew(recorder, checkout, monkeypatch, changed):
+def test_changed_interpreter_or_folder_starts_anew(recorder, checkout, changed):
     recorder.run('setup')
-    if changed == 'python':
-        other = next(name for name in setup_venv.SUPPORTED if name != setup_venv.PYTHON_VERSION)
-        monkeypatch.setattr(setup_venv, 'PYTHON_VERSION', other)
-    elif changed == 'prefix':
-        monkeypatch.setattr(sys, 'base_prefix', '/other')
-    else:
-        stamp = checkout / '.venv' / 'setup.json'
-        stamp.write_text(json.dumps({**json.loads(stamp.read_text()), 'folder': '/other'}))
+    stamp = checkout / '.venv' / 'setup.json'
+    stamp.write_text(json.dumps(json.loads(stamp.read_text()) | {changed: 'other'}))
     assert recorder.run('setup') == ['venv', 'torch', 'pip']
     assert '--clear' in recorder.commands['venv']
 
@@ -195,7 +183,7 @@ def test_interrupted_installation_starts_anew(recorder, checkout, step):
     recorder.run('setup')
     stamp = checkout / '.venv' / 'setup.json'
     stamp.write_text(stamp.read_text()[:9])
-    recorder.fails, recorder.failure = step, KeyboardInterrupt()
+    recorder.fails = step
     assert setup_venv.main(['setup']) == 130
     recorder.fails = ''
     assert recorder.run('setup') == ['venv', 'torch', 'pip']
@@ -209,29 +197,20 @@ def test_interrupted_installation_starts_anew(recorder, checkout, step):
 
 
 def test_environment_has_no_other_ros(checkout, monkeypatch):
-    variables = {
+    kept = {'ROS_DOMAIN_ID': '7', 'STAVPR_DATA': '/data'}
+    variables = kept | dict.fromkeys(setup_venv.FOREIGN, 'x') | {
         'PATH': '/opt/ros/jazzy/bin:/usr/bin:/ws/install/a/bin:/opt/rosalind/bin',
-        'PYTHONPATH': '/opt/ros/jazzy/lib',
         'AMENT_PREFIX_PATH': '/ws/install/a:/opt/ros/jazzy',
         'COLCON_PREFIX_PATH': '/ws/install',
-        'ROS_DISTRO': 'humble',
-        'ROS_DOMAIN_ID': '7',
-        'MAKEFLAGS': 'j',
-        'STAVPR_DATA': '/data',
         'LD_LIBRARY_PATH': '/opt/ros/jazzy/lib:/v/lib/python3.11/site-packages/ros_rcl.libs',
-        '_ROS_WHEELS_BOOTSTRAP_COMPLETE': '1',
-    }
+    }  # fmt: skip
     monkeypatch.setattr(os, 'environ', variables)
     venv = str(checkout / '.venv')
-    assert setup_venv.clean_environment() == {
+    assert setup_venv.clean_environment() == kept | {
         'PATH': f'{venv}/bin:/usr/bin:/opt/rosalind/bin',
-        'VIRTUAL_ENV': venv,
-        'AMENT_PREFIX_PATH': venv,
-        'CMAKE_PREFIX_PATH': venv,
         'COLCON_HOME': f'{venv}/colcon',
-        'ROS_DOMAIN_ID': '7',
-        'STAVPR_DATA': '/data',
         'PIP_USER': '0',
+        **dict.fromkeys(('VIRTUAL_ENV', 'AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH'), venv),
     }
 
 

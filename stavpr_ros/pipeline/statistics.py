@@ -23,18 +23,12 @@ LONGEST_LOSS = 10  # periods; longer pauses are pauses of the camera, not losses
 
 @dataclass(frozen=True)
 class Tally:
-    """
-    The events of one kind; recent ones are those of the last ``RECENT`` seconds.
+    """The events of one kind, by name; recent ones are those of the last ``RECENT`` seconds."""
 
-    :param total: number since the start, by name; ``recent``: the recent ones.
-    :param rate: recent events per second.
-    :param age: seconds since the last event, None = none since the last activation.
-    """
-
-    total: Counter[str] = field(default_factory=Counter)
+    total: Counter[str] = field(default_factory=Counter)  # since the start
     recent: Counter[str] = field(default_factory=Counter)
-    rate: float = 0.0
-    age: float | None = None
+    rate: float = 0.0  # recent events per second
+    age: float | None = None  # seconds since the last event of this activation
 
     @property
     def count(self) -> int:
@@ -47,34 +41,25 @@ class ImageCounts:
     """
     All counts at one moment; totals are since the start.
 
-    :param uptime: seconds since the start or the last activation.
-    :param received: images, without names; ``answered``: results by status in lower case, as
-        ``'no match'``; ``dropped``: images without a result by cause, as ``'queue full'``.
-    :param missing: images that the stamps lack at the rate of the camera, an estimate.
-    :param status: of the last result, with its reason, place (-1 = none) and distance (NaN =
-        none).
-    :param nearest: smallest distance of all results, +inf = none had one.
     :param times: mean and maximum over recent images [ms] of all stages together (``total``),
         without waiting (``work``), and of each stage; empty = no measurement.
-    :param gaps: pauses in the stamps, the longest of ``longest_gap`` seconds.
-    :param jumps_back: jumps back of the stamps, by at most ``longest_jump_back`` seconds.
     """
 
-    uptime: float = 0.0
-    received: Tally = field(default_factory=Tally)
-    answered: Tally = field(default_factory=Tally)
-    dropped: Tally = field(default_factory=Tally)
-    missing: Tally = field(default_factory=Tally)
-    status: str = ''
+    uptime: float = 0.0  # seconds since the start or the last activation
+    received: Tally = field(default_factory=Tally)  # without names
+    answered: Tally = field(default_factory=Tally)  # by status in lower case, as 'no match'
+    dropped: Tally = field(default_factory=Tally)  # without a result, by cause, as 'queue full'
+    missing: Tally = field(default_factory=Tally)  # by the stamps and the camera's rate: estimate
+    status: str = ''  # of the last result, as are reason, place and distance
     reason: str = ''
-    place: int = -1
-    distance: float = math.nan
-    nearest: float = math.inf
+    place: int = -1  # -1 = none
+    distance: float = math.nan  # NaN = none
+    nearest: float = math.inf  # smallest distance of all results
     times: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    gaps: int = 0
-    longest_gap: float = 0.0
-    jumps_back: int = 0
-    longest_jump_back: float = 0.0
+    gaps: int = 0  # pauses in the stamps
+    longest_gap: float = 0.0  # seconds
+    jumps_back: int = 0  # of the stamps
+    longest_jump_back: float = 0.0  # seconds
 
 
 class Statistics:

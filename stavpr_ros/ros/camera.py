@@ -5,7 +5,6 @@
 import math
 from typing import Any
 
-import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
@@ -95,6 +94,11 @@ class CameraInput:
             self._tf = Buffer()
             self._listener = TransformListener(self._tf, node)
 
+    @property
+    def state(self) -> str:
+        """Return the problem, or that camera and transform are known, for the diagnostics."""
+        return self.problem or ('known, transform assumed' if self.assumed else 'known')
+
     def close(self) -> None:
         """Unsubscribe."""
         self._node.destroy_subscription(self._subscription)
@@ -116,8 +120,7 @@ class CameraInput:
             if mount is None:
                 return None
             try:
-                self._known = info, base, frame, camera_of(info, mount)
-                self.problem = ''
+                self._known, self.problem = (info, base, frame, camera_of(info, mount)), ''
             except InputError as error:
                 self._known = info, base, frame, None
                 self.problem = f'camera_info: {error}'
@@ -156,7 +159,7 @@ class CameraInput:
             self._node.get_logger().warning(self.problem, throttle_duration_sec=REPORT_PERIOD)
             return None
         p, o = found.translation, found.rotation
-        return tuple(np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w]).tolist())
+        return p.x, p.y, p.z, o.x, o.y, o.z, o.w
 
 
 def _topic(node: Node) -> str:

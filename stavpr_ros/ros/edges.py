@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loop closures are completed with their relative poses on a thread of its own, in order."""
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 import threading
 import traceback
 
 from rclpy.logging import get_logger
-from stavpr_msgs.msg import AlignedPlaces, LoopClosure
+from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
@@ -22,8 +21,8 @@ MOST_WAITING = 64  # closures; while there are more, edges are aligned only
 
 
 @dataclass(frozen=True)
-class _Closure:
-    """A closure that waits for its edge."""
+class WaitingClosure:
+    """A closure that waits for its edge; cameras: None = unknown."""
 
     message: LoopClosure
     pair: MatchedPair
@@ -52,7 +51,7 @@ class EdgePublisher:
     :param publish: called with each closure, on the thread.
     :param ending: set when the node ends.
 
-    ``aligns``: edges may be aligned by odometry.
+    ``aligns``: edges may be aligned by odometry; ``counts``: the edges so far.
     """
 
     def __init__(
@@ -61,13 +60,7 @@ class EdgePublisher:
         self._estimator, self._publish = EdgeEstimator(method), publish
         self.aligns = method in ('auto', 'aligned')
         self._worker = Worker(self._complete, 2**31, ending)
-        self._counts: Counter[str] = Counter()
-        self._reason = ''
-
-    @property
-    def counts(self) -> EdgeCounts:
-        """Return the counts."""
-        return EdgeCounts(dict(self._counts), self._reason)
+        self.counts = EdgeCounts({})
 
     def aligned(self, pair: MatchedPair) -> Edge:
         """Return the edge by odometry alone, at once, if the method permits it."""
@@ -75,19 +68,9 @@ class EdgePublisher:
             return align(pair)
         return Edge(Source.NONE, f'parameter relative_pose is {self._estimator.method}')
 
-    def put(
-        self,
-        message: LoopClosure,
-        pair: MatchedPair,
-        query_camera: Camera | None,
-        place_camera: Camera | None,
-    ) -> None:
-        """
-        Publish a closure when its edge is ready.
-
-        :param query_camera, place_camera: None = unknown.
-        """
-        self._worker.put(_Closure(message, pair, query_camera, place_camera))
+    def put(self, closure: WaitingClosure) -> None:
+        """Publish a closure when its edge is ready."""
+        self._worker.put(closure)
 
     def flush(self) -> None:
         """Publish the waiting closures, aligned only."""
@@ -102,7 +85,7 @@ class EdgePublisher:
         """End the thread; return whether it has ended."""
         return self._worker.stop()
 
-    def _complete(self, closure: _Closure, in_time: bool = True) -> None:
+    def _complete(self, closure: WaitingClosure, in_time: bool = True) -> None:
         in_time = in_time and self._worker.waiting < MOST_WAITING
         try:
             edge = self._estimator.estimate(
@@ -111,15 +94,9 @@ class EdgePublisher:
         except Exception as error:  # an edge less must not be a closure less
             get_logger('stavpr_edges').error(f'no edge: {traceback.format_exc()}')
             edge = Edge(Source.NONE, f'internal error: {type(error).__name__}: {error}')
-        self._counts[edge.source.name.lower()] += 1
-        self._reason = edge.reason
+        sources, name = self.counts.sources, edge.source.name.lower()
+        self.counts = EdgeCounts({**sources, name: sources.get(name, 0) + 1}, edge.reason)
         message = closure.message
         message.has_relative_pose = edge.source is not Source.NONE
-        pair = AlignedPlaces(
-            query_index=message.query_index,
-            query_stamp=message.query_stamp,
-            place_index=message.place_index,
-            place_stamp=message.place_stamp,
-        )
-        message.relative_pose = relative_pose_message(edge, pair, message.pose_child_frame)
+        message.relative_pose = relative_pose_message(edge, message, message.pose_child_frame)
         self._publish(message)

@@ -20,11 +20,7 @@ SILENCE = 2.0  # seconds without an image from which on the input of an active n
 BUSY = 0.8  # share of its time that the worker is busy; below it, a full queue is due to a burst
 MISSING = 0.05  # share of the received images; from this estimate on missing ones are reported
 HOPELESS = 5  # windows' lengths of images without any match, from which on the limit is suspect
-BLANK = 3.0
-"""
-Standard deviation of an image [of 255] below which it shows nothing. The darkest tunnels of
-Nordland have 3; of the other data sets no image is below 22.
-"""
+BLANK = 3.0  # standard deviation of an image, of 255; the darkest tunnels of Nordland have 3
 NEXT_TRANSITION = {'unconfigured': 'configure', 'inactive': 'activate'}
 INVALID = 'invalid: '  # first word of the causes of images that cannot be decoded
 RECENTLY = f'in the last {RECENT} s'
@@ -34,39 +30,24 @@ Finding = tuple[bytes, str]  # level and message
 
 @dataclass(frozen=True, kw_only=True)
 class Health:
-    """
-    The state of a node from which its diagnostics are made.
+    """The state of a node from which its diagnostics are made; empty texts = none."""
 
-    :param state: label of the life-cycle state.
-    :param problem: cause of the last failed transition or load; empty = none failed.
-    :param loading: path of the map that is being loaded by a service; empty = none.
-    :param input: topic and publishers of the images; empty while the node is not active.
-    :param hardware_id: robot and camera of the statuses.
-    :param odometry: fresh, stale or never; empty = it is not subscribed to.
-    :param queue: waiting images; ``window``: images in the window.
-    :param missing: prerequisite of a match that is missing; empty = none.
-    :param odometry_fault: why no odometry can arrive on its topic; empty = unknown.
-    :param camera: whether the camera of the edges is known, or why not.
-    :param edges: counts of the edges.
-    :param contrast: standard deviation of the last image, of 255; NaN = unknown.
-    """
-
-    state: str
-    problem: str = ''
-    hardware_id: str = ''
+    state: str  # label of the life-cycle state
+    problem: str = ''  # cause of the last failed transition or load
+    hardware_id: str = ''  # robot and camera
     settings: NodeSettings
     counts: ImageCounts
     map_info: MapInfo
-    loading: str = ''
-    input: InputStatus = field(default_factory=InputStatus)
-    odometry: str = ''
-    queue: int = 0
-    window: int = 0
-    missing: str = ''
-    odometry_fault: str = ''
-    camera: str = 'not needed'
+    loading: str = ''  # path of the map that a service loads
+    input: InputStatus = field(default_factory=InputStatus)  # while the node is active
+    odometry: str = ''  # fresh, stale or never, while it is subscribed to
+    queue: int = 0  # waiting images
+    window: int = 0  # images in it
+    missing: str = ''  # prerequisite of a match
+    odometry_fault: str = ''  # why no odometry can arrive on its topic
+    camera: str = 'not needed'  # whether the camera of the edges is known, or why not
     edges: EdgeCounts = field(default_factory=lambda: EdgeCounts({}))
-    contrast: float = math.nan
+    contrast: float = math.nan  # standard deviation of the last image, of 255; NaN = unknown
 
     @property
     def map_path(self) -> str:
@@ -88,9 +69,9 @@ def findings(health: Health, node: str) -> dict[str, list[Finding]]:
         remedy = f"; run 'ros2 lifecycle set {node} {transition}'" if transition else ''
         idle = [(OK, f'{health.state}: no image is processed{remedy}')]
         return {'input': idle, 'map': of_map, 'recognition': idle, 'processing': idle}
-    counts, topic = health.counts, health.input.topic
-    normal = f'{counts.received.rate:.1f} images per second on {topic}'
-    if counts.received.age is None:
+    received, topic = health.counts.received, health.input.topic
+    normal = f'{received.rate:.1f} images per second on {topic}'
+    if received.age is None:
         normal = f'waiting for the first image on {topic}'
     return {
         'input': [*_silence(health), *_image_faults(health)] or [(OK, normal)],
@@ -152,10 +133,8 @@ def _image_faults(health: Health) -> Iterator[Finding]:
         yield WARN, f'{what} without odometry at their stamps {RECENTLY}: compare both'
     if counts.received.rate and health.contrast < BLANK:
         text = f'the images show nothing (standard deviation {health.contrast:.1f} of 255)'
-        remedy = (
-            'check the lens cap, the exposure and the driver, look at them with rqt_image_view'
-        )
-        yield WARN, f'{text}: {remedy}'
+        remedy = 'check the lens cap, the exposure and the driver'
+        yield WARN, f'{text}: {remedy}, look at them with rqt_image_view'
 
 
 def _map_finding(health: Health) -> Finding:

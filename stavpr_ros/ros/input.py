@@ -4,7 +4,8 @@
 
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future, wait
+from concurrent.futures import CancelledError, Future, InvalidStateError, wait
+from contextlib import suppress
 from dataclasses import dataclass
 import threading
 import time
@@ -23,9 +24,7 @@ from stavpr_ros.ros.subscriptions import AdaptiveSubscription, qos_remedy
 from stavpr_ros.signals import time_left
 
 STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end
-
 QUEUE = 10  # images in the middleware while the executor is busy
-
 END_POLL = 0.2  # seconds until a waiting caller detects the end of the node
 
 Result = TypeVar('Result')
@@ -33,24 +32,15 @@ Result = TypeVar('Result')
 
 @dataclass(frozen=True)
 class InputStatus:
-    """
-    The topic of the images and its publishers.
+    """The topic of the images and its publishers."""
 
-    :param topic: after remapping.
-    :param publishers: of the topic, of any QoS and type; ``incompatible``: those that are not
-        received because of their QoS.
-    :param mistyped: other message types on the topic; empty = none.
-    :param remedy: for the incompatible publishers; ``loss_remedy``: for lost images.
-    :param reliability: of the subscription, with the reason.
-    """
-
-    topic: str = ''
-    publishers: int = 0
-    incompatible: int = 0
-    mistyped: str = ''
-    remedy: str = ''
-    loss_remedy: str = ''
-    reliability: str = ''
+    topic: str = ''  # after remapping
+    publishers: int = 0  # of any QoS and type
+    incompatible: int = 0  # not received because of their QoS
+    mistyped: str = ''  # other message types on the topic
+    remedy: str = ''  # for the incompatible publishers
+    loss_remedy: str = ''  # for lost images
+    reliability: str = ''  # of the subscription, with the reason
 
 
 class ImageInput:
@@ -91,7 +81,13 @@ class ImageInput:
         self._type = f'sensor_msgs/msg/{message_type.__name__}'
         self.topic = node.resolve_topic_name(name)  # before events, which come on another thread
         self._subscription = AdaptiveSubscription(
-            node, message_type, name, QUEUE, self.on_image, self._on_lost, self._on_refused
+            node,
+            message_type,
+            name,
+            QUEUE,
+            self.on_image,
+            lambda count: statistics.dropped('lost in transport', count),
+            self._on_refused,
         )
 
     def status(self) -> InputStatus:
@@ -99,9 +95,8 @@ class ImageInput:
         subscription = self._subscription
         subscription.follow()
         infos = self._node.get_publishers_info_by_topic(self.topic)
-        requested = subscription.qos
         incompatible = sum(
-            qos_check_compatible(info.qos_profile, requested)[0] == QoSCompatibility.ERROR
+            qos_check_compatible(info.qos_profile, subscription.qos)[0] == QoSCompatibility.ERROR
             for info in infos
             if info.topic_type == self._type
         )
@@ -127,9 +122,6 @@ class ImageInput:
         self.remedy = qos_remedy(self.topic, policy)
         self._node.get_logger().error(f'images are not received: {self.remedy}')
 
-    def _on_lost(self, count: int) -> None:
-        self._statistics.dropped('lost in transport', count)
-
     def on_image(self, message: Any) -> None:
         """Enqueue an image, or reject it for its rate; the callback of the subscription."""
         with self._lock:
@@ -138,19 +130,15 @@ class ImageInput:
             arrival = time.monotonic()
             self._statistics.received()
             stamp = nanoseconds(message.header.stamp)
-            self._check_stamp(stamp)
+            ahead, missing = self.stamps.update(stamp)
+            self._statistics.stepped(ahead, missing)
+            if ahead < 0:
+                self._last = None
+                self._restart(f'the stamps of the images jumped back by {-ahead:.3f} s')
             if reason := self._exceeds_rate(stamp, arrival):
                 self._reject(message, reason)
             else:
                 self._enqueue(message, arrival)
-
-    def _check_stamp(self, stamp: int) -> None:
-        """Count gaps of the stamps and missing images; restart after a jump back."""
-        ahead, missing = self.stamps.update(stamp)
-        self._statistics.stepped(ahead, missing)
-        if ahead < 0:
-            self._last = None
-            self._restart(f'the stamps of the images jumped back by {-ahead:.3f} s')
 
     def _exceeds_rate(self, stamp: int, arrival: float) -> str:
         """Return why an image exceeds ``max_rate``, by stamps, or by arrival without them."""
@@ -265,28 +253,19 @@ class Worker:
                     return
                 call = self._calls.popleft() if self._calls else None
                 item = None if call else self._items.popleft()
-            if call is None:
-                self._process_safely(item)
-            else:
+            if call is not None:
                 self._call(*call)
+                continue
+            try:
+                self._process(item)
+            except Exception:  # must not end the thread, and with it all later items
+                get_logger('stavpr_worker').error(f'an item was lost: {traceback.format_exc()}')
 
     def _call(self, future: Future[Any], function: Callable[[], Any]) -> None:
         self._running = future
-        try:
-            result, error = function(), None
-        except Exception as raised:  # handed to the caller
-            result, error = None, raised
+        with suppress(InvalidStateError):  # stop() has abandoned the call
+            try:
+                future.set_result(function())
+            except Exception as error:
+                future.set_exception(error)
         self._running = None
-        if future.done():  # abandoned by stop()
-            return
-        if error is None:
-            future.set_result(result)
-        else:
-            future.set_exception(error)
-
-    def _process_safely(self, item: Any) -> None:
-        """Process an item; an error must not end the thread, and with it all later items."""
-        try:
-            self._process(item)
-        except Exception:
-            get_logger('stavpr_worker').error(f'an item was lost: {traceback.format_exc()}')

@@ -14,15 +14,13 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
-from stavpr_ros.parameters import PARAMETERS
+from stavpr_ros.parameters import EXPECTED, PARAMETERS
 
 PACKAGE = 'stavpr_ros'
 TYPES: dict[str, type] = {row.name: type(row.default) for row in PARAMETERS} | {
     'use_sim_time': bool
 }
-EXPECTED: dict[type, str] = {bool: 'true or false', int: 'an integer', float: 'a number'}
-CAMERA = '{camera}'
-"""In a text, the name of each of several cameras."""
+CAMERA = '{camera}'  # in a text, the name of each of several cameras
 
 
 def remappings() -> list[tuple[str, Any]]:
@@ -55,7 +53,13 @@ def node_launch(
     arguments = [*own, *_arguments(image, odom, fixed)]
     actions = [other for other in others if other not in own]
     check = _check([argument.name for argument in arguments])
-    return LaunchDescription([*arguments, check, _nodes(cameras, fixed), *actions])
+
+    def start(context: LaunchContext) -> list[Node]:
+        names = [''] if cameras is None else cameras.perform(context).replace(' ', '').split(',')
+        texts = {n: LaunchConfiguration(n).perform(context) for n in TYPES if n not in fixed}
+        return [_node(texts, fixed, camera) for camera in names]
+
+    return LaunchDescription([*arguments, check, OpaqueFunction(function=start), *actions])
 
 
 def unknown_arguments(given: Iterable[str], known: Iterable[str]) -> list[str]:
@@ -122,17 +126,6 @@ def _arguments(image: str, odom: str, fixed: dict[str, object]) -> list[DeclareL
             if name not in fixed
         ),
     ]
-
-
-def _nodes(cameras: LaunchConfiguration | None, fixed: dict[str, object]) -> OpaqueFunction:
-    """Start a node for each camera with the given arguments; the file has the others."""
-
-    def start(context: LaunchContext) -> list[Node]:
-        names = [''] if cameras is None else cameras.perform(context).replace(' ', '').split(',')
-        texts = {n: LaunchConfiguration(n).perform(context) for n in TYPES if n not in fixed}
-        return [_node(texts, fixed, camera) for camera in names]
-
-    return OpaqueFunction(function=start)
 
 
 def _node(texts: dict[str, str], fixed: dict[str, object], camera: str) -> Node:

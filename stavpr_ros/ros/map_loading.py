@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loading of the node's map from a file, while the old one stays in use."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import wait
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 import threading
 import time
 
@@ -55,10 +55,19 @@ class MapLoader:
         :param lock: held while the map comes into use, but not while its file is read.
         :raises StavprError: an invalid file, model or setting, or a file that takes too long.
         """
-        with self._loading(path):
-            loaded = self._read_in_time(path)
-            with lock or nullcontext():
-                self._use(loaded)
+        with self._lock:
+            self.path, self.problem = path, ''
+            self._on_change()
+            try:
+                loaded = self._read_in_time(path)
+                with lock or nullcontext():
+                    self._use(loaded)
+            except Exception as error:
+                self.problem = f'cannot load {path}: {error}'
+                raise
+            finally:
+                self.path = ''
+                self._on_change()
         places = loaded.places
         self._node.get_logger().info(
             f'map {path}: {len(places)} places, features {places.settings.kind}, '
@@ -76,20 +85,6 @@ class MapLoader:
         self._ended.set()
         if self._verifying.is_alive():
             self._verifying.join(END_POLL)
-
-    @contextmanager
-    def _loading(self, path: str) -> Iterator[None]:
-        with self._lock:
-            self.path, self.problem = path, ''
-            self._on_change()
-            try:
-                yield
-            except Exception as error:
-                self.problem = f'cannot load {path}: {error}'
-                raise
-            finally:
-                self.path = ''
-                self._on_change()
 
     def _read_in_time(self, path: str) -> LoadedMap:
         """Read a map on a thread that is abandoned when it takes too long, or the node ends."""

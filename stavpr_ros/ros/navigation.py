@@ -59,44 +59,27 @@ class Navigation:
         if places is not self._places:
             self._places, self._transform = places, None
             self._unmatched = self._settings.pipeline.sequence.length
+        map_frame = self._settings.map_frame
+        pose = places.place(match.newest_index).pose if match.accepted else None
+        if pose is not None and odometry is not None:
+            moved = map_to_odometry(pose, odometry)
+            self._transform = transform_message(moved, map_frame, odometry_frame)
+        # a whole window without a match, or a new window
+        lost = self._unmatched >= self._settings.pipeline.sequence.length - 1
+        self._unmatched = 0 if match.accepted else self._unmatched + 1
         with until_shutdown(self._node):
-            if self._tf is not None:
-                self._publish_transform(header, match, places, odometry, odometry_frame)
-            if self._initial_pose is not None:
-                self._publish_initial_pose(header, match, places)
+            if self._tf is not None and self._transform is not None:
+                self._transform.header.stamp = header.stamp  # without a match, the last transform
+                self._tf.publish(tf_message()(transforms=[self._transform]))
+            found = matched_pose_message(header, match, places, map_frame) if lost else None
+            if self._initial_pose is not None and found is not None:
+                self._initial_pose.publish(planar(found))
 
     def close(self) -> None:
         """Destroy the publishers, and release the map."""
         self._places = None
-        for publisher in (self._tf, self._initial_pose):
-            if publisher is not None:
-                self._node.destroy_publisher(publisher)
-
-    def _publish_transform(
-        self,
-        header: Header,
-        match: Match,
-        places: PlaceMap,
-        odometry: np.ndarray | None,
-        odometry_frame: str,
-    ) -> None:
-        """Publish the transform of this match; without one, the last, with the new stamp."""
-        pose = places.place(match.newest_index).pose if match.accepted else None
-        if pose is not None and odometry is not None:
-            self._transform = transform_message(
-                map_to_odometry(pose, odometry), self._settings.map_frame, odometry_frame
-            )
-        if self._transform is not None:
-            self._transform.header.stamp = header.stamp
-            self._tf.publish(tf_message()(transforms=[self._transform]))
-
-    def _publish_initial_pose(self, header: Header, match: Match, places: PlaceMap) -> None:
-        """Publish the first match after a whole window without one, or with a new window."""
-        lost = self._unmatched >= self._settings.pipeline.sequence.length - 1
-        self._unmatched = 0 if match.accepted else self._unmatched + 1
-        message = matched_pose_message(header, match, places, self._settings.map_frame)
-        if lost and message is not None:
-            self._initial_pose.publish(planar(message))
+        for publisher in filter(None, (self._tf, self._initial_pose)):
+            self._node.destroy_publisher(publisher)
 
 
 def map_to_odometry(place: np.ndarray, odometry: np.ndarray) -> np.ndarray:

@@ -29,7 +29,6 @@ from stavpr_ros.ros.parameters import (
     declare_parameters,
     inside_maps_folder,
     require_changeable,
-    require_inside,
     require_writable,
     typed,
     unknown_parameters,
@@ -67,8 +66,6 @@ class PlaceRecognitionNode(ManagedNode):
         self.problem = ''  # why the last transition failed
         self._map_info = MapInfoPublisher(self)
         self._served = Services(self, lambda: self.runtime, self.load_map, self.set_operation)
-        folder = self.settings.maps_path
-        self.add_pre_set_parameters_callback(lambda given: inside_maps_folder(given, self, folder))
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         backwards = JumpThreshold(
@@ -82,12 +79,9 @@ class PlaceRecognitionNode(ManagedNode):
         )
         self._start: Timer | None = None
         if self.settings.autostart:
-            self._start = self.create_timer(
-                0.0,
-                self._on_start,
-                callback_group=MutuallyExclusiveCallbackGroup(),
-                clock=Clock(clock_type=ClockType.STEADY_TIME),
-            )
+            group = MutuallyExclusiveCallbackGroup()
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            self._start = self.create_timer(0.0, self._on_start, callback_group=group, clock=clock)
 
     @property
     def runtime(self) -> Runtime:
@@ -220,7 +214,9 @@ class PlaceRecognitionNode(ManagedNode):
         """Set parameters, all or none, one thread at a time."""
         try:
             with self._lock:
-                return super().set_parameters_atomically([typed(row) for row in parameters])
+                folder = self.settings.maps_path
+                given = [inside_maps_folder(typed(row), self, folder) for row in parameters]
+                return super().set_parameters_atomically(given)
         except SettingsError as error:
             return self._rejected(error)
 
@@ -273,7 +269,6 @@ class PlaceRecognitionNode(ManagedNode):
         changes = {name: value for name, value in values.items() if value != current[name]}
         if self._runtime is not None:
             require_changeable(changes, self.state)
-        require_inside(changes, self.settings.maps_path)
         settings = self._settings_with(changes)
         if settings.save_path != self.settings.save_path:
             require_writable(settings.save_path)
@@ -302,8 +297,7 @@ class PlaceRecognitionNode(ManagedNode):
         self._verbosity = verbosity
 
     def _on_clock_jump(self, jump: Any) -> None:
-        runtime = self._runtime
-        if runtime is not None:
+        if (runtime := self._runtime) is not None:
             runtime.restart(f'the clock jumped back by {-jump.delta.nanoseconds / 1e9:.3f} s')
 
     def _health(self) -> Health:
@@ -345,8 +339,7 @@ class PlaceRecognitionNode(ManagedNode):
                 self._lock.release()
         else:
             self.left_behind = True
-            runtime = self._runtime
-            if runtime is not None:
+            if (runtime := self._runtime) is not None:
                 runtime.save_at_end()
         if self.left_behind:
             self.get_logger().warning('a thread is still loading or compiling: it is abandoned')

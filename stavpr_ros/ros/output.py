@@ -11,6 +11,8 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 import numpy as np
 from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, qos_policy_name_from_kind, QoSProfile, ReliabilityPolicy
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
@@ -39,12 +41,7 @@ MIN_VARIANCE = 0.01  # of a pose: (0.1 m)^2 and (0.1 rad)^2
 
 @dataclass(frozen=True)
 class PoseFrames:
-    """
-    The frames of the poses of places.
-
-    :param frame: in which the poses are.
-    :param child: whose poses they are, '' = unknown.
-    """
+    """Frame in which the poses of places are, and the child whose poses they are; '' = unknown."""
 
     frame: str = ''
     child: str = ''
@@ -225,13 +222,10 @@ def loop_closure_message(
     return message
 
 
-def relative_pose_message(edge: Edge, pair: AlignedPlaces, frame: str) -> RelativePose:
-    """
-    Return an edge as a message.
-
-    :param pair: indices and stamps of query and place.
-    :param frame: of the base.
-    """
+def relative_pose_message(
+    edge: Edge, pair: AlignedPlaces | LoopClosure, frame: str
+) -> RelativePose:
+    """Return an edge as a message, with the indices and stamps of a pair; frame: of the base."""
     message = RelativePose(
         source=edge.source,
         reason=edge.reason,
@@ -286,12 +280,21 @@ def matched_pose_message(
     return message
 
 
-def image_message(header: Header, image: np.ndarray) -> Image:
-    """Return an image, RGB (h, w, 3) uint8, as a message."""
+def image_message(header: Header, image: np.ndarray, encoding: str = 'rgb8') -> Image:
+    """Return an image, shape (h, w, channels) in the type of the encoding, as a message."""
     height, width = image.shape[:2]
-    message = Image(header=header, height=height, width=width, encoding='rgb8', step=width * 3)
-    message.data = array.array('B', np.ascontiguousarray(image).tobytes())
+    message = Image(header=header, height=height, width=width, encoding=encoding)
+    message.step = image.nbytes // height
+    message.data = array.array('B', image.tobytes())
     return message
+
+
+def is_requested(node: Node, publisher: Publisher) -> bool:
+    """Return whether a topic has a subscriber; not after the shutdown of ROS."""
+    requested = False
+    with until_shutdown(node):
+        requested = publisher.get_subscription_count() > 0
+    return requested
 
 
 class Output:
@@ -305,6 +308,7 @@ class Output:
     def __init__(self, node: ManagedNode, burst: int, robot_id: str) -> None:
         self._node, self._robot_id = node, robot_id
         self._qos = QoSProfile(depth=max(DEPTH, burst), reliability=ReliabilityPolicy.RELIABLE)
+        self._publishers: list[Any] = []
         self.match = self._publisher(PlaceMatch, '~/match')
         self.place_index = self._publisher(Int32, '~/place_index')
         self.distance = self._publisher(Float32, '~/distance')
@@ -321,12 +325,12 @@ class Output:
                 'publisher is reliable and volatile'
             )
 
-        return self._node.create_lifecycle_publisher(
-            message_type,
-            topic,
-            qos or self._qos,
-            event_callbacks=PublisherEventCallbacks(incompatible_qos=on_incompatible),
+        events = PublisherEventCallbacks(incompatible_qos=on_incompatible)
+        publisher = self._node.create_lifecycle_publisher(
+            message_type, topic, qos or self._qos, event_callbacks=events
         )
+        self._publishers.append(publisher)
+        return publisher
 
     def publish(
         self,
@@ -347,16 +351,16 @@ class Output:
         """
         robot_id = self._robot_id
         message = match_message(header, match, places, robot_id, edge, frames.child)
+        pose = matched_pose_message(header, match, places, frames.frame)
+        candidates = candidates_message(header, match, places, robot_id)
         with until_shutdown(self._node):
             if match.accepted:
                 self.place_index.publish(Int32(data=message.place_index))
                 self.distance.publish(Float32(data=message.distance))
-            for publisher, more in (
-                (self.pose, matched_pose_message(header, match, places, frames.frame)),
-                (self.candidates, candidates_message(header, match, places, robot_id)),
-            ):
-                if more is not None:
-                    publisher.publish(more)
+            if pose is not None:
+                self.pose.publish(pose)
+            if candidates is not None:
+                self.candidates.publish(candidates)
             if match.image is not None and self.match_image.get_subscription_count():
                 self.match_image.publish(image_message(header, draw_match(match, places)))
             self.match.publish(message)
@@ -367,18 +371,7 @@ class Output:
         with until_shutdown(self._node):
             self.loop_closure.publish(message)
 
-    @property
-    def candidates_requested(self) -> bool:
-        """Whether ``~/candidates`` has a subscriber."""
-        requested = False
-        with until_shutdown(self._node):
-            requested = bool(self.candidates.get_subscription_count())
-        return requested
-
     def close(self) -> None:
         """Destroy the publishers."""
-        for publisher in (
-            *(self.match, self.place_index, self.distance, self.candidates),
-            *(self.pose, self.loop_closure, self.match_image),
-        ):
+        for publisher in self._publishers:
             self._node.destroy_lifecycle_publisher(publisher)

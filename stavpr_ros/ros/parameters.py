@@ -11,18 +11,13 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.parameter import Parameter
 from stavpr_ros.errors import OutputError, SettingsError
 from stavpr_ros.output_file import require_room
-from stavpr_ros.parameters import BY_NAME, NodeParameter, PARAMETERS
+from stavpr_ros.parameters import BY_NAME, EXPECTED, NodeParameter, PARAMETERS
 from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 _FILES = ('map_path', 'save_path', 'model_path')
-_TYPES = {
-    bool: 'true or false',
-    int: 'an integer',
-    float: 'a number',
-    str: """text; quote a number or a truth value twice: "'2'\"""",
-}
+_TEXT = """text; quote a number or a truth value twice: "'2'\""""
 _CHANGED_BY_SERVICE = {'map_path': 'load_map', 'operation': 'set_operation'}
 
 
@@ -37,11 +32,9 @@ def descriptor(row: NodeParameter) -> ParameterDescriptor:
     if row.bounds is not None:
         low, high = row.bounds
         if isinstance(row.default, int):
-            result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
+            result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
         else:
-            result.floating_point_range = [
-                FloatingPointRange(from_value=low, to_value=high, step=0.0)
-            ]
+            result.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
     return result
 
 
@@ -57,7 +50,8 @@ def typed(parameter: Parameter) -> Parameter:
     if isinstance(row.default, float) and type(value) is int:
         return Parameter(row.name, value=float(value))
     raise SettingsError(
-        f'{row.name} = {value!r} has the wrong type: expected {_TYPES[type(row.default)]}'
+        f'{row.name} = {value!r} has the wrong type: '
+        f'expected {EXPECTED.get(type(row.default), _TEXT)}'
     )
 
 
@@ -109,46 +103,27 @@ def require_changeable(changes: Mapping[str, Any], state: str) -> None:
         )
 
 
-def inside_maps_folder(
-    parameters: list[Parameter], node: ManagedNode, folder: Path
-) -> list[Parameter]:
+def inside_maps_folder(parameter: Parameter, node: ManagedNode, folder: Path) -> Parameter:
     """
-    Return parameters that are set after the start, with absolute paths of the files they name.
+    Return a parameter that is set after the start, with the absolute path of the file it names.
 
-    A name that leads out of the folder stays as it is, for :func:`require_inside` to reject.
+    :raises SettingsError: a file outside the maps folder: anyone on the ROS graph may set
+        parameters; names the parameter.
     """
-    return [_with_path(parameter, node, folder) for parameter in parameters]
-
-
-def _with_path(parameter: Parameter, node: ManagedNode, folder: Path) -> Parameter:
     name, value = parameter.name, parameter.value
-    known = name in _FILES and isinstance(value, str) and value
-    if not known or value == node.get_parameter(name).value:
+    if name not in BY_NAME or not value or value == node.get_parameter(name).value:
         return parameter
-    try:
-        return Parameter(name, value=inside(folder, value))
-    except SettingsError:
-        return parameter
-
-
-def require_inside(changes: Mapping[str, Any], folder: Path) -> None:
-    """
-    Reject files outside the maps folder: anyone on the ROS graph may set parameters.
-
-    :param changes: name to value, those that differ from the current values.
-    :raises SettingsError: names the parameter.
-    """
-    for name in _FILES:
-        if changes.get(name):
-            try:
-                inside(folder, changes[name])
-            except SettingsError as error:
-                raise SettingsError(f'{name}: {error}') from error
-    if '"model"' in changes.get('feature_settings', ''):
+    if name == 'feature_settings' and '"model"' in value:
         raise SettingsError(
             'feature_settings: the file of a network is not set after the start by "model", but '
             'by parameter model_path'
         )
+    if name not in _FILES:
+        return parameter
+    try:
+        return Parameter(name, value=inside(folder, value))
+    except SettingsError as error:
+        raise SettingsError(f'{name}: {error}') from error
 
 
 def require_writable(save_path: str) -> None:

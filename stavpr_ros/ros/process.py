@@ -27,12 +27,9 @@ from stavpr_ros.signals import end_process, interrupted, signals_deferred, time_
 
 SPIN_SECONDS = 0.2  # until a signal is noticed
 CALLBACK_SECONDS = 2.0  # for running callbacks at the end
-SERVICE_SECONDS = 2.0
-"""Time in which a node shows its parameter service; some tools have none."""
-
+SERVICE_SECONDS = 2.0  # until a node shows its parameter service; some tools have none
+# read by Fast DDS 2.14, which ignores the FASTDDS_ spelling of later versions
 PROFILES_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-"""Read by Fast DDS 2.14, which ignores the ``FASTDDS_`` spelling of later versions."""
-
 PROFILES_FILE = 'config/fastdds_large_images.xml'
 
 AnyNode = TypeVar('AnyNode', bound=Node)
@@ -150,14 +147,9 @@ def run_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> in
         if its end may lose something.
     :param arguments: without the program's name; the process's own if None.
     """
-    nodes: list[AnyNode] = []
-
-    def kept() -> AnyNode:
-        nodes.append(make())
-        return nodes[0]
-
+    node = None
     try:
-        with ros_node(kept, arguments) as node:
+        with ros_node(make, arguments) as node:
             spin_until(node, threads=getattr(node, 'THREADS', 1))
     except (StavprError, ParameterException) as error:
         get_logger('stavpr').fatal(f'cannot start: {error}')
@@ -165,7 +157,7 @@ def run_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> in
     except BaseException:  # an interrupt inside a foreign library may be raised as another one
         if not interrupted():
             raise
-    return int(any(getattr(node, 'failed', False) for node in nodes))
+    return int(getattr(node, 'failed', False))
 
 
 class Discovery:
@@ -200,25 +192,19 @@ class Discovery:
         """Return whether all nodes have responded, or need not; to be called while spinning."""
         if self._start is None:
             self._start = time.monotonic()
-        names = self._names()
+        names = {
+            f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+            for info in self._endpoints()
+            if not info.node_name.startswith('_NODE_NAME_UNKNOWN')
+        }
         for name in names - self._responses.keys():
-            self._request(name)
+            if name not in self._clients:
+                service = f'{name}/get_parameters'
+                self._clients[name] = self._node.create_client(GetParameters, service)
+            if self._clients[name].service_is_ready():
+                self._responses[name] = self._clients[name].call_async(GetParameters.Request())
         requested = [self._responses[name] for name in names if name in self._responses]
         waited = time.monotonic() - self._start
         if not all(response.done() for response in requested):
             return waited > self._timeout
         return (bool(names) and len(requested) == len(names)) or waited > SERVICE_SECONDS
-
-    def _request(self, name: str) -> None:
-        if name not in self._clients:
-            self._clients[name] = self._node.create_client(GetParameters, f'{name}/get_parameters')
-        if self._clients[name].service_is_ready():
-            self._responses[name] = self._clients[name].call_async(GetParameters.Request())
-
-    def _names(self) -> set[str]:
-        """Return the full names of the nodes at the other end, as far as they are known."""
-        return {
-            f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-            for info in self._endpoints()
-            if not info.node_name.startswith('_NODE_NAME_UNKNOWN')
-        }

@@ -32,7 +32,6 @@ RESPONSE_TIMEOUT = 3.5  # seconds of attempts; callbacks have a little more when
 RESPONSE_PAUSE = 0.05
 
 
-
 @contextmanager
 def until_shutdown(node: Node) -> Iterator[None]:
     """Ignore errors of the middleware if ROS was shut down before the node."""

@@ -21,6 +21,8 @@ class Receipts:
     The recognition node publishes one result for each image that it receives, processed or not.
 
     :param node: for the subscription; the caller spins it.
+
+    ``status`` is that of the last result.
     """
 
     def __init__(self, node: Node) -> None:
@@ -28,6 +30,7 @@ class Receipts:
         self._outstanding: Counter[tuple[int, int, str]] = Counter()
         self._sent = self._received = 0
         self._last = time.monotonic()  # event
+        self.status = PlaceMatch.NOT_READY
         node.create_subscription(PlaceMatch, 'stavpr/match', self._on_match, RESULTS)
 
     def sent(self, header: Header) -> None:
@@ -36,9 +39,13 @@ class Receipts:
         self._outstanding[_key(header)] += 1
         self._last = time.monotonic()
 
+    def complete(self) -> bool:
+        """Return whether each image has its result."""
+        return self._received == self._sent
+
     def settled(self) -> bool:
         """Return whether no more results are expected."""
-        if self._received == self._sent or not self._node.count_publishers(self._topic):
+        if self.complete() or not self._node.count_publishers(self._topic):
             return True
         return time.monotonic() - self._last > QUIET
 
@@ -55,6 +62,7 @@ class Receipts:
         if self._outstanding[key] > 0:
             self._outstanding[key] -= 1
             self._received += 1
+            self.status = match.status
             self._last = time.monotonic()
 
 

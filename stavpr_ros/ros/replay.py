@@ -5,6 +5,7 @@
 import array
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 import importlib.util
 import math
 from pathlib import Path
@@ -22,6 +23,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError, UnavailableError
+from stavpr_ros.ros.output import time_message
 from stavpr_ros.ros.playback import keyboard, Playback
 from stavpr_ros.ros.process import Discovery
 from stavpr_ros.ros.receipts import Receipts
@@ -30,7 +32,6 @@ from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-SECOND = 1_000_000_000
 SPIN_SECONDS = 0.1  # until a signal is noticed
 TRIES = 3  # how often one image is sent
 RELIABLE = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
@@ -48,14 +49,13 @@ class NoResultError(StavprError):
 def image_message(record: ImageRecord) -> Image:
     """Return the message of a record, with the recorded header."""
     message = Image(
+        header=Header(stamp=time_message(record.stamp_ns), frame_id=record.frame_id),
         height=record.height,
         width=record.width,
         encoding=record.encoding,
         is_bigendian=int(record.is_bigendian),
         step=record.step,
     )
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(record.stamp_ns, SECOND)
-    message.header.frame_id = record.frame_id
     data = array.array('B')  # the one type that rclpy does not check byte by byte
     data.frombytes(memoryview(record.data).cast('B'))
     message.data = data
@@ -129,8 +129,6 @@ class Replayer:
         self.receipts = Receipts(node)
         self._others = {topic.name: self._publish_on(topic, to) for topic, to in topics.items()}
         self._match_topic = node.resolve_topic_name('stavpr/match')
-        if options.lossless:
-            node.create_subscription(PlaceMatch, 'stavpr/match', self._on_match, RELIABLE)
         self.playback = Playback(None if options.lossless else options.rate, options.paused)
         self._serve()
         self._clock: Publisher | None = None
@@ -141,7 +139,6 @@ class Replayer:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._discovery = Discovery(node, self._endpoints, options.timeout)
-        self._outstanding: Header | None = None
         self._poll: Callable[[], None] = lambda: None
 
     @property
@@ -183,12 +180,10 @@ class Replayer:
         """
         playback = self.playback
         keys = {' ': self._toggle, 's': playback.step, '\x1b[C': playback.step}
-        first = True
         with keyboard(keys) as self._poll:
-            for record in records:
-                if first:
+            for i, record in enumerate(records):
+                if i == 0:
                     playback.start(record.time_ns)
-                    first = False
                 self._send(record)
         self._poll = lambda: None
 
@@ -203,10 +198,10 @@ class Replayer:
             self._others[record.topic].publish(record.content)
             return
         message = image_message(record)
+        self.receipts.sent(message.header)
         if self.options.lossless:
             self._send_until_answered(message)
         else:
-            self.receipts.sent(message.header)
             self.publisher.publish(message)
         self.published += 1
 
@@ -294,21 +289,16 @@ class Replayer:
             if attempt:
                 self.resent += 1
                 self.notify(f'{name}: no result for {timeout:g} s, sent again (try {attempt + 1})')
-            self._outstanding = message.header
             self.publisher.publish(message)
-            if self._spin_until(lambda: self._outstanding is None, timeout):
-                return
-        raise NoResultError(
-            f'{name} got no result on {self._match_topic} in {TRIES} tries of '
-            f'{timeout:g} s: expected one message per image; check that the node runs and '
-            f'subscribes to {self.publisher.topic_name}, or give a slow one a longer --timeout'
-        )
-
-    def _on_match(self, match: PlaceMatch) -> None:
-        if match.header != self._outstanding:
-            return
-        self._outstanding = None
-        if match.status == PlaceMatch.DROPPED:
+            if self._spin_until(self.receipts.complete, timeout):
+                break
+        else:
+            raise NoResultError(
+                f'{name} got no result on {self._match_topic} in {TRIES} tries of '
+                f'{timeout:g} s: expected one message per image; check that the node runs and '
+                f'subscribes to {self.publisher.topic_name}, or give a slow one a longer --timeout'
+            )
+        if self.receipts.status == PlaceMatch.DROPPED:
             self.dropped += 1
             self.notify(
                 f'image {self.published + 1} was dropped by the node: check for another publisher'
@@ -319,20 +309,14 @@ class Replayer:
         return [self.publisher, *self._others.values()]
 
     def _publish_on(self, topic: RecordedTopic, name: str) -> Publisher:
-        durability = (
-            DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE
-        )
-        profile = QoSProfile(
-            depth=OTHERS_DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=durability
-        )
+        profile = QoSProfile(depth=OTHERS_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
+        if topic.latched:
+            profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
         return self.node.create_publisher(message_class(topic.message_type), name, profile)
 
     def _publish_clock(self) -> None:
         if self._clock is not None and self.playback.started:
-            seconds, nanoseconds = divmod(self.playback.now_ns(), SECOND)
-            message = ClockMessage()
-            message.clock.sec, message.clock.nanosec = seconds, nanoseconds
-            self._clock.publish(message)
+            self._clock.publish(ClockMessage(clock=time_message(self.playback.now_ns())))
 
     def _toggle(self) -> None:
         self.playback.pause(not self.playback.paused)
@@ -347,12 +331,9 @@ class Replayer:
             ('toggle_paused', self._toggle),
             ('play_next', playback.step),
         ):
+            self.node.create_service(Trigger, f'~/{name}', partial(self._on_request, act))
 
-            def serve(
-                _: Trigger.Request, response: Trigger.Response, act: Callable[[], Any] = act
-            ) -> Trigger.Response:
-                response.success = act() is not False
-                response.message = 'paused' if playback.paused else 'playing'
-                return response
-
-            self.node.create_service(Trigger, f'~/{name}', serve)
+    def _on_request(self, act: Callable[[], Any], _: Any, response: Any) -> Any:
+        response.success = act() is not False
+        response.message = 'paused' if self.playback.paused else 'playing'
+        return response

@@ -25,13 +25,14 @@ from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.relative_pose.pair import MatchedPair
 from stavpr_ros.ros.camera import CameraInput
-from stavpr_ros.ros.edges import EdgePublisher
+from stavpr_ros.ros.edges import EdgePublisher, WaitingClosure
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import ImageInput, InputStatus, STOP_TIMEOUT, Worker
 from stavpr_ros.ros.map_info import map_info_message
 from stavpr_ros.ros.map_loading import MapLoader
 from stavpr_ros.ros.navigation import Navigation
 from stavpr_ros.ros.output import (
+    is_requested,
     loop_closure_message,
     nanoseconds,
     Output,
@@ -143,7 +144,12 @@ class Runtime:
         if self.settings.relative_pose in ('auto', 'pnp'):
             self.camera = CameraInput(self._node, self.settings.camera_transform)
         self.images = ImageInput(
-            self._node, self.settings, self._statistics, self._enqueue, self._reject, self.restart
+            self._node,
+            self.settings,
+            self._statistics,
+            self._enqueue,
+            lambda message, reason: self._drop(message, Status.SKIPPED, reason, 'max_rate'),
+            self.restart,
         )
 
     def deactivate(self) -> None:
@@ -252,8 +258,7 @@ class Runtime:
         """Empty the window before the images that arrive from now on."""
         self._node.get_logger().info(f'window reset: {reason}')
         self._epoch += 1
-        odometry = self.odometry  # another thread may unsubscribe
-        if odometry is not None:
+        if (odometry := self.odometry) is not None:  # another thread may unsubscribe
             odometry.trajectory.clear()
 
     def reset(self) -> None:
@@ -283,6 +288,7 @@ class Runtime:
     def complete(self, health: Health) -> Health:
         """Return the health of the node with the queue, the window and the subscriptions."""
         pipeline, images, odometry = self.pipeline, self.images, self.odometry
+        camera = self.camera
         return replace(
             health,
             problem=health.problem or self._maps.problem or self.problem or pipeline.problem,
@@ -292,45 +298,30 @@ class Runtime:
             queue=self.worker.waiting,
             window=pipeline.window_fill,
             missing=pipeline.missing,
-            camera=self._camera_state(),
+            camera='not needed' if camera is None else camera.state,
             edges=self._edges.counts,
             odometry_fault='' if odometry is None else odometry.fault(),
             contrast=pipeline.contrast,
         )
-
-    def _camera_state(self) -> str:
-        """Return whether camera and transform are known, for the diagnostics."""
-        if self.camera is None:
-            return 'not needed'
-        if self.camera.problem:
-            return self.camera.problem
-        return 'known, transform assumed' if self.camera.assumed else 'known'
 
     # images
 
     def _enqueue(self, message: Any, arrival: float) -> None:
         dropped = self.worker.put(_Item(message, arrival, self._epoch))
         if dropped is not None:
-            self._drop(
-                dropped.message,
-                Status.DROPPED,
-                'newer images arrived before it was processed',
-                'queue full',
-            )
+            reason = 'newer images arrived before it was processed'
+            self._drop(dropped.message, Status.DROPPED, reason, 'queue full')
             self._node.get_logger().warning(
                 'images arrive faster than they are processed, some are dropped: see /diagnostics',
                 throttle_duration_sec=REPORT_PERIOD,
             )
 
-    def _reject(self, message: Any, reason: str) -> None:
-        self._drop(message, Status.SKIPPED, reason, 'max_rate')
-
     def _drop(self, message: Any, status: Status, reason: str, cause: str) -> None:
         """Publish the status of an image that is not processed."""
         self._statistics.dropped(cause)
         threshold = self.pipeline.threshold
-        threshold = math.nan if threshold is None else threshold
-        self._output.publish(message.header, Match(status, reason, threshold))
+        match = Match(status, reason, math.nan if threshold is None else threshold)
+        self._output.publish(message.header, match)
 
     def _process(self, item: _Item) -> None:
         """Process one image, on the worker."""
@@ -345,17 +336,18 @@ class Runtime:
         header = item.message.header
         stamp = nanoseconds(header.stamp)
         odometry = self.odometry  # another thread may unsubscribe
-        pose, frames = None, PoseFrames(self.settings.map_frame)
+        pose, frames, odometry_frame = None, PoseFrames(self.settings.map_frame), ''
         if odometry is not None:
-            pose = odometry.trajectory.at(stamp)
+            pose, odometry_frame = odometry.trajectory.at(stamp), odometry.frame
             # places of a route have the poses of the odometry
             own = self.pipeline.operation != 'localization'
-            frames = PoseFrames(odometry.frame if own else frames.frame, odometry.child_frame)
-        candidates = self._output.candidates_requested or self._views.needs_candidates
+            frames = PoseFrames(odometry_frame if own else frames.frame, odometry.child_frame)
+        candidates = (
+            is_requested(self._node, self._output.candidates) or self._views.needs_candidates
+        )
         camera, camera_input = None, self.camera
         if camera_input is not None:
-            base = '' if odometry is None else odometry.child_frame
-            camera = camera_input.camera(base, header.frame_id)
+            camera = camera_input.camera(frames.child, header.frame_id)
         try:
             match = self.pipeline.process(item.message, stamp, pose, camera, candidates)
         except Exception as error:
@@ -364,7 +356,6 @@ class Runtime:
             )
             reason = f'internal error: {type(error).__name__}: {error}'
             match = Match(Status.INVALID_IMAGE, reason, cause='internal error')
-        odometry_frame = '' if odometry is None else odometry.frame
         self._navigation.publish(header, match, self.pipeline.places, pose, odometry_frame)
         if match.status is Status.NOT_READY and (path := self._maps.path):
             match = replace(match, reason=f'map {path} is being loaded')
@@ -388,12 +379,10 @@ class Runtime:
         # a match does not wait for PnP
         edge = self._edges.aligned(pair) if pair is not None else None
         message = self._output.publish(header, match, self.pipeline.places, frames, edge)
-        if pair is not None:
-            self._put_closure(header, match, frames, pair, camera)
+        self._put_closure(header, match, frames, pair, camera)
         if match.late is not None:
             pair = self.pipeline.matched_pair(match.late, self._edges.aligns)
-            if pair is not None:
-                self._put_closure(header, match.late, frames, pair, camera)
+            self._put_closure(header, match.late, frames, pair, camera)
         return message
 
     def _put_closure(
@@ -401,23 +390,26 @@ class Runtime:
         header: Header,
         match: Match,
         frames: PoseFrames,
-        pair: MatchedPair,
+        pair: MatchedPair | None,
         camera: Camera | None,
     ) -> None:
-        """Publish the loop closure of a match when its edge is ready."""
+        """Publish the loop closure of a match, if it has a pair, when its edge is ready."""
+        if pair is None:
+            return
         places, odometry = pair.source, self.odometry
         is_map = self.pipeline.operation == 'localization'
         if is_map and (
             self.settings.relative_pose == 'none' or places.place(pair.place).pose is None
         ):
             return
-        known = not np.isnan(pair.query_pose).any() and odometry is not None
+        known = odometry is not None and not np.isnan(pair.query_pose).any()
         query = (pair.query_pose, odometry.frame) if known and odometry else (None, '')
         message = loop_closure_message(
             header, match, places, self.settings.robot_id, frames, query
         )
         if message is not None:
-            self._edges.put(message, pair, camera, places.camera if is_map else camera)
+            place_camera = places.camera if is_map else camera
+            self._edges.put(WaitingClosure(message, pair, camera, place_camera))
 
     def _publish_route(self) -> None:
         """Publish the route for a new subscriber, in the frame of the last image if it grows."""

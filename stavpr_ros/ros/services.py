@@ -40,24 +40,17 @@ class Services:
         self._logger = node.get_logger()
         self._runtime, self._load, self._operate = runtime, load_map, set_operation
         self._faults: dict[str, str] = {}  # last fault of a service, until it succeeds
-        group = MutuallyExclusiveCallbackGroup()
-        groups = {
-            LoadMap: MutuallyExclusiveCallbackGroup(),
-            SaveMap: MutuallyExclusiveCallbackGroup(),
-        }
-        for kind, name, serve in (
-            (LoadMap, 'load_map', self._load_map),
-            (SaveMap, 'save_map', self._save_map),
-            (Trigger, 'reset', self._reset),
-            (Relocalize, 'relocalize', self._relocalize),
-            (SetOperation, 'set_operation', self._set_operation),
+        loading, saving, others = (MutuallyExclusiveCallbackGroup() for _ in range(3))
+        for kind, name, serve, group in (
+            (LoadMap, 'load_map', self._load_map, loading),
+            (SaveMap, 'save_map', self._save_map, saving),
+            (Trigger, 'reset', self._reset, others),
+            (Relocalize, 'relocalize', self._relocalize, others),
+            (SetOperation, 'set_operation', self._set_operation, others),
         ):
             callback = self._callback(name, serve)
-            repeat_responses(
-                node.create_service(
-                    kind, f'~/{name}', callback, callback_group=groups.get(kind, group)
-                )
-            )
+            service = node.create_service(kind, f'~/{name}', callback, callback_group=group)
+            repeat_responses(service)
 
     def _callback(
         self, name: str, serve: Callable[[Runtime, Any, Any], str]

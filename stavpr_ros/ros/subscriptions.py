@@ -31,8 +31,7 @@ _REMEDIES = {
 }
 ODOMETRY = 'nav_msgs/msg/Odometry'
 OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABILITY)
-MEMORY = 32
-"""Images that are remembered, so that none is delivered by two subscriptions in turn."""
+MEMORY = 32  # images that are remembered, so that none is delivered by two subscriptions in turn
 
 
 def qos_remedy(topic: str, policy: str) -> str:
@@ -59,34 +58,26 @@ def subscribe(
     :param events: callbacks of the middleware; those that it does not support are left out.
     :raises SettingsError: invalid qos_overrides.
     """
-    try:
-        return node.create_subscription(
-            message_type,
-            topic,
-            callback,
-            qos,
-            callback_group=group or MutuallyExclusiveCallbackGroup(),
-            event_callbacks=SubscriptionEventCallbacks(**events),
-            qos_overriding_options=QoSOverridingOptions(overridable),
-        )
-    except UnsupportedEventTypeError:
-        events.popitem()
-        return subscribe(
-            node,
-            message_type,
-            topic,
-            callback,
-            qos,
-            overridable=overridable,
-            group=group,
-            **events,
-        )
-    except (RuntimeError, ParameterException) as error:
-        name = node.resolve_topic_name(topic)
-        raise SettingsError(
-            f'cannot subscribe to {name}: {error}; correct qos_overrides.{name}.subscription and '
-            'start again'
-        ) from error
+    group = group or MutuallyExclusiveCallbackGroup()
+    while True:
+        try:
+            return node.create_subscription(
+                message_type,
+                topic,
+                callback,
+                qos,
+                callback_group=group,
+                event_callbacks=SubscriptionEventCallbacks(**events),
+                qos_overriding_options=QoSOverridingOptions(overridable),
+            )
+        except UnsupportedEventTypeError:
+            events.popitem()
+        except (RuntimeError, ParameterException) as error:
+            name = node.resolve_topic_name(topic)
+            raise SettingsError(
+                f'cannot subscribe to {name}: {error}; correct qos_overrides.{name}.subscription '
+                'and start again'
+            ) from error
 
 
 class AdaptiveSubscription:
@@ -159,12 +150,11 @@ class AdaptiveSubscription:
         with self._lock:
             if self._closed or self._previous is not None:
                 return
-            reliability, reason = self._choose(self.qos.reliability)
-            changed = reason != self._reason
-            self._reason = reason
+            before = self._reason
+            reliability, self._reason = self._choose(self.qos.reliability)
             if reliability != self.qos.reliability:
                 self._previous, self._current = self._current, self._subscribe(reliability)
-            if changed:
+            if before != self._reason:
                 self._log()
 
     def close(self) -> None:

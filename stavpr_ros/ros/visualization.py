@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Topics for viewers (RViz 2, Foxglove, the monitor), published while somebody subscribes."""
 
-import array
 from collections import deque
 from collections.abc import Callable
 import math
@@ -21,7 +20,7 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each, places_to_draw
 from stavpr_ros.recognition import Match
-from stavpr_ros.ros.output import image_message, LATCHED, pose_message
+from stavpr_ros.ros.output import image_message, is_requested, LATCHED, pose_message
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
@@ -78,8 +77,27 @@ class Visualization:
         :param frame: of the poses of the places.
         :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
         """
+        places = pipeline.places
+        fixed = places if isinstance(places, PlaceMap) else None
+        if frame != self.frame or fixed is not self._map:
+            self.frame, self._map, self._correction = frame, fixed, None
+            self._poses.clear()
+            self._lines.clear()
+        self._note(header, match, places, odometry)
         with until_shutdown(self._node):
-            self._publish(header, match, pipeline, frame, odometry)
+            self.publish_route(places, frame)
+            if self._is_requested(self._matched) and match.accepted:
+                own = Header(stamp=header.stamp, frame_id=frame)
+                self._matched.publish(Path(header=own, poses=list(self._poses)))
+            if self._is_requested(self._markers):
+                self._markers.publish(self._markers_message(header, match, places))
+            if match.image is not None and self._is_requested(self._image):
+                drawn = cv2.cvtColor(draw_match(match, places), cv2.COLOR_RGB2BGR)
+                _, jpeg = cv2.imencode('.jpg', drawn, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+                image = CompressedImage(header=header, format='jpeg', data=jpeg.tobytes())
+                self._image.publish(image)
+            if self._is_requested(self._window) or self._is_requested(self._distances):
+                self._publish_distances(header, match, pipeline)
 
     def publish_route(self, places: Places, frame: str) -> None:
         """Publish the poses of all places, if they are requested and not published yet."""
@@ -108,34 +126,6 @@ class Visualization:
         ):
             self._node.destroy_publisher(publisher)
 
-    def _publish(
-        self,
-        header: Header,
-        match: Match,
-        pipeline: Pipeline,
-        frame: str,
-        odometry: np.ndarray | None,
-    ) -> None:
-        places = pipeline.places
-        fixed = places if isinstance(places, PlaceMap) else None
-        if frame != self.frame or fixed is not self._map:
-            self.frame, self._map, self._correction = frame, fixed, None
-            self._poses.clear()
-            self._lines.clear()
-        self.publish_route(places, frame)
-        self._note(header, match, places, odometry)
-        if self._is_requested(self._matched) and match.accepted:
-            own = Header(stamp=header.stamp, frame_id=frame)
-            self._matched.publish(Path(header=own, poses=list(self._poses)))
-        if self._is_requested(self._markers):
-            self._markers.publish(self._markers_message(header, match, places))
-        if match.image is not None and self._is_requested(self._image):
-            drawn = cv2.cvtColor(draw_match(match, places), cv2.COLOR_RGB2BGR)
-            _, jpeg = cv2.imencode('.jpg', drawn, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-            self._image.publish(CompressedImage(header=header, format='jpeg', data=jpeg.tobytes()))
-        if self._is_requested(self._window) or self._is_requested(self._distances):
-            self._publish_distances(header, match, pipeline)
-
     def _publish_distances(self, header: Header, match: Match, pipeline: Pipeline) -> None:
         row, places = pipeline.newest_distances(), pipeline.places
         if places is None or not row.size:
@@ -151,10 +141,7 @@ class Visualization:
             columns = np.stack(
                 [least_of_each(row, COLUMNS)[0], least_of_each(numbers, COLUMNS)[0]], axis=1
             ).astype(np.float32)
-            message = Image(header=header, height=1, width=len(columns), encoding='32FC2')
-            message.step = columns.nbytes
-            message.data = array.array('B', columns.tobytes())
-            self._distances.publish(message)
+            self._distances.publish(image_message(header, columns[None], '32FC2'))
 
     def _note(
         self, header: Header, match: Match, places: Places, odometry: np.ndarray | None
@@ -229,10 +216,7 @@ class Visualization:
             return self._node.create_publisher(kind, topic, LATCHED)
 
     def _is_requested(self, publisher: Publisher) -> bool:
-        requested = False
-        with until_shutdown(self._node):
-            requested = bool(publisher.get_subscription_count())
-        return requested
+        return is_requested(self._node, publisher)
 
 
 def color(probability: float) -> ColorRGBA:

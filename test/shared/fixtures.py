@@ -102,6 +102,24 @@ def context():
     rclpy.try_shutdown(context=context)
 
 
+@pytest.fixture
+def make_node(context):
+    """Make a node that is not configured; it is destroyed with the test."""
+    from robot import PARAMETERS, parameters_of
+    from stavpr_ros.ros.node import PlaceRecognitionNode
+
+    made = []
+
+    def make(**parameters):
+        overrides = parameters_of(PARAMETERS | {'autostart': False} | parameters)
+        made.append(PlaceRecognitionNode(context=context, parameter_overrides=overrides))
+        return made[-1]
+
+    yield make
+    for node in made:
+        node.destroy_node()
+
+
 @pytest.fixture(scope='module')
 def robot():
     """Yield a robot with a camera: a ROS node beside the tested one."""

@@ -116,16 +116,15 @@ class Robot:
         self.diagnostics: dict[str, DiagnosticStatus] = {}
         self.log: list[str] = []
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
-        self.node.create_subscription(Log, '/rosout', self._on_log, LATCHED)
+        self.node.create_subscription(
+            Log, '/rosout', lambda line: self.log.append(line.msg), LATCHED
+        )
         self.stamp = 1_700_000_000 * SECOND
 
     def close(self) -> None:
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
-
-    def _on_log(self, line: Log) -> None:
-        self.log.append(line.msg)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self.arrays.append(message)
