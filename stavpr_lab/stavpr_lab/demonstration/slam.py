@@ -13,7 +13,7 @@ from rosbags.typesys import get_typestore, Stores
 from stavpr_lab.demonstration.recordings import remove_earlier_bag, TOPIC
 from stavpr_lab.demonstration.street.laps import intrinsics, LapDrive
 from stavpr_lab.demonstration.street.traverses import SIZE
-from stavpr_lab.evaluation.plots import INK, page, QUIET
+from stavpr_lab.evaluation.plots import titled_page
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping.trajectory import SECOND
 from stavpr_ros.output_file import JSON, write_output
@@ -189,13 +189,9 @@ def write_result(
             folder / f'{name}.tum', tum_text(drive.stamps, planar_poses(poses)), TUM, True
         )
     plot = folder / 'slam.png'
-    with page(plot, 12.5, 6.6) as figure:
-        parts = figure.add_gridspec(2, 1, height_ratios=(1.1, 5.5))
-        top, below = figure.add_subfigure(parts[0]), figure.add_subfigure(parts[1])
-        top.text(0.012, 0.96, 'Three laps of a synthetic street', fontsize=15, va='top',
-                 weight='bold', color=INK)  # fmt: skip
-        top.text(0.012, 0.6, result.summary(), fontsize=10.5, va='top', color=QUIET)
-        left, right = below.subplots(1, 2)
+    title = 'Three laps of a synthetic street'
+    with titled_page(plot, 12.5, 5.5, title, result.summary()) as figure:
+        left, right = figure.subplots(1, 2)
         style: dict[str, Any] = {'lw': 1.0}
         left.plot(*result.truth[:, :2].T, color='black', label='truth', lw=2.2, alpha=0.5)
         left.plot(*result.before[:, :2].T, color='#c44', label='odometry', **style)

@@ -9,10 +9,10 @@ import json
 from typing import Any
 
 import cv2
+import jinja2
 import numpy as np
 from stavpr_lab.evaluation.drive import UNSEEN_DISTANCE
 from stavpr_lab.evaluation.evaluate import Evaluation, WindowDistances
-from stavpr_lab.evaluation.extra import import_extra
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import RANKS
 from stavpr_lab.evaluation.plots import Box, COLORS, SEQUENCE
@@ -47,9 +47,7 @@ def html_page(
     :param plots: PNG files ``precision_recall``, ``distances``, ``similarity_matrix``, ``drive``
         and, where probabilities are declared, ``calibration``.
     :param boxes: where the axes of ``curves`` and ``matrix`` are.
-    :raises UnavailableError: jinja2 is not installed.
     """
-    jinja2 = import_extra('jinja2')
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     environment.policies['json.dumps_kwargs'] = {'separators': (',', ':')}
     template = resources.files('stavpr_lab.evaluation').joinpath(TEMPLATE).read_text('utf-8')

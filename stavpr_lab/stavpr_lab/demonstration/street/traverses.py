@@ -80,6 +80,10 @@ class Conditions:
 
 
 GOOD_LIGHT = Conditions()
+AFTERNOON = Conditions(
+    sun=0.25, sun_azimuth=250.0, sun_elevation=20.0, clouds=0.7, ambient=0.55, warmth=0.08,
+    lane=-LANE, traffic=2,
+)  # fmt: skip
 RAINY_DUSK = Conditions(
     sun=0.0, ambient=0.5, exposure=0.82, warmth=-0.07, clouds=1.0, fog=0.005, rain=0.4,
     noise=0.009, lamps=0.12, autumn=0.6, lane=-LANE, shake=0.25, traffic=2,
