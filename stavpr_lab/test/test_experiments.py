@@ -23,8 +23,6 @@ from stavpr_ros.mapping import build_map
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.sources.folder import FolderSource
 
-pytest.importorskip('sklearn', reason='the extra evaluation is not installed')
-
 
 @pytest.fixture
 def run(monkeypatch, capsys):
@@ -37,13 +35,6 @@ def nordland(tmp_path):
     for name in ('summer', 'winter'):
         write_images(tmp_path / 'nordland' / name, route_images(24))
     return ['--data', tmp_path, '--datasets', 'nordland']
-
-
-def test_presets_are_the_experiments_of_the_paper():
-    fast = PRESETS['paper'][-1]
-    assert (fast.projection, fast.spatial.xi) == (512, 3)
-    ablation = [(column.spatial.strategy, column.temporal) for column in PRESETS['ablation']]
-    assert ablation == [('none', False), ('adaptive', False), ('none', True), ('adaptive', True)]
 
 
 def test_sweep_configurations_vary_one_parameter():

@@ -249,8 +249,3 @@ def test_from_poses_never_accepts_places_with_unknown_pose():
         assert truth.n == 3
     with pytest.raises(InputError, match=r'2 of 3 query images have no pose \(0, 2\)'):
         GroundTruth.from_poses(np.array([unknown, pose(5), unknown]), places, 1)
-
-
-def test_from_file_of_the_corridor_is_the_identity_within_two(data_folder):
-    truth = GroundTruth.from_file(data_folder / 'corridor' / 'ground_truth.csv', 111, 111)
-    np.testing.assert_array_equal(truth.pairs, GroundTruth.identity(111, 111, 2).pairs)

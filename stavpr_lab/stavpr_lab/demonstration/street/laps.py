@@ -13,7 +13,7 @@ from math import pi
 
 import numpy as np
 from stavpr_lab.demonstration.street.rendering import EYE, FOCAL, HORIZON
-from stavpr_lab.demonstration.street.street import CELL, Street, THING_ALONG, VIEW
+from stavpr_lab.demonstration.street.street import CELL, Street, VIEW
 from stavpr_lab.demonstration.street.traverses import (
     AFTERNOON,
     DETOUR,
@@ -54,10 +54,10 @@ class RingWorld(World):
         cells, end = round(LENGTH / CELL), round(VIEW / CELL) + 1
         lots, lot_of = open_street.lots, open_street.lot_of[:, :cells]
         again = lots.copy()
-        again[:, 0] += LENGTH
-        things = open_street.things[open_street.things[:, THING_ALONG] < LENGTH]
-        ahead = things[things[:, THING_ALONG] < VIEW].copy()
-        ahead[:, THING_ALONG] += LENGTH
+        again['start'] += LENGTH
+        things = open_street.things[open_street.things['along'] < LENGTH]
+        ahead = things[things['along'] < VIEW].copy()
+        ahead['along'] += LENGTH
         curvature = _closed_curvature(self.seed, cells)
         ring = replace(
             open_street,
