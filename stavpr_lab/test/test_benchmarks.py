@@ -18,7 +18,6 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import accuracy
 import city
-import compare
 import data
 import graphs
 from lower_bounds import Peaks
@@ -78,12 +77,6 @@ def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     assert len(graphs.read(path)) == len(rows)
 
 
-def test_command_on_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(torch.cuda, 'is_available', lambda: False)
-    assert matching.main(['--device', 'cuda', '--output', str(tmp_path)]) == 2
-    assert 'torch sees no CUDA device here' in capsys.readouterr().err
-
-
 # ------------------------------------------------ peers on an equal footing
 
 
@@ -109,24 +102,6 @@ def test_sequence_peer_with_other_results_is_rejected():
 
 
 # ------------------------------------------------ comparison, accuracy
-
-
-DRIVER = """
-def make_frame(strips, weights, mode, precision):
-    return lambda strips, weights: (-2, 0.0)
-"""
-
-
-@pytest.mark.long
-def test_compare_with_this_checkout_is_equal_and_with_another_driver_different(tmp_path, capsys):
-    (tmp_path / 'driver.py').write_text(DRIVER)
-    given = '--sizes 40 --dimensions 16 --precisions float32 --rounds 2 --frames 3 --allowed 1e9'
-    arguments = [str(BENCHMARKS.parent), *given.split()]
-    for driver, status, result in (('', 0, 'equal'), (tmp_path / 'driver.py', 1, 'DIFFERENT')):
-        assert compare.main([*arguments, '--driver', str(driver)]) == status
-        lines = capsys.readouterr().out.splitlines()
-        assert [line.split()[0] for line in lines] == ['mode', 'robust', 'paper']
-        assert all(line.endswith(result) for line in lines[1:])
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def documented_commands() -> list[list[str]]:
                 words = [word.removeprefix('$bin/') for word in words if word != '&']
                 if words[:3] == ['ros2', 'run', 'stavpr_ros']:
                     words = words[3:]
-                if words and words[0] in stavpr.COMMANDS and words[0] != 'node':
+                if words and words[0] in stavpr.all_commands() and words[0] != 'node':
                     found.append(words)
     return found
 

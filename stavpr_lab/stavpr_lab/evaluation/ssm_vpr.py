@@ -41,7 +41,7 @@ class SsmVprSettings:
     :param large_dimension, small_dimension: of the whitened cubes.
     :param neighbors: cubes of the map that a cube of the query votes for.
     :param candidates: images that stage 2 compares.
-    :param memory: last answers that frame correlation uses; 0 = none.
+    :param memory: last answers that frame correlation uses.
     :param gain: most additional weight of a candidate.
     :param reach: places from an answer at which that weight is 0.
     """
@@ -189,7 +189,7 @@ class SsmVpr:
         found = [self._whitening(cubes(each[None], settings.large)[0]) for each in self.first]
         self._image = np.repeat(np.arange(len(found)), len(found[0]))
         self._cubes = torch.cat(found)
-        self._answers: deque[tuple[int, float]] = deque(maxlen=settings.memory or None)
+        self._answers: deque[tuple[int, float]] = deque(maxlen=settings.memory)
 
     def candidates(self, query: torch.Tensor) -> np.ndarray:
         """
@@ -215,14 +215,13 @@ class SsmVpr:
         places = self.candidates(first)
         scores = self.reranker.scores(second, places) * self.weights(places)
         order = np.argsort(-scores, kind='stable')
-        if self.settings.memory:
-            self._answers.append((int(places[order[0]]), float(scores[order[0]])))
+        self._answers.append((int(places[order[0]]), float(scores[order[0]])))
         return places[order], scores[order]
 
     def weights(self, places: np.ndarray) -> np.ndarray:
         """Return the weight of each place by the last answers, at least 1, shape (K,)."""
         settings, best = self.settings, np.zeros(len(places))
-        if not settings.memory or len(self._answers) < settings.memory:
+        if len(self._answers) < settings.memory:
             return 1 + best
         strongest = max(score for _, score in self._answers)
         for answer, score in self._answers:
