@@ -27,6 +27,7 @@ from stavpr_lab.evaluation.records import IN_WINDOW
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.robust import evenly
 
 SHOWN = 8  # pairs of images
 LARGEST = 4000  # images of a traverse whose distances are drawn
@@ -118,9 +119,8 @@ def choose_closures(count: int, correct: np.ndarray | None) -> list[int]:
     bad = np.setdiff1d(np.arange(count), good)
     chosen: set[int] = set()
     for indices, most in ((bad, SHOWN if not len(good) else SHOWN // 4), (good, SHOWN)):
-        room = min(most, SHOWN - len(chosen), len(indices))
-        if room:
-            chosen |= set(indices[np.linspace(0, len(indices) - 1, room).astype(int)].tolist())
+        room = min(most, SHOWN - len(chosen))
+        chosen |= set(indices[evenly(len(indices), room)].tolist())
     return sorted(chosen)
 
 

@@ -26,6 +26,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from stavpr_ros.errors import InputError
+from stavpr_ros.recognition.robust import evenly
 import torch
 from torch.nn.functional import normalize
 
@@ -104,7 +105,7 @@ def learn_whitening(maps: torch.Tensor, side: int, dimension: int) -> PcaWhiteni
     per_image = -(-SAMPLE // n)
     rng = np.random.default_rng(0)
     samples = []
-    for i in np.unique(np.linspace(0, n - 1, min(n, SAMPLE)).astype(int)):
+    for i in evenly(n, SAMPLE):
         found = cubes(maps[i : i + 1], side)[0]
         chosen = rng.choice(len(found), min(per_image, len(found)), replace=False)
         samples.append(found[torch.from_numpy(chosen)])
