@@ -190,7 +190,8 @@ def draw_loops(result: LoopResult, place_map: PlaceMap, title: str, folder: Path
     """
     path = folder / 'loop.png'
     with titled_page(path, 12.5, 5.9, title, result.summary()) as figure:
-        left, right = figure.subfigures(1, 2, width_ratios=(1, 1.1))
+        halves: Any = figure.subfigures(1, 2, width_ratios=(1, 1.1))
+        left, right = halves
         _draw_traverse(left, left.add_subplot(), result, _compared_distances(result, place_map))
         draw_pairs(right, _pairs(result, place_map), 2)
     return path

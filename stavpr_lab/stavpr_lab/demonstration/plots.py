@@ -112,7 +112,8 @@ def demo_sheet(
     """
     above, below = 0.5 + 1.52 * max(1, -(-len(pairs) // 3)), 4.2
     with titled_page(path, 11, above + below, title, result.summary()) as figure:
-        top, bottom = figure.subfigures(2, 1, height_ratios=(above, below))
+        rows: Any = figure.subfigures(2, 1, height_ratios=(above, below))
+        top, bottom = rows
         left, right = bottom.subfigures(1, 2, width_ratios=(1, 1.18))
         draw_pairs(top, pairs, 3)
         _draw_matrix(left, distances, result)

@@ -265,7 +265,8 @@ def titled_page(
     """Yield the part of a page below its title and some lines of text, ``height`` inches high."""
     head = 0.5 + 0.17 * len(text.splitlines())
     with page(path, width, head + height) as figure:
-        top, below = figure.subfigures(2, 1, height_ratios=(head, height))
+        parts: Any = figure.subfigures(2, 1, height_ratios=(head, height))
+        top, below = parts
         top.text(0.012, 0.96, title, fontsize=15, weight='bold', va='top', color=INK)
         top.text(0.012, 0.54, text, fontsize=10.5, va='top', color=QUIET)
         yield below
