@@ -268,7 +268,7 @@ def titled_page(
         parts: Any = figure.subfigures(2, 1, height_ratios=(head, height))
         top, below = parts
         top.text(0.012, 0.96, title, fontsize=15, weight='bold', va='top', color=INK)
-        top.text(0.012, 0.54, text, fontsize=10.5, va='top', color=QUIET)
+        top.text(0.012, 0.06, text, fontsize=10.5, va='bottom', color=QUIET)
         yield below
 
 
