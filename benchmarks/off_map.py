@@ -22,13 +22,13 @@ import numpy as np
 from off_map_page import DAY, markdown, NIGHT, Results, summary_section
 from results import environment, RESULTS, ROOT
 from stavpr_lab.evaluation.calibration import calibrate
-from stavpr_lab.evaluation.drive import DriveChanges, select_places
+from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import accepted_counts, image_matches, sweep
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import build_map, PlaceMap
+from stavpr_ros.mapping import build_map, PlaceMap, select_places
 from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.robust import THRESHOLD
 from stavpr_ros.sources import open_source

@@ -30,7 +30,6 @@ setup(
         'numba>=0.59',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
-        'rosbags>=0.10',
         'scikit-learn>=1.4',
         'scipy>=1.11',
         'stavpr_ros',

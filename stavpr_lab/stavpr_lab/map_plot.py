@@ -3,17 +3,15 @@
 """``map info --plot``: the route with its poses, thumbnails, and the map compared with itself."""
 
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 import numpy as np
 from stavpr_lab.evaluation.plots import color_bar, page, QUIET, SCALE
 from stavpr_ros.mapping import PlaceMap, select_places
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.robust import evenly
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, SubFigure
 
 COMPARED = 500  # places of the matrix, at most
 SHOWN = 8  # thumbnails
@@ -44,7 +42,7 @@ def _runs(place_map: PlaceMap) -> list[tuple[str, np.ndarray]]:
     ]
 
 
-def _draw_route(axes: 'Axes', place_map: PlaceMap) -> None:
+def _draw_route(axes: Axes, place_map: PlaceMap) -> None:
     axes.set_title('route, seen from above', fontsize=10.5, loc='left')
     assert place_map.poses is not None
     for name, places in _runs(place_map):
@@ -63,7 +61,7 @@ def _draw_route(axes: 'Axes', place_map: PlaceMap) -> None:
         axes.legend(loc='best')
 
 
-def _draw_thumbnails(figure: 'SubFigure', place_map: PlaceMap, columns: int) -> None:
+def _draw_thumbnails(figure: SubFigure, place_map: PlaceMap, columns: int) -> None:
     places = evenly(len(place_map), SHOWN).tolist()
     grid = figure.subplots(SHOWN // columns, columns, squeeze=False)
     for axes in grid.flat:
@@ -77,7 +75,7 @@ def _draw_thumbnails(figure: 'SubFigure', place_map: PlaceMap, columns: int) -> 
             axes.imshow(image, interpolation='lanczos')
 
 
-def _draw_matrix(figure: 'Figure | SubFigure', axes: 'Axes', place_map: PlaceMap) -> None:
+def _draw_matrix(figure: Figure | SubFigure, axes: Axes, place_map: PlaceMap) -> None:
     """Draw the distances of places to each other, as mode robust compares images."""
     n, places = len(place_map), evenly(len(place_map), COMPARED)
     some = select_places(place_map, places)

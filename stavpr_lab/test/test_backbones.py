@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's networks: parameters by name and shape, against a second implementation."""
 
-import argparse
 from dataclasses import replace
 
 import cv2
@@ -17,7 +16,6 @@ from stavpr_lab.features.paper_networks import (
     VGG16Pool4,
 )
 from stavpr_lab.features.weights import load_parameters
-from stavpr_ros.commands.feature_options import add_feature_options, make_extractor
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.registry import backbone_class, settings_class
 import torch
@@ -187,15 +185,3 @@ def test_load_parameters_of_other_network_is_rejected(densenet_parameters, chang
 def test_published_settings_out_of_range_are_rejected(kind, bad):
     with pytest.raises(SettingsError):
         settings_class(kind)(**bad)
-
-
-def test_feature_options_make_extractor(vgg_file):
-    parser = argparse.ArgumentParser()
-    add_feature_options(parser)
-    words = ['--features', 'vgg16', '--vgg16-size', '112', '--device', 'cpu', '--vgg16-model']
-    words.append(str(vgg_file))
-    extractor = make_extractor(parser.parse_args([*words, '--vgg16-half', 'true']))
-    assert (extractor.settings.backbone.size, extractor.settings.backbone.half) == (112, True)
-    words = ['--features', 'densenet161_places365', '--densenet161_places365-model', '/gone']
-    with pytest.raises(UnavailableError, match='/gone'):
-        make_extractor(parser.parse_args([*words, '--device', 'cpu']))

@@ -8,7 +8,6 @@ import json
 from pathlib import Path
 import sys
 
-import cv2
 import numpy as np
 import oracle
 import pytest
@@ -19,18 +18,15 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import accuracy
 import city
-import compare
 import data
 import graphs
 from lower_bounds import Peaks
 import matching
-import memory
 import off_map
 import off_map_page
 import peaks
 import report
 import results
-from results import PeerTime, Row
 from run import Run
 import stages
 from stavpr_lab.evaluation.ground_truth import GroundTruth
@@ -81,44 +77,6 @@ def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     assert len(graphs.read(path)) == len(rows)
 
 
-def test_command_on_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(torch.cuda, 'is_available', lambda: False)
-    assert matching.main(['--device', 'cuda', '--output', str(tmp_path)]) == 2
-    assert 'torch sees no CUDA device here' in capsys.readouterr().err
-
-
-def test_report_sums_stages_counts_losses_and_names_missed_targets():
-    parts = [Row(s, 'robust', 5, 0, 'float32', 0.001, 0, 7) for s in report.ROBUST_STAGES[2:]]
-    parts += [Row('mean_centering', 'robust', 5, 8, 'float32', 0.001, 0.0, 7)]
-    parts += [Row('image_distances', '', 5, 8, p, 0.002, 0.0, 7) for p in ('int8', 'float32')]
-    frame = Row('frame', 'robust', 5, 8, 'int8', 0.010, 0.001, 7, 0.005)
-    peers = (
-        PeerTime('prange', 0.016, 0.0, 8.0),
-        PeerTime('librosa', 0.001, 0.0, 0.5),
-        PeerTime('torch float32', 0.001, 0.0, 0.1, partial=True),
-    )
-    sequences = Row('lm_dtw', 'paper', 20_000, 0, 'float32', 0.002, 0, 9, 0.001, peers)
-    run = Run('cpu', PEAKS, rows=[*parts, frame, sequences])
-    run.skip('x', 1, 0, 'why')
-    held = memory.Memory('localization', 'robust', 'int8', 5, 8, 10**6, 3 * 10**6)
-    text = '\n'.join(report.report(results.environment(named_commit='abc'), run, [held]))
-    assert 'Commit abc' in text
-    assert '| 7 ms | 10 ms | 1 ms | 5 ms | 2 |' in text  # five stages of 1 ms, one of 2 ms
-    assert '## Beside peers (1 of 2 lost)' in text
-    assert '| 1 MB | 3 MB | 3 | <= 1.1 | **not reached** |' in text
-    assert 'paper | 20,000 | - | prange | 8 | >= 8 | reached |' in text
-    assert 'paper | 20,000 | - | librosa | 0.5 | >= 100 | **not reached** |' in text
-    assert 'both | 2,000 | 512 | torch float32 | - | <= 1.25 | not measured |' in text
-    assert '| x | 1 | - | why |' in text
-
-
-def test_graph_of_committed_results_is_drawn(tmp_path):
-    rows = graphs.read(results.RESULTS / 'matching-amd-epyc-2-cores-512-bit.json')
-    assert {row.stage for row in rows} >= {'image_distances', 'filter_update', 'frame'}
-    graphs.draw(rows, tmp_path / 'graph.png')
-    assert cv2.imread(str(tmp_path / 'graph.png')).shape[1] > 1000
-
-
 # ------------------------------------------------ peers on an equal footing
 
 
@@ -143,36 +101,7 @@ def test_sequence_peer_with_other_results_is_rejected():
         stages.sequence_peers(Run('cpu', PEAKS), window, wrong)
 
 
-@pytest.mark.parametrize(('precision', 'name'), [('float32', 'faiss'), ('int8', 'usearch')])
-def test_search_that_is_not_installed_is_left_out_by_name(monkeypatch, precision, name):
-    monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.setitem(sys.modules, 'usearch.index', None)
-    run = Run('cpu', PEAKS)
-    places, query = (data.make_features(n, 16, 7, 'cpu', 0) for n in (50, 1))
-    (peer,) = stages.references(run, places, query, precision)
-    assert peer.name == 'torch float32'
-    assert [skipped['name'] for skipped in run.skipped] == [name]
-
-
 # ------------------------------------------------ comparison, accuracy
-
-
-DRIVER = """
-def make_frame(strips, weights, mode, precision):
-    return lambda strips, weights: (-2, 0.0)
-"""
-
-
-@pytest.mark.long
-def test_compare_with_this_checkout_is_equal_and_with_another_driver_different(tmp_path, capsys):
-    (tmp_path / 'driver.py').write_text(DRIVER)
-    given = '--sizes 40 --dimensions 16 --precisions float32 --rounds 2 --frames 3 --allowed 1e9'
-    arguments = [str(BENCHMARKS.parent), *given.split()]
-    for driver, status, result in (('', 0, 'equal'), (tmp_path / 'driver.py', 1, 'DIFFERENT')):
-        assert compare.main([*arguments, '--driver', str(driver)]) == status
-        lines = capsys.readouterr().out.splitlines()
-        assert [line.split()[0] for line in lines] == ['mode', 'robust', 'paper']
-        assert all(line.endswith(result) for line in lines[1:])
 
 
 @pytest.mark.parametrize(
@@ -259,35 +188,13 @@ def test_first_right_match_counts_images_since_start():
 
 
 def test_process_of_matches_is_measured_beside_process_without():
-    run = Run('cpu', 0.001)
+    run = Run('cpu', PEAKS)
     stages.process_stages(run, 2 * stages.DRIVEN, 'int8', 0)
-    (row, _), = run.rows
+    (row,) = run.rows
     assert (row.stage, [peer.name for peer in row.peers]) == ('process', ['without matches'])
 
 
-
-
 # ------------------------------------------------ the city
-
-
-def test_city_results_are_merged_and_written_between_the_marks(tmp_path):
-    def result(case, precision):
-        drive = {'precision': precision, 'recall': 0.5, 'processor_ms': 12.0}
-        found = {'exact': drive, 'first_stage': drive, 'statuses_changed': 1, 'places_moved': 0}
-        return found | {'case': case, 'places': 1000, 'threads': 2, 'load': 0.1}
-
-    path, page = tmp_path / 'city.json', tmp_path / 'page.md'
-    city.merged(path, [result('corridor', 0.1), result('gardens_point', 0.2)])
-    found = city.merged(path, [result('corridor', 0.75)])
-    page.write_text(f'before {city.BEGIN} old {city.END} after')
-    for _ in range(2):
-        city.write_page(found, page)
-    text = page.read_text()
-    assert (text[:6], text[-5:], 'old' in text) == ('before', 'after', False)
-    assert text.index('gardens_point') < text.index('corridor')
-    assert text.count('| corridor | 1,000 | 0.750 / 0.500 |') == 1
-    shown = city.PAGE.read_text(encoding='utf-8')
-    assert shown.count(city.BEGIN) == shown.count(city.END) == 1
 
 
 def test_simulated_places_have_mean_and_neighbors_of_real_ones():

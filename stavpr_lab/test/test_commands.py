@@ -248,6 +248,9 @@ def test_match_record_names_every_status():
         ('--loop x --truth identity', 'takes a file'),
         ('--loop --sequence-length 1', '--sequence-length'),
         ('--loop --mode paper', '--threshold'),
+        ('--slam world --map a', '--slam has its own drive'),
+        ('--slam world --false-closures 1.5', '--false-closures 1.5'),
+        ('--slam world --drift -1', '--drift -1'),
     ],
 )
 def test_demo_with_wrong_options_names_them(run, tmp_path, options, word):

@@ -87,7 +87,6 @@ def results_of(places, scores):
 
 
 def test_false_alarm_rate_counts_unknown_images_below_the_threshold():
-    pytest.importorskip('sklearn', reason='the extra evaluation is not installed')
     known = results_of([0, 1, 2], [0.1, 0.2, 0.3])
     unknown = results_of([0, 0, 0, -1], [0.1, 0.2, 0.25, np.inf])
     evaluation = evaluate_traverse(known, GroundTruth.identity(3, 3), 3, unknown)
@@ -96,7 +95,6 @@ def test_false_alarm_rate_counts_unknown_images_below_the_threshold():
 
 def test_worst_mistakes_are_ordered_and_apart():
     """Other places before near misses, then by distance; none near another one."""
-    pytest.importorskip('sklearn', reason='the extra evaluation is not installed')
     places, scores = np.arange(60), np.full(60, 0.05)
     mistakes = ((10, 40, 0.5), (12, 41, 0.6), (30, 33, 0.1), (50, 5, 0.2), (28, 6, np.inf))
     for image, place, score in mistakes:

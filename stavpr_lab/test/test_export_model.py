@@ -51,17 +51,6 @@ class Pooled(nn.Module):
         return normalize(self.fc(self.backbone(x).clamp(min=1e-6).pow(3).mean((2, 3))), dim=1)
 
 
-class Crica(Pooled):
-    """As CricaVPR: the images of a batch influence each other."""
-
-    def __init__(self):
-        super().__init__()
-        self.encoder = nn.TransformerEncoderLayer(12, 2, 8, dropout=0.0)
-
-    def forward(self, x):
-        return self.encoder(super().forward(x)[:, None])[:, 0]
-
-
 class Loop(Pooled):
     """As AnyLoc: a Python loop over the batch."""
 
@@ -109,12 +98,8 @@ def pooled(backbone='ResNet18', fc_output_dim=32):
     return Pooled(fc_output_dim)
 
 
-def crica():
-    return nn.DataParallel(Crica())
-
-
 def loop():
-    return Loop()
+    return nn.DataParallel(Loop())
 
 
 def transformer():
@@ -127,10 +112,6 @@ def salad():
 
 def no_model():
     return 'no model'
-
-
-def broken():
-    raise RuntimeError('no weights')
 
 
 def not_finite():
@@ -186,7 +167,6 @@ def features(path, layer):
          {'backbone': 'ResNet50', 'fc_output_dim': 16}, True),
         ('transformer', ['--vector', 'token'], {}, True),
         ('salad', [], {}, True),
-        ('crica', [], {}, False),
         ('loop', [], {}, False),
     ],
 )  # fmt: skip
@@ -256,7 +236,6 @@ TOKENS = ['--vector', 'token', '--map-module']
         ('pooled', ['--argument', 'backbone=x'], 2, "'x' is no JSON"),
         ('pooled', ['--argument', '1'], 2, 'expected NAME=JSON'),
         ('missing', [], 1, 'entry missing of .* fails'),
-        ('broken', [], 1, 'RuntimeError: no weights'),
         ('no_model', [], 1, 'returns a str: expected a torch.nn.Module'),
         ('not_finite', [], 1, 'NaN or infinite'),
         ('loop', ['--size', 7000], 2, 'must be 8 to 4096'),
@@ -269,13 +248,6 @@ def test_export_names_what_is_wrong(run, repository, tmp_path, name, options, co
     assert found == code
     assert re.search(words, errors), errors
     assert not path.exists()
-
-
-def test_export_keeps_a_file_of_another_kind(run, repository, tmp_path):
-    (tmp_path / 'a.onnx').write_text('notes')
-    options = [ALLOW, '--output', tmp_path / 'a.onnx', '--force']
-    code, _, errors = run(*entry(repository, 'pooled', *options))
-    assert (code, 'no ONNX file' in errors) == (1, True)
 
 
 # ------------------------------------------------ quantized networks

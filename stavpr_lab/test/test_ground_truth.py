@@ -72,17 +72,6 @@ def test_widened_stays_within_query_and_map():
             by_hand().widened(wrong)
 
 
-def test_select_equals_the_rows_of_the_matrix():
-    rng = np.random.default_rng(0)
-    matrix = rng.random((40, 30)) < 0.1
-    truth = GroundTruth.from_pairs(*np.nonzero(matrix), 40, 30)
-    indices = rng.integers(0, 40, 100)
-    np.testing.assert_array_equal(truth_matrix(truth.select(indices)), matrix[indices])
-    places = rng.integers(-1, 30, 40)
-    expected = [bool(place >= 0 and matrix[query, place]) for query, place in enumerate(places)]
-    assert truth.accepts(places).tolist() == expected
-
-
 def test_loop_closures_of_either_triangle_are_the_same():
     lower = np.zeros((5, 5), bool)
     lower[3, 0] = lower[4, 1] = lower[4, 3] = True
@@ -249,8 +238,3 @@ def test_from_poses_never_accepts_places_with_unknown_pose():
         assert truth.n == 3
     with pytest.raises(InputError, match=r'2 of 3 query images have no pose \(0, 2\)'):
         GroundTruth.from_poses(np.array([unknown, pose(5), unknown]), places, 1)
-
-
-def test_from_file_of_the_corridor_is_the_identity_within_two(data_folder):
-    truth = GroundTruth.from_file(data_folder / 'corridor' / 'ground_truth.csv', 111, 111)
-    np.testing.assert_array_equal(truth.pairs, GroundTruth.identity(111, 111, 2).pairs)

@@ -1,29 +1,14 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Every Python file: license header, rules of ament_flake8 and ament_pep257."""
+"""The license header of every Python file."""
 
 from collections.abc import Iterator
 import os
 from pathlib import Path
-import subprocess
-import sys
-
-import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 NOT_OURS = {'build', 'install', 'log'}
 HEADER = ['# Copyright 2026 The stavpr_ros authors', '# SPDX-License-Identifier: Apache-2.0']
-# The rules that ament_pep257 ignores in ROS 2 Jazzy; it checks all others of pydocstyle.
-PEP257_IGNORES = {
-    *('D100', 'D101', 'D102', 'D103', 'D104', 'D105', 'D106', 'D107'),
-    *('D203', 'D212', 'D404'),
-}
-PLUGINS = (
-    'flake8_builtins',
-    'flake8_comprehensions',
-    'flake8_import_order',
-    'flake8_quotes',
-)
 
 
 def python_files() -> Iterator[Path]:
@@ -36,39 +21,8 @@ def python_files() -> Iterator[Path]:
         yield from (Path(folder, name) for name in sorted(files) if name.endswith('.py'))
 
 
-def without_header(paths: list[Path]) -> list[Path]:
-    """Return the files that do not begin with the license header, behind a shebang or without."""
-    missing = []
-    for path in paths:
+def test_python_files_have_license_header():
+    for path in python_files():
         lines = path.read_text(encoding='utf-8').split('\n')
         start = 1 if lines[0].startswith('#!') else 0
-        if lines[start : start + 2] != HEADER:
-            missing.append(path)
-    return missing
-
-
-def test_python_files_have_license_header():
-    assert [str(path.relative_to(ROOT)) for path in without_header(list(python_files()))] == []
-
-
-@pytest.mark.long  # ruff checks nearly the same rules in `make lint`
-@pytest.mark.parametrize('name', ['flake8', 'pydocstyle'])
-def test_linter_of_ament_finds_nothing(name):
-    for module in (name, *PLUGINS) if name == 'flake8' else (name,):
-        pytest.importorskip(module, reason=f'{module} is not installed (extra dev)')
-    # pydocstyle without the decorators of properties, as ament_pep257 calls it: their summaries
-    # are checked
-    pydocstyle = (
-        'import pydocstyle, sys; '
-        f'rules = set(pydocstyle.violations.ErrorRegistry.get_error_codes()) - {PEP257_IGNORES}; '
-        'found = pydocstyle.check(sys.argv[1:], select=rules); '
-        'sys.exit("\\n".join(map(str, found)) or 0)'
-    )
-    command = {
-        'flake8': ['-m', 'flake8', '--config', 'setup.cfg', '.'],
-        'pydocstyle': ['-c', pydocstyle, *map(str, python_files())],
-    }[name]
-    done = subprocess.run(
-        [sys.executable, *command], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+        assert lines[start : start + 2] == HEADER, path

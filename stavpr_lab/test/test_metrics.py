@@ -7,7 +7,6 @@ import oracle
 import pytest
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import (
-    counts_at,
     evaluate_ranking,
     image_matches,
     Ranking,
@@ -16,8 +15,6 @@ from stavpr_lab.evaluation.metrics import (
 from stavpr_ros.alignment import SequenceMatch
 from stavpr_ros.errors import InputError
 from stavpr_ros.recognition import Match, Status
-
-pytest.importorskip('sklearn', reason='the extra evaluation is not installed')
 
 NONE = Match(Status.WARMING_UP)
 
@@ -30,16 +27,6 @@ def ranking(places, scores):
 def window(middle, path, distance):
     nearest = SequenceMatch(path[0][1], path[-1][1], middle, distance, -1, float('nan'))
     return Match(Status.NO_MATCH, sequence=nearest, path=np.array(path, np.int32))
-
-
-def test_counts_at_four_queries_by_hand():
-    """Accepted and correct, accepted and wrong, rejected, rejected and not in the map."""
-    distances = np.array([0.1, 0.2, 0.5, 0.6])
-    correct = np.array([True, False, True, False])
-    counts = counts_at(0.3, distances, correct, np.array([True, True, True, False]))
-    assert (counts.true_positives, counts.false_positives, counts.false_negatives) == (1, 1, 1)
-    assert (counts.precision, counts.recall, counts.f1) == (0.5, 0.5, 0.5)
-    assert counts_at(0.2, distances, correct).false_positives == 0  # below, not at the threshold
 
 
 def test_best_f1_on_a_tie_is_that_of_the_lowest_threshold():

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 from stavpr_lab.demonstration.plots import demo_sheet
-from stavpr_lab.evaluation.calibration import calibrate
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import evaluate_ranking, ImageMatches, Ranking
 from stavpr_lab.evaluation.plots import (
@@ -17,7 +16,6 @@ from stavpr_lab.evaluation.plots import (
     MatchPair,
     precision_recall,
     reduced_matrix,
-    reliability,
 )
 from stavpr_lab.evaluation.records import TraverseEvaluation
 from stavpr_ros.pipeline.overlay import match_image, NO_MATCH, RIGHT
@@ -132,15 +130,6 @@ def test_drive_shows_outcomes_true_places_and_unseen_images(path):
     assert all(colors_of(path, GREEN, RED, AMBER, GRAY, YELLOW, (233, 233, 228)))
     drive(path, truth[:0], 50, queries, outcomes, queries < 0)
     assert colors_of(path, YELLOW) == [False]
-
-
-def test_reliability_shows_bins_above_and_below_the_diagonal(path):
-    declared = np.array([0.25, 0.95, 0.95, 0.95])
-    correct = np.array([True, False, True, True])
-    calibration = calibrate(declared, correct, np.ones(4, bool))
-    assert calibration is not None
-    reliability(path, calibration)
-    assert all(colors_of(path, (35, 88, 165), (127, 168, 220)))
 
 
 @pytest.mark.parametrize(('accepted', 'color'), [(True, RIGHT), (False, NO_MATCH)])

@@ -7,7 +7,6 @@ import pytest
 from scores import best_f1
 from stavpr_lab.evaluation.paper.datasets import open_dataset
 from stavpr_lab.evaluation.seqslam import (
-    enhance_contrast,
     match_differences,
     preprocess,
     seqslam,
@@ -32,26 +31,6 @@ def test_preprocess_weights_red_more_than_blue():
     gray = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8) * 40
     color = np.stack([gray, gray * 0, 200 - gray], axis=2)  # red as the gray image, blue against
     np.testing.assert_allclose(preprocess([color], SMALL), preprocess([gray], SMALL), atol=0.05)
-
-
-def test_enhance_contrast_by_hand():
-    """
-    Window 2, one place before and one after: 1 3 | 1 3 5 | 3 5 3 | 5 3.
-
-    Means 2, 3, 11/3, 4; deviations 1, sqrt(8/3), sqrt(8)/3, 1.
-    """
-    D = np.array([[1.0, 3, 5, 3], [7, 7, 7, 7]])
-    enhanced = enhance_contrast(D, 2)
-    np.testing.assert_allclose(enhanced, [[-1, 0, np.sqrt(2), -1], [0, 0, 0, 0]], atol=1e-12)
-    assert enhance_contrast(D.astype(np.float32), 2).dtype == np.float32
-
-
-def test_lines_at_three_speeds_by_hand():
-    """Speeds 0.5, 1 and 1.5 over five images, halves rounded up."""
-    settings = SeqSlamSettings(length=5, slowest=0.5, fastest=1.5, speed_step=0.5)
-    assert settings.lines.tolist() == [[0, 1, 1, 2, 2], [0, 1, 2, 3, 4], [0, 2, 3, 5, 6]]
-    assert len(SeqSlamSettings().lines) == 5  # 0.8, 0.9, 1.0, 1.1, 1.2
-    assert SeqSlamSettings().lines[:, -1].tolist() == [15, 17, 19, 21, 23]
 
 
 def naive(D, settings):

@@ -44,12 +44,6 @@ def test_world_with_same_seed_renders_same_bytes():
     assert not np.array_equal(one[17].image, other[17].image)
 
 
-def test_traverse_image_is_independent_of_order(world):
-    traverse = second_traverse(world, 30, SIZE)
-    alone = traverse[12].image
-    assert np.array_equal(list(traverse)[12].image, alone)
-
-
 def shift_of_patch(before, after, x, y, size=36, reach=14):
     """Find how many pixels a patch has moved sideways."""
     patch = before[y : y + size, x : x + size]

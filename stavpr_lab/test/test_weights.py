@@ -156,16 +156,6 @@ def test_download_takes_https_only(server, cache, monkeypatch):
     assert server.requests == 0
 
 
-def test_download_that_cannot_begin_fails_with_advice(server, cache, tmp_path, content):
-    """No server on this port; a file where the folder should be."""
-    with pytest.raises(UnavailableError, match=r'127.0.0.1:1/ cannot be downloaded.*its path'):
-        download('http://127.0.0.1:1/', cache / 'tiny.pth', '0' * 64)
-    assert list(cache.iterdir()) == []
-    (tmp_path / 'file').touch()
-    with pytest.raises(UnavailableError, match='cannot be'):
-        fetch(server, tmp_path / 'file', content)
-
-
 def test_published_hash_is_checked_in_full(server, cache, content, monkeypatch):
     digest = hashlib.sha256(content).hexdigest()
     other = digest[:16] + '0' * 48

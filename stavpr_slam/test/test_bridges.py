@@ -27,11 +27,10 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.ros.output import nanoseconds
 from stavpr_slam.commands.bridge import main
 from stavpr_slam.pose_graph import Closure
-from stavpr_slam.pose_graph.foreign import body_information, ForeignKeyframes, keyframe_edge
+from stavpr_slam.pose_graph.foreign import ForeignKeyframes, keyframe_edge
 from stavpr_slam.ros.bridges.bridge import interfaces
 from stavpr_slam.ros.graph_messages import pose_array
 
-PLACE = np.array([0, 0, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)])  # heading y
 COVARIANCE = np.diag([0.2, 0.1, 0.3, 0.01, 0.02, 0.03]) ** 2
 
 
@@ -67,12 +66,6 @@ def test_keyframe_edge_covariance_is_that_of_samples():
     turns = Rotation.from_matrix(end[:, :3, :3] @ edge.transform[:3, :3].T).as_rotvec()
     errors = np.concatenate([end[:, :3, 3] - edge.transform[:3, 3], turns], axis=1)
     np.testing.assert_allclose(np.cov(errors.T), edge.covariance, atol=2e-3)
-
-
-def test_body_information_of_turned_query_has_swapped_axes():
-    edge = keyframe_edge(closure(PLACE), (1, np.eye(4)), (2, np.eye(4)))
-    expected = 1 / np.array([0.1, 0.2, 0.3, 0.02, 0.01, 0.03]) ** 2
-    np.testing.assert_allclose(body_information(edge), np.diag(expected), atol=1e-8)
 
 
 def test_foreign_keyframes_near_returns_nearest_with_motion():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import Closure, PoseGraph
-from stavpr_slam.pose_graph.acceptance import Acceptance, LEAST_CLUSTERS, SCALES
+from stavpr_slam.pose_graph.acceptance import LEAST_CLUSTERS, SCALES
 from stavpr_slam.pose_graph.cycles import Cycles
 from stavpr_slam.pose_graph.odometry import OdometryNoise
 from stavpr_slam.pose_graph.transforms import planar_poses
@@ -57,13 +57,6 @@ def test_optimize_loops_that_contradict_odometry_move_the_solution(draw):
     assert graph.accepted > 0.9 * len(closures)
     assert graph.noise.rotation > OdometryNoise().scaled(SCALES[0]).rotation
     assert error(found, truth) < 0.5 * error(odometry, truth)
-
-
-def test_optimize_without_the_ratio_would_move_precise_odometry(monkeypatch):
-    monkeypatch.setattr(Acceptance, '_estimate_from_loops', lambda _: False)
-    truth, odometry, closures = short_loop(0, PRECISE)
-    found, _ = solve(truth, closures, odometry)
-    assert error(found, truth) > 3 * error(odometry, truth)
 
 
 @pytest.mark.parametrize(('off', 'moves'), [(0.0, False), (0.4, False), (6.0, True)])

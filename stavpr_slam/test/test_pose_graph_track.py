@@ -4,7 +4,6 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.mapping.transforms import to_poses
 from stavpr_slam.pose_graph import ChainSettings, GraphSettings, PoseGraph
 from stavpr_slam.pose_graph.files import save_graph
 from stavpr_slam.pose_graph.odometry import KeyframeChain
@@ -65,15 +64,6 @@ def test_saved_trajectory_has_the_odometry_between_keyframes(solved, tmp_path):
     assert error(found, truth) < 1
     before, after = path_messages('map', *graph.chain.trajectory(graph.solved))
     assert len(before.poses) == len(after.poses) == len(rows)
-
-
-def test_keyframes_alone_would_be_off_by_half_a_meter(solved):
-    """What the tests above are about: keyframes in between which the robot stands."""
-    graph, stamps, odometry, _ = solved
-    keyframes, poses = graph.chain.stamps, to_poses(graph.solved)
-    found = np.column_stack([np.interp(stamps, keyframes, poses[:, i]) for i in (0, 1)])
-    exact = [graph.at(t, pose) for t, pose in zip(stamps.tolist(), odometry, strict=True)]
-    assert np.linalg.norm(found - np.array(exact)[:, :2], axis=1).max() > 0.4
 
 
 @pytest.mark.parametrize(('jitter', 'most'), [(0.0, 5), (0.05, MOST + 2)])

@@ -59,7 +59,7 @@ another drive (they combine; applied in the order speed, stop, reverse, drop):
 examples:
   evaluate --map summer/ --query winter/
   evaluate --map route.stavpr --query tuesday.bag --truth pairs.csv --mode paper --json result.json
-  evaluate --map summer/ --query winter/ --crop-map 0.3 --crop-query 0.1 --warp vary
+  evaluate --map summer/ --query winter/ --crop-map 0.3 --crop-query 0.1 --speed vary
   evaluate --map monday/ --query tuesday/ --unknown another_town/ --output report/
   evaluate --map monday/ --query tuesday/ --remove-from-map 40:90 --remove-from-map 200:260
   evaluate --query loop/ --loop-closure --exclude-places 50 --truth closures.png
@@ -124,23 +124,20 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_drive_options(parser: argparse.ArgumentParser) -> None:
-    from stavpr_lab.evaluation.drive import KINDS
-
     add = parser.add_argument_group('another drive').add_argument
     pairs: dict[str, Any] = {'type': _pair, 'action': 'append', 'default': []}
     removal = 'leave places FIRST .. LAST - 1 out of the map; may be repeated'
     add('--remove-from-map', metavar='FIRST:LAST', help=removal, **pairs)
     add('--mirror', action='store_true', help='mirror the images of the query left-right')
     add('--reverse', action='store_true', help='drive the query in reverse order')
-    speed = 'images of the query per image, or varying'
-    add('--speed', type=_speed, metavar='X', help=speed)
+    speed = 'images of the query per image, varying, or stop (30 images in the middle)'
+    add('--speed', '--warp', metavar='X', help=speed)
     stop = 'stand still at image IMAGE of the query for COUNT more; may be repeated'
     add('--stop', metavar='IMAGE:COUNT', help=stop, **pairs)
     drop = 'leave each image of the query out with this probability (%(default)g)'
     add('--drop', type=float, default=0.0, metavar='P', help=drop)
     seed = 'of the images that are left out (%(default)s)'
     add('--drop-seed', type=int, default=0, metavar='N', help=seed)
-    add('--warp', choices=KINDS, help='a speed or a stop in the middle, as in the benchmarks')
 
 
 def _pair(text: str) -> tuple[int, int]:
@@ -148,13 +145,6 @@ def _pair(text: str) -> tuple[int, int]:
     if len(numbers) != 2 or not all(number.isdecimal() for number in numbers):
         raise argparse.ArgumentTypeError(f'{text!r}: expected two whole numbers, as 60:100')
     return int(numbers[0]), int(numbers[1])
-
-
-def _speed(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def _add_ground_truth_options(parser: argparse.ArgumentParser) -> None:
@@ -213,8 +203,6 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         parser.error('--late-closures goes with --loop-closure')
     if loop:
         _check_loop_closure(parser, arguments)
-    if arguments.warp and arguments.speed is not None:
-        parser.error('--warp and --speed: give one of them')
     if arguments.tolerance is not None and arguments.tolerance < 0:
         parser.error(f'--tolerance {arguments.tolerance} must be at least 0')
     of_map = arguments.map_poses and not arguments.odometry
@@ -225,7 +213,7 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
 def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     if arguments.exclude_places is None:
         arguments.exclude_places = EXCLUDE_PLACES
-    names = ('unknown', 'remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop', 'warp')
+    names = ('unknown', 'remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop')
     for name in names:
         if getattr(arguments, name):
             parser.error(f'--loop-closure: --{name.replace("_", "-")} needs a --map')
@@ -286,7 +274,7 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
 
     poses = ('query_poses', 'map_poses', 'meters', 'degrees') if arguments.truth == 'poses' else ()
     names = [
-        *('map', 'query', 'dataset', 'topic', 'unknown', 'loop_closure', 'exclude_places', 'warp'),
+        *('map', 'query', 'dataset', 'topic', 'unknown', 'loop_closure', 'exclude_places'),
         *('remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
         *('crop_map', 'crop_query', 'truth', *poses),
         *('mode', 'min_probability', 'sequence_length', 'beta', 'nms_radius'),
@@ -378,16 +366,13 @@ def _export(report: 'Report', folder: Path, force: bool) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from stavpr_lab.evaluation.extra import import_extra
     from stavpr_lab.evaluation.report import chosen_window
     from stavpr_lab.evaluation.report_files import PAGE, write_folder, write_json
 
-    import_extra('sklearn.metrics')  # an error before the work, not after it
     folder = arguments.output or (None if arguments.json else OUTPUT)
     if arguments.json:
         require_replaceable(arguments.json, JSON, arguments.force)
     if folder:
-        import_extra('jinja2')
         if Path(folder).is_file():
             raise SourceError(f'{folder} is a file: --output takes a folder')
         if Path(folder).is_dir():

@@ -14,7 +14,6 @@ from stavpr_lab.evaluation.drive import (
     DriveChanges,
     FrameSource,
     mirrored,
-    select_places,
 )
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.paper.datasets import open_dataset
@@ -30,7 +29,14 @@ from stavpr_ros.features.descriptors import (
     read_descriptors,
     require_comparable,
 )
-from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap
+from stavpr_ros.mapping import (
+    build_map,
+    descriptor_map,
+    is_map,
+    load_map,
+    PlaceMap,
+    select_places,
+)
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag_file import is_bag
 from stavpr_ros.sources.folder import text_of
@@ -269,9 +275,7 @@ def _poses(path: str | None, place_map: PlaceMap, name: str, degrees: float | No
 def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
     """Drive the query as the options want it, on a map without the places that they remove."""
     query, reference = sequences.query, sequences.reference
-    warp = DriveChanges.named(arguments.warp or 'same', len(query))
-    if arguments.speed is not None:
-        warp = replace(warp, speed=arguments.speed)
+    warp = DriveChanges.named(arguments.speed or 'same', len(query))
     changes = replace(
         warp,
         removed=tuple(arguments.remove_from_map),
@@ -303,9 +307,8 @@ def _description(arguments: argparse.Namespace) -> str:
     """Return the changes of the drive as text of the title."""
     parts = [f'without places {a} .. {b - 1}' for a, b in arguments.remove_from_map]
     parts += [name for name in ('mirror', 'reverse') if getattr(arguments, name)]
-    if arguments.warp or arguments.speed is not None:
-        speed = arguments.warp or arguments.speed
-        parts.append(f'speed {speed if isinstance(speed, str) else format(speed, "g")}')
+    if arguments.speed:
+        parts.append(f'speed {arguments.speed}')
     if arguments.drop:
         parts.append(f'drop {arguments.drop:g}')
     parts += [f'stop {image}:{count}' for image, count in arguments.stop]

@@ -222,10 +222,8 @@ def _number(value: float | None) -> str:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from stavpr_lab.evaluation.extra import import_extra
     from stavpr_lab.evaluation.report import jsonable
 
-    import_extra('sklearn.metrics')
     if arguments.json:
         require_replaceable(arguments.json, JSON, arguments.force)
     folders = _check(arguments)

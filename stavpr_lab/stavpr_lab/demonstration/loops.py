@@ -4,32 +4,30 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
+from matplotlib.axes import Axes
+from matplotlib.figure import SubFigure
 import numpy as np
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.plots import (
     BRIGHT,
     color_bar,
     draw_pairs,
-    INK,
     legend_above,
     MatchPair,
     MEANING,
     Outcome,
-    page,
     QUIET,
     SCALE,
+    titled_page,
     TRUTH,
 )
 from stavpr_lab.evaluation.records import IN_WINDOW
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import SubFigure
+from stavpr_ros.recognition.robust import evenly
 
 SHOWN = 8  # pairs of images
 LARGEST = 4000  # images of a traverse whose distances are drawn
@@ -121,9 +119,8 @@ def choose_closures(count: int, correct: np.ndarray | None) -> list[int]:
     bad = np.setdiff1d(np.arange(count), good)
     chosen: set[int] = set()
     for indices, most in ((bad, SHOWN if not len(good) else SHOWN // 4), (good, SHOWN)):
-        room = min(most, SHOWN - len(chosen), len(indices))
-        if room:
-            chosen |= set(indices[np.linspace(0, len(indices) - 1, room).astype(int)].tolist())
+        room = min(most, SHOWN - len(chosen))
+        chosen |= set(indices[evenly(len(indices), room)].tolist())
     return sorted(chosen)
 
 
@@ -152,7 +149,7 @@ def _compared_distances(result: LoopResult, place_map: PlaceMap) -> np.ndarray |
 
 
 def _draw_traverse(
-    figure: 'SubFigure', axes: 'Axes', result: LoopResult, distances: np.ndarray | None
+    figure: SubFigure, axes: Axes, result: LoopResult, distances: np.ndarray | None
 ) -> None:
     """Draw the compared pairs, the ground truth, and the aligned pairs."""
     N = result.N
@@ -192,14 +189,9 @@ def draw_loops(result: LoopResult, place_map: PlaceMap, title: str, folder: Path
     :returns: its path.
     """
     path = folder / 'loop.png'
-    text = result.summary()
-    head = 0.4 + 0.17 * len(text.splitlines())
-    with page(path, 12.5, 5.9 + head) as figure:
-        parts = figure.add_gridspec(2, 2, height_ratios=(head, 5.9), width_ratios=(1, 1.1))
-        top = figure.add_subfigure(parts[0, :])
-        top.text(0.012, 0.96, title, fontsize=15, weight='bold', va='top', color=INK)
-        top.text(0.012, 0.54, text, fontsize=10.5, va='top', color=QUIET)
-        left = figure.add_subfigure(parts[1, 0])
+    with titled_page(path, 12.5, 5.9, title, result.summary()) as figure:
+        halves: Any = figure.subfigures(1, 2, width_ratios=(1, 1.1))
+        left, right = halves
         _draw_traverse(left, left.add_subplot(), result, _compared_distances(result, place_map))
-        draw_pairs(figure.add_subfigure(parts[1, 1]), _pairs(result, place_map), 2)
+        draw_pairs(right, _pairs(result, place_map), 2)
     return path

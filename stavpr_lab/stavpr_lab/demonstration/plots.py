@@ -4,8 +4,10 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
+from matplotlib.axes import Axes
+from matplotlib.figure import SubFigure
 import numpy as np
 from stavpr_lab.evaluation.plots import (
     COLORS,
@@ -17,21 +19,16 @@ from stavpr_lab.evaluation.plots import (
     MatchPair,
     MEANING,
     Outcome,
-    page,
     PAPER,
-    QUIET,
     runs,
     shade_runs,
     THRESHOLD,
+    titled_page,
 )
 from stavpr_lab.evaluation.records import TraverseEvaluation
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import SubFigure
 
 SHOWN = 6  # pairs of images: two rows of three
 
@@ -114,19 +111,16 @@ def demo_sheet(
     :param distances: every query to every place, shape (N, n).
     """
     above, below = 0.5 + 1.52 * max(1, -(-len(pairs) // 3)), 4.2
-    with page(path, 11, 0.75 + above + below) as figure:
-        parts = figure.add_gridspec(
-            3, 2, height_ratios=(0.75, above, below), width_ratios=(1, 1.18)
-        )
-        top = figure.add_subfigure(parts[0, :])
-        top.text(0.012, 0.66, title, fontsize=15, weight='bold', va='center', color=INK)
-        top.text(0.012, 0.2, result.headline, fontsize=10.5, va='center', color=QUIET)
-        draw_pairs(figure.add_subfigure(parts[1, :]), pairs, 3)
-        _draw_matrix(figure.add_subfigure(parts[2, 0]), distances, result)
-        _draw_time(figure.add_subfigure(parts[2, 1]).add_subplot(), result, threshold)
+    with titled_page(path, 11, above + below, title, result.summary()) as figure:
+        rows: Any = figure.subfigures(2, 1, height_ratios=(above, below))
+        top, bottom = rows
+        left, right = bottom.subfigures(1, 2, width_ratios=(1, 1.18))
+        draw_pairs(top, pairs, 3)
+        _draw_matrix(left, distances, result)
+        _draw_time(right.add_subplot(), result, threshold)
 
 
-def _draw_matrix(figure: 'SubFigure', distances: np.ndarray, result: TraverseEvaluation) -> None:
+def _draw_matrix(figure: SubFigure, distances: np.ndarray, result: TraverseEvaluation) -> None:
     """Draw a matrix with a row a query and a column a place, the true and the matched places."""
     axes, truth, correct = figure.add_subplot(), result.true_places, result.correct
     pairs = np.stack([np.arange(len(distances)), result.matched], axis=1)
@@ -146,7 +140,7 @@ def _draw_matrix(figure: 'SubFigure', distances: np.ndarray, result: TraverseEva
             axes.text(*at, 'not in the map', va='center', color=INK, fontsize=9.5)
 
 
-def _draw_time(axes: 'Axes', result: TraverseEvaluation, threshold: float) -> None:
+def _draw_time(axes: Axes, result: TraverseEvaluation, threshold: float) -> None:
     """Draw the distance of each query's best match as a dot in the color of its outcome."""
     distances, kinds = result.matches.distances, np.array(outcomes_of(result))
     index = np.arange(len(distances))

@@ -3,15 +3,15 @@
 """The recordings of a demonstration: a synthetic street, written as bags, or the user's own."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 import shutil
 
 import numpy as np
 from stavpr_lab.demonstration.street import (
+    AFTERNOON,
     first_traverse,
-    GOOD_LIGHT,
     nearest_places,
     second_traverse,
     Traverse,
@@ -30,10 +30,6 @@ from stavpr_ros.sources.frame import ImageRecord
 from tqdm import tqdm
 
 TOPIC = '/camera/image_raw'
-LATER = replace(
-    GOOD_LIGHT, sun=0.25, sun_azimuth=250.0, sun_elevation=20.0, clouds=0.7, ambient=0.55,
-    warmth=0.08, lane=-1.0, traffic=2,
-)  # fmt: skip
 OnError = Callable[[ImageError], None]
 
 
@@ -119,7 +115,7 @@ def synthetic_loop(folder: Path, exclude: int, tolerance: int) -> LoopTraverse:
     bag = folder / 'loop'
     remove_earlier_bag(bag)
     world = World()
-    first, second = first_traverse(world), second_traverse(world, conditions=LATER)
+    first, second = first_traverse(world), second_traverse(world, conditions=AFTERNOON)
     epoch = int(first.stamps[-1] + first.stamps[1] - first.stamps[0])
     both = chain(_records(first, 'first time'), _records(second, 'second time', epoch))
     write_bag(bag, TOPIC, both)

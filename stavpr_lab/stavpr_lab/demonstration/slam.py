@@ -8,19 +8,23 @@ import json
 from pathlib import Path
 from typing import Any
 
+from nav_msgs.msg import Odometry
 import numpy as np
-from rosbags.typesys import get_typestore, Stores
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import CameraInfo
 from stavpr_lab.demonstration.recordings import remove_earlier_bag, TOPIC
 from stavpr_lab.demonstration.street.laps import intrinsics, LapDrive
 from stavpr_lab.demonstration.street.traverses import SIZE
-from stavpr_lab.evaluation.plots import INK, page, QUIET
+from stavpr_lab.evaluation.plots import titled_page
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping.trajectory import SECOND
 from stavpr_ros.output_file import JSON, write_output
+from stavpr_ros.ros.output import pose_message, time_message
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord
 from stavpr_slam.pose_graph.files import TUM, tum_text
 from stavpr_slam.pose_graph.transforms import planar_poses
+from std_msgs.msg import Header
 from tqdm import tqdm
 
 ODOMETRY, CAMERA_INFO = '/odom', '/camera_info'  # beside the topic of the node's images, /image
@@ -39,36 +43,20 @@ def write_drive(drive: LapDrive, bag: Path) -> None:
 
 
 def _records(drive: LapDrive) -> Iterator[ImageRecord | MessageRecord]:
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types = store.types
     poses = planar_poses(drive.odometry)
     K = intrinsics()
     P = np.column_stack([K, np.zeros(3)])
+    odometry = Odometry(header=Header(frame_id='odom'), child_frame_id='base_link')
+    info = CameraInfo(
+        header=Header(frame_id='camera'), width=SIZE[0], height=SIZE[1],
+        distortion_model='plumb_bob', d=np.zeros(5), k=K.ravel(), r=np.eye(3).ravel(), p=P.ravel(),
+    )  # fmt: skip
     for i in tqdm(range(len(drive)), desc='three laps', unit='image', disable=None):
         stamp = int(drive.stamps[i])
-        time = types['builtin_interfaces/msg/Time'](stamp // SECOND, stamp % SECOND)
-        numbers = dict(zip('xyzw', poses[i, 3:].tolist(), strict=True))
-        pose = types['geometry_msgs/msg/Pose'](
-            types['geometry_msgs/msg/Point'](*poses[i, :3].tolist()),
-            types['geometry_msgs/msg/Quaternion'](**numbers),
-        )
-        zero = types['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
-        header = types['std_msgs/msg/Header']
-        odometry = types['nav_msgs/msg/Odometry'](
-            header(time, 'odom'), 'base_link',
-            types['geometry_msgs/msg/PoseWithCovariance'](pose, np.zeros(36)),
-            types['geometry_msgs/msg/TwistWithCovariance'](
-                types['geometry_msgs/msg/Twist'](zero, zero), np.zeros(36)
-            ),
-        )  # fmt: skip
-        region = types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)
-        info = types['sensor_msgs/msg/CameraInfo'](
-            header(time, 'camera'), SIZE[1], SIZE[0], 'plumb_bob', np.zeros(5), K.ravel(),
-            np.eye(3).ravel(), P.ravel(), 0, 0, region,
-        )  # fmt: skip
+        odometry.header.stamp = info.header.stamp = time_message(stamp)
+        odometry.pose.pose = pose_message(poses[i])
         for topic, message in ((ODOMETRY, odometry), (CAMERA_INFO, info)):
-            content = bytes(store.serialize_cdr(message, message.__msgtype__))
-            yield MessageRecord(stamp, topic, content)
+            yield MessageRecord(stamp, topic, serialize_message(message))
         yield ImageRecord.of_image(drive.frame(i).image, stamp, frame_id='camera')
 
 
@@ -189,13 +177,9 @@ def write_result(
             folder / f'{name}.tum', tum_text(drive.stamps, planar_poses(poses)), TUM, True
         )
     plot = folder / 'slam.png'
-    with page(plot, 12.5, 6.6) as figure:
-        parts = figure.add_gridspec(2, 1, height_ratios=(1.1, 5.5))
-        top, below = figure.add_subfigure(parts[0]), figure.add_subfigure(parts[1])
-        top.text(0.012, 0.96, 'Three laps of a synthetic street', fontsize=15, va='top',
-                 weight='bold', color=INK)  # fmt: skip
-        top.text(0.012, 0.6, result.summary(), fontsize=10.5, va='top', color=QUIET)
-        left, right = below.subplots(1, 2)
+    title = 'Three laps of a synthetic street'
+    with titled_page(plot, 12.5, 5.5, title, result.summary()) as figure:
+        left, right = figure.subplots(1, 2)
         style: dict[str, Any] = {'lw': 1.0}
         left.plot(*result.truth[:, :2].T, color='black', label='truth', lw=2.2, alpha=0.5)
         left.plot(*result.before[:, :2].T, color='#c44', label='odometry', **style)

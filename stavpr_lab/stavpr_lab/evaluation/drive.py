@@ -4,8 +4,8 @@
 A recorded query driven differently: faster, with stops, dropped images, backward, off the map.
 
 A :class:`Drive` is the indices of the images that are shown and of the places that the map keeps,
-and their ground truth; :func:`select_places` applies them. :func:`mirrored` and :func:`cropped`
-change the images themselves.
+and their ground truth; :func:`stavpr_ros.mapping.select_places` applies them.
+:func:`mirrored` and :func:`cropped` change the images themselves.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,7 +17,6 @@ from typing import Protocol, Self
 import numpy as np
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.errors import ImageError, SettingsError
-from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.sources.frame import Frame
 
 VARYING = 'varying'
@@ -268,15 +267,3 @@ def cropped(source: FrameSource, left: float, right: float) -> FrameSource:
         return frame.image[:, first:last]
 
     return source if left == right == 0 else ChangedSource(source, crop)
-
-
-def select_places(place_map: PlaceMap, indices: np.ndarray) -> PlaceMap:
-    """Return some places of a map, or images of a query, in any order, repeated or not."""
-    return replace(
-        place_map,
-        features=place_map.features[indices],
-        stamps=place_map.stamps[indices],
-        ids=tuple(place_map.ids[i] for i in indices),
-        poses=None if place_map.poses is None else place_map.poses[indices],
-        thumbnails=tuple(place_map.thumbnails[i] for i in indices) if place_map.thumbnails else (),
-    )

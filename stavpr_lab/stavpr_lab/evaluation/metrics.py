@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from stavpr_lab.evaluation.extra import import_extra
+from sklearn.metrics import average_precision_score, precision_recall_curve
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.alignment import aligned_index
 from stavpr_ros.errors import InputError
@@ -279,7 +279,6 @@ def evaluate_ranking(
 
     :param images: the queries that count; all by default.
     :raises InputError: no queries are left.
-    :raises UnavailableError: scikit-learn is not installed.
     """
     correct = ground_truth.accepts(ranking.places)[images]
     has_match = ground_truth.has_match[images]
@@ -323,13 +322,12 @@ def _recall_at(k: int, correct: np.ndarray, has_match: np.ndarray) -> float:
 
 def _sklearn_metrics(scores: np.ndarray, correct: np.ndarray) -> tuple[float, float, float]:
     """Return average precision, best F1 and recall at 100 % precision, as scikit-learn counts."""
-    metrics = import_extra('sklearn.metrics')
     if not correct.any():
         return 0.0, 0.0, 0.0
     finite = np.isfinite(scores)
     # scikit-learn takes finite values only: queries without a match come last
     confidence = -np.where(finite, scores, scores[finite].max(initial=0.0) + 1)
-    precision, recall, _ = metrics.precision_recall_curve(correct, confidence)
-    average = metrics.average_precision_score(correct, confidence)
+    precision, recall, _ = precision_recall_curve(correct, confidence)
+    average = average_precision_score(correct, confidence)
     f1 = 2 * precision * recall / np.maximum(precision + recall, np.finfo(float).tiny)
     return float(average), float(f1.max()), float(recall[precision == 1].max())

@@ -12,17 +12,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 import io
 from pathlib import Path
-from typing import Any, Literal, TYPE_CHECKING
+from typing import Any, Literal
 
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.legend import Legend
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 import numpy as np
 from stavpr_lab.evaluation.calibration import Calibration
 from stavpr_lab.evaluation.metrics import Metrics
 from stavpr_ros.output_file import PNG, write_output
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, SubFigure
-    from matplotlib.legend import Legend
 
 Outcome = Literal['right', 'wrong', 'match', 'no match', 'unseen']
 Box = tuple[float, float, float, float]
@@ -235,12 +237,8 @@ def reliability(path: Path, calibration: Calibration) -> None:
 
 
 @contextmanager
-def page(path: Path, width: float, height: float) -> Iterator['Figure']:
+def page(path: Path, width: float, height: float) -> Iterator[Figure]:
     """Yield an empty figure (width and height in inches) in the common style, then write it."""
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     look: dict[Any, Any] = {
         'font.size': 10.5,
         'font.family': 'DejaVu Sans',
@@ -260,29 +258,41 @@ def page(path: Path, width: float, height: float) -> Iterator['Figure']:
         write_output(path, content.getvalue(), PNG, force=True)
 
 
+@contextmanager
+def titled_page(
+    path: Path, width: float, height: float, title: str, text: str
+) -> Iterator[SubFigure]:
+    """Yield the part of a page below its title and some lines of text, ``height`` inches high."""
+    head = 0.5 + 0.17 * len(text.splitlines())
+    with page(path, width, head + height) as figure:
+        parts: Any = figure.subfigures(2, 1, height_ratios=(head, height))
+        top, below = parts
+        top.text(0.012, 0.96, title, fontsize=15, weight='bold', va='top', color=INK)
+        top.text(0.012, 0.06, text, fontsize=10.5, va='bottom', color=QUIET)
+        yield below
+
+
 def runs(mask: np.ndarray) -> list[tuple[int, int]]:
     """Return the runs of True as (first, one past the last)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
 
 
-def shade_runs(axes: 'Axes', mask: np.ndarray, label: str) -> None:
+def shade_runs(axes: Axes, mask: np.ndarray, label: str) -> None:
     """Shade the images where a mask is true, over the whole height."""
     for number, (first, end) in enumerate(runs(mask)):
         name = '' if number else label
         axes.axvspan(first - 0.5, end - 0.5, color='#e9e9e4', lw=0, zorder=0, label=name)
 
 
-def _box(axes: 'Axes') -> Box:
+def _box(axes: Axes) -> Box:
     """Return where the axes of a written figure are."""
     position = axes.get_position()
     return position.x0, 1 - position.y1, position.width, position.height
 
 
-def draw_pairs(figure: 'Figure | SubFigure', pairs: Sequence[MatchPair], columns: int) -> None:
+def draw_pairs(figure: Figure | SubFigure, pairs: Sequence[MatchPair], columns: int) -> None:
     """Draw the pairs on a grid, with a legend of the colors above."""
-    from matplotlib.lines import Line2D
-
     if not pairs:
         figure.text(0.5, 0.5, 'no images to show', ha='center', va='center', color=QUIET)
         return
@@ -301,10 +311,8 @@ def draw_pairs(figure: 'Figure | SubFigure', pairs: Sequence[MatchPair], columns
     legend.set_in_layout(False)
 
 
-def _draw_pair(axes: 'Axes', pair: MatchPair) -> None:
+def _draw_pair(axes: Axes, pair: MatchPair) -> None:
     """Draw a query with its place on the right, and the frame."""
-    from matplotlib.patches import Rectangle
-
     height, width = pair.query.shape[:2]
     start = width * 1.03  # of the place
     axes.imshow(pair.query, extent=(0, width, height, 0), interpolation='lanczos')
@@ -326,8 +334,8 @@ def _draw_pair(axes: 'Axes', pair: MatchPair) -> None:
 
 
 def draw_matrix(
-    figure: 'Figure | SubFigure',
-    axes: 'Axes',
+    figure: Figure | SubFigure,
+    axes: Axes,
     distances: np.ndarray,
     shape: tuple[int, ...],
     truth: np.ndarray | None,
@@ -363,7 +371,7 @@ def draw_matrix(
         handle.set_markersize(9)
 
 
-def legend_above(axes: 'Axes', columns: int) -> 'Legend':
+def legend_above(axes: Axes, columns: int) -> Legend:
     """Put the legend above the axes, where it covers nothing and does not widen the layout."""
     handles, labels = axes.get_legend_handles_labels()
     legend = axes.legend(
@@ -383,7 +391,7 @@ def legend_above(axes: 'Axes', columns: int) -> 'Legend':
     return legend
 
 
-def color_bar(figure: 'Figure | SubFigure', image: Any, axes: 'Axes') -> None:
+def color_bar(figure: Figure | SubFigure, image: Any, axes: Axes) -> None:
     """Draw the scale of the distances beside the axes."""
     bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.015, aspect=32)
     bar.outline.set_visible(False)

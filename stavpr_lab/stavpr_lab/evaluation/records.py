@@ -46,17 +46,6 @@ class TraverseEvaluation:
             return None
         return self.accepted & self.matches.within(self.true_places, self.tolerance)
 
-    @property
-    def headline(self) -> str:
-        """Return the result in a line."""
-        line = f'{np.count_nonzero(self.accepted)} of {len(self.accepted)} images matched'
-        if self.counts is not None:
-            c = self.counts
-            line += f', precision {c.precision:.2f}, recall {c.recall:.2f}, F1 {c.f1:.2f}'
-        if not len(self.seconds):
-            return line
-        return f'{line}; {1 / self.seconds.mean():.0f} images per second'
-
     def summary(self) -> str:
         """Return the result in words, a line each."""
         lines = [f'{np.count_nonzero(self.accepted)} of {len(self.accepted)} images matched']

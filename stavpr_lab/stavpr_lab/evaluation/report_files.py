@@ -40,7 +40,6 @@ def write_folder(report: Report, folder: Path, force: bool = False) -> Path:
     :returns: the page.
     :raises SourceError: the folder cannot be made.
     :raises OutputError: a file cannot be written, or must not be replaced.
-    :raises UnavailableError: jinja2 is not installed.
     """
     page = folder / PAGE
     try:

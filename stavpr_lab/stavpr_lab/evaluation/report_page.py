@@ -9,15 +9,16 @@ import json
 from typing import Any
 
 import cv2
+import jinja2
 import numpy as np
 from stavpr_lab.evaluation.drive import UNSEEN_DISTANCE
 from stavpr_lab.evaluation.evaluate import Evaluation, WindowDistances
-from stavpr_lab.evaluation.extra import import_extra
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import RANKS
 from stavpr_lab.evaluation.plots import Box, COLORS, SEQUENCE
 from stavpr_lab.evaluation.report import jsonable, METRICS, Report
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.recognition.robust import evenly
 
 TEMPLATE = 'report.html.jinja'
 VIEWS = 240  # windows that can be looked at: more would make a large file
@@ -47,9 +48,7 @@ def html_page(
     :param plots: PNG files ``precision_recall``, ``distances``, ``similarity_matrix``, ``drive``
         and, where probabilities are declared, ``calibration``.
     :param boxes: where the axes of ``curves`` and ``matrix`` are.
-    :raises UnavailableError: jinja2 is not installed.
     """
-    jinja2 = import_extra('jinja2')
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     environment.policies['json.dumps_kwargs'] = {'separators': (',', ':')}
     template = resources.files('stavpr_lab.evaluation').joinpath(TEMPLATE).read_text('utf-8')
@@ -139,9 +138,7 @@ def _data(report: Report, mistakes: list[int]) -> dict[str, Any]:
     """Return the data of the page's script."""
     evaluation = report.evaluation
     windows = evaluation.results.windows
-    kept = set(
-        np.linspace(0, len(windows) - 1, min(VIEWS, len(windows))).round().astype(int).tolist()
-    )
+    kept = set(evenly(len(windows), VIEWS).tolist())
     shown = [window for i, window in enumerate(windows) if i in kept or window.image in mistakes]
     views = [_view(evaluation, window) for window in shown]
     places = {view[name] for view in views for name in ('place', 'true')}
@@ -158,8 +155,7 @@ def _data(report: Report, mistakes: list[int]) -> dict[str, Any]:
 
 def _points(curve: np.ndarray) -> list[list[float]]:
     """Return some points of a curve: the first, the last, some between."""
-    kept = np.unique(np.linspace(0, len(curve) - 1, min(len(curve), POINTS)).round().astype(int))
-    return np.round(curve[kept], 6).tolist()
+    return np.round(curve[evenly(len(curve), POINTS)], 6).tolist()
 
 
 def _view(evaluation: Evaluation, window: WindowDistances) -> dict[str, Any]:

@@ -17,8 +17,6 @@ import cv2
 import numpy as np
 import torch
 
-BATCH = 256  # query images whose differences are made at a time
-
 
 @dataclass(frozen=True)
 class SeqSlamSettings:
@@ -93,11 +91,17 @@ def match_differences(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndar
     windows = N - settings.length + 1
     if windows < 1 or n <= settings.lines[:, -1].min():
         return places, scores
-    totals, speeds = _line_totals(enhance_contrast(D, settings.contrast_window), settings)
-    starts = np.argmin(totals, axis=1)
-    rows = np.arange(windows)
-    lines = settings.lines[speeds[rows, starts]] + starts[:, None]
-    found = totals[rows, starts] / settings.length
+    enhanced = enhance_contrast(D, settings.contrast_window)
+    totals = np.full((len(settings.lines), windows, n), np.inf, enhanced.dtype)
+    for total, line in zip(totals, settings.lines, strict=True):
+        starts = max(0, n - line[-1])  # those whose line ends inside the map
+        total[:, :starts] = 0
+        for position, offset in enumerate(line if starts else ()):
+            total[:, :starts] += enhanced[position : position + windows, offset : offset + starts]
+    rows, starts = np.arange(windows), totals.min(axis=0).argmin(axis=1)
+    speeds = totals[:, rows, starts].argmin(axis=0)  # the slowest on a tie
+    lines = settings.lines[speeds] + starts[:, None]
+    found = totals[speeds, rows, starts] / settings.length
     middle = settings.middle
     places[middle : middle + windows] = lines[:, middle]
     scores[middle : middle + windows] = found
@@ -137,12 +141,8 @@ def differences(queries: np.ndarray, places: np.ndarray) -> np.ndarray:
     :param places: shape (n, pixels), float32.
     :returns: D, shape (N, n), float32.
     """
-    D = np.empty((len(queries), len(places)), np.float32)
-    reference = torch.from_numpy(places)
-    for first in range(0, len(queries), BATCH):
-        part = torch.from_numpy(queries[first : first + BATCH])
-        D[first : first + BATCH] = torch.cdist(part, reference, p=1.0).numpy() / queries.shape[1]
-    return D
+    sums = torch.cdist(torch.from_numpy(queries), torch.from_numpy(places), p=1.0)
+    return sums.numpy() / queries.shape[1]
 
 
 def enhance_contrast(D: np.ndarray, window: int) -> np.ndarray:
@@ -168,27 +168,3 @@ def enhance_contrast(D: np.ndarray, window: int) -> np.ndarray:
         flat = variance <= 1e-12 * (squares[-1] / n)
         enhanced[i] = np.where(flat, 0, (centered - mean) / np.sqrt(np.where(flat, 1, variance)))
     return enhanced
-
-
-def _line_totals(enhanced: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return the sum of the best line from every start, for every window.
-
-    :returns: sums, shape (windows, n), +inf where every line leaves the map, and the line's row of
-        ``settings.lines`` (the slowest on a tie), shape (windows, n), int64.
-    """
-    N, n = enhanced.shape
-    windows = N - settings.length + 1
-    best = np.full((windows, n), np.inf, enhanced.dtype)
-    speeds = np.zeros((windows, n), np.int64)
-    for speed, line in enumerate(settings.lines):
-        starts = n - line[-1]  # those whose line ends inside the map
-        if starts < 1:
-            continue
-        total = np.zeros((windows, starts), enhanced.dtype)
-        for position, offset in enumerate(line):
-            total += enhanced[position : position + windows, offset : offset + starts]
-        better = total < best[:, :starts]
-        best[:, :starts][better] = total[better]
-        speeds[:, :starts][better] = speed
-    return best, speeds

@@ -26,6 +26,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from stavpr_ros.errors import InputError
+from stavpr_ros.recognition.robust import evenly
 import torch
 from torch.nn.functional import normalize
 
@@ -41,7 +42,7 @@ class SsmVprSettings:
     :param large_dimension, small_dimension: of the whitened cubes.
     :param neighbors: cubes of the map that a cube of the query votes for.
     :param candidates: images that stage 2 compares.
-    :param memory: last answers that frame correlation uses; 0 = none.
+    :param memory: last answers that frame correlation uses.
     :param gain: most additional weight of a candidate.
     :param reach: places from an answer at which that weight is 0.
     """
@@ -104,7 +105,7 @@ def learn_whitening(maps: torch.Tensor, side: int, dimension: int) -> PcaWhiteni
     per_image = -(-SAMPLE // n)
     rng = np.random.default_rng(0)
     samples = []
-    for i in np.unique(np.linspace(0, n - 1, min(n, SAMPLE)).astype(int)):
+    for i in evenly(n, SAMPLE):
         found = cubes(maps[i : i + 1], side)[0]
         chosen = rng.choice(len(found), min(per_image, len(found)), replace=False)
         samples.append(found[torch.from_numpy(chosen)])
@@ -189,7 +190,7 @@ class SsmVpr:
         found = [self._whitening(cubes(each[None], settings.large)[0]) for each in self.first]
         self._image = np.repeat(np.arange(len(found)), len(found[0]))
         self._cubes = torch.cat(found)
-        self._answers: deque[tuple[int, float]] = deque(maxlen=settings.memory or None)
+        self._answers: deque[tuple[int, float]] = deque(maxlen=settings.memory)
 
     def candidates(self, query: torch.Tensor) -> np.ndarray:
         """
@@ -215,14 +216,13 @@ class SsmVpr:
         places = self.candidates(first)
         scores = self.reranker.scores(second, places) * self.weights(places)
         order = np.argsort(-scores, kind='stable')
-        if self.settings.memory:
-            self._answers.append((int(places[order[0]]), float(scores[order[0]])))
+        self._answers.append((int(places[order[0]]), float(scores[order[0]])))
         return places[order], scores[order]
 
     def weights(self, places: np.ndarray) -> np.ndarray:
         """Return the weight of each place by the last answers, at least 1, shape (K,)."""
         settings, best = self.settings, np.zeros(len(places))
-        if not settings.memory or len(self._answers) < settings.memory:
+        if len(self._answers) < settings.memory:
             return 1 + best
         strongest = max(score for _, score in self._answers)
         for answer, score in self._answers:

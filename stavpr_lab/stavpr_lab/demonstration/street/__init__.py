@@ -3,6 +3,7 @@
 """A synthetic street and two traverses of it, for the demonstration and for tests."""
 
 from stavpr_lab.demonstration.street.traverses import (
+    AFTERNOON,
     Conditions,
     first_traverse,
     GOOD_LIGHT,
@@ -14,6 +15,7 @@ from stavpr_lab.demonstration.street.traverses import (
 )
 
 __all__ = [
+    'AFTERNOON',
     'GOOD_LIGHT',
     'RAINY_DUSK',
     'Conditions',

@@ -13,8 +13,9 @@ from math import pi
 
 import numpy as np
 from stavpr_lab.demonstration.street.rendering import EYE, FOCAL, HORIZON
-from stavpr_lab.demonstration.street.street import CELL, Street, THING_ALONG, VIEW
+from stavpr_lab.demonstration.street.street import CELL, Street, VIEW
 from stavpr_lab.demonstration.street.traverses import (
+    AFTERNOON,
     DETOUR,
     DETOUR_FROM,
     DETOUR_TO,
@@ -33,10 +34,6 @@ from stavpr_lab.demonstration.street.traverses import (
 from stavpr_ros.sources.frame import Frame
 from stavpr_slam.simulated_odometry import drifted, relative_poses
 
-OTHER_LIGHT = replace(
-    GOOD_LIGHT, sun=0.25, sun_azimuth=250.0, sun_elevation=20.0, clouds=0.7, ambient=0.55,
-    warmth=0.08, lane=-LANE, traffic=2,
-)  # fmt: skip
 DUSK = replace(RAINY_DUSK, lane=LANE, traffic=3)
 AGAIN = 330  # images of lap 2, and of lap 3
 LANE_CHANGE = 15  # images
@@ -57,10 +54,10 @@ class RingWorld(World):
         cells, end = round(LENGTH / CELL), round(VIEW / CELL) + 1
         lots, lot_of = open_street.lots, open_street.lot_of[:, :cells]
         again = lots.copy()
-        again[:, 0] += LENGTH
-        things = open_street.things[open_street.things[:, THING_ALONG] < LENGTH]
-        ahead = things[things[:, THING_ALONG] < VIEW].copy()
-        ahead[:, THING_ALONG] += LENGTH
+        again['start'] += LENGTH
+        things = open_street.things[open_street.things['along'] < LENGTH]
+        ahead = things[things['along'] < VIEW].copy()
+        ahead['along'] += LENGTH
         curvature = _closed_curvature(self.seed, cells)
         ring = replace(
             open_street,
@@ -199,7 +196,7 @@ def drive_laps(
     third = np.linspace(0, LENGTH, AGAIN, endpoint=False)
     laps = (
         Traverse(world, first, np.zeros(PLACES, bool), GOOD_LIGHT, size=size),
-        second_traverse(world, AGAIN, size, OTHER_LIGHT, _lanes(LANE, -LANE, AGAIN)),
+        second_traverse(world, AGAIN, size, AFTERNOON, _lanes(LANE, -LANE, AGAIN)),
         Traverse(
             world, third, np.zeros(AGAIN, bool), DUSK, size=size, lanes=_lanes(-LANE, LANE, AGAIN)
         ),

@@ -19,11 +19,6 @@ from stavpr_lab.demonstration.street.street import (
     CAR,
     CELL,
     LAMP,
-    THING_ACROSS,
-    THING_ALONG,
-    THING_KIND,
-    THING_SEED,
-    THING_SIZE,
     TREE,
     VAN,
 )
@@ -41,7 +36,7 @@ def draw_things(color, depth, things, line, camera, light, fine):
     :param fine: samples per row of the image.
     """
     for k in range(len(things)):
-        kind = int(things[k, THING_KIND])
+        kind = things[k].kind
         if kind in (CAR, VAN):
             _draw_car(color, depth, things[k], line, camera, light, fine)
         else:
@@ -63,10 +58,10 @@ def _draw_card(color, depth, thing, line, camera, light, fine):
     """Draw a tree, lamp or sign as a card that faces the camera."""
     along, across, eye, focal, horizon, yaw, _ = camera
     rows, columns = depth.shape
-    z, right = _from_camera(line, along, thing[THING_ALONG] - along, thing[THING_ACROSS])
+    z, right = _from_camera(line, along, thing.along - along, thing.across)
     if z < 2.0:
         return
-    size, seed, kind = thing[THING_SIZE], int(thing[THING_SEED]), int(thing[THING_KIND])
+    size, seed, kind = thing.scale, thing.seed, thing.kind
     scale = focal / z
     mid = columns / 2 + ((right - across) / z - yaw) * focal
     half, tall = (
@@ -84,7 +79,7 @@ def _draw_card(color, depth, thing, line, camera, light, fine):
             if kind == TREE:
                 cover, r, g, b = _tree(u / size, h / size, seed, light[_FOLIAGE], size * scale)
             elif kind == LAMP:
-                cover, r, g, b = _lamp(u, h, thing[THING_ACROSS] > 0, light[_LAMPS])
+                cover, r, g, b = _lamp(u, h, thing.across > 0, light[_LAMPS])
             else:
                 cover, r, g, b = _sign(u, h, seed)
             if cover:
@@ -159,10 +154,10 @@ def _sign(u, h, seed):
 def _draw_car(color, depth, thing, line, camera, light, fine):
     """Draw a car or van: its shadow, its body and its cabin."""
     along, across, eye, focal, horizon, yaw, _ = camera
-    size, seed, van = thing[THING_SIZE], int(thing[THING_SEED]), thing[THING_KIND] == VAN
+    size, seed, van = thing.scale, thing.seed, thing.kind == VAN
     length = (5.2 if van else 4.3) * size
-    middle = thing[THING_ALONG] - along + length / 2
-    z, u = _from_camera(line, along, middle, thing[THING_ACROSS])
+    middle = thing.along - along + length / 2
+    z, u = _from_camera(line, along, middle, thing.across)
     z, u = z - length / 2, u - across
     half = 0.98 if van else 0.88
     lens = (focal, horizon, yaw, eye, fine)

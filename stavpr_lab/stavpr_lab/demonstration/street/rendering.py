@@ -19,13 +19,8 @@ import numpy as np
 from stavpr_lab.demonstration.street.objects import draw_things
 from stavpr_lab.demonstration.street.street import (
     CELL,
-    LOT_HEIGHT,
-    LOT_KIND,
-    LOT_SETBACK,
-    LOT_START,
     SIDE_STREET,
     Street,
-    THING_ALONG,
     VIEW,
 )
 from stavpr_lab.demonstration.street.surfaces import ground, hash01, noise, sky
@@ -59,7 +54,7 @@ def render(
         center line.
     :param pitch, yaw: radians that it looks up, and to the right of the street's direction.
     :param light: the conditions; the direction of the sun is filled in here.
-    :param traffic: cars, rows as in the table of things of a :class:`Street`.
+    :param traffic: cars, as the things of a :class:`Street`.
     :param grain_seed: seed of sensor noise and rain drops.
     :returns: RGB, shape (height, width, 3), uint8.
     """
@@ -70,7 +65,7 @@ def render(
     level = np.sqrt(1 - light[SUN_UP] ** 2)
     light[SUN_RIGHT], light[SUN_AHEAD] = sin(towards) * level, cos(towards) * level
     things = np.concatenate([street.things, traffic])
-    ahead = things[:, THING_ALONG] - along
+    ahead = things['along'] - along
     seen = np.flatnonzero((ahead > -3) & (ahead < 150))
     things = things[seen[np.argsort(-ahead[seen], kind='stable')]]
     focal = FOCAL * width
@@ -131,16 +126,16 @@ def _find_walls(lots, lot_of, line, along, across, slope, eye, walls):
             lot = lot_of[row, first + step]
             last = last_near if row < 2 else last_far
             inside = -1
-            setback = lots[lot, LOT_SETBACK]
-            if lots[lot, LOT_KIND] != SIDE_STREET and setback <= abs(u1) < setback + BLOCK_DEPTH:
+            setback = lots[lot].setback
+            if lots[lot].kind != SIDE_STREET and setback <= abs(u1) < setback + BLOCK_DEPTH:
                 inside = lot
                 if lot != last and count < len(walls):
                     front = abs(u0) < setback
                     part = (setback - abs(u0)) / (abs(u1) - abs(u0)) if front else 0.0
                     z = max(z0 + part * (z1 - z0), 0.05)
                     ahead = max(ahead0 + part * (ahead1 - ahead0), 0.05)
-                    place = ahead + along - lots[lot, LOT_START] if front else abs(u0) - setback
-                    top = roof_height(lots, lot, place) if front else lots[lot, LOT_HEIGHT]
+                    place = ahead + along - lots[lot].start if front else abs(u0) - setback
+                    top = roof_height(lots[lot], place) if front else lots[lot].height
                     if (top - eye) / z > highest:
                         highest = (top - eye) / z
                         walls[count, WALL_DEPTH], walls[count, WALL_TOP] = z, top
@@ -182,9 +177,9 @@ def sunlit(lots, lot_of, along, across, height, light):
     reach = max(0.0, (16.0 - across * (1 if right > 0 else -1)) / abs(right))
     there = along + light[SUN_AHEAD] * reach
     lot = lot_of[row, min(max(int(there / CELL), 0), lot_of.shape[1] - 1)]
-    if lots[lot, LOT_KIND] == SIDE_STREET:
+    if lots[lot].kind == SIDE_STREET:
         return 1.0
-    above = height + light[SUN_UP] * reach - roof_height(lots, lot, there - lots[lot, LOT_START])
+    above = height + light[SUN_UP] * reach - roof_height(lots[lot], there - lots[lot].start)
     return min(1.0, max(0.0, above * 1.5 + 0.5))
 
 
@@ -193,14 +188,14 @@ def _lit_wall(lots, lot_of, walls, k, height, street_along, light):
     """Paint and light one point of a wall."""
     lot, front, row = int(walls[k, WALL_LOT]), walls[k, WALL_FRONT] > 0, int(walls[k, WALL_ROW])
     r, g, b = wall(
-        lots, lot, front, walls[k, WALL_ALONG], height, walls[k, WALL_DEPTH], light[LAMPS]
+        lots[lot], front, walls[k, WALL_ALONG], height, walls[k, WALL_DEPTH], light[LAMPS]
     )
     if r > 0.9 and b < 0.75 * r and light[LAMPS] > 0:  # a lamp behind the window shines by itself
         return r * 0.75, g * 0.75, b * 0.75
     facing = light[SUN_RIGHT] * (-1 if row & 1 else 1) if front else -light[SUN_AHEAD]
     power = light[AMBIENT] * (0.72 + 0.28 * min(1.0, height / 9.0)) * (1.0 if front else 0.9)
     if facing > 0 and light[SUN] > 0:
-        setback = lots[lot, LOT_SETBACK]
+        setback = lots[lot].setback
         across = min(setback, 18.0) * (1 if row & 1 else -1)
         power += light[SUN] * facing * sunlit(lots, lot_of, street_along, across, height, light)
     return r * power, g * power, b * power
@@ -210,7 +205,7 @@ def _lit_wall(lots, lot_of, walls, k, height, street_along, light):
 def _lit_ground(lots, lot_of, seed, along, across, depth, light):
     """Paint and light one point of the ground."""
     lot = lot_of[1 if across > 0 else 0, min(max(int(along / CELL), 0), lot_of.shape[1] - 1)]
-    r, g, b = ground(along, across, lots[lot, LOT_KIND], seed, depth)
+    r, g, b = ground(along, across, lots[lot].kind, seed, depth)
     power = light[AMBIENT] * (1.0 - 0.3 * min(1.0, abs(across) / 17.0))
     if light[SUN] > 0:
         power += light[SUN] * light[SUN_UP] * sunlit(lots, lot_of, along, across, 0.0, light)

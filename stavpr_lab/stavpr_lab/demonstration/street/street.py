@@ -20,30 +20,18 @@ VIEW = 260.0  # how far the renderer looks along the route, meters
 ROAD_HALF_WIDTH = 5.6  # two lanes and a row of parked cars on each side
 LEFT, RIGHT = range(2)  # the near rows; the far rows follow in the same order
 
-# Columns of the table of lots; kernels read them by number.
-(
-    LOT_START,
-    LOT_LENGTH,
-    LOT_SETBACK,
-    LOT_HEIGHT,
-    LOT_KIND,
-    LOT_RED,
-    LOT_GREEN,
-    LOT_BLUE,
-    LOT_GROUND_FLOOR,
-    LOT_FLOOR,
-    LOT_PITCH,
-    LOT_WINDOW,
-    LOT_STYLE,
-    LOT_GABLE,
-    LOT_SEED,
-    LOT_TRIM,
-) = range(16)
+LOT = np.dtype([
+    *((name, 'f8') for name in ('start', 'length', 'setback', 'height')), ('kind', 'i8'),
+    *((name, 'f8') for name in ('red', 'green', 'blue', 'ground_floor', 'floor', 'pitch')),
+    ('window', 'f8'), ('style', 'i8'), ('gable', 'f8'), ('seed', 'i8'), ('trim', 'f8'),
+])  # fmt: skip
 BUILDING, SIDE_STREET, PARK = range(3)
 PLASTER, BRICK, OFFICE, HALL = range(4)
 
-# Columns of the table of things that stand in the street.
-THING_KIND, THING_ALONG, THING_ACROSS, THING_SIZE, THING_SEED = range(5)
+# A thing in the street; its size is a factor.
+THING = np.dtype([
+    ('kind', 'i8'), ('along', 'f8'), ('across', 'f8'), ('scale', 'f8'), ('seed', 'i8'),
+])  # fmt: skip
 TREE, LAMP, SIGN, CAR, VAN = range(5)
 
 PALETTE = (
@@ -60,10 +48,10 @@ class Street:
     One street as the tables that the renderer reads.
 
     :param length: meters of the route; the tables reach :data:`VIEW` further.
-    :param lots: one row per lot, columns LOT_*, shape (lots, 16), float64.
+    :param lots: shape (lots,), :data:`LOT`.
     :param lot_of: lot in each cell of the four rows, shape (4, cells), int32.
     :param curvature: curvature of the center line, positive to the right, shape (cells,), 1/meter.
-    :param things: trees, lamps, signs, shape (things, 5), columns THING_*, float64.
+    :param things: trees, lamps, signs, shape (things,), :data:`THING`.
     :param seed: of its layout and of its ground.
     :param rigid: bends turn the street, so that images agree with poses; else they only move it
         sideways with depth.
@@ -99,11 +87,11 @@ def make_street(seed: int, length: float) -> Street:
         at = -int(dice.random() * 16)
         while at < cells:
             lot = _draw_lot(dice, row, at * CELL)
-            stop = at + int(lot[LOT_LENGTH] / CELL)
+            stop = at + int(lot[1] / CELL)  # its length
             lot_of[row, max(at, 0) : stop] = len(lots)
             lots.append(lot)
             at = stop
-    table = np.array(lots, np.float64)
+    table = np.array(lots, LOT)
     return Street(
         length=length,
         lots=table,
@@ -168,7 +156,7 @@ def _plant(dice: Random, lots: np.ndarray, lot_of: np.ndarray) -> np.ndarray:
     for row, side in ((LEFT, -1), (RIGHT, 1)):
         at, avenue = _between(dice, 0, 20), 0.0
         while at < end:
-            kind = lots[lot_of[row, int(at / CELL)], LOT_KIND]
+            kind = lots['kind'][lot_of[row, int(at / CELL)]]
             if kind == PARK:
                 across, size = side * _between(dice, 16.5, 24), _between(dice, 0.9, 1.6)
                 things.append((TREE, at, across, size, dice.random() * 2**30))
@@ -181,4 +169,4 @@ def _plant(dice: Random, lots: np.ndarray, lot_of: np.ndarray) -> np.ndarray:
                 size, across = _between(dice, 0.6, 1.1), side * _between(dice, 6.1, 6.5)
                 things.append((pick, at, across, size, dice.random() * 2**30))
             at += _between(dice, 7, 15)
-    return np.array(sorted(things, key=lambda thing: thing[1]), np.float64).reshape(-1, 5)
+    return np.array(sorted(things, key=lambda thing: thing[1]), THING)

@@ -19,11 +19,11 @@ from stavpr_lab.demonstration.street.street import (
     CAR,
     CELL,
     LEFT,
-    LOT_KIND,
     make_street,
     RIGHT,
     SIDE_STREET,
     Street,
+    THING,
     VAN,
 )
 from stavpr_lab.demonstration.street.surfaces import hash01, noise
@@ -80,6 +80,10 @@ class Conditions:
 
 
 GOOD_LIGHT = Conditions()
+AFTERNOON = Conditions(
+    sun=0.25, sun_azimuth=250.0, sun_elevation=20.0, clouds=0.7, ambient=0.55, warmth=0.08,
+    lane=-LANE, traffic=2,
+)  # fmt: skip
 RAINY_DUSK = Conditions(
     sun=0.0, ambient=0.5, exposure=0.82, warmth=-0.07, clouds=1.0, fog=0.005, rain=0.4,
     noise=0.009, lamps=0.12, autumn=0.6, lane=-LANE, shake=0.25, traffic=2,
@@ -176,7 +180,7 @@ class Traverse:
             kind = VAN if hash01(car, 1, c.traffic) < 0.15 else CAR
             if gap > 2 and hash01(int(k / 60), car, c.traffic) < 0.75:
                 rows.append((kind, along + gap, lane, 1.0, 9000 + car * 31 + c.traffic * 7))
-        return np.array(rows, np.float64).reshape(-1, 5)
+        return np.array(rows, THING)
 
 
 def first_traverse(world: World) -> Traverse:
@@ -230,9 +234,9 @@ def _park_cars(street: Street, seed: int) -> np.ndarray:
             along = spot * 5.6 + hash01(spot, side + 5, seed)
             lots = street.lot_of[row, [int(along / CELL), int((along + 5) / CELL)]]
             crowd = noise(spot / 7.0, float(side), seed + 3)
-            if (street.lots[lots, LOT_KIND] != SIDE_STREET).all() and hash01(
+            if (street.lots['kind'][lots] != SIDE_STREET).all() and hash01(
                 spot, side + 8, seed
             ) < crowd * 0.7:
                 kind = VAN if hash01(spot, side + 11, seed) < 0.12 else CAR
                 rows.append((kind, along, side * 4.55, 1.0, spot * 2 + (side > 0) + 4000 * seed))
-    return np.array(rows, np.float64).reshape(-1, 5)
+    return np.array(rows, THING)

@@ -12,20 +12,6 @@ from numba import njit
 from stavpr_lab.demonstration.street.street import (
     BRICK,
     HALL,
-    LOT_BLUE,
-    LOT_FLOOR,
-    LOT_GABLE,
-    LOT_GREEN,
-    LOT_GROUND_FLOOR,
-    LOT_HEIGHT,
-    LOT_KIND,
-    LOT_LENGTH,
-    LOT_PITCH,
-    LOT_RED,
-    LOT_SEED,
-    LOT_STYLE,
-    LOT_TRIM,
-    LOT_WINDOW,
     OFFICE,
     PARK,
 )
@@ -33,22 +19,22 @@ from stavpr_lab.demonstration.street.surfaces import hash01, noise, part
 
 
 @njit(cache=True, error_model='numpy')
-def roof_height(lots, lot, along):
+def roof_height(lot, along):
     """Return how high a lot's building is at a distance along its front: gables and chimneys."""
-    height = lots[lot, LOT_HEIGHT]
-    if lots[lot, LOT_KIND] == PARK:
-        return height + 0.5 * noise(along * 1.3, 0.0, int(lots[lot, LOT_SEED]))
-    if lots[lot, LOT_GABLE] > 0:
-        height += min(along, lots[lot, LOT_LENGTH] - along) * 0.55
-    seed = int(lots[lot, LOT_SEED])
-    chimney = lots[lot, LOT_LENGTH] * (0.15 + 0.7 * hash01(1, 2, seed))
-    if abs(along - chimney) < 0.5 and lots[lot, LOT_STYLE] != OFFICE:
+    height = lot.height
+    if lot.kind == PARK:
+        return height + 0.5 * noise(along * 1.3, 0.0, lot.seed)
+    if lot.gable > 0:
+        height += min(along, lot.length - along) * 0.55
+    seed = lot.seed
+    chimney = lot.length * (0.15 + 0.7 * hash01(1, 2, seed))
+    if abs(along - chimney) < 0.5 and lot.style != OFFICE:
         height += 1.5
     return height
 
 
 @njit(cache=True, error_model='numpy')
-def wall(lots, lot, front, along, height, far, lamps):
+def wall(lot, front, along, height, far, lamps):
     """
     Paint a point of a building or hedge.
 
@@ -57,16 +43,16 @@ def wall(lots, lot, front, along, height, far, lamps):
     :param far: meters from the camera; fine grain fades with it.
     :param lamps: share of windows that are lit.
     """
-    seed = int(lots[lot, LOT_SEED])
-    style = lots[lot, LOT_STYLE]
+    seed = lot.seed
+    style = lot.style
     grain = 0.16 * (noise(along * 0.5, height * 0.35, seed) - 0.5)
     fine = max(0.0, 1.0 - far / 32.0)
     if fine > 0:
         grain += 0.16 * fine * (noise(along * 5.0, height * 7.0, seed + 1) - 0.5)
-    if lots[lot, LOT_KIND] == PARK:
+    if lot.kind == PARK:
         leaf = 0.75 + 2.0 * grain + 0.45 * noise(along * 2.2, height * 2.5, seed + 3) - 0.2
         return 0.24 * leaf, 0.37 * leaf, 0.17 * leaf
-    top = lots[lot, LOT_HEIGHT]
+    top = lot.height
     if front and height > top:  # tiles and chimneys above the eaves
         tile = 0.8 + 0.2 * part(height * 3.0) + 2 * grain
         return (
@@ -74,7 +60,7 @@ def wall(lots, lot, front, along, height, far, lamps):
             if seed & 1
             else (0.27 * tile, 0.28 * tile, 0.31 * tile)
         )
-    r, g, b = lots[lot, LOT_RED], lots[lot, LOT_GREEN], lots[lot, LOT_BLUE]
+    r, g, b = lot.red, lot.green, lot.blue
     shade = 1.0 + grain * 1.5
     if style == BRICK and far < 30:
         course = floor(height * 7.0)
@@ -91,9 +77,9 @@ def wall(lots, lot, front, along, height, far, lamps):
             if 0.3 < x < 0.7 and 0.25 < y < 0.75:
                 return 0.2, 0.22, 0.26
         return r * shade, g * shade, b * shade
-    if height < lots[lot, LOT_GROUND_FLOOR] and style != HALL:
-        return _ground_floor(lots, lot, along, height, shade, lamps)
-    return _upper_floors(lots, lot, along, height, shade, lamps)
+    if height < lot.ground_floor and style != HALL:
+        return _ground_floor(lot, along, height, shade, lamps)
+    return _upper_floors(lot, along, height, shade, lamps)
 
 
 @njit(cache=True, error_model='numpy')
@@ -112,27 +98,27 @@ def _glass(x, y, seed, lamps):
 
 
 @njit(cache=True, error_model='numpy')
-def _upper_floors(lots, lot, along, height, shade, lamps):
+def _upper_floors(lot, along, height, shade, lamps):
     """Paint the floors above the ground floor, and all of a hall."""
-    seed = int(lots[lot, LOT_SEED])
-    r, g, b = lots[lot, LOT_RED] * shade, lots[lot, LOT_GREEN] * shade, lots[lot, LOT_BLUE] * shade
-    style, trim = lots[lot, LOT_STYLE], lots[lot, LOT_TRIM]
-    bays = max(1, floor(lots[lot, LOT_LENGTH] / lots[lot, LOT_PITCH]))
-    x = along / lots[lot, LOT_LENGTH] * bays
+    seed = lot.seed
+    r, g, b = lot.red * shade, lot.green * shade, lot.blue * shade
+    style, trim = lot.style, lot.trim
+    bays = max(1, floor(lot.length / lot.pitch))
+    x = along / lot.length * bays
     bay = floor(x)
     if style == HALL:
-        return _hall(lots, lot, along, height, shade, bay)
-    under = lots[lot, LOT_HEIGHT] - height
+        return _hall(lot, along, height, shade, bay)
+    under = lot.height - height
     if under < 0.55:  # cornice with dentils
         tooth = 0.72 if under > 0.3 and part(along * 1.7) < 0.5 else 1.0
         if trim > 0.4:
             tooth *= (0.84 + 0.1 * trim) * shade
             return tooth, tooth * 0.97, tooth * 0.92
         return r * tooth * 0.7, g * tooth * 0.7, b * tooth * 0.7
-    y = (height - lots[lot, LOT_GROUND_FLOOR]) / lots[lot, LOT_FLOOR]
+    y = (height - lot.ground_floor) / lot.floor
     story = floor(y)
     if style != OFFICE:
-        return _house_bay(lots, lot, along, height, x - bay, y - story, bay, story, shade, lamps)
+        return _house_bay(lot, along, height, x - bay, y - story, bay, story, shade, lamps)
     x, y = x - bay, y - story
     if x < 0.06 or y < 0.2:
         band = 0.9 + 0.25 * hash01(0, story, seed)
@@ -143,36 +129,36 @@ def _upper_floors(lots, lot, along, height, shade, lamps):
 
 
 @njit(cache=True, error_model='numpy')
-def _hall(lots, lot, along, height, shade, bay):
+def _hall(lot, along, height, shade, bay):
     """Paint sheet metal, a gate and a painted name."""
-    seed = int(lots[lot, LOT_SEED])
+    seed = lot.seed
     rib = (0.9 + 0.16 * (part(along * 1.6) < 0.5)) * shade
     if height < 3.9 and hash01(bay, 0, seed) < 0.3:
         slat = 0.42 + 0.2 * part(height * 2.5)
         return slat, slat * 0.98, slat * 0.95
-    if 4.2 < height < 5.4 and 0.25 < along / lots[lot, LOT_LENGTH] < 0.75:
+    if 4.2 < height < 5.4 and 0.25 < along / lot.length < 0.75:
         if letters(along, (height - 4.2) / 1.2, seed):
             return 0.92 * shade, 0.9 * shade, 0.86 * shade
         rib *= 0.6
-    return lots[lot, LOT_RED] * rib, lots[lot, LOT_GREEN] * rib, lots[lot, LOT_BLUE] * rib
+    return lot.red * rib, lot.green * rib, lot.blue * rib
 
 
 @njit(cache=True, error_model='numpy')
-def _house_bay(lots, lot, along, height, x, y, bay, story, shade, lamps):
+def _house_bay(lot, along, height, x, y, bay, story, shade, lamps):
     """
     Paint a bay of a house: window, shutters, balcony.
 
     :param x: place within the bay, 0 to 1.
     :param y: place within the floor, 0 to 1.
     """
-    seed = int(lots[lot, LOT_SEED])
-    r, g, b = lots[lot, LOT_RED] * shade, lots[lot, LOT_GREEN] * shade, lots[lot, LOT_BLUE] * shade
-    trim = lots[lot, LOT_TRIM]
+    seed = lot.seed
+    r, g, b = lot.red * shade, lot.green * shade, lot.blue * shade
+    trim = lot.trim
     pale = (0.84 + 0.1 * trim) * shade
-    half, tall, off = lots[lot, LOT_WINDOW] / 2, 0.8 + 0.08 * trim, abs(x - 0.5)
-    roomy = lots[lot, LOT_HEIGHT] - height > 0.9  # no window is cut by the eaves
+    half, tall, off = lot.window / 2, 0.8 + 0.08 * trim, abs(x - 0.5)
+    roomy = lot.height - height > 0.9  # no window is cut by the eaves
     if off < half and 0.26 < y < tall and roomy and hash01(bay, 77, seed) > 0.08:
-        edge = 0.16 / lots[lot, LOT_PITCH]
+        edge = 0.16 / lot.pitch
         bar = (seed & 4 and off < edge * 0.35) or (seed & 8 and 0.56 < y < 0.585)
         if bar or off > half - edge or y > tall - 0.05 or y < 0.3:
             return (
@@ -182,12 +168,7 @@ def _house_bay(lots, lot, along, height, x, y, bay, story, shade, lamps):
             )
         pane = seed + bay * 131 + story * 7177
         return _glass((x - 0.5 + half) / (2 * half), (y - 0.26) / (tall - 0.26), pane, lamps)
-    if (
-        seed & 16
-        and half <= off < half * 1.62
-        and 0.26 < y < tall
-        and lots[lot, LOT_STYLE] != BRICK
-    ):
+    if seed & 16 and half <= off < half * 1.62 and 0.26 < y < tall and lot.style != BRICK:
         slat = 0.75 + 0.35 * part(height * 5)  # of a shutter
         return 0.3 * slat, (0.3 + 0.2 * trim) * slat, (0.45 - 0.2 * trim) * slat
     if off < half * 1.15 and (0.2 < y < 0.26 or tall < y < tall + 0.05):  # sill and lintel
@@ -213,11 +194,11 @@ def letters(along, height, seed):
 
 
 @njit(cache=True, error_model='numpy')
-def _ground_floor(lots, lot, along, height, shade, lamps):
+def _ground_floor(lot, along, height, shade, lamps):
     """Paint shops (sign, awning, window) or a plinth with a door and windows."""
-    seed = int(lots[lot, LOT_SEED])
-    r, g, b = lots[lot, LOT_RED] * shade, lots[lot, LOT_GREEN] * shade, lots[lot, LOT_BLUE] * shade
-    length, top = lots[lot, LOT_LENGTH], lots[lot, LOT_GROUND_FLOOR]
+    seed = lot.seed
+    r, g, b = lot.red * shade, lot.green * shade, lot.blue * shade
+    length, top = lot.length, lot.ground_floor
     bays = max(1, floor(length / 4.2))
     x = along / length * bays
     bay = floor(x)
