@@ -34,7 +34,6 @@ from results import PeerTime, Row
 from run import Run
 import stages
 from stavpr_lab.evaluation.ground_truth import GroundTruth
-from stavpr_ros.alignment import match_sequence, SequenceDistances
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import descriptor_map
@@ -74,11 +73,10 @@ def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     assert document['commit'] == 'abc'
     for row in rows:
         assert row['ratio_to_lower_bound'] == row['median_s'] / row['lower_bound_s']
-        for peer in row['peers']:
-            assert peer['ratio'] == peer['median_s'] / row['median_s']
     text = path.with_suffix('.md').read_text()
     assert text.index('A frame in mode robust') < text.index('## All stages')
-    assert len(graphs.read(path)) == len(rows)
+    graphs.draw(graphs.read(path), tmp_path / 'graph.png')
+    assert cv2.imread(str(tmp_path / 'graph.png')).shape[1] > 1000
 
 
 def test_command_on_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
@@ -112,13 +110,6 @@ def test_report_sums_stages_counts_losses_and_names_missed_targets():
     assert '| x | 1 | - | why |' in text
 
 
-def test_graph_of_committed_results_is_drawn(tmp_path):
-    rows = graphs.read(results.RESULTS / 'matching-amd-epyc-2-cores-512-bit.json')
-    assert {row.stage for row in rows} >= {'image_distances', 'filter_update', 'frame'}
-    graphs.draw(rows, tmp_path / 'graph.png')
-    assert cv2.imread(str(tmp_path / 'graph.png')).shape[1] > 1000
-
-
 # ------------------------------------------------ peers on an equal footing
 
 
@@ -132,26 +123,6 @@ def test_librosa_peer_scales_sample_and_rejects_other_sums(monkeypatch):
     assert stages.librosa_peer(window, dtw).job() == 2.0 * 600 / 500
     with pytest.raises(AssertionError, match='start 0'):
         stages.librosa_peer(window, lambda C, backtrack: dtw(C + 1, backtrack))
-
-
-def test_sequence_peer_with_other_results_is_rejected():
-    window = data.make_window(20, 100, 0)
-    ours = match_sequence(window, stages.SEQUENCE)
-    assert stages.sequence_peers(Run('cpu', PEAKS), window, ours)[0].name == 'prange'
-    wrong = SequenceDistances(ours.distances, ours.lengths + 1)
-    with pytest.raises(AssertionError):
-        stages.sequence_peers(Run('cpu', PEAKS), window, wrong)
-
-
-@pytest.mark.parametrize(('precision', 'name'), [('float32', 'faiss'), ('int8', 'usearch')])
-def test_search_that_is_not_installed_is_left_out_by_name(monkeypatch, precision, name):
-    monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.setitem(sys.modules, 'usearch.index', None)
-    run = Run('cpu', PEAKS)
-    places, query = (data.make_features(n, 16, 7, 'cpu', 0) for n in (50, 1))
-    (peer,) = stages.references(run, places, query, precision)
-    assert peer.name == 'torch float32'
-    assert [skipped['name'] for skipped in run.skipped] == [name]
 
 
 # ------------------------------------------------ comparison, accuracy
@@ -192,13 +163,6 @@ def test_changes_of_value_are_listed_and_classified(group, name, before, after, 
     assert found is worse
     assert accuracy.changes(old, old) == ([], False)
     assert accuracy.changes(old, {'a': {}})[1]  # a value is gone
-
-
-def test_committed_accuracy_table_has_its_markdown():
-    path = BENCHMARKS / 'results' / 'accuracy-eb40c94.json'
-    document = json.loads(path.read_text())
-    text = '\n'.join(accuracy.markdown(document, document['results'])).rstrip() + '\n'
-    assert path.with_suffix('.md').read_text() == text
 
 
 # ------------------------------------------------ off the map
@@ -261,33 +225,11 @@ def test_first_right_match_counts_images_since_start():
 def test_process_of_matches_is_measured_beside_process_without():
     run = Run('cpu', 0.001)
     stages.process_stages(run, 2 * stages.DRIVEN, 'int8', 0)
-    (row, _), = run.rows
+    ((row, _),) = run.rows
     assert (row.stage, [peer.name for peer in row.peers]) == ('process', ['without matches'])
 
 
-
-
 # ------------------------------------------------ the city
-
-
-def test_city_results_are_merged_and_written_between_the_marks(tmp_path):
-    def result(case, precision):
-        drive = {'precision': precision, 'recall': 0.5, 'processor_ms': 12.0}
-        found = {'exact': drive, 'first_stage': drive, 'statuses_changed': 1, 'places_moved': 0}
-        return found | {'case': case, 'places': 1000, 'threads': 2, 'load': 0.1}
-
-    path, page = tmp_path / 'city.json', tmp_path / 'page.md'
-    city.merged(path, [result('corridor', 0.1), result('gardens_point', 0.2)])
-    found = city.merged(path, [result('corridor', 0.75)])
-    page.write_text(f'before {city.BEGIN} old {city.END} after')
-    for _ in range(2):
-        city.write_page(found, page)
-    text = page.read_text()
-    assert (text[:6], text[-5:], 'old' in text) == ('before', 'after', False)
-    assert text.index('gardens_point') < text.index('corridor')
-    assert text.count('| corridor | 1,000 | 0.750 / 0.500 |') == 1
-    shown = city.PAGE.read_text(encoding='utf-8')
-    assert shown.count(city.BEGIN) == shown.count(city.END) == 1
 
 
 def test_simulated_places_have_mean_and_neighbors_of_real_ones():

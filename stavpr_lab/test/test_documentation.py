@@ -17,7 +17,6 @@ from stavpr_slam.ros.bridges.bridge import EdgeBridge
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').glob('*.md'))]
-README_LINES = 180
 NAMES = {row.name for row in PARAMETERS}
 
 
@@ -104,9 +103,7 @@ def test_documented_options_exist(run):
 
 def test_documented_parameters_exist():
     text = '\n'.join(page.read_text() for page in PAGES)
-    given = set(re.findall(r'-p (\w+):=', text)) | set(
-        re.findall(r'param set /stavpr (\w+)', text)
-    )
+    given = set(re.findall(r'(?:-p (?=\w+:=)|param set /stavpr )(\w+)', text))
     assert given
     assert given <= NAMES | EdgeBridge.ROBOTS.keys()
     table = (ROOT / 'README.md').read_text().partition('| parameter |')[2].partition('\n\n')[0]
@@ -119,10 +116,6 @@ def test_links_between_pages_resolve(page):
         assert (page.parent / target).exists(), f'{page.name} links to {target}'
 
 
-def test_readme_is_short():
-    assert len((ROOT / 'README.md').read_text().splitlines()) <= README_LINES
-
-
 def test_readme_results_are_those_of_accuracy_table():
     results = ROOT / 'benchmarks/results/accuracy-198bcca.json'
     table = json.loads(results.read_text())['results']
@@ -130,15 +123,12 @@ def test_readme_results_are_those_of_accuracy_table():
     def f1(key: str) -> float:
         return float(table[key]['sequence']['f1'])
 
-    rows = {
-        mode: [float(cell) for cell in re.findall(r'[\d.]+', line)]
-        for mode, line in re.findall(
-            r'^\| `(paper|robust)` \| ([.\d| ]+)\|$', (ROOT / 'README.md').read_text(), re.M
+    speeds = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')
+    for mode in ('paper', 'robust'):
+        (row,) = re.findall(
+            rf'^\| `{mode}` (\| [.\d| ]+)$', (ROOT / 'README.md').read_text(), re.M
         )
-    }
-    assert set(rows) == {'paper', 'robust'}
-    for mode, numbers in rows.items():
-        speeds = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')
+        numbers = [float(cell) for cell in re.findall(r'[\d.]+', row)]
         expected = [
             f1(f'gardens_point/g/{mode}/same'),
             min(f1(f'gardens_point/g/{mode}/{speed}') for speed in speeds),

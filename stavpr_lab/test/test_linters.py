@@ -2,53 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every Python file: license header, rules of ament_flake8 and ament_pep257."""
 
-from collections.abc import Iterator
-import os
 from pathlib import Path
 import subprocess
 import sys
 
 import pytest
+from test_language import repository_files
 
 ROOT = Path(__file__).resolve().parents[2]
-NOT_OURS = {'build', 'install', 'log'}
-HEADER = ['# Copyright 2026 The stavpr_ros authors', '# SPDX-License-Identifier: Apache-2.0']
+HEADER = '# Copyright 2026 The stavpr_ros authors\n# SPDX-License-Identifier: Apache-2.0\n'
 # The rules that ament_pep257 ignores in ROS 2 Jazzy; it checks all others of pydocstyle.
 PEP257_IGNORES = {
     *('D100', 'D101', 'D102', 'D103', 'D104', 'D105', 'D106', 'D107'),
     *('D203', 'D212', 'D404'),
 }
-PLUGINS = (
-    'flake8_builtins',
-    'flake8_comprehensions',
-    'flake8_import_order',
-    'flake8_quotes',
-)
-
-
-def python_files() -> Iterator[Path]:
-    """Yield the Python files of the repository, the executables without a suffix as well."""
-    yield from sorted((ROOT / 'scripts').iterdir())
-    for folder, subfolders, files in os.walk(ROOT):
-        subfolders[:] = sorted(
-            name for name in subfolders if not name.startswith('.') and name not in NOT_OURS
-        )
-        yield from (Path(folder, name) for name in sorted(files) if name.endswith('.py'))
-
-
-def without_header(paths: list[Path]) -> list[Path]:
-    """Return the files that do not begin with the license header, behind a shebang or without."""
-    missing = []
-    for path in paths:
-        lines = path.read_text(encoding='utf-8').split('\n')
-        start = 1 if lines[0].startswith('#!') else 0
-        if lines[start : start + 2] != HEADER:
-            missing.append(path)
-    return missing
+PLUGINS = ('flake8_builtins', 'flake8_comprehensions', 'flake8_import_order', 'flake8_quotes')
 
 
 def test_python_files_have_license_header():
-    assert [str(path.relative_to(ROOT)) for path in without_header(list(python_files()))] == []
+    """Behind a shebang or without."""
+    for path in [*sorted((ROOT / 'scripts').iterdir()), *repository_files('.py')]:
+        text = path.read_text(encoding='utf-8').removeprefix('#!/usr/bin/env python3\n')
+        assert text.startswith(HEADER), path
 
 
 @pytest.mark.long  # ruff checks nearly the same rules in `make lint`
@@ -66,7 +41,7 @@ def test_linter_of_ament_finds_nothing(name):
     )
     command = {
         'flake8': ['-m', 'flake8', '--config', 'setup.cfg', '.'],
-        'pydocstyle': ['-c', pydocstyle, *map(str, python_files())],
+        'pydocstyle': ['-c', pydocstyle, *map(str, repository_files('.py'))],
     }[name]
     done = subprocess.run(
         [sys.executable, *command], cwd=ROOT, capture_output=True, text=True, check=False
