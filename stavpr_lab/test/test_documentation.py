@@ -38,16 +38,16 @@ def code_blocks(page: Path, language: str = '') -> list[str]:
 
 
 def documented_commands() -> list[list[str]]:
-    """Every ``build_map``, ``evaluate``, ``replay`` and ``record`` command of the pages."""
-    found = []
+    """Every command of the pages but the node."""
+    found, names = [], {*stavpr.COMMANDS, *stavpr.PACKAGES}
     for page in PAGES:
         for block in code_blocks(page):
             for line in block.replace('\\\n', ' ').splitlines():
                 words = shlex.split(line.split('  #')[0].removeprefix('$ '), comments=False)
                 words = [word.removeprefix('$bin/') for word in words if word != '&']
-                if words[:3] == ['ros2', 'run', 'stavpr_ros']:
+                if words[:2] == ['ros2', 'run'] and words[2][:7] == 'stavpr_':
                     words = words[3:]
-                if words and words[0] in stavpr.COMMANDS and words[0] != 'node':
+                if words and words[0] in names - {'node'}:
                     found.append(words)
     return found
 
