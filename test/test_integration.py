@@ -28,19 +28,14 @@ def program(map_file, tmp_path):
     for camera in CAMERAS:
         shutil.copy(map_file, tmp_path / f'{camera}.stavpr')
     with (tmp_path / 'log').open('w') as log:
-        process = subprocess.Popen(
-            [sys.executable, 'program.py'],
-            cwd=tmp_path,
-            env=environment(),
-            stdout=log,
-            stderr=subprocess.STDOUT,
-        )
+        command, output = [sys.executable, 'program.py'], {'stdout': log, 'stderr': log}
+        process = subprocess.Popen(command, cwd=tmp_path, env=environment(), **output)
     yield process
     process.kill()
     process.wait()
-    log = (tmp_path / 'log').read_text()
-    print(log)
-    assert 'Traceback' not in log
+    text = (tmp_path / 'log').read_text()
+    print(text)
+    assert 'Traceback' not in text
 
 
 def have(matches, count):

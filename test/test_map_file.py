@@ -56,6 +56,7 @@ def test_saved_map_is_read_as_it_was(example, saved, read):
     found = read(saved)
     assert_same(found, example)
     assert torch.equal(found.features.strips, example.features.strips)
+    assert found.features.cells == example.features.cells == (4, 2)
     assert (found.session(11).name, found.session(12).id) == ('morning', 'b')
     assert found.thumbnails[1:3] == example.thumbnails[1:3]
     use(found)

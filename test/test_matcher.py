@@ -2,9 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The matcher of the CPU: fused kernels equal separate functions."""
 
+from dataclasses import replace
+
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import numba
 import numpy as np
+from places import features_of
 import pytest
 from stavpr_ros.alignment import (
     best_match,
@@ -17,32 +21,23 @@ from stavpr_ros.alignment import (
 )
 from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
-from stavpr_ros.recognition.matcher import make_matcher
+from stavpr_ros.recognition.matcher import make_matcher, PRECISIONS
 from stavpr_ros.recognition.sequence_search import SequenceBuffer
+from stavpr_ros.threads import limit_threads
 import torch
+
+ADAPTIVE = SpatialSettings()
 
 
 def random_features(W, n, d, seed=0):
     """Return unit-norm features of n images; one strip of the first image is zero."""
     rng = np.random.default_rng(seed)
     strips = rng.standard_normal((W, n, d))
-    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
-    if n:
-        strips[0, 0] = 0
-    weights = rng.uniform(0.1, 1, (W, n))
-    weights /= np.linalg.norm(weights, axis=0)
-    settings = FeatureSettings('gradient', GradientSettings(), W)
-    return LocalFeatures(
-        torch.from_numpy(strips).float(), torch.from_numpy(weights).float(), settings
-    )
-
-
-def make(features, spatial=None):
-    return CpuMatcher(features, spatial or SpatialSettings())
+    strips[0, :1] = 0
+    weights = torch.from_numpy(rng.uniform(0.1, 1, (W, n))).float()
+    return replace(features_of(strips), weights=torch.nn.functional.normalize(weights, dim=0))
 
 
 # ------------------------------------------------ distances
@@ -61,14 +56,14 @@ def test_fused_distances_equal_separate_functions(W, n, d, strategy, data):
     xi = data.draw(st.one_of(st.none(), st.integers(1, W)))
     features, queries = random_features(W, n, d), random_features(W, 3, d, seed=1)
     spatial = SpatialSettings(strategy, 1.0, xi)
-    matrix = make(features, spatial).distance_matrix(queries.strips, queries.weights)
+    matrix = CpuMatcher(features, spatial).distance_matrix(queries.strips, queries.weights)
     assert matrix.shape == (3, n)
     for x in range(3):
         separate = image_distances(
             strip_distances(queries.strips[:, x], features.strips).numpy(), spatial
         )
         np.testing.assert_array_equal(matrix[x], separate)
-        row = make(features, spatial).distances(queries.strips[:, x], queries.weights[:, x])
+        row = CpuMatcher(features, spatial).distances(queries.strips[:, x], queries.weights[:, x])
         np.testing.assert_array_equal(row, separate)
 
 
@@ -77,11 +72,13 @@ def test_strategies_without_dtw_equal_separate_functions(W):
     features, query = random_features(W, 70, 24), random_features(W, 2, 24, seed=1)
     for x in range(2):
         strips, weights = query.strips[:, x], query.weights[:, x]
-        row = make(features, SpatialSettings('none')).distances(strips, weights)
+        row = CpuMatcher(features, SpatialSettings('none')).distances(strips, weights)
         expected = holistic_distances(strips, weights, features.strips, features.weights)
         np.testing.assert_allclose(row, expected, atol=1e-6)
         if W >= 4:
-            row = make(features, SpatialSettings('sliding_window')).distances(strips, weights)
+            row = CpuMatcher(features, SpatialSettings('sliding_window')).distances(
+                strips, weights
+            )
             d = strip_distances(strips, features.strips).numpy()
             np.testing.assert_array_equal(
                 row, image_distances(d, SpatialSettings('sliding_window'))
@@ -90,9 +87,29 @@ def test_strategies_without_dtw_equal_separate_functions(W):
 
 def test_distances_of_features_not_contiguous_are_equal():
     features, query = random_features(7, 60, 32), random_features(7, 1, 32, seed=1)
-    part = make(features[11:40]).distances(query.strips[:, 0], query.weights[:, 0])
-    whole = make(features).distances(query.strips[:, 0], query.weights[:, 0])
+    part = CpuMatcher(features[11:40], ADAPTIVE).distances(query.strips[:, 0], query.weights[:, 0])
+    whole = CpuMatcher(features, ADAPTIVE).distances(query.strips[:, 0], query.weights[:, 0])
     np.testing.assert_array_equal(part, whole[11:40])
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason='one processor only')
+def test_kernels_of_one_and_two_threads_return_same_bits():
+    features, queries = random_features(7, 3000, 16), random_features(7, 20, 16, seed=1)
+    results = []
+    for threads in (1, 2):
+        limit_threads(threads)
+        matrices = [
+            make_matcher(features, SpatialSettings(strategy), 'cpu', precision)
+            .distance_matrix(queries.strips, queries.weights)
+            .numpy()
+            for strategy in ('adaptive', 'vanilla', 'sliding_window')
+            for precision in PRECISIONS
+        ]
+        sequences = match_sequence(matrices[0], SequenceSettings())
+        arrays = [*matrices, sequences.distances, sequences.lengths]
+        results.append([array.tobytes() for array in arrays])
+    limit_threads(0)
+    assert results[0] == results[1]
 
 
 # ------------------------------------------------ the window

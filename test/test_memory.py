@@ -30,21 +30,6 @@ def path(small_map, tmp_path):
     return tmp_path / 'map'
 
 
-def test_open_map_holds_the_same_map_as_load_map(path, small_map):
-    opened, loaded = open_map(path), load_map(path)
-    assert len(opened) == len(loaded.features) == len(small_map)
-    assert (opened.settings, opened.ids, opened.dimension) == (
-        loaded.settings,
-        loaded.ids,
-        loaded.dimension,
-    )
-    for features in (opened.features, opened.features[:], opened.features.to('cpu')):
-        assert torch.equal(features.strips, small_map.features.strips)
-        assert torch.equal(features.weights, small_map.features.weights)
-    assert torch.equal(opened.features[3:7].strips, small_map.features.strips[:, 3:7])
-    assert 'tensor' not in repr(opened.features)
-
-
 def test_features_read_from_a_file_begin_with_a_cache_line(path):
     """So that a matcher in float32 shares them instead of making a copy."""
     assert load_map(path).features.strips.data_ptr() % CACHE_LINE == 0

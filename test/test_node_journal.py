@@ -6,7 +6,7 @@ import os
 import random
 import resource
 
-from processes import Process, SECOND
+from processes import node_process, SECOND
 import pytest
 from rclpy.lifecycle import TransitionCallbackReturn
 from robot import image_message, PARAMETERS
@@ -111,8 +111,7 @@ def recording(robot, tmp_path):
     def start():
         files = {'save_path': tmp_path / 'route.stavpr', 'maps_folder': tmp_path}
         given = PARAMETERS | {'operation': 'mapping', 'queue_size': 1000} | files
-        words = [word for name, value in given.items() for word in ('-p', f'{name}:={value}')]
-        started.append(Process(tmp_path / 'log', 'node', '--ros-args', *words))
+        started.append(node_process(tmp_path / 'log', **given))
         # a killed node stays in the graph for a while: wait for the log of the new one
         robot.until(lambda: 'backend' in started[-1].output(), 'the node')
         robot.wait_for_node()

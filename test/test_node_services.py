@@ -3,6 +3,7 @@
 """Services of the node: valid and invalid requests, and maps that change during a stream."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 import threading
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -14,7 +15,8 @@ from robot import image_message, LENGTH, SECOND
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import MapFileError
-from stavpr_ros.mapping import load_map
+from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.pipeline import read_map
 from stavpr_ros.ros import map_loading, runtime
 from std_srvs.srv import Trigger
 
@@ -174,6 +176,42 @@ def test_node_that_maps_with_odometry_saves_and_publishes_poses(robot, start, ro
     robot.until(lambda: len(poses) == 6, 'a pose for each match')
     assert {pose.header.frame_id for pose in poses} == {'map'}
     assert [pose.pose.pose.position.x for pose in poses] == list(range(14, 20))
+
+
+def test_load_map_during_a_stream_processes_every_image(
+    robot, start, small_map, route, tmp_path, monkeypatch
+):
+    """At 20 Hz: matches with the old map, a window that fills, matches with the new map."""
+    save_map(replace(small_map, ids=('new',) * 60), tmp_path / 'new.stavpr')
+    start(queue_size=1000, **PAPER)
+    robot.drive(route[20:28])
+    before, sent, later = len(robot.answers), [], threading.Event()
+
+    def publish():
+        stamp = robot.stamp + (1 + len(sent)) * SECOND
+        sent.append(image_message(route[28 + len(sent) % 30], stamp))
+        robot.publisher.publish(sent[-1])
+        if len(sent) == 8:
+            later.set()
+
+    def read_during_the_stream(*given):
+        later.wait()
+        return read_map(*given)
+
+    monkeypatch.setattr(runtime, 'read_map', read_during_the_stream)
+    timer = robot.node.create_timer(0.05, publish)
+    robot.does(LoadMap, 'load_map', path=str(tmp_path / 'new.stavpr'))
+    during = len(sent)
+    robot.until(lambda: len(sent) >= during + 2 * LENGTH, 'more of the stream')
+    robot.node.destroy_timer(timer)
+    robot.until(lambda: len(robot.answers) >= before + len(sent), 'all matches')
+    matches = robot.answers[before:]
+    assert [match.header for match in matches] == [image.header for image in sent]
+    warming = [i for i, match in enumerate(matches) if match.status == PlaceMatch.WARMING_UP]
+    assert warming == list(range(warming[0], warming[0] + LENGTH - 1))
+    for part, word in ((matches[: warming[0]], 'place'), (matches[warming[-1] + 1 :], 'new')):
+        accepted = [match for match in part if match.status == PlaceMatch.MATCH]
+        assert {match.newest_id.split()[0] for match in accepted} == {word}
 
 
 def test_load_map_of_a_damaged_file_keeps_the_map_and_the_window(

@@ -27,6 +27,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 REMEDY = 'generate it: python3 tools/parameter_files.py'
 DEFAULTS = {row.name: row.default for row in PARAMETERS}
+PAPER = {'mode': 'paper', 'min_probability': 0.9}
 
 
 def test_files_are_generated_from_table():
@@ -66,41 +67,35 @@ def test_default_values_give_default_settings():
     assert settings.pipeline.keyframes.change == DEFAULTS['keyframe_change']
     for field in fields(PipelineSettings):
         if field.name != 'keyframes':  # the library takes every image by default
-            assert getattr(settings.pipeline, field.name) == getattr(expected, field.name), (
-                field.name
-            )
+            assert getattr(settings.pipeline, field.name) == getattr(expected, field.name)
     for field in fields(NodeSettings):
         if field.name != 'pipeline':
             assert getattr(settings, field.name) == DEFAULTS[field.name]
 
 
 @pytest.mark.parametrize(
-    ('name', 'value', 'attribute', 'expected'),
+    ('values', 'attribute', 'expected'),
     [
-        ('xi', 3, 'spatial.xi', 3),
-        ('sigma', 2.0, 'spatial.sigma', 2.0),
-        ('strategy', 'vanilla', 'spatial.strategy', 'vanilla'),
-        ('vertical', True, 'spatial.vertical', True),
-        ('sequence_length', 7, 'sequence.length', 7),
-        ('beta', 3.0, 'sequence.beta', 3.0),
-        ('min_probability', 0.25, 'applied_threshold', 0.75),
-        ('keyframe_interval', 1.5, 'keyframes.interval', 1.5),
-        ('keyframe_distance', 2.5, 'keyframes.distance', 2.5),
-        ('keyframe_angle', 3.5, 'keyframes.angle', 3.5),
-        ('geometric_check', 'sift', 'geometric.method', 'sift'),
+        ({'xi': 3}, 'spatial.xi', 3),
+        ({'sigma': 2.0}, 'spatial.sigma', 2.0),
+        ({'strategy': 'vanilla'}, 'spatial.strategy', 'vanilla'),
+        ({'vertical': True}, 'spatial.vertical', True),
+        ({'sequence_length': 7}, 'sequence.length', 7),
+        ({'beta': 3.0}, 'sequence.beta', 3.0),
+        ({'min_probability': 0.25}, 'applied_threshold', 0.75),
+        (PAPER | {'threshold': 0.25}, 'applied_threshold', 0.25),
+        (PAPER | {'threshold': -1.0}, 'applied_threshold', None),
+        ({'keyframe_interval': 1.5}, 'keyframes.interval', 1.5),
+        ({'keyframe_distance': 2.5}, 'keyframes.distance', 2.5),
+        ({'keyframe_angle': 3.5}, 'keyframes.angle', 3.5),
+        ({'geometric_check': 'sift'}, 'geometric.method', 'sift'),
     ],
 )
-def test_node_settings_of_value_contain_it(name, value, attribute, expected):
-    setting = node_settings(DEFAULTS | {name: value}).pipeline
+def test_node_settings_of_values_contain_them(values, attribute, expected):
+    setting = node_settings(DEFAULTS | values).pipeline
     for part in attribute.split('.'):
         setting = getattr(setting, part)
     assert setting == expected
-
-
-@pytest.mark.parametrize(('threshold', 'applied'), [(0.25, 0.25), (-1.0, None)])
-def test_threshold_in_mode_paper_is_applied_instead_of_min_probability(threshold, applied):
-    values = {'mode': 'paper', 'threshold': threshold, 'min_probability': 0.9}
-    assert node_settings(DEFAULTS | values).pipeline.applied_threshold == applied
 
 
 @pytest.mark.parametrize(
@@ -165,39 +160,29 @@ def test_network_without_its_settings_is_rejected_by_name(values, missing):
 
 
 def test_network_of_feature_settings_and_model_path_is_accepted():
-    settings = PipelineSettings(
-        features='onnx', feature_settings='{"layer": "relu"}', model_path='/nowhere/net.onnx'
-    )
-    assert settings.model_path == '/nowhere/net.onnx'
+    layer = '{"layer": "relu"}'
+    PipelineSettings(features='onnx', feature_settings=layer, model_path='/nowhere/net.onnx')
 
 
 @pytest.mark.parametrize(
-    ('mode', 'operation', 'backend', 'available', 'stages'),
+    ('operation', 'backend', 'why_not', 'why', 'extraction', 'matching'),
     [
-        ('robust', 'localization', 'auto', 'cuda', ('cuda', 'cuda', 'cuda')),
-        ('paper', 'localization', 'auto', 'cuda', ('cuda', 'cuda', 'cuda')),
-        ('robust', 'loop_closure', 'auto', 'cuda', ('cuda', 'cpu', 'cpu')),
-        ('robust', 'localization', 'cpu', 'cuda', ('cpu', 'cpu', 'cpu')),
-        ('robust', 'localization', 'auto', 'cpu', ('cpu', 'cpu', 'cpu')),
+        ('localization', 'auto', '', ' (CUDA is available)', 'cuda', 'cuda'),
+        ('loop_closure', 'auto', '', ' (CUDA is available)', 'cuda', 'cpu'),
+        ('localization', 'cpu', '', '', 'cpu', 'cpu'),
+        ('localization', 'auto', 'no device', ' (no device)', 'cpu', 'cpu'),
     ],
 )
 def test_backend_summary_names_device_of_each_stage(
-    monkeypatch, mode, operation, backend, available, stages
+    monkeypatch, operation, backend, why_not, why, extraction, matching
 ):
-    module = 'stavpr_ros.pipeline.settings'
-    monkeypatch.setattr(
-        f'{module}.choose_backend', lambda name: available if name == 'auto' else name
-    )
-    monkeypatch.setattr(
-        f'{module}.why_no_cuda', lambda: '' if available == 'cuda' else 'no device'
-    )
-    why = {'cuda': ' (CUDA is available)', 'cpu': ' (no device)'}[available] * (backend == 'auto')
-    settings = PipelineSettings(mode=mode, backend=backend)
-    extraction, distances, sequences = stages
+    module, available = 'stavpr_ros.pipeline.settings', 'cpu' if why_not else 'cuda'
+    monkeypatch.setattr(f'{module}.choose_backend', {'auto': available, 'cpu': 'cpu'}.get)
+    monkeypatch.setattr(f'{module}.why_no_cuda', lambda: why_not)
+    settings = PipelineSettings(backend=backend)
     assert settings.extraction_device == ('cpu' if extraction == 'cpu' else backend)
+    extracting = f'backend {backend}{why}: extraction on {extraction}'
+    assert settings.backend_summary('mapping') == extracting
     assert settings.backend_summary(operation) == (
-        f'backend {backend}{why}: extraction on {extraction}, image distances on {distances} '
-        f'(float32), sequences on {sequences}'
+        f'{extracting}, image distances on {matching} (float32), sequences on {matching}'
     )
-    extraction_only = settings.backend_summary('mapping')
-    assert extraction_only == f'backend {backend}{why}: extraction on {extraction}'

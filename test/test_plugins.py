@@ -53,8 +53,11 @@ def test_command_of_another_package_runs(plugged, capsys):
     assert 'greet' in capsys.readouterr().out
 
 
-def test_command_of_this_package_is_not_replaced(plugged):
+def test_command_and_scheme_of_this_package_are_not_replaced(plugged):
+    from stavpr_ros.fleet.addresses import STORE
+
     assert stavpr.all_commands()['node'].module == 'stavpr_ros.commands.node'
+    assert store_of('faiss:file') is STORE
 
 
 def test_broken_plugin_is_named_and_skipped(plugged, caplog):
@@ -66,12 +69,6 @@ def test_broken_plugin_is_named_and_skipped(plugged, caplog):
 def test_store_of_another_package_opens_its_scheme(plugged):
     assert is_address('drawer:socks')
     assert store_of('drawer:socks').open_map('drawer:socks') == 'drawer:socks'
-
-
-def test_built_in_scheme_is_not_replaced(plugged):
-    from stavpr_ros.fleet.addresses import STORE
-
-    assert store_of('faiss:file') is STORE
 
 
 def test_unknown_scheme_lists_known_ones():

@@ -81,5 +81,4 @@ def test_watch_by_hand_counts_images_between_two_stamps():
 def test_watch_after_a_jump_back_estimates_the_period_anew():
     watch = StampWatch(0)
     for start in (START, START - 60_000 * MS):
-        counts = [watch.update(start + 100 * MS * i)[1] for i in (*range(12), 13)]
-        assert counts == [0] * 13
+        assert not any(watch.update(start + 100 * MS * i)[1] for i in (*range(12), 13))

@@ -51,16 +51,12 @@ REPLACEMENTS = WORDS | SPELLINGS
 AVOIDED = re.compile('|'.join([rf'(?<![^\W_])(?:{"|".join(WORDS)})(?![^\W_])', *SPELLINGS]))
 
 
-def prose_files() -> Iterator[Path]:
-    """Yield all files with prose but this one."""
+def repository_files(*suffixes: str) -> Iterator[Path]:
     for folder, subfolders, files in os.walk(ROOT):
         subfolders[:] = sorted(
             name for name in subfolders if not name.startswith('.') and name not in NOT_OURS
         )
-        for name in sorted(files):
-            path = Path(folder, name)
-            if name.endswith(SUFFIXES) and path != Path(__file__).resolve():
-                yield path
+        yield from (Path(folder, name) for name in sorted(files) if name.endswith(suffixes))
 
 
 def findings(text: str) -> Iterator[str]:
@@ -75,7 +71,8 @@ def findings(text: str) -> Iterator[str]:
 def test_prose_uses_terms_of_field():
     found = [
         f'{path.relative_to(ROOT)}:{line}'
-        for path in prose_files()
+        for path in repository_files(*SUFFIXES)
+        if path != Path(__file__).resolve()
         for line in findings(path.read_text(encoding='utf-8'))
     ]
     assert not found, f'{len(found)} avoided words:\n' + '\n'.join(found)
