@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mode robust: each option alone, and all on real traverses of other speed, season and view."""
 
+from functools import cache
+
 from evaluation_commands import best_f1
 import numpy as np
 from places import features_of, map_of
@@ -12,7 +14,7 @@ from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import counts_at, image_matches
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import extract_features
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
@@ -151,19 +153,6 @@ def test_z_normalized_around_subtracts_mean_of_neighbors():
 # ------------------------------------------------ the recognizer
 
 
-def test_robust_recognizer_of_its_own_map_matches_every_window(small_map):
-    answers = recognize_all(robust(small_map, sequence=SHORT, nms_radius=5), small_map.features)
-    for i, answer in enumerate(answers[4:], start=4):
-        assert answer.sequence.middle == i - 2
-        if i < 8:
-            continue  # of so few images it may not be certain
-        assert answer.status is Status.MATCH
-        assert (answer.place_index, answer.newest_index) == (i - 2, i)
-        assert answer.path.tolist() == [[row, i - 4 + row] for row in range(5)]
-        assert 0 <= answer.sequence.distance < 0.5
-        assert not answer.sequence.second_best_distance <= answer.sequence.distance
-
-
 def test_robust_recognizer_after_reset_is_as_new(small_map):
     one = robust(small_map, sequence=SHORT, nms_radius=5)
     first = repr(recognize_all(one, small_map.features[20:30]))
@@ -171,29 +160,7 @@ def test_robust_recognizer_after_reset_is_as_new(small_map):
     assert repr(recognize_all(one, small_map.features[20:30])) == first
 
 
-def test_robust_recognizer_at_chance_level_does_not_match(small_map, route):
-    rng = np.random.default_rng(1)
-    elsewhere = [rng.integers(0, 256, (96, 128, 3), np.uint8) for _ in range(40)]
-    query = FeatureExtractor(projection=64).extract(elsewhere)
-    answers = recognize_all(robust(small_map, sequence=SHORT, nms_radius=5), query)[4:]
-    matched = [a for a in answers if a.status is Status.MATCH]
-    assert len(matched) <= len(answers) / 10
-    for answer in answers:
-        if answer.status is not Status.MATCH:
-            assert answer.sequence.distance >= THRESHOLD
-            assert answer.probability == 1 - answer.sequence.distance
-            assert answer.place_index == -1
-
-
-@pytest.mark.parametrize(
-    'without',
-    [
-        '',
-        'mean_centering',
-        'query_znorm',
-        'place_filter',
-    ],
-)
+@pytest.mark.parametrize('without', ['', 'mean_centering', 'query_znorm', 'place_filter'])
 @pytest.mark.parametrize('strategy', ['adaptive', 'none'])
 def test_recognizer_without_one_option_finds_places(small_map, without, strategy):
     robust_options = ROBUST.without(without) if without else ROBUST
@@ -217,16 +184,10 @@ def test_recognizer_without_one_option_finds_places(small_map, without, strategy
 @pytest.fixture(scope='module')
 def traverses(data_folder):
     """Return a function from a folder to the gradient features of its images."""
-    extractor, known = FeatureExtractor(), {}
-
-    def features(name):
-        if name not in known:
-            known[name] = extract_features(
-                open_source(data_folder / name), extractor, progress=False
-            )
-        return known[name]
-
-    return features
+    extractor = FeatureExtractor()
+    return cache(
+        lambda name: extract_features(open_source(data_folder / name), extractor, progress=False)
+    )
 
 
 def evaluated(reference, query, truth):
@@ -238,46 +199,28 @@ def evaluated(reference, query, truth):
     ).precision
 
 
-def taken(features, indices):
-    rows = torch.from_numpy(np.asarray(indices))
-    return LocalFeatures(features.strips[:, rows], features.weights[:, rows], features.settings)
-
-
-def test_gardens_point_at_every_speed_is_recognized(traverses):
+@pytest.mark.parametrize('kind', ['', *WARPS])
+def test_gardens_point_at_every_speed_is_recognized(traverses, kind):
     reference, query = traverses('gardens_point/day_left'), traverses('gardens_point/day_right')
     truth = GroundTruth.identity(200, 200, 2)
-    f1, precision = evaluated(reference, query, truth)
-    print(f'Gardens Point, robust, gradient: F1 {f1:.4f}, precision {precision:.4f}')
-    assert f1 >= 0.99
-    assert precision >= 0.95
-    for kind in WARPS:
-        indices = DriveChanges.named(kind, 200).images(200)
-        f1, precision = evaluated(reference, taken(query, indices), truth.select(indices))
-        print(f'Gardens Point {kind}: F1 {f1:.4f}, precision {precision:.4f}')
-        assert f1 >= 0.95
-        assert precision >= 0.93
+    indices = DriveChanges.named(kind, 200).images(200) if kind else np.arange(200)
+    f1, precision = evaluated(reference, query[indices], truth.select(indices))
+    assert f1 >= (0.95 if kind else 0.99)
+    assert precision >= (0.93 if kind else 0.95)
 
 
 def test_corridor_is_recognized(traverses, data_folder):
     truth = GroundTruth.from_file(data_folder / 'corridor' / 'ground_truth.csv', 111, 111, 0)
-    f1, precision = evaluated(traverses('corridor/ref'), traverses('corridor/query'), truth)
-    print(f'corridor, robust, gradient: F1 {f1:.4f}, precision {precision:.4f}')
-    assert f1 >= 0.95
-    assert precision >= 0.95
+    assert min(evaluated(traverses('corridor/ref'), traverses('corridor/query'), truth)) >= 0.95
 
 
 @pytest.mark.parametrize(
     ('route', 'query'),
-    [
-        ('gardens_point/day_left', 'corridor/query'),
-        ('corridor/ref', 'gardens_point/day_right'),
-    ],
+    [('gardens_point/day_left', 'corridor/query'), ('corridor/ref', 'gardens_point/day_right')],
 )
 def test_other_route_is_not_matched(traverses, route, query):
     answers = recognize_all(robust(map_of(traverses(route))), traverses(query))[19:]
-    alarms = np.mean([answer.status is Status.MATCH for answer in answers])
-    print(f'{query} on the map of {route}: {alarms:.3f} false alarms')
-    assert alarms <= 0.05
+    assert np.mean([answer.status is Status.MATCH for answer in answers]) <= 0.05
 
 
 def test_hallway_loop_is_closed(traverses, data_folder):
@@ -293,6 +236,5 @@ def test_hallway_loop_is_closed(traverses, data_folder):
     score = counts_at(
         THRESHOLD, answered.distances, truth.accepts(answered.places), truth.has_match
     )
-    print(f'hallway: precision {score.precision:.3f}, recall {score.recall:.3f}')
     assert score.precision >= 0.95
     assert score.recall >= 0.7
