@@ -41,6 +41,9 @@ class CpuMatcher:
         memory begins with a cache line are shared, not copied.
     """
 
+    _map: np.ndarray | tuple[np.ndarray, np.ndarray]
+    _cells: tuple[int, int] | None = None
+
     def __init__(
         self,
         features: LocalFeatures | Int8Features,
@@ -74,10 +77,9 @@ class CpuMatcher:
         self._map = strips.numpy()
 
     def _prepare(self, W: int, spatial: SpatialSettings) -> None:
-        self._spatial, self._cells = spatial, None
+        self._spatial = spatial
         self._band = spatial.band(W)
         self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
-        self._map: np.ndarray | tuple[np.ndarray, np.ndarray]
 
     @property
     def places(self) -> int:
