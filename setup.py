@@ -25,8 +25,10 @@ SIBLINGS = ('stavpr_slam', 'stavpr_lab')
 WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel', 'sdist'}.isdisjoint(sys.argv)
 
 # Commands of other packages print there where they are.
-EXECUTABLES = ('node', 'build_map', 'map', 'replay', 'record', 'monitor')
-MOVED = ('weights', 'demo', 'evaluate', 'experiments', 'export_model', 'pose_graph', 'bridge')
+EXECUTABLES = ('node', 'build_map', 'map', 'replay', 'record')
+MOVED = (
+    'weights', 'monitor', 'demo', 'evaluate', 'experiments', 'export_model', 'pose_graph', 'bridge'
+)  # fmt: skip
 
 EVALUATION = ['jinja2>=3.1', 'matplotlib>=3.6', 'scikit-learn>=1.4']
 TEST = ['hypothesis>=6.98', 'pytest>=7.4', 'PyYAML>=6.0', 'safetensors>=0.4']

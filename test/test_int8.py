@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from llvmlite import binding, ir
 import numpy as np
 import oracle
+from places import recognize_all
 import pytest
-from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_ros.alignment import image_distances, SpatialSettings
 from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.errors import SettingsError

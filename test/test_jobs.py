@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """build_map and evaluate over several inputs: in processes, and on a Ray cluster."""
 
-import json
 from pathlib import Path
 import subprocess
 import sys
@@ -10,7 +9,6 @@ import sys
 import cv2
 from fixtures import route_images
 import pytest
-from stavpr_lab.commands import evaluate
 from stavpr_ros.commands import build_map, jobs
 from stavpr_ros.commands.jobs import Job, job_names, other_arguments, run_jobs
 from stavpr_ros.errors import SettingsError
@@ -59,21 +57,6 @@ def test_build_map_of_several_inputs_equals_maps_of_each(drives, built, tmp_path
     assert ids(tmp_path / 'maps') == ids(built)
 
 
-@pytest.mark.long
-def test_evaluate_of_several_queries_equals_each(built, tmp_path):
-    monday = str(built / 'monday.stavpr')
-    queries = [monday, str(built / 'tuesday.stavpr')]
-    several = ['--map', monday, '--query', *queries, '--output', str(tmp_path / 'reports')]
-    assert evaluate.main([*several, '--processes', '2']) == 0
-    assert evaluate.main(['--map', monday, '--query', monday, '--json', str(tmp_path / 'a')]) == 0
-    one, other = (
-        json.loads(file.read_text()) for file in (tmp_path / 'a', tmp_path / 'reports/monday.json')
-    )
-    for name in ('sequence', 'single', 'decision', 'calibration', 'map_id'):
-        assert one[name] == other[name]
-    assert (tmp_path / 'reports' / 'tuesday' / 'report.html').is_file()
-
-
 def test_run_jobs_failed_job_does_not_stop_others(monkeypatch, capfd):
     def run(command, **_):
         return subprocess.CompletedProcess(command, int(command[-1]), f'{command[-1]}\n')
@@ -114,12 +97,6 @@ def test_job_names_and_arguments():
     assert other_arguments(given, '--input') == ['--every', '2', '--force']
     with pytest.raises(SettingsError, match='--processes 0'):
         run_jobs([], 0, None)
-
-
-def test_several_queries_reject_options_of_one(capfd):
-    with pytest.raises(SystemExit):
-        evaluate.main(['--map', 'a', '--query', 'b', 'c', '--window', '3'])
-    assert '--window goes with one --query' in capfd.readouterr().err
 
 
 def test_run_here_returns_code_and_output():

@@ -12,7 +12,7 @@ from pipelines import at, LENGTH, localizing, message, SECOND
 import pytest
 from scipy.spatial.transform import Rotation
 from stavpr_msgs.msg import PlaceMatch
-from stavpr_ros.relative_pose.transforms import matrix_of
+from stavpr_ros.mapping.transforms import matrices
 from stavpr_ros.ros.navigation import map_to_odometry, Navigation, planar
 from stavpr_ros.ros.output import pose_message
 from test_visualization import header, Publishers
@@ -30,8 +30,8 @@ def test_map_to_odometry_takes_the_pose_of_odometry_to_that_of_the_map():
     place, odometry = (
         np.concatenate([rng.normal(size=3), Rotation.random(rng=rng).as_quat()]) for _ in range(2)
     )
-    found = matrix_of(map_to_odometry(place, odometry)) @ matrix_of(odometry)
-    np.testing.assert_allclose(found, matrix_of(place), atol=1e-12)
+    found = matrices(map_to_odometry(place, odometry)) @ matrices(odometry)
+    np.testing.assert_allclose(found, matrices(place), atol=1e-12)
 
 
 def test_planar_keeps_yaw_and_has_the_covariance_of_x_y_and_yaw_only():

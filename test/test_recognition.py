@@ -5,8 +5,8 @@
 from dataclasses import replace
 
 import numpy as np
+from places import recognize_all
 import pytest
-from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_ros.alignment import (
     align_sequence,
     best_match,

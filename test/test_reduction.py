@@ -5,7 +5,6 @@
 import cv2
 import numpy as np
 import pytest
-from stavpr_lab.commands import evaluate
 from stavpr_ros.commands import build_map
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import SettingsError
@@ -105,9 +104,3 @@ def test_unknown_projection_is_rejected(folder, projection, capsys):
             ['--input', str(folder), '--output', 'x.stavpr', f'--projection={projection}']
         )
     assert 'expected D or pca:D' in capsys.readouterr().err
-
-
-def test_evaluation_of_images_refers_to_map_for_principal_components(folder, capsys):
-    source = str(folder)
-    assert evaluate.main(['--map', source, '--query', source, '--projection', 'pca:4']) != 0
-    assert 'build one by build_map' in capsys.readouterr().err

@@ -1,23 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Mode robust: each option alone, and all on real traverses of other speed, season and view."""
+"""Mode robust: each option alone, and all together."""
 
-from functools import cache
-
-from evaluation_commands import best_f1
 import numpy as np
-from places import features_of, map_of
+from places import features_of, recognize_all
 import pytest
-from stavpr_lab.evaluation.drive import DriveChanges
-from stavpr_lab.evaluation.evaluate import recognize_all
-from stavpr_lab.evaluation.ground_truth import GroundTruth
-from stavpr_lab.evaluation.metrics import counts_at, image_matches
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import extract_features
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.place_filter import CLOSE
 from stavpr_ros.recognition.robust import (
     MeanCentering,
@@ -31,11 +21,9 @@ from stavpr_ros.recognition.robust import (
     Whitening,
     z_normalized,
 )
-from stavpr_ros.sources import open_source
 import torch
 
 SHORT = SequenceSettings(length=5, beta=2.0)
-WARPS = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')
 
 
 def robust(place_map, **changes) -> PlaceRecognizer:
@@ -176,65 +164,3 @@ def test_recognizer_without_one_option_finds_places(small_map, without, strategy
     assert abs(places[0] - answers[-1].sequence.middle) <= CLOSE
     assert len(set(places.tolist())) == len(places) >= 5
     assert (np.diff(distances) >= 0).all()
-
-
-# ------------------------------------------------ real traverses
-
-
-@pytest.fixture(scope='module')
-def traverses(data_folder):
-    """Return a function from a folder to the gradient features of its images."""
-    extractor = FeatureExtractor()
-    return cache(
-        lambda name: extract_features(open_source(data_folder / name), extractor, progress=False)
-    )
-
-
-def evaluated(reference, query, truth):
-    """Best F1, and the precision at the default threshold."""
-    answers = image_matches(recognize_all(robust(map_of(reference)), query), 20)
-    correct = truth.accepts(answers.places)
-    return best_f1(answers.distances, correct).f1, counts_at(
-        THRESHOLD, answers.distances, correct
-    ).precision
-
-
-@pytest.mark.parametrize('kind', ['', *WARPS])
-def test_gardens_point_at_every_speed_is_recognized(traverses, kind):
-    reference, query = traverses('gardens_point/day_left'), traverses('gardens_point/day_right')
-    truth = GroundTruth.identity(200, 200, 2)
-    indices = DriveChanges.named(kind, 200).images(200) if kind else np.arange(200)
-    f1, precision = evaluated(reference, query[indices], truth.select(indices))
-    assert f1 >= (0.95 if kind else 0.99)
-    assert precision >= (0.93 if kind else 0.95)
-
-
-def test_corridor_is_recognized(traverses, data_folder):
-    truth = GroundTruth.from_file(data_folder / 'corridor' / 'ground_truth.csv', 111, 111, 0)
-    assert min(evaluated(traverses('corridor/ref'), traverses('corridor/query'), truth)) >= 0.95
-
-
-@pytest.mark.parametrize(
-    ('route', 'query'),
-    [('gardens_point/day_left', 'corridor/query'), ('corridor/ref', 'gardens_point/day_right')],
-)
-def test_other_route_is_not_matched(traverses, route, query):
-    answers = recognize_all(robust(map_of(traverses(route))), traverses(query))[19:]
-    assert np.mean([answer.status is Status.MATCH for answer in answers]) <= 0.05
-
-
-def test_hallway_loop_is_closed(traverses, data_folder):
-    features = traverses('rtabmap_hallway_loop/samples')
-    truth = GroundTruth.from_file(
-        data_folder / 'rtabmap_hallway_loop' / 'samples_GT.bmp', 84, 84, 0
-    )
-    truth = truth.loop_closures(19)
-    assert truth.has_match.sum() == 44
-    closer = LoopCloser(RecognizerSettings(THRESHOLD, mode='robust'), 20, features.settings)
-    answers = [closer.update(features[i : i + 1]) for i in range(84)]
-    answered = image_matches(answers, 20)
-    score = counts_at(
-        THRESHOLD, answered.distances, truth.accepts(answered.places), truth.has_match
-    )
-    assert score.precision >= 0.95
-    assert score.recall >= 0.7

@@ -374,3 +374,19 @@ def test_evaluate_records_with_invalid_image_keeps_others_aligned():
     np.testing.assert_equal(result.matches.probabilities, [0.9, 0.9, 0.9, np.nan, 0.9, 0.9])
     assert result.counts.true_positives == 5
     assert result.counts.false_negatives == 1
+
+
+@pytest.mark.parametrize(
+    'options',
+    [
+        ['--slam', 'world', '--map', 'a'],
+        ['--slam', 'world', '--false-closures', '1.5'],
+        ['--slam', 'world', '--drift', '-1'],
+        ['--slam', 'other'],
+    ],
+)
+def test_demo_with_invalid_slam_options_exits_with_usage(options, capsys):
+    with pytest.raises(SystemExit) as raised:
+        demo.main(options)
+    assert raised.value.code == 2
+    assert 'usage' in capsys.readouterr().err

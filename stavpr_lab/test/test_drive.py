@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drives by hand: which images are shown, which places are kept, and their ground truth."""
 
-from evaluation_commands import truth_matrix
 import numpy as np
 import pytest
+from scores import truth_matrix
 from stavpr_lab.evaluation.drive import cropped, DriveChanges
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.errors import SettingsError

@@ -7,10 +7,11 @@ import os
 import re
 
 import cv2
-from evaluation_commands import best_f1, read_json, runner, write_images
+from evaluation_commands import read_json, runner, write_images
 from fixtures import route_images
 import numpy as np
 import pytest
+from scores import best_f1
 from stavpr_lab.commands import evaluate
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.metrics import image_matches

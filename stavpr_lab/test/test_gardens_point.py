@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real images through the node over ROS: equal to the library, match for match."""
 
-from evaluation_commands import best_f1
 import numpy as np
 import pytest
+from scores import best_f1
 from stavpr_lab.demonstration.live import run_live
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.metrics import image_matches

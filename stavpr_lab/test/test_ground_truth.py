@@ -5,9 +5,9 @@
 import pickle
 
 import cv2
-from evaluation_commands import truth_matrix
 import numpy as np
 import pytest
+from scores import truth_matrix
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.errors import InputError, SourceError
 

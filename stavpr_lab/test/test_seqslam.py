@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """SeqSLAM: every step by hand, the whole against plain loops, F1 on real traverses."""
 
-from evaluation_commands import best_f1
 import numpy as np
 import pytest
+from scores import best_f1
 from stavpr_lab.evaluation.paper.datasets import open_dataset
 from stavpr_lab.evaluation.seqslam import (
     enhance_contrast,

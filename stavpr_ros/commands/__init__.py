@@ -34,5 +34,4 @@ COMMANDS = {
     'record': Command(
         'stavpr_ros.commands.record', 'write matches or loop closures to a JSON Lines file', True
     ),
-    'monitor': Command('stavpr_ros.commands.monitor', 'show the node in a web browser', True),
 }

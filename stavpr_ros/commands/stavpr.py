@@ -18,6 +18,7 @@ PACKAGES = {
     'evaluate': 'stavpr_lab',
     'experiments': 'stavpr_lab',
     'demo': 'stavpr_lab',
+    'monitor': 'stavpr_lab',
     'pose_graph': 'stavpr_slam',
     'bridge': 'stavpr_slam',
 }

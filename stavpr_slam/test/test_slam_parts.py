@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parts around the pose graph: false closures, its client, tf, restarts, options of the demo."""
+"""Parts around the pose graph: false closures, its client, tf, restarts."""
 
 import sys
 from types import ModuleType, SimpleNamespace
@@ -12,7 +12,6 @@ import pytest
 import rclpy
 from rclpy.context import Context
 from sensor_msgs.msg import CameraInfo
-from stavpr_lab.commands import demo
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure, RelativePose
 from stavpr_ros.errors import StavprError
 from stavpr_ros.ros.camera import CameraInput
@@ -87,22 +86,6 @@ def test_false_closures_coherent_are_runs(context, monkeypatch):
 def test_fetch_graph_without_node_names_what_is_missing():
     with pytest.raises(StavprError, match=r'pose_graph: 3 closures not in 0\.3 s'):
         fetch_graph([], 3, DOMAIN, timeout=0.3)
-
-
-@pytest.mark.parametrize(
-    'options',
-    [
-        ['--slam', 'world', '--map', 'a'],
-        ['--slam', 'world', '--false-closures', '1.5'],
-        ['--slam', 'world', '--drift', '-1'],
-        ['--slam', 'other'],
-    ],
-)
-def test_demo_with_invalid_slam_options_exits_with_usage(options, capsys):
-    with pytest.raises(SystemExit) as raised:
-        demo.main(options)
-    assert raised.value.code == 2
-    assert 'usage' in capsys.readouterr().err
 
 
 def test_pose_graph_started_late_counts_closures_of_earlier_places():

@@ -1,13 +1,11 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs, a runner and a score for the tests of evaluation."""
+"""Images as files, and a runner, for the tests of commands."""
 
 import json
 
 import cv2
-import numpy as np
 import pytest
-from stavpr_lab.evaluation.metrics import sweep
 
 
 def write_images(folder, images):
@@ -35,15 +33,3 @@ def runner(command, monkeypatch, capsys):
 def read_json(text):
     """Parse JSON as browsers do: without NaN and Infinity."""
     return json.loads(text, parse_constant=pytest.fail)
-
-
-def best_f1(distances, correct):
-    """Return the counts with the best F1 of queries that all have a place in the map."""
-    return max(sweep(distances, correct), key=lambda counts: counts.f1)
-
-
-def truth_matrix(truth):
-    """Return the accepted pairs as a matrix, shape (N, n), bool."""
-    matrix = np.zeros((truth.N, truth.n), bool)
-    matrix[tuple(truth.pairs.T)] = True
-    return matrix

@@ -13,9 +13,9 @@ import numpy as np
 from processes import Process, TIMEOUT
 import pytest
 from robot import LENGTH
+from stavpr_lab.monitor.node import encode_row, History, KEPT, Monitor, span_of
+from stavpr_lab.monitor.server import MonitorServer
 from stavpr_ros.errors import StavprError, UnavailableError
-from stavpr_ros.ros.monitor import encode_row, History, KEPT, Monitor, span_of
-from stavpr_ros.ros.monitor_server import MonitorServer
 
 
 @pytest.fixture

@@ -15,8 +15,8 @@ import threading
 from typing import Any
 from urllib.parse import urlsplit
 
+from stavpr_lab.monitor.node import History
 from stavpr_ros.errors import StavprError, UnavailableError
-from stavpr_ros.ros.monitor import History
 
 EVENT_SECONDS = 5.0  # most time between two events, so that a closed browser is noticed
 MAX_REQUEST = 10_000  # bytes
@@ -37,7 +37,7 @@ class MonitorServer(ThreadingHTTPServer):
         self, host: str, port: int, history: History, command: Callable[[str, str], str]
     ) -> None:
         self.history, self.command = history, command
-        self.page = (files('stavpr_ros.ros') / 'monitor.html').read_bytes()
+        self.page = (files('stavpr_lab.monitor') / 'page.html').read_bytes()
         try:
             super().__init__((host, port), _Handler)
         except OSError as error:

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import sys
 
 import rclpy
+from stavpr_lab.monitor.node import History, Monitor
+from stavpr_lab.monitor.server import MonitorServer
 from stavpr_ros.commands.program import make_parser, run_program
-from stavpr_ros.ros.monitor import History, Monitor
-from stavpr_ros.ros.monitor_server import MonitorServer
 from stavpr_ros.ros.process import own_arguments, ros_node, spin_until
 
 EPILOG = """\
@@ -18,8 +18,8 @@ map, the distances of the last minutes and the diagnostics, and starts and stops
 nothing from the network.
 
 examples:
-  ros2 run stavpr_ros monitor
-  ros2 run stavpr_ros monitor --port 8081 --ros-args -r __ns:=/robot
+  ros2 run stavpr_lab monitor
+  ros2 run stavpr_lab monitor --port 8081 --ros-args -r __ns:=/robot
   ssh -L 8080:localhost:8080 robot      then open http://localhost:8080 here
 
 exit codes: 0 stopped by a signal, 1 the port cannot be used, 2 usage

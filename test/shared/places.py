@@ -26,3 +26,9 @@ def map_of(features, poses=None, **parts):
     """Return a map of features."""
     n = len(features)
     return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n, poses, **parts)
+
+
+def recognize_all(recognizer, features):
+    """Return the matches of all images of a sequence, starting with an empty window."""
+    recognizer.reset()
+    return [recognizer.update(features[i : i + 1]) for i in range(len(features))]

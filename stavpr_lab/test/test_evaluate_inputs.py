@@ -1,0 +1,156 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Inputs of evaluate besides two folders: descriptors, several queries, options of maps."""
+
+import json
+
+import cv2
+from evaluation_commands import runner, write_images
+from fixtures import route_images
+import numpy as np
+import pytest
+from stavpr_lab.commands import evaluate
+from stavpr_ros.commands import build_map
+from stavpr_ros.errors import UnavailableError
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.features.descriptors import read_descriptors
+from stavpr_ros.mapping import load_map
+import torch
+
+NAMES = ('monday', 'tuesday')
+
+
+@pytest.fixture(scope='module')
+def vectors():
+    """Return a curve of 40 vectors, not of unit norm; the sixth is zero."""
+    curve = np.cumsum(np.random.default_rng(0).standard_normal((40, 24)), axis=0)
+    curve[5] = 0
+    return curve.astype(np.float32)
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    return runner(evaluate, monkeypatch, capsys)
+
+
+@pytest.fixture
+def pair(tmp_path, vectors):
+    """Write descriptors of a map and a query, with noise; return the options."""
+    np.save(tmp_path / 'map.npy', vectors)
+    noise = np.random.default_rng(3).normal(0, 0.5, vectors.shape)
+    np.savez(tmp_path / 'query.npz', query=vectors + noise)
+    paths = ['--map', tmp_path / 'map.npy', '--query', f'{tmp_path}/query.npz:query']
+    return [*paths, '--sequence-length', 5]
+
+
+def test_evaluate_of_descriptors_and_of_exported_ones_are_equal(run, pair, tmp_path):
+    first, second, exported = (tmp_path / name for name in ('1.json', '2.json', 'arrays'))
+    assert run(*pair, '--json', first, '--export', exported)[0] == 0
+    again = ['--map', exported / 'map.npy', '--query', exported / 'query.npy', *pair[4:]]
+    assert run(*again, '--json', second)[0] == 0
+    numbers = [json.loads(path.read_text()) for path in (first, second)]
+    assert numbers[0]['sequence']['f1'] == pytest.approx(numbers[1]['sequence']['f1'])
+    assert numbers[0]['single']['recall_at_1'] > 0.9
+    code, _, errors = run(*pair, '--json', tmp_path / '3.json', '--export', exported)
+    assert (code, 'exists already' in errors) == (1, True)
+
+
+def test_evaluate_exports_strips_of_images(run, route, tmp_path):
+    folder = write_images(tmp_path / 'images', route[:24])
+    both = ['--map', folder, '--query', folder, '--sequence-length', 5]
+    assert run(*both, '--json', tmp_path / 'a.json', '--export', tmp_path)[0] == 0
+    array, features = np.load(tmp_path / 'map.npy'), FeatureExtractor().extract(route[:24])
+    assert array.shape == (24, 7, 224)
+    again = read_descriptors(str(tmp_path / 'map.npy'))
+    torch.testing.assert_close(again.strips, features.strips)
+    torch.testing.assert_close(again.weights, features.weights)
+
+
+@pytest.mark.parametrize(
+    ('options', 'word'),
+    [
+        (['--strips', 7], '--strips'),
+        (['--projection', 8], '--projection'),
+        (['--features', 'onnx'], '--features onnx'),
+        (['--gradient-cell', 32], '--gradient-cell'),
+        (['--crop-map', 0.2], 'saved map or an array'),
+        (['--mirror'], 'saved map or an array'),
+    ],
+)
+def test_evaluate_of_descriptors_rejects_options_of_images(run, pair, options, word):
+    code, _, errors = run(*pair, *options)
+    assert (code, word in errors) == (2, True)
+
+
+def test_map_of_descriptors_takes_descriptors_only(
+    run, pair, route, tmp_path, monkeypatch, capsys
+):
+    build = runner(build_map, monkeypatch, capsys)
+    saved = tmp_path / 'route.stavpr'
+    source = ['--descriptors-source', 'netvlad']
+    poses = tmp_path / 'poses.csv'
+    poses.write_text(''.join(f'{i},0,0\n' for i in range(40)))
+    code, output, _ = build('--input', pair[1], '--output', saved, *source, '--poses', poses)
+    assert (code, '1 strips of 24 dimensions' in output) == (0, True)
+    place_map = load_map(saved)
+    assert place_map.pose(39)[0] == 39
+    with pytest.raises(UnavailableError, match='not from images'):
+        place_map.extractor()
+    query = ['--query', *pair[3:], '--json', tmp_path / 'a.json', '--force']
+    assert run('--map', saved, *query)[0] == 0
+    code, _, errors = run('--map', saved, *query, '--descriptors-source', 'megaloc')
+    assert (code, 'megaloc' in errors) == (1, True)
+    images = write_images(tmp_path / 'images', route[:24])
+    code, _, errors = run('--map', saved, '--query', images)
+    assert (code, 'not from images' in errors) == (1, True)
+    for option in (['--topic', 'x'], ['--keyframe-change', 1]):
+        code, _, errors = build('--input', pair[1], '--output', tmp_path / 'b', *option)
+        assert (code, option[0] in errors) == (2, True)
+
+
+@pytest.fixture(scope='module')
+def drives(tmp_path_factory):
+    """Return folders of images of two drives."""
+    root = tmp_path_factory.mktemp('drives')
+    for seed, name in enumerate(NAMES):
+        (root / name).mkdir()
+        for i, image in enumerate(route_images(30, seed)):
+            cv2.imwrite(str(root / name / f'{i:03}.png'), image)
+    return [str(root / name) for name in NAMES]
+
+
+@pytest.fixture(scope='module')
+def built(drives, tmp_path_factory):
+    """Build maps of both, one by one."""
+    folder = tmp_path_factory.mktemp('maps')
+    for name, drive in zip(NAMES, drives, strict=True):
+        file = str(folder / f'{name}.stavpr')
+        assert build_map.main(['--input', drive, '--output', file, '--no-thumbnails']) == 0
+    return folder
+
+
+@pytest.mark.long
+def test_evaluate_of_several_queries_equals_each(built, tmp_path):
+    monday = str(built / 'monday.stavpr')
+    queries = [monday, str(built / 'tuesday.stavpr')]
+    several = ['--map', monday, '--query', *queries, '--output', str(tmp_path / 'reports')]
+    assert evaluate.main([*several, '--processes', '2']) == 0
+    assert evaluate.main(['--map', monday, '--query', monday, '--json', str(tmp_path / 'a')]) == 0
+    one, other = (
+        json.loads(file.read_text()) for file in (tmp_path / 'a', tmp_path / 'reports/monday.json')
+    )
+    for name in ('sequence', 'single', 'decision', 'calibration', 'map_id'):
+        assert one[name] == other[name]
+    assert (tmp_path / 'reports' / 'tuesday' / 'report.html').is_file()
+
+
+def test_several_queries_reject_options_of_one(capfd):
+    with pytest.raises(SystemExit):
+        evaluate.main(['--map', 'a', '--query', 'b', 'c', '--window', '3'])
+    assert '--window goes with one --query' in capfd.readouterr().err
+
+
+def test_evaluation_of_images_refers_to_map_for_principal_components(tmp_path, route, capsys):
+    source = str(write_images(tmp_path / 'images', route[:30]))
+    assert evaluate.main(['--map', source, '--query', source, '--projection', 'pca:4']) != 0
+    assert 'build one by build_map' in capsys.readouterr().err
