@@ -37,7 +37,6 @@ setup(
         'tqdm>=4.66',
     ],
     extras_require={
-        'faiss': ['faiss-cpu>=1.8'],
         'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
         'slam': ['evo>=1.31', 'stavpr_slam'],
     },

@@ -5,10 +5,9 @@
 from dataclasses import replace
 
 import numpy as np
+from places import features_of
 import pytest
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.features import LocalFeatures
-from stavpr_ros.features.extractor import FeatureSettings
 from stavpr_ros.recognition import RecognizerSettings, route_features, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.place_filter import PlaceFilter
@@ -67,13 +66,7 @@ def laps(count):
     rng = np.random.default_rng(0)
     known = rng.standard_normal((W, LAP, D))
     strips = known[:, np.arange(count) % LAP] + 0.4 * rng.standard_normal((W, count, D))
-    strips += rng.standard_normal((W, 1, D))
-    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
-    return LocalFeatures(
-        torch.from_numpy(strips).float(),
-        torch.full((W, count), W**-0.5),
-        FeatureSettings('gradient', None, W),
-    )
+    return features_of(strips + rng.standard_normal((W, 1, D)))
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition.blocks import PlaceChanges
+from stavpr_ros.recognition.map_change import APART
 from stavpr_ros.recognition.robust import THRESHOLD
 from stavpr_ros.recognition.sequence_search import _smooth, FilterSearch, SequenceBuffer
 import torch
@@ -168,7 +170,9 @@ def test_equal_images_in_dark_stretch_of_map_move_on(route):
     dark = features_of(route).strips.numpy().copy()
     dark[:, 20:50] = 0
     search = FilterSearch(SequenceBuffer(4, PLACES, 8))
-    search.change.learn(dark)
+    seen = PlaceChanges(PLACES, APART)
+    seen.add(torch.from_numpy(dark))
+    search.change.learn(seen.changes)
     at, images = np.arange(PLACES), 30
     for i in range(images):
         z = np.where(np.abs(at - i) < 2, -4, 0).astype(np.float32)

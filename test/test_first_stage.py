@@ -5,11 +5,11 @@
 from dataclasses import replace
 
 import numpy as np
+from places import features_of, map_of
 import pytest
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.mapping import descriptor_map, Session
+from stavpr_ros.mapping import Session
 from stavpr_ros.recognition import first_stage, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.first_stage import CHUNK, FirstStage
@@ -22,12 +22,7 @@ pytestmark = pytest.mark.usefixtures('one_thread')
 
 
 def random_features(n, seed=0, strips=W):
-    drawn = torch.from_numpy(
-        np.random.default_rng(seed).standard_normal((strips, n, d), np.float32)
-    )
-    unit = drawn / drawn.norm(dim=2, keepdim=True)
-    weights = torch.full((strips, n), strips**-0.5)
-    return LocalFeatures(unit, weights, FeatureSettings('random', None, strips))
+    return features_of(np.random.default_rng(seed).standard_normal((strips, n, d), np.float32))
 
 
 def noisy(features, share=0.4, seed=1):
@@ -118,12 +113,9 @@ def test_distances_of_chunks_end_with_map():
 
 
 def recognizer(features, sessions=1, **changes):
-    place_map = descriptor_map(features)
-    if sessions > 1:
-        n = len(features)
-        index = (np.arange(n) * sessions // n).astype(np.int32)
-        names = tuple(Session(str(i)) for i in range(sessions))
-        place_map = replace(place_map, sessions=names, session_index=index)
+    index = (np.arange(len(features)) * sessions // len(features)).astype(np.int32)
+    names = tuple(Session(str(i)) for i in range(sessions))
+    place_map = map_of(features, sessions=names, session_index=index)
     return PlaceRecognizer(place_map, replace(SETTINGS, **changes))
 
 

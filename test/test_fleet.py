@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps of a fleet: their homes, recognition in neighborhoods, and homes that fail."""
 
-import ast
 from dataclasses import replace
-from pathlib import Path
 import threading
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -15,7 +13,6 @@ import pytest
 from robot import image_message
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap
-import stavpr_ros
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import FleetError, InputError, OutputTakenError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
@@ -339,12 +336,3 @@ def test_load_map_service_rejects_addresses(robot, start, server):
     for name in (server.address('route'), 'faiss:route.stavpr'):
         assert 'does not exist' in robot.refuses(LoadMap, 'load_map', path=name)
     assert len(server.requests) == before
-
-
-def test_fleet_is_imported_within_functions_only():
-    package = Path(stavpr_ros.__file__).parent
-    for path in package.rglob('*.py'):
-        if path.parent.name != 'fleet':
-            tree = ast.parse(path.read_text())
-            imported = [ast.unparse(one) for one in tree.body if isinstance(one, ast.ImportFrom)]
-            assert not [one for one in imported if 'stavpr_ros.fleet' in one], path

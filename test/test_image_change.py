@@ -6,9 +6,18 @@ import numpy as np
 from places import route_strips
 import pytest
 from stavpr_ros.alignment.cpu.dot import change_between
-from stavpr_ros.recognition.map_change import AHEAD, APART, STRETCH
+from stavpr_ros.recognition.blocks import PlaceChanges
+from stavpr_ros.recognition.map_change import (
+    AHEAD,
+    APART,
+    FLOOR,
+    ImageChange,
+    OFFSET,
+    SMOOTHED,
+    STRETCH,
+)
 from stavpr_ros.recognition.robust import FilterSettings
-from stavpr_ros.recognition.sequence_search import FLOOR, ImageChange, OFFSET, SMOOTHED
+import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 SETTINGS = FilterSettings()
@@ -26,9 +35,20 @@ def plain_change(a, b):
 
 
 def learned(strips):
-    change = ImageChange(strips.shape[1], SETTINGS)
-    change.learn(strips)
+    change, seen = ImageChange(strips.shape[1], SETTINGS), PlaceChanges(strips.shape[1], APART)
+    seen.add(torch.from_numpy(strips))
+    change.learn(seen.changes)
     return change
+
+
+def learned_on_route(strips, room):
+    """Return what is learned from one place after the other; memory grows to the room."""
+    route = ImageChange(5, SETTINGS)
+    for n in range(1, strips.shape[1] + 1):
+        if n == 6:
+            route.grow(room)
+        route.learn_newest(strips[:, :n], n)
+    return route
 
 
 def test_curve_is_mean_change_of_places_apart():
@@ -51,19 +71,13 @@ def test_curve_beyond_short_map_is_that_of_unrelated_images(places):
 
 def test_learn_newest_of_each_place_equals_learn():
     strips = drive_strips(30)
-    route = ImageChange(5, SETTINGS)
-    for n in range(1, 31):
-        if n == 6:
-            route.grow(32)
-        route.learn_newest(strips[:, :n], n)
-    np.testing.assert_allclose(route.curve, learned(strips).curve, rtol=1e-5)
+    curve = learned_on_route(strips, 32).curve
+    np.testing.assert_allclose(curve, learned(strips).curve, rtol=1e-5)
 
 
 def test_learn_newest_of_standing_camera_leaves_curve():
     strips = drive_strips(30)
-    route = ImageChange(60, SETTINGS)
-    for n in range(1, 31):
-        route.learn_newest(strips[:, :n], n)
+    route = learned_on_route(strips, 60)
     before = route.curve
     stood = np.concatenate([strips, strips[:, -1:]], axis=1)
     route.learn_newest(stood, stood.shape[1])
@@ -148,33 +162,31 @@ def probable_at(place, n):
     return by_place
 
 
-def test_unlit_is_where_places_of_map_are_equal_or_soon_will_be():
+def test_dark_stretch_is_where_places_of_map_are_equal_or_soon_will_be():
     strips = drive_strips(60)
     strips[:, 30:41] = 0  # 31..40 equal the one before
     change = learned(strips)
-    dark = [change.unlit(probable_at(place, 60)) for place in range(60)]
+    dark = [change.is_dark_stretch(probable_at(place, 60)) for place in range(60)]
     assert dark == [30 + STRETCH - AHEAD < place <= 40 for place in range(60)]
-    assert not change.unlit(np.zeros(60))
+    assert not change.is_dark_stretch(np.zeros(60))
     change.evict(5)
-    assert [change.unlit(probable_at(place, 55)) for place in range(55)] == dark[5:]
+    assert [change.is_dark_stretch(probable_at(place, 55)) for place in range(55)] == dark[5:]
 
 
-def test_unlit_needs_probability_of_such_places():
+def test_dark_stretch_needs_probability_of_such_places():
     strips = drive_strips(60)
     strips[:, 30:41] = 0
     change, by_place = learned(strips), np.zeros(60)
     by_place[5], by_place[35] = 0.72, 0.28
-    assert not change.unlit(by_place)
+    assert not change.is_dark_stretch(by_place)
     by_place[5], by_place[35] = 0.68, 0.32
-    assert change.unlit(by_place)
-    assert change.unlit(by_place / 100)  # relative to the probability on the map
+    assert change.is_dark_stretch(by_place)
+    assert change.is_dark_stretch(by_place / 100)  # relative to the probability on the map
 
 
-def test_unlit_of_route_knows_its_newest_places():
+def test_dark_stretch_of_route_knows_its_newest_places():
     strips = drive_strips(30)
     strips[:, 20:26] = 0
-    route = ImageChange(30, SETTINGS)
-    for n in range(1, 31):
-        route.learn_newest(strips[:, :n], n)
-    assert route.unlit(probable_at(22, 30))
-    assert not route.unlit(probable_at(28, 30))
+    route = learned_on_route(strips, 30)
+    assert route.is_dark_stretch(probable_at(22, 30))
+    assert not route.is_dark_stretch(probable_at(28, 30))

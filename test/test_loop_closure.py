@@ -10,7 +10,6 @@ from places import features_of
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
-from stavpr_ros.alignment.spatial import adaptive_weights
 from stavpr_ros.devices import why_no_cuda
 from stavpr_ros.errors import (
     FeatureMismatchError,
@@ -86,38 +85,17 @@ class PlainCloser:
     """
 
     def __init__(self, settings, exclude, features):
-        W = len(features.strips)
-        self.settings, self.exclude, self.all = settings, exclude, features.strips.contiguous()
-        self.a = adaptive_weights(W, settings.spatial, np.dtype(np.float32))
-        self.rows = []
-
-    def distances(self, image, last):
-        from stavpr_ros.alignment.cpu import dot
-
-        out = np.empty((1, last), np.float32)
-        dot.image_distances(
-            self.all[:, :last].contiguous().numpy(),
-            dot.tiled(self.all[:, image : image + 1]),
-            self.a,
-            7,
-            out,
-        )
-        return out[0]
-
-    def normalized(self, image, first, last):
-        """Return the row of an image to places first..last-1, none if they are too few."""
-        if last - first < LEAST_PLACES:
-            return np.empty(0, np.float32)
-        live = self.distances(image, last)[first:]
-        if self.settings.applied_options.query_znorm:
-            live = z_normalized(live, AROUND)
-        return live
+        self.settings, self.exclude, self.all, self.rows = settings, exclude, features, []
 
     def add(self, image, first, last):
         """Return the sequence of an image that may be matched with places first..last-1."""
-        row = np.full(self.all.shape[1], np.inf, np.float32)
-        live = self.normalized(image, first, last)
-        row[first : first + len(live)] = live
+        row = np.full(len(self.all), np.inf, np.float32)
+        if last - first >= LEAST_PLACES:
+            strips, weights = self.all.strips[:, image], self.all.weights[:, image]
+            matcher = CpuMatcher(self.all[:last], self.settings.spatial)
+            row[first:last] = matcher.distances(strips, weights)[first:]
+            if self.settings.applied_options.query_znorm:
+                row[first:last] = z_normalized(row[first:last], AROUND)
         self.rows = [*self.rows, row][-self.settings.sequence.length :]
         if len(self.rows) < self.settings.sequence.length:
             return None
@@ -497,7 +475,5 @@ def test_settled_route_holds_its_places_through_growth_and_eviction(laps, monkey
     held = laps[evicted:200]
     newest = route.newest
     found = matcher.to_oldest(route.strips, newest, route.count - 3)
-    expected = CpuMatcher(held, SpatialSettings(), 'int8').distances(
-        newest[:, 0], torch.ones(7)
-    )
+    expected = CpuMatcher(held, SpatialSettings(), 'int8').distances(newest[:, 0], torch.ones(7))
     torch.testing.assert_close(found, expected[:-3], atol=1e-6, rtol=0)

@@ -163,7 +163,6 @@ def test_inliers_separate_real_places(data_folder, name, recall):
         np.mean([check.inliers(query[i], thumbnail(reference[j])) >= least for i, j in pairs])
         for pairs in (right, wrong)
     ]
-    print(f'{name}: {verified[0]:.2f} of right places verified, {verified[1]:.3f} of wrong ones')
     assert verified[0] >= recall
     assert verified[1] <= 0.03
 

@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 import sys
 
+import cv2
 import numpy as np
 import oracle
 import pytest
@@ -22,11 +23,13 @@ import data
 import graphs
 from lower_bounds import Peaks
 import matching
+import memory
 import off_map
 import off_map_page
 import peaks
 import report
 import results
+from results import PeerTime, Row
 from run import Run
 import stages
 from stavpr_lab.evaluation.ground_truth import GroundTruth

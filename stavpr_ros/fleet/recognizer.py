@@ -30,14 +30,12 @@ from stavpr_ros.fleet.neighborhoods import Votes
 from stavpr_ros.fleet.store import place_vectors, sample_places
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import Match, RecognizerSettings, Status
+from stavpr_ros.recognition.blocks import PlaceChanges
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+from stavpr_ros.recognition.map_change import APART, ImageChange
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
-from stavpr_ros.recognition.robust import (
-    FilterSettings,
-    MIN_DEVIATION,
-    ROBUST,
-)
-from stavpr_ros.recognition.sequence_search import FilterSearch, ImageChange, SequenceBuffer
+from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION, ROBUST
+from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
 from stavpr_ros.recognition.sessions import SessionLayout
 from stavpr_ros.threads import call_on_thread
 import torch
@@ -132,7 +130,7 @@ class FleetRecognizer(SequenceRecognizer):
             )
         super().__init__(settings, city.settings, 0)
         if city.poses is not None:
-            self._compare(city.poses[:, :2])
+            self._enable_odometry_check(city.poses[:, :2])
         self._city, self._timeout = city, timeout
         index = city.store.index
         self._centering = index.centering()
@@ -141,23 +139,21 @@ class FleetRecognizer(SequenceRecognizer):
         # the sample, then the chunks: the matcher shares the memory
         self._strips = torch.zeros(W, self._sampled + CHUNKS * CHUNK, d)
         self._weights = torch.zeros(W, self._strips.shape[1])
-        centered = self._centering.places(sample)
-        self._strips[:, : self._sampled], self._weights[:, : self._sampled] = (
-            centered.strips,
-            centered.weights,
-        )
+        seen = PlaceChanges(self._sampled, APART)
+        centered = self._centering.places(sample, seen.add)
+        self._strips[:, : self._sampled] = centered.strips
+        self._weights[:, : self._sampled] = centered.weights
         self._matcher = CpuMatcher(
             LocalFeatures(self._strips, self._weights, city.settings), settings.spatial
         )
         self._learned = ImageChange(self._sampled, FilterSettings())
-        self._learned.learn(centered.strips, _firsts(places, index.runs(places)))
+        self._learned.learn(seen.changes, _firsts(places, index.runs(places)))
         self._chunks = np.full(CHUNKS, -1)  # in each slot
         self._wanted = np.zeros(CHUNKS, np.int64)  # number of the image that wanted it last
         self._places = np.full(CHUNKS * CHUNK, -1)
         self._same_as = self._places.copy()
         self._from_before = np.ones(len(self._places), np.float32)
         self._pending: Future[_Lookup] | None = None
-        self.problem = ''
         self._count = 0
         self.reset()
 
@@ -183,15 +179,7 @@ class FleetRecognizer(SequenceRecognizer):
     def update(
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
     ) -> Match:
-        """
-        Add the next image and match the window that ends with it.
-
-        :param features: those of one image, strips (W, 1, d).
-        :param stamp: when it was taken, ns; 0 = unknown.
-        :param pose: by odometry, shape (7,), z is up; None = unknown.
-        :raises FeatureMismatchError: made with other settings than the map's.
-        :raises InputError: not one image, features that are not finite, or an invalid pose.
-        """
+        """See :meth:`SequenceRecognizer.update`."""
         position = position_of(pose)
         self._require_one_image(features, 'the map')
         if features.dimension != self._city.dimension:
@@ -203,7 +191,7 @@ class FleetRecognizer(SequenceRecognizer):
         sampled, change = row[: self._sampled][self._learned.distinct(self._sampled)], 1.0
         if self._images:
             change = change_between(strips.numpy(), self._images[-1].strips.numpy())
-        self._centering.stands(change < self._learned.standstill)
+        self._centering.note_standstill(change < self._learned.standstill)
         mean, deviation = float(sampled.mean()), max(float(sampled.std()), MIN_DEVIATION)
         z = (row[self._sampled :] - np.float32(mean)) / np.float32(deviation)
         image = _Image(strips, features.weights[:, 0], change, stamp, mean, deviation, z)
@@ -218,10 +206,7 @@ class FleetRecognizer(SequenceRecognizer):
         elif self._layout is not None:
             self._push(image)
         if self._layout is not None:
-            match = self._compared(self._match_window(), position)
-            self._nearest = match.sequence
-            stamps, changes = self._buffer.stamps, tuple(self._changes)
-            return replace(match, window_stamps=stamps, window_changes=changes)
+            return self._compared(self._match_window(), position)
         status = Status.WARMING_UP
         if self.window_fill == self._settings.sequence.length:
             status = Status.NO_MATCH
@@ -355,7 +340,7 @@ class FleetRecognizer(SequenceRecognizer):
         model, share = FilterSettings(), len(places) / len(self._city)
         model = replace(model, start=model.start * share, enter=model.enter * share)
         self._search = self._filter = FilterSearch(self._buffer, model, layout)
-        self._filter.change.adopt(self._learned, self._from_before[self._order])
+        self._filter.change.copy_statistics(self._learned, self._from_before[self._order])
         for image in self._images:
             self._push(image)
 
@@ -378,11 +363,3 @@ def _changes_from_before(strips: np.ndarray) -> np.ndarray:
     similarity = np.einsum('wnd,wnd->wn', strips[:, 1:], strips[:, :-1])
     similarity[~(strips[:, 1:].any(axis=2) | strips[:, :-1].any(axis=2))] = 1
     return np.append(np.float32(1), 1 - similarity.mean(axis=0)).astype(np.float32)
-
-
-class FleetMap(CityMap):
-    """A city's map that makes its recognizer, as the pipeline expects of a map in a store."""
-
-    def recognizer(self, settings: RecognizerSettings) -> FleetRecognizer:
-        """Return a recognizer of this map; see :class:`FleetRecognizer`."""
-        return FleetRecognizer(self, settings)

@@ -41,6 +41,9 @@ class CpuMatcher:
         memory begins with a cache line are shared, not copied.
     """
 
+    _map: np.ndarray | tuple[np.ndarray, np.ndarray]
+    _cells: tuple[int, int] | None = None
+
     def __init__(
         self,
         features: LocalFeatures | Int8Features,
@@ -50,13 +53,10 @@ class CpuMatcher:
         W = len(features.strips)
         if spatial.strategy == 'sliding_window' and W < WINDOW:
             raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')
-        self._spatial = spatial
+        self._prepare(W, spatial)
         self._cells = features.cells if spatial.vertical else None
         self._weights = features.weights.cpu()
         self._places = self._weights.shape[1]
-        self._band = spatial.band(W)
-        self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
-        self._map: np.ndarray | tuple[np.ndarray, np.ndarray]
         if precision == 'int8' and isinstance(features, LocalFeatures):
             features = rounded(features, lambda some: some)
         if isinstance(features, Int8Features):
@@ -76,6 +76,11 @@ class CpuMatcher:
             strips = strips.clone()
         self._map = strips.numpy()
 
+    def _prepare(self, W: int, spatial: SpatialSettings) -> None:
+        self._spatial = spatial
+        self._band = spatial.band(W)
+        self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
+
     @property
     def places(self) -> int:
         """Return the number of places n."""
@@ -88,7 +93,7 @@ class CpuMatcher:
     def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Return the distances of Q images to every place, (Q, n)."""
         out = np.empty((strips.shape[1], self.places), np.float32)
-        if len(self._weights) == 1:  # one vector an image: its alignment is its cosine distance
+        if len(strips) == 1:  # one vector an image: its alignment is its cosine distance
             if isinstance(self._map, tuple):
                 int8.cosine_distances(self._map, int8.tiled(strips), out)
             else:
@@ -135,7 +140,7 @@ class CpuMatcher:
         return (1 - (similarity * self._weights.T) @ weights).numpy()
 
 
-class CpuRouteMatcher:
+class CpuRouteMatcher(CpuMatcher):
     """
     Compares an image with the oldest places of a route that grows.
 
@@ -147,8 +152,7 @@ class CpuRouteMatcher:
     device = None  # a CUDA device where the route lies
 
     def __init__(self, W: int, spatial: SpatialSettings) -> None:
-        self._band = spatial.band(W)
-        self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
+        self._prepare(W, spatial)
 
     def to_oldest(self, strips: RouteStrips, newest: torch.Tensor, places: int) -> torch.Tensor:
         """
@@ -156,19 +160,10 @@ class CpuRouteMatcher:
 
         :param strips: of the route; newest: of the image, (W, 1, d), float32.
         """
-        out = np.empty((1, places), np.float32)
-        is_vector = len(newest) == 1  # its alignment is its cosine distance
         if isinstance(strips, Int8Strips):
-            rounded_map, rounded_query = strips.kernel_arguments(), int8.tiled(newest)
-            if is_vector:
-                int8.cosine_distances(rounded_map, rounded_query, out)
-            else:
-                dot.image_distances(rounded_map, rounded_query, self._a, self._band, out)
-            return torch.from_numpy(out[0])
-        assert isinstance(strips, torch.Tensor)
-        held = strips.numpy()
-        if is_vector:
-            dot.cosine_distances(held[0], newest[0].numpy(), out)
+            self._map = strips.kernel_arguments()
         else:
-            dot.image_distances(held, dot.tiled(newest), self._a, self._band, out)
-        return torch.from_numpy(out[0])
+            assert isinstance(strips, torch.Tensor)
+            self._map = strips.numpy()
+        self._places = places
+        return self.distance_matrix(newest, newest[:, :, 0])[0]

@@ -42,9 +42,6 @@ class CudaPlaceFilter:
     order. Nothing waits for the device but the first of :meth:`belief`, :meth:`most_probable` and
     :meth:`way` after an image.
 
-    :param places: that there is room for.
-    :param lag: most images that states are followed back.
-    :param gaps: places that there are none of, between sessions.
     """
 
     def __init__(
@@ -144,11 +141,6 @@ class CudaPlaceFilter:
         self._states[:, n:] = self._sums[:, n:] = 0
         self._find_seen()
 
-    @property
-    def off_map(self) -> float:
-        """Probability that the camera is off the map."""
-        return float(self._off.sum())
-
     def places_of_states(self) -> np.ndarray:
         """Return the probability of each place, (room,), float32; copied from the device."""
         found: np.ndarray = (self._by_place() * self._scale).float().cpu().numpy()
@@ -168,15 +160,7 @@ class CudaPlaceFilter:
         speed_weights: np.ndarray,
         speed_likelihoods: np.ndarray | float = 1.0,
     ) -> None:
-        """
-        Advance by an image.
-
-        :param z: z-normalized distances to the first n places, (n,), float32, on the device; +inf
-            bans a place.
-        :param weight: alpha; 0 = the image is no evidence.
-        :param speed_weights: relative probability of each speed, (V,).
-        :param speed_likelihoods: of each speed relative to that off the map, (V,).
-        """
+        """See :meth:`stavpr_ros.recognition.place_filter.PlaceFilter.update`; z on the device."""
         s, (K, V), v, n = self.settings, self._shape, self._views, len(z)
         slot = self.count % len(self._origins)
         moved = np.rint(self._speeds * (self.count + 1)) - np.rint(self._speeds * self.count)

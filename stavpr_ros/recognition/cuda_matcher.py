@@ -19,9 +19,7 @@ import torch
 BLOCK_WORDS = 2**26  # most words of products that lie in memory at a time: 256 MiB
 QUERIES = 32  # most images of a batch whose products are made at once
 AT_ONCE = 1024  # places of a route: the memory of products is the same for so many
-PLACES_IN_PIECES = (
-    2**14
-)  # most places of int8 widened at a time
+PLACES_IN_PIECES = 2**14  # most places of int8 widened at a time
 
 
 class CudaMatcher:
@@ -58,8 +56,9 @@ class CudaMatcher:
         self._weights = features.weights.to(device)
         self._workspace: tuple[torch.Tensor, Any] | None = None
         self._choose_kernel(spatial)
-        if self.places:
-            self._warm_up()
+        if self.places:  # compiles the kernel and loads the libraries before the first image
+            W, _, d = self._strips.shape
+            self.distances(torch.zeros(W, d), torch.zeros(W))
 
     def _hold(self, strips: torch.Tensor, reciprocals: torch.Tensor | None) -> None:
         """Compare with these strips; reciprocal lengths are of int8."""
@@ -79,34 +78,17 @@ class CudaMatcher:
         elif spatial.strategy != 'none':
             self._kernel = dtw.spatial_dtw(W, band)
 
-    def _warm_up(self) -> None:
-        """Compile the kernel and load the libraries before the first image."""
-        W, _, d = self._strips.shape
-        self.distances(torch.zeros(W, d), torch.zeros(W))
-
     @property
     def places(self) -> int:
         """Return the number of places n of the map."""
         return self._strips.shape[1]
 
     def distances(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-        """
-        Return the distances of one image to every place.
-
-        :param strips: shape (W, d), float32, on any device.
-        :param weights: shape (W,).
-        :returns: shape (n,), float32, on the device.
-        """
+        """Return the distances of one image, on any device, to every place, (n,)."""
         return self.distance_matrix(strips[:, None], weights[:, None])[0]
 
     def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-        """
-        Return the distances of many images to every place.
-
-        :param strips: shape (W, Q, d), float32, on any device.
-        :param weights: shape (W, Q).
-        :returns: shape (Q, n), float32, on the device.
-        """
+        """Return the distances of Q images, on any device, to every place, (Q, n)."""
         device = self._runtime.torch_device
         strips = strips.transpose(0, 1)
         if self._reciprocals is None:  # others are rounded on the CPU
@@ -158,13 +140,13 @@ class CudaMatcher:
         is_whole = last - first == n and self._reciprocals is None
         if is_whole and self._strips.is_contiguous():  # the map is one matrix, read once
             block, view = self._space((rows, W, n), (0, 1, 2))
-            self._multiply(
-                torch.mm, vectors, self._strips.view(W * n, d).T, block.view(rows, W * n)
-            )
+            references = self._strips.view(W * n, d).T.float()
+            torch.mm(vectors.float(), references, out=block.view(rows, W * n))
             return view
         block, view = self._space((W, rows, last - first), (1, 0, 2))
-        references = self._strips[:, first:last].transpose(1, 2)
-        self._multiply(torch.bmm, vectors.expand(W, rows, d), references, block)
+        # products of whole numbers and their sums are exact in float32
+        references = self._strips[:, first:last].transpose(1, 2).float()
+        torch.bmm(vectors.expand(W, rows, d).float(), references, out=block)
         if self._reciprocals is not None and lengths is not None:
             block.mul_(self._reciprocals[:, None, first:last]).mul_(lengths[:, None])
         return view
@@ -177,12 +159,6 @@ class CudaMatcher:
             self._workspace = block, self._runtime.array(block.permute(order))
         return self._workspace
 
-    def _multiply(
-        self, product: Any, left: torch.Tensor, right: torch.Tensor, out: torch.Tensor
-    ) -> None:
-        """Multiply; products of whole numbers and their sums are exact in float32."""
-        product(left.float(), right.float(), out=out)
-
     def _holistic(self, query: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Distances (n,) without alignment."""
         if self._reciprocals is None:
@@ -194,7 +170,7 @@ class CudaMatcher:
         for first in range(0, n, PLACES_IN_PIECES):
             piece = slice(first, first + PLACES_IN_PIECES)
             part = torch.empty_like(similarity[:, piece], memory_format=torch.contiguous_format)
-            self._multiply(torch.bmm, self._strips[:, piece], vectors[:, :, None], part)
+            torch.bmm(self._strips[:, piece].float(), vectors[:, :, None].float(), out=part)
             similarity[:, piece] = part
         similarity.mul_(self._reciprocals[:, :, None]).mul_(lengths[:, None, None])
         return 1 - (similarity[:, :, 0] * weights[:, None] * self._weights).sum(dim=0)

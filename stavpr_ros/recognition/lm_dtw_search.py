@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nearest sequence of the map by LM-DTW, on the CPU."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +9,9 @@ from stavpr_ros.alignment.lm_dtw import (
     best_match,
     match_padded,
     padded_width,
-    SequenceMatch,
 )
 from stavpr_ros.alignment.path import NO_PATH, trace_sequence
 from stavpr_ros.recognition.sequence_search import SequenceBuffer, WindowMatch
-from stavpr_ros.recognition.sessions import Sequences
 
 
 class LmDtwSearch:
@@ -40,24 +37,13 @@ class LmDtwSearch:
         path = NO_PATH
         if nearest is not None:
             path = trace_sequence(window[:, :n], nearest.first, k)
-        return _renumbered(
-            nearest, path, lambda: (matches.distances, matches.middles + first), first
-        )
-
-
-def _renumbered(
-    nearest: SequenceMatch | None, path: np.ndarray, sequences: Callable[[], Sequences], first: int
-) -> WindowMatch:
-    """Return a match whose places are counted from the first place ever, evicted ones included."""
-    if nearest is None or not first:
-        return WindowMatch(nearest, path, sequences)
-    path[:, 1] += first
-    second_best = nearest.second_best_index
-    moved = replace(
-        nearest,
-        first=nearest.first + first,
-        last=nearest.last + first,
-        middle=nearest.middle + first,
-        second_best_index=second_best + first if second_best >= 0 else -1,
-    )
-    return WindowMatch(moved, path, sequences)
+            path[:, 1] += first  # counted from the first place ever, evicted ones included
+            second_best = nearest.second_best_index
+            nearest = replace(
+                nearest,
+                first=nearest.first + first,
+                last=nearest.last + first,
+                middle=nearest.middle + first,
+                second_best_index=second_best + first if second_best >= 0 else -1,
+            )
+        return WindowMatch(nearest, path, lambda: (matches.distances, matches.middles + first))

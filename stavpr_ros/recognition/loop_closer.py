@@ -8,7 +8,6 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
@@ -16,7 +15,7 @@ from stavpr_ros.recognition.cpu_matcher import CpuRouteMatcher
 from stavpr_ros.recognition.match import Match, Status
 from stavpr_ros.recognition.matcher import PRECISIONS
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
-from stavpr_ros.recognition.robust import FilterSettings, z_normalized
+from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.route_features import RouteFeatures
 from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
 from stavpr_ros.recognition.settings import RecognizerSettings
@@ -70,6 +69,8 @@ class LoopCloser(SequenceRecognizer):
     :raises UnavailableError: no such backend here.
     """
 
+    _around = AROUND
+
     def __init__(
         self,
         settings: RecognizerSettings,
@@ -85,21 +86,28 @@ class LoopCloser(SequenceRecognizer):
             raise SettingsError(
                 f'precision {precision!r} is unknown: take one of {", ".join(PRECISIONS)}'
             )
-        super().__init__(settings, feature_settings, 0, to_oldest=True, model=MODEL)
+        backend = choose_loop_backend(backend)
+        super().__init__(
+            settings, feature_settings, 0, to_oldest=True, model=MODEL, backend=backend
+        )
         W = feature_settings.strips
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
-        self._matcher = _matcher(W, settings.spatial, choose_loop_backend(backend))
+        self._matcher: CpuRouteMatcher | CudaRouteMatcher
+        if backend == 'cpu':
+            self._matcher = CpuRouteMatcher(W, settings.spatial)
+        else:
+            from stavpr_ros.recognition import cuda_matcher
+
+            self._matcher = cuda_matcher.CudaRouteMatcher(W, settings.spatial)
         options = settings.applied_options
         device = self._matcher.device
         self._route = RouteFeatures(
             feature_settings, options.mean_centering, options.whitening, limit, precision, device
         )
-        if device is not None and self._filter is not None:
-            self._match_on_device()
         # of the images of the window: each one had a match as the middle one
         self._closed: deque[bool] = deque(maxlen=settings.sequence.length)
         self._track: list[np.ndarray] = []  # position of each place held
-        self._compare(self._track)
+        self._enable_odometry_check(self._track)
         # stamps of the latest places, not yet old enough in seconds
         self._young: deque[int] = deque()
         self._places = 0  # the newest image may be matched with so many of the oldest places
@@ -132,16 +140,9 @@ class LoopCloser(SequenceRecognizer):
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
     ) -> Match:
         """
-        Add the next image and match the window that ends with it; places are earlier images.
+        See :meth:`SequenceRecognizer.update`; places are earlier images.
 
-        An error leaves everything as it was.
-
-        :param features: those of one image, strips (W, 1, d).
-        :param stamp: when it was taken, ns; 0 = unknown: it is then excluded by the count of
-            images alone.
-        :param pose: by odometry, shape (7,), z is up; None = unknown.
-        :raises FeatureMismatchError: made with other settings.
-        :raises InputError: not one image, features that are not finite, or an invalid pose.
+        Without a stamp, only the count of images excludes places.
         """
         position = position_of(pose)
         self._require_one_image(features, 'the route so far')
@@ -189,15 +190,19 @@ class LoopCloser(SequenceRecognizer):
     def _append(self, features: LocalFeatures, stamp: int) -> None:
         """Make the image a place, and count the places that it may be matched with."""
         route = self._route
+        parts: list[SequenceBuffer | FilterSearch] = [self._buffer]
+        if self._filter is not None:
+            parts.append(self._filter)
         if route.count == self._limit:
             evicted = max(1, self._limit // EVICTED)
-            for part in (route, *self._parts()):
+            route.evict(evicted)
+            for part in parts:
                 part.evict(evicted)
             del self._track[:evicted]
             while len(self._young) > route.count:
                 self._young.popleft()
         if route.append(features):
-            for part in self._parts():
+            for part in parts:
                 part.grow(route.room)
         if self._filter is not None:
             latest = route.latest.numpy()
@@ -205,11 +210,6 @@ class LoopCloser(SequenceRecognizer):
             self._filter.change.recenter_query(latest[:, -2:][:, 0])
         self._young.append(stamp)
         self._places = max(0, route.count - max(self._exclude, self._count_young(stamp)))
-
-    def _parts(self) -> list[SequenceBuffer | FilterSearch]:
-        """Return what has an entry for each place."""
-        own = [self._filter] if self._filter is not None else []
-        return [self._buffer, *own]
 
     def _count_young(self, stamp: int) -> int:
         """Count the latest places, the newest included, that are too young for this stamp."""
@@ -219,30 +219,11 @@ class LoopCloser(SequenceRecognizer):
             young.popleft()
         return len(young) if stamp else 0
 
-    def _z_normalized(self, row: np.ndarray, counted: np.ndarray) -> np.ndarray:
-        return z_normalized(row, AROUND, counted)
-
-    def _z_normalized_on(self, row: torch.Tensor) -> torch.Tensor:
-        from stavpr_ros.recognition.cuda_filter import z_normalized_on_device
-
-        counted = torch.from_numpy(self._counted(len(row))).to(row.device)
-        return z_normalized_on_device(row, AROUND, counted)
-
     def _distances(self) -> torch.Tensor:
         """Return the distances of the newest image to its places; none if they are too few."""
         if self._places < LEAST_PLACES:
             return torch.empty(0, device=self._matcher.device)
         return self._matcher.to_oldest(self._route.strips, self._route.newest, self._places)
-
-
-def _matcher(
-    W: int, spatial: SpatialSettings, backend: str
-) -> 'CpuRouteMatcher | CudaRouteMatcher':
-    if backend == 'cpu':
-        return CpuRouteMatcher(W, spatial)
-    from stavpr_ros.recognition.cuda_matcher import CudaRouteMatcher
-
-    return CudaRouteMatcher(W, spatial)
 
 
 def least_limit(exclude: int, length: int) -> int:

@@ -1,30 +1,35 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-How much the images of a map change from place to place.
+How much images change from place to place of the map, and from image to image of the query.
 
 The change of two images is 1 less the mean cosine similarity of their strips, each with the one in
-the same place: 0 for equal images, about 1 for unrelated ones.
+the same place: 0 for equal images, about 1 for unrelated ones. How it grows with the number of
+places in between is learned from the map, so that the query's changes show how fast it moves.
 """
+
+from collections import deque
 
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
-from stavpr_ros.alignment.cpu.int8 import Int8Strips
-from stavpr_ros.recognition.blocks import PlaceChanges
-from stavpr_ros.recognition.robust import change_weights, FilterSettings
-import torch
+from stavpr_ros.recognition.robust import change_weights, FilterSettings, LEAST_DISTINCT
 
-LEARNED_AT_ONCE = 256  # places
 APART = 5  # places apart up to which the map's changes are learned
 STANDING = 0.05  # weight of a place by its change, up to which the curve is not learned from it
 AHEAD = 8  # places within which an unlit stretch may begin
 STRETCH = 4  # places in a row, at least, equal each to the one before: an unlit stretch
 UNLIT = 0.3  # probability of such places above which equal images do not mean standstill
+SPREAD, SCALE = 0.25, 0.4  # deviations of the logarithm: of each change, of all in other light
+NOISE = 0.15  # deviation of what noise adds to all changes
+LEAST_LIKELY = -8.0  # logarithm of the least likelihood of a speed, without its exponent
+SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
+OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
+FLOOR = 1e-3  # least relative probability of a speed
 
 
-class MapChange:
+class ImageChange:
     """
-    Changes of a map from place to place.
+    Changes of a map from place to place, and of a query from image to image.
 
     ``curve`` holds the mean change of places 0, 1, ... ``APART`` apart while the camera moves, 1
     where none is known; ``standstill`` the change below which a camera stands.
@@ -37,27 +42,11 @@ class MapChange:
         self._sums, self._counts = np.zeros(APART + 1), np.zeros(APART + 1)
         self._from_before = np.ones(places, np.float32)  # change of each place from the one before
         self._update_curve()
+        self.reset()
 
-    def learn(
-        self,
-        strips: torch.Tensor | np.ndarray | Int8Strips,
-        firsts: np.ndarray | tuple[int, ...] = (0,),
-    ) -> None:
+    def learn(self, changes: np.ndarray, firsts: np.ndarray | tuple[int, ...] = (0,)) -> None:
         """
-        Learn from all places of a map.
-
-        :param strips: unit-norm, (W, n, d), of any precision.
-        :param firsts: first place of each session.
-        """
-        n = strips.shape[1]
-        seen = PlaceChanges(n, APART)
-        for low in range(0, n, LEARNED_AT_ONCE):
-            seen.add(torch.as_tensor(strips[:, low : low + LEARNED_AT_ONCE]))
-        self.take(seen.changes, firsts)
-
-    def take(self, changes: np.ndarray, firsts: np.ndarray | tuple[int, ...] = (0,)) -> None:
-        """
-        Take the changes of all places of a map.
+        Learn from the changes of all places of a map.
 
         :param changes: of each place from the ones 1 to ``APART`` places before, (``APART``, n).
         :param firsts: first place of each session.
@@ -97,9 +86,9 @@ class MapChange:
             self._counts[1 : len(changes) + 1] += 1
             self._update_curve()
 
-    def adopt(self, learned: 'MapChange', from_before: np.ndarray) -> None:
+    def copy_statistics(self, learned: 'ImageChange', from_before: np.ndarray) -> None:
         """
-        Take what was learned from a sample, for some places of its map.
+        Use what was learned from a sample of the map that these places are of.
 
         :param from_before: change of each place from the one before, (n,), float32.
         """
@@ -124,11 +113,22 @@ class MapChange:
         self.curve[0] = 0
         self.standstill = self._settings.standstill * self.curve[1]
         self._find_equal()
+        speeds = np.array(self._settings.speeds)
+        left = np.maximum(1 - self.curve, 0)  # of the similarity: it shrinks in one ratio further
+        ratio = min(left[-1] / left[-2], 1) if left[-2] > 0 else 0.0
+        beyond = np.arange(1, int(np.ceil(APART * speeds.max())) - APART + 1)
+        curve = np.append(self.curve, self.curve[-1] + left[-1] * (1 - ratio**beyond))
+        changes = np.interp(np.outer(speeds, range(1, APART + 1)), np.arange(len(curve)), curve)
+        changes += OFFSET
+        covariances = SPREAD**2 * np.eye(APART) + SCALE**2
+        covariances = covariances + NOISE**2 / (changes[:, :, None] * changes[:, None])
+        # by speed, and images apart
+        self._expected, self._precisions = np.log(changes), np.linalg.inv(covariances)
 
     def _find_equal(self) -> None:
         self._equal = self._from_before < self.standstill  # to the place before, up to noise
 
-    def unlit(self, by_place: np.ndarray) -> bool:
+    def is_dark_stretch(self, by_place: np.ndarray) -> bool:
         """
         Whether equal images are expected where the camera is: places of the map are equal there.
 
@@ -142,3 +142,74 @@ class MapChange:
         for places in range(min(AHEAD, n)):
             ahead[: n - places] |= equal[places:]
         return bool(by_place[ahead].sum() > UNLIT * by_place.sum())
+
+    def reset(self) -> None:
+        """Forget the query."""
+        self._last: np.ndarray | None = None
+        self._latest: deque[float] = deque(maxlen=SMOOTHED)
+        self._moving: deque[np.ndarray] = deque(maxlen=APART + 1)  # latest images with motion
+        self._by_apart: deque[list[float]] = deque(maxlen=SMOOTHED)  # their latest changes
+
+    def next_query(self, strips: np.ndarray) -> float:
+        """Return the change of the query's next image (W, d) from the one before, 1 at first."""
+        change = 1.0 if self._last is None else change_between(strips, self._last)
+        self._last = strips
+        if not self.is_standstill(change):
+            self._moving.append(strips)
+        return change
+
+    def recenter_query(self, strips: np.ndarray) -> None:
+        """Take the query's last image (W, d) again: its mean has changed. None after a reset."""
+        if self._last is not None:
+            self._last = strips
+
+    def is_standstill(self, change: float) -> bool:
+        """Whether the query's images are equal up to noise: the camera stands, or it is dark."""
+        return bool(change < self.standstill)
+
+    def distinct(self, n: int) -> np.ndarray:
+        """Return which of n places count, (n,), bool: of a standstill one; all if few would."""
+        distinct = ~self._equal[:n]
+        return distinct if np.count_nonzero(distinct) >= LEAST_DISTINCT else np.ones(n, bool)
+
+    def stood(self) -> np.ndarray:
+        """Return the places where the map's camera stood, (places there is room for,), bool."""
+        stood = self._equal.copy()
+        stood[:-1] |= self._equal[1:]
+        return stood
+
+    def stretches(self, first: int, end: int) -> np.ndarray:
+        """Return the number of the stretch of equal places that each is in, (end - first,)."""
+        return np.cumsum(~self._equal[first:end])
+
+    def weight(self, change: float) -> float:
+        """Return the exponent alpha of the image's likelihood."""
+        s = self._settings
+        relative = change / max(float(self.curve[1]), 1e-6)
+        return s.weight * min(s.most_change, max(s.least_change, relative))
+
+    def speed_weights(self, change: float) -> np.ndarray:
+        """Return the relative probability of each speed after another change, (V,)."""
+        self._latest.append(change)
+        seen = np.log(sum(self._latest) / len(self._latest) + OFFSET)
+        off = (seen - self._expected[:, 0]) / self._settings.change_deviation
+        return np.asarray(np.exp(-0.5 * off**2) + FLOOR)
+
+    def speed_likelihoods(self, change: float) -> np.ndarray:
+        """
+        Return the likelihood of each speed after another change, of the most likely one 1, (V,).
+
+        The likelihood of the state off the map is 1. Compared are the logarithms of the changes of
+        images 1 to ``APART`` apart, each the mean of the latest ones, with those on the curve of
+        the map. Light makes all of them smaller or larger, and noise larger: both count as
+        Gaussian errors that the changes have in common.
+        """
+        if len(self._moving) <= APART or not self._settings.speed_weight:
+            return np.ones(len(self._expected))
+        newest = self._moving[-1]
+        before = [self._moving[-1 - apart] for apart in range(2, APART + 1)]
+        self._by_apart.append([change, *(change_between(newest, image) for image in before)])
+        off = np.log(np.mean(self._by_apart, axis=0) + OFFSET) - self._expected
+        logs = -0.5 * np.einsum('vi,vij,vj->v', off, self._precisions, off)
+        likely = np.exp(self._settings.speed_weight * np.maximum(logs - logs.max(), LEAST_LIKELY))
+        return np.asarray(likely)

@@ -27,7 +27,6 @@ state came from in speed travels in the lowest two bits of its probability, whic
 on; two origins share a byte, those of an even speed and of the next.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numba as nb
@@ -93,12 +92,14 @@ class PlaceFilter:
     """
     The filter over n places; see the module.
 
+    ``count`` is the number of images since the reset.
+
     It holds 4 bytes for each state of a place and half a byte for each image of the lag: 247 bytes
     a place with the default speeds and levels and a lag of 10.
 
     :param places: places that there is room for.
     :param lag: most images that states are followed back.
-    :param gaps: places that there are none of, between sessions: who moves there is off the map.
+    :param gaps: columns between sessions; a state that enters one leaves the map.
     """
 
     def __init__(
@@ -134,17 +135,7 @@ class PlaceFilter:
         self._a[:] = self._by_place[:] = self._maxima[:] = 0
         self._scale = 1.0
         self._off = np.full(len(self._levels), 1 / len(self._levels))
-        self._count = self._known = 0
-
-    @property
-    def count(self) -> int:
-        """Images since the reset."""
-        return self._count
-
-    @property
-    def off_map(self) -> float:
-        """Probability that the camera is off the map."""
-        return float(self._off.sum())
+        self._known = self.count = 0
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -162,11 +153,10 @@ class PlaceFilter:
 
     def _set_by_place(self, by_place: np.ndarray) -> None:
         self._by_place[: len(by_place)], self._by_place[len(by_place) :] = by_place, 0
-        self._find_maxima(range(len(self._maxima)))
+        self._find_maxima(slice(None))
 
-    def _find_maxima(self, blocks: Iterable[int]) -> None:
-        for block in blocks:
-            self._maxima[block] = self._by_place[block * BLOCK : (block + 1) * BLOCK].max()
+    def _find_maxima(self, blocks: slice | np.ndarray) -> None:
+        self._maxima[blocks] = self._by_place.reshape(-1, BLOCK)[blocks].max(axis=1)
 
     def places_of_states(self) -> np.ndarray:
         """Return the probability of each place, (room,), float32."""
@@ -188,12 +178,12 @@ class PlaceFilter:
         :param speed_likelihoods: of each speed relative to that off the map, (V,).
         """
         s, n = self.settings, len(z)
-        slot = self._count % len(self._steps)
-        moved = np.rint(self._speeds * (self._count + 1)) - np.rint(self._speeds * self._count)
+        slot = self.count % len(self._steps)
+        moved = np.rint(self._speeds * (self.count + 1)) - np.rint(self._speeds * self.count)
         self._steps[slot] = moved
         real = max(n - len(self._gaps), 1)
         states = len(self._levels) * len(self._speeds) * real
-        if not self._count and n:
+        if not self.count and n:
             self._a[: -(-n // BLOCK)] = s.start / states
             self._off[:] = (1 - s.start) / len(self._levels)
             self._clear_from(n)
@@ -227,7 +217,7 @@ class PlaceFilter:
         total = float(off.sum() + seen.sum())
         self._off, self._scale = off / total, 1 / total
         self._known = n
-        self._count += 1
+        self.count += 1
 
     def _clear_from(self, n: int) -> None:
         """Set states and sums from place n on to 0."""
@@ -248,16 +238,16 @@ class PlaceFilter:
         ways, states = np.empty((most, 5), np.int64), np.empty(most, np.float32)
         count = followed_back(
             self._a, np.float32(least or 1), top, self._origins, self._steps,
-            (self._count - 1) % len(self._steps), images_ago, ways, states,
+            (self.count - 1) % len(self._steps), images_ago, ways, states,
         )  # fmt: skip
         return belief_of(ways[:count], states[:count].astype(np.float64) * self._scale)
 
     def _top(self, n: int) -> np.ndarray:
         """Return the ``TOP`` most probable places, int64; they lie in blocks with large maxima."""
         blocks = max(1, -(-n // BLOCK))
-        some = np.sort(np.argpartition(self._maxima[:blocks], max(blocks - TOP, 0))[-TOP:])
+        part = np.sort(np.argpartition(self._maxima[:blocks], max(blocks - TOP, 0))[-TOP:])
         places = np.empty(min(TOP, n), np.int64)
-        _largest(self._by_place, some, n, places)
+        _largest(self._by_place, part, n, places)
         return places
 
     def probable_blocks(self) -> np.ndarray:
@@ -283,7 +273,7 @@ class PlaceFilter:
         places = np.empty(images + 1, np.int32)
         trace_back(
             *(int(i) for i in state[:3]), self._origins, self._steps,
-            (self._count - 1) % len(self._steps), images, places,
+            (self.count - 1) % len(self._steps), images, places,
         )  # fmt: skip
         return places
 
@@ -334,7 +324,7 @@ def exp(x):
 
 
 @kernel
-def _see(z, first, count, weight, mu, seen):
+def _likelihoods(z, first, count, weight, mu, seen):
     """Write the likelihood of each level and place into seen (K, BLOCK); 0 from ``count`` on."""
     K = len(mu)
     flat = seen.reshape(-1)
@@ -512,7 +502,7 @@ def advance(
             first = part * PLACES + block * BLOCK
             count, at = min(BLOCK, n - first), first // BLOCK
             whole = (count + LANES - 1) // LANES * LANES
-            _see(z, first, count, weight, mu, seen)
+            _likelihoods(z, first, count, weight, mu, seen)
             if block:
                 before = (at - 1) * size + BLOCK - reach
                 _mix(states, before, BLOCK, reach, levels, speeds, b, mixed, 0, width, sums)
@@ -659,7 +649,7 @@ def _merge(ways, probabilities, order, best, weights):
 
 @kernel
 def _sum_close(places, weights, n, near, sums):
-    """Write the places of n close to any of some, ascending, and their probabilities <= 1."""
+    """Write places within ``CLOSE`` of any of these, ascending, and probabilities, at most 1."""
     found = low = end = 0
     for place in places:
         for y in range(max(place - CLOSE, end), min(place + CLOSE + 1, n)):
@@ -676,7 +666,7 @@ def _sum_close(places, weights, n, near, sums):
 
 @kernel
 def _most_probable(by_place, maxima, excluded):
-    """Return the place with the largest sum but some, ascending, and the sum; 0 if all are."""
+    """Return the most probable place outside ``excluded``, ascending, and its sum, 0 if none."""
     best, at, i = F(-1), 0, 0
     for block in range(len(maxima)):
         while i < len(excluded) and excluded[i] < block * BLOCK:

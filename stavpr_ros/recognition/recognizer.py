@@ -58,6 +58,8 @@ class SequenceRecognizer(ABC):
     :param layout: of a map of several sessions.
     :param to_oldest: see :class:`stavpr_ros.recognition.sequence_search.FilterSearch`.
     :param model: of the filter.
+    :param backend: where the window and the filter are, ``cpu`` or ``cuda``; without a filter, on
+        the CPU.
 
     ``problem`` is why places of the map cannot be reached, empty while they can; ``stages`` what
     a time budget chose, empty without one.
@@ -65,6 +67,7 @@ class SequenceRecognizer(ABC):
 
     problem = ''
     stages = ''
+    _around = 0  # see z_normalized
 
     def __init__(
         self,
@@ -74,17 +77,26 @@ class SequenceRecognizer(ABC):
         layout: SessionLayout | None = None,
         to_oldest: bool = False,
         model: FilterSettings | None = None,
+        backend: str = 'cpu',
     ) -> None:
         sequence = settings.sequence
         self._settings, self._feature_settings = settings, feature_settings
         self._options = settings.applied_options
-        self._layout, self._to_oldest, self._model = layout, to_oldest, model
+        self._layout = layout
         columns = places if layout is None else layout.width
+        on_device = backend == 'cuda' and self._options.place_filter
+        device = torch.device('cpu')
+        if on_device:
+            from stavpr_ros.alignment.cuda.compilation import runtime
+
+            device = runtime().torch_device
         copies = 1 if self._options.place_filter else 2
-        self._buffer = SequenceBuffer(sequence.length, columns, sequence.k, copies=copies)
+        self._buffer = SequenceBuffer(
+            sequence.length, columns, sequence.k, device=device, copies=copies
+        )
         self._filter = None
         if self._options.place_filter:
-            self._filter = FilterSearch(self._buffer, model, layout, to_oldest)
+            self._filter = FilterSearch(self._buffer, model, layout, to_oldest, on_device)
         self._search: Search = self._filter or LmDtwSearch(self._buffer)
         # x and y of each place, or of the places held; empty = unknown
         self._positions: Positions = ()
@@ -100,37 +112,18 @@ class SequenceRecognizer(ABC):
         """
         Add the next image and match the window that ends with it.
 
-        :param features: of one image.
-        :param stamp: ns, 0 = unknown.
-        :param pose: by odometry, shape (7,), or None.
+        An error leaves everything as it was.
+
+        :param features: those of one image, strips (W, 1, d).
+        :param stamp: when it was taken, ns; 0 = unknown.
+        :param pose: by odometry, shape (7,), z is up; None = unknown.
+        :raises FeatureMismatchError: made with other settings than the places.
+        :raises InputError: not one image, features that are not finite, or an invalid pose.
         """
 
     @abstractmethod
     def reset(self) -> None:
         """Drop the images of the window."""
-
-    def _match_on_device(self) -> None:
-        """Move the window and the filter to the CUDA device."""
-        from stavpr_ros.alignment.cuda.compilation import runtime
-
-        assert self._filter is not None
-        sequence, places, change = (
-            self._settings.sequence,
-            self._buffer.places,
-            self._filter.change,
-        )
-        device = runtime().torch_device
-        self._buffer = SequenceBuffer(sequence.length, places, sequence.k, device=device, copies=1)
-        self._filter = FilterSearch(
-            self._buffer, self._model, self._layout, self._to_oldest, on_device=True
-        )
-        self._filter.change = change
-        self._search = self._filter
-
-    @property
-    def settings(self) -> RecognizerSettings:
-        """Return the settings in force."""
-        return self._settings
 
     @property
     def window_fill(self) -> int:
@@ -222,7 +215,7 @@ class SequenceRecognizer(ABC):
         """
         on_device = self._filter is not None and self._filter.on_device
         if self._options.query_znorm:
-            row = self._z_normalized_on(row) if on_device else self._z_normalized_here(row)
+            row = self._z_normalized(row, on_device)
         if self._layout is not None:
             row = self._layout.spread(row)
         self._buffer.push(row.to(self._buffer.memory.device), stamp)
@@ -232,46 +225,42 @@ class SequenceRecognizer(ABC):
             change = self._filter.change.next_query(strips.cpu().numpy())
             self._filter.update(row if on_device else row.cpu().numpy(), change)
             self._changes.append(change)
-        match = self._compared(self._match_window(), position)
-        self._nearest = match.sequence
-        return replace(
-            match, window_stamps=self._buffer.stamps, window_changes=tuple(self._changes)
-        )
+        return self._compared(self._match_window(), position)
 
-    def _compare(self, positions: Positions) -> None:
-        """Compare matches with odometry, if the settings want it, by the positions of places."""
+    def _enable_odometry_check(self, positions: Positions) -> None:
+        """Compare matches with odometry, if odometry_error > 0, by the positions of places."""
         error, length = self._settings.odometry_error, self._settings.sequence.length
         if error and self._filter is not None:
             self._positions, self._motion = positions, RelativeMotion(length, error)
 
     def _compared(self, match: Match, position: np.ndarray) -> Match:
-        """Return a match, less probable if odometry disagrees with its path."""
-        if self._motion is None or match.sequence is None or np.isnan(position[0]):
-            return match
-        first = self._buffer.first
-        session = first, first + len(self._positions)
-        if self._layout is not None:
-            session = self._layout.session_of(match.sequence.middle)
-        return self._motion.compared(match, self._positions, first, session)
+        """Return a match of the window, less probable if odometry disagrees with its path."""
+        if not (self._motion is None or match.sequence is None or np.isnan(position[0])):
+            first = self._buffer.first
+            session = first, first + len(self._positions)
+            if self._layout is not None:
+                session = self._layout.session_of(match.sequence.middle)
+            match = self._motion.compared(match, self._positions, first, session)
+        self._nearest = match.sequence
+        return replace(
+            match, window_stamps=self._buffer.stamps, window_changes=tuple(self._changes)
+        )
 
-    def _z_normalized(self, row: np.ndarray, counted: np.ndarray) -> np.ndarray:
-        if self._layout is not None:
-            return self._layout.z_normalized(row, counted)
-        return z_normalized(row, counted=counted)
-
-    def _z_normalized_here(self, row: torch.Tensor) -> torch.Tensor:
-        return torch.from_numpy(self._z_normalized(row.cpu().numpy(), self._counted(len(row))))
-
-    def _counted(self, n: int) -> np.ndarray:
-        """Return which of the first n places count for the mean distance, (n,), bool."""
-        return np.ones(n, bool) if self._filter is None else self._filter.change.distinct(n)
-
-    def _z_normalized_on(self, row: torch.Tensor) -> torch.Tensor:
-        from stavpr_ros.recognition.cuda_filter import z_normalized_on_device
-
+    def _z_normalized(self, row: torch.Tensor, on_device: bool) -> torch.Tensor:
+        """Return the row, z-normalized in each session by the places that count."""
+        n = len(row)
+        counted = np.ones(n, bool) if self._filter is None else self._filter.change.distinct(n)
         runs = [slice(None)] if self._layout is None else self._layout.runs
-        counted = torch.from_numpy(self._counted(len(row))).to(row.device)
-        return torch.cat([z_normalized_on_device(row[run], counted=counted[run]) for run in runs])
+        around = self._around
+        if on_device:
+            from stavpr_ros.recognition.cuda_filter import z_normalized_on_device
+
+            known = torch.from_numpy(counted).to(row.device)
+            return torch.cat([z_normalized_on_device(row[i], around, known[i]) for i in runs])
+        values = row.cpu().numpy()
+        return torch.from_numpy(
+            np.concatenate([z_normalized(values[i], around, counted[i]) for i in runs])
+        )
 
     def _match_window(self) -> Match:
         threshold, length = self._settings.threshold, self._settings.sequence.length
@@ -327,10 +316,11 @@ class PlaceRecognizer(SequenceRecognizer):
         backend: str = 'cpu',
         precision: str = 'float32',
     ) -> None:
+        backend = choose_backend(backend)
         layout = layout_of(place_map, settings.nms_radius)
-        super().__init__(settings, place_map.settings, len(place_map), layout)
+        super().__init__(settings, place_map.settings, len(place_map), layout, backend=backend)
         if place_map.poses is not None and place_map.has_poses:
-            self._compare(place_map.poses[:, :2])
+            self._enable_odometry_check(place_map.poses[:, :2])
         features = place_map.features
         if not isinstance(features, StoredFeatures):  # these are checked whenever they are read
             for _, some in blocks(features):
@@ -341,13 +331,10 @@ class PlaceRecognizer(SequenceRecognizer):
             features, self._options, 'float32' if settings.spatial.vertical else precision
         )
         self._centering, held = held_map.centering, held_map.features
-        backend = choose_backend(backend)
         self._matcher = make_matcher(held, settings.spatial, backend, precision)
         if self._filter is not None:
             firsts = (0,) if layout is None else layout.firsts
-            self._filter.change.take(held_map.changes, firsts)
-        if backend == 'cuda' and self._filter is not None:
-            self._match_on_device()
+            self._filter.change.learn(held_map.changes, firsts)
         if backend == 'cuda' and not self._options.any:
             from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
 
@@ -456,17 +443,7 @@ class PlaceRecognizer(SequenceRecognizer):
     def update(
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
     ) -> Match:
-        """
-        Add the next image and match the window that ends with it.
-
-        An error leaves the window as it was.
-
-        :param features: those of one image, strips (W, 1, d).
-        :param stamp: when it was taken, ns; 0 = unknown.
-        :param pose: by odometry, shape (7,), z is up; None = unknown.
-        :raises FeatureMismatchError: made with other settings than the map's.
-        :raises InputError: not one image, features that are not finite, or an invalid pose.
-        """
+        """See :meth:`SequenceRecognizer.update`."""
         position = position_of(pose)
         self._require_one_image(features, 'the map')
         self._require_dimension(features)
@@ -481,9 +458,9 @@ class PlaceRecognizer(SequenceRecognizer):
             row = stage.distances(strips, weights, centering.next_query(features.vectors))
         match = self._match(row, strips, stamp, position)
         if self._filter is not None:
-            stands = self._filter.change.is_standstill(self._changes[-1])
+            is_standing = self._filter.change.is_standstill(self._changes[-1])
             for centering in self._centerings:
-                centering.stands(stands)
+                centering.note_standstill(is_standing)
         return match
 
 

@@ -64,7 +64,8 @@ class RelativeMotion:
         follows = match.accepted and 0 <= place - self._last <= FARTHEST
         self._followed = self._followed + 1 if follows else 0
         self._last = place
-        low, high = max(session[0], place - self._reach), min(session[1], place + self._reach)
+        reach = FARTHEST * len(self.way) + 1  # places to either side that the way may lead along
+        low, high = max(session[0], place - reach), min(session[1], place + reach)
         track = np.array(positions[low - first : high - first])
         way, after = np.array(self.way), self._length - 1 - (self._length - 1) // 2
         agreed = 1.0
@@ -74,11 +75,6 @@ class RelativeMotion:
             )
             agreed = agreed if np.isnan(found) else min(agreed, found)
         return less_probable(match, agreed)
-
-    @property
-    def _reach(self) -> int:
-        """Return the places to either side that the way may lead along."""
-        return FARTHEST * len(self.way) + 1
 
 
 def less_probable(match: Match, agreed: float) -> Match:

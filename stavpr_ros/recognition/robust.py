@@ -8,7 +8,7 @@ and successive ones are correlated.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -71,12 +71,11 @@ class RobustOptions:
 
         :raises SettingsError: no option of that name.
         """
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        known = [field.name for field in fields(self)]
         for name in names:
-            if name not in values:
-                raise SettingsError(f'option {name!r} is unknown: take one of {", ".join(values)}')
-            values[name] = False
-        return RobustOptions(**values)
+            if name not in known:
+                raise SettingsError(f'option {name!r} is unknown: take one of {", ".join(known)}')
+        return replace(self, **dict.fromkeys(names, False))
 
 
 PAPER = RobustOptions(False, False, False, False)
@@ -302,7 +301,9 @@ class MeanCentering:
     def _converted(self, strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
         if strips.shape[1] == 1 and not strips.is_cuda:
             return self._converted_image(strips[:, 0], mean)[:, None]
-        centered = without_mean(strips, mean)
+        centered = strips - mean[:, None]
+        centered *= strips.any(dim=2, keepdim=True)
+        normalize(centered)
         return centered if self.whitening is None else normalize(self.whitening(centered))
 
     def _converted_image(self, strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
@@ -328,13 +329,13 @@ class MeanCentering:
             self._count += 1
         return self._converted(strips[:, None], (self._sum / self._count).float())[:, 0]
 
-    def stands(self, stands: bool) -> None:
+    def note_standstill(self, is_standing: bool) -> None:
         """
-        Take whether the query's camera has stood since the image before the newest.
+        Count the newest image as one of a standstill, or end that.
 
         Of a standstill, ``PRIOR`` images count: else its place would be the mean.
         """
-        self._standing = self._standing + 1 if stands else 0
+        self._standing = self._standing + 1 if is_standing else 0
         if self._standing > PRIOR:
             self._sum, self._count = self._before
 
@@ -359,13 +360,6 @@ def normalize(strips: torch.Tensor) -> torch.Tensor:
     """Give features (..., d) unit norm, in place, and return them; zero ones stay zero."""
     strips /= strips.norm(dim=-1, keepdim=True).clamp_(min=1e-12)
     return strips
-
-
-def without_mean(strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
-    """Return unit-norm (W, n, d) less (W, d)."""
-    centered = strips - mean[:, None]
-    centered *= strips.any(dim=2, keepdim=True)
-    return normalize(centered)
 
 
 def z_normalized(

@@ -46,6 +46,9 @@ class RouteFeatures:
     :param precision: of the features once the route is settled, see the module.
     :param device: a CUDA device where the features lie; None = on the CPU. Only the image's own
         are copied to it, and a sample is copied back when whitening is learned.
+
+    ``latest`` holds the features of the newest ``LATEST`` places, oldest first, (W, m, d), on the
+    CPU; ``mean`` the mean that is subtracted, (W, d), float32, zeros without centering.
     """
 
     def __init__(
@@ -63,7 +66,7 @@ class RouteFeatures:
         # centered, (W, room, d)
         self.strips: RouteStrips = torch.empty((settings.strips, 0, 0), device=self._device)
         self._is_settled, self._since_mean = False, 0  # images since the mean was taken
-        self._latest = torch.empty((settings.strips, 0, 0))  # see latest
+        self.latest = torch.empty((settings.strips, 0, 0))
         self._settings, self._centering, self._limit = settings, mean_centering, limit
         self._whitens = whitening
         # of the features less the mean; on the CPU, and on the device
@@ -74,7 +77,7 @@ class RouteFeatures:
         # (W, room): the norm of each feature before it was made unit norm; 0 for zero features
         self._norms = torch.empty((settings.strips, 0), device=self._device)
         # sum of the original features, and their mean weighted by `change_weights`, (W, d)
-        self._sum = self._mean = torch.empty((settings.strips, 0))
+        self._sum = self.mean = torch.empty((settings.strips, 0))
         self._newest = np.empty((settings.strips, 0), np.float32)  # original
         self._changes = np.empty(0, np.float32)  # from place to place, (room,)
         self._next_mean = 1
@@ -87,17 +90,7 @@ class RouteFeatures:
     @property
     def newest(self) -> torch.Tensor:
         """Centered features of the newest place, (W, 1, d), float32, on the CPU."""
-        return self._latest[:, -1:]
-
-    @property
-    def latest(self) -> torch.Tensor:
-        """Those of the newest ``LATEST`` places, oldest first, (W, m, d)."""
-        return self._latest
-
-    @property
-    def mean(self) -> torch.Tensor:
-        """Return the mean that is subtracted, (W, d), float32; zeros without centering."""
-        return self._mean
+        return self.latest[:, -1:]
 
     def original(self) -> LocalFeatures:
         """
@@ -109,7 +102,7 @@ class RouteFeatures:
         if n and (self._centering or self._whitens):
             strips, norms = self._centered(slice(n)).cpu(), self._norms[:, :n].cpu()
             for j in range(len(strips)):
-                strips[j] += self._mean[j] * (norms[j, :, None] > 0)
+                strips[j] += self.mean[j] * (norms[j, :, None] > 0)
         else:
             strips = self._float32(slice(n)).cpu().clone()
         return LocalFeatures(strips, self._weights[:, :n].clone(), self._settings, self._cells)
@@ -123,11 +116,14 @@ class RouteFeatures:
             self._cells = features.cells
         newest, norms = self._whitened(strips), strips[:, 0].any(dim=1).float()
         if self._centering or self._whitens:
-            change = -self._whitened(self._mean[:, None])[:, 0]
+            change = -self._whitened(self.mean[:, None])[:, 0]
             moved = [_moved(newest[j], norms[j : j + 1], change[j]) for j in range(len(strips))]
             newest = torch.stack([unit for unit, _ in moved])
             norms = torch.cat([length for _, length in moved])
-        self._write(newest.contiguous(), norms)
+        newest = newest.contiguous()
+        self._write(self.count, newest)
+        self._norms[:, self.count] = norms
+        self.latest = torch.cat([self.latest[:, 1 - LATEST :], newest], dim=1)
         self._weights[:, self.count] = features.weights[:, 0]
         before, self._newest = self._newest, strips[:, 0].numpy()
         self._changes[self.count] = change_between(self._newest, before) if self.count else 0
@@ -137,7 +133,7 @@ class RouteFeatures:
         if self._is_settled:
             self._since_mean += 1
             if self._centering and self._since_mean >= self.count:
-                self._update_mean()
+                self._learn(0)
             return grows
         is_full = self.count == min(SETTLED, self._limit or SETTLED)
         settles = is_full and self._precision != 'float32'
@@ -149,28 +145,24 @@ class RouteFeatures:
             self._is_settled, self._since_mean = True, 0
         return grows
 
-    def _write(self, newest: torch.Tensor, norms: torch.Tensor) -> None:
-        """Make features (W, 1, d), of norms (W,) before, those of the next place."""
+    def _write(self, first: int, strips: torch.Tensor) -> None:
+        """Make strips (W, m, d) those of the places from ``first`` on."""
         if isinstance(self.strips, torch.Tensor):
-            self.strips[:, self.count] = newest[:, 0]
+            self.strips[:, first : first + strips.shape[1]] = strips
         else:
-            self.strips.write(self.count, newest)
-        self._norms[:, self.count] = norms
-        self._latest = torch.cat([self._latest[:, 1 - LATEST :], newest], dim=1)
+            self.strips.write(first, strips.cpu())
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the mean is then that of the others until the next eviction."""
         kept = self.count - count
         self._weights[:, :kept] = self._weights[:, count : self.count].clone()
-        if (self._centering or self._whitens) and not self._is_settled:
-            self._sum -= self._total(np.ones(count))
-            self.count = kept
-            self._learn(count)
-            self._changes[:kept] = self._changes[count : count + kept].copy()
-            self._next_mean = self.count + count + 1
-            return
         self._sum -= self._total(np.ones(count))
         self._changes[:kept] = self._changes[count : self.count].copy()
+        if (self._centering or self._whitens) and not self._is_settled:
+            self.count = kept
+            self._learn(count)
+            self._next_mean = self.count + count + 1
+            return
         if isinstance(self.strips, torch.Tensor):
             move_up(self.strips, count, self.count)
         else:
@@ -202,8 +194,8 @@ class RouteFeatures:
         room = room if self._limit is None else min(room, self._limit)
         if not n:
             shape = W, 0, d
-            self._sum, self._mean = torch.zeros((W, d), dtype=torch.float64), torch.zeros((W, d))
-            self.strips, self._latest = self._floats.new_empty(shape), torch.empty(shape)
+            self._sum, self.mean = torch.zeros((W, d), dtype=torch.float64), torch.zeros((W, d))
+            self.strips, self.latest = self._floats.new_empty(shape), torch.empty(shape)
         if isinstance(self.strips, torch.Tensor):
             self.strips = grown(self.strips, room)
         else:
@@ -226,9 +218,7 @@ class RouteFeatures:
             of_piece = torch.stack(sums)
             if self._there:
                 of_piece = self._there.inverse(of_piece[:, None])[:, 0]
-            total += (
-                of_piece.cpu() + (alive * of_place).sum(dim=1, keepdim=True).cpu() * self._mean
-            )
+            total += of_piece.cpu() + (alive * of_place).sum(dim=1, keepdim=True).cpu() * self.mean
         return total
 
     def _weighted_mean(self, first: int, weights: np.ndarray) -> torch.Tensor:
@@ -238,12 +228,12 @@ class RouteFeatures:
         return (total / weights.sum()).float()
 
     def _learn(self, first: int) -> None:
-        """Take the present mean and, of a short route, whitening; ``first`` becomes place 0."""
-        weights = change_weights(self._changes[first : first + self.count])
-        mean = self._weighted_mean(first, weights) if self._centering else self._mean
-        self._shift(first, 0, self._whitened((self._mean - mean)[:, None])[:, 0])
-        self._mean = mean
-        if self._whitens and self.count <= SETTLED:
+        """Take the mean and, until the route is settled, whitening; ``first`` becomes place 0."""
+        weights = change_weights(self._changes[: self.count])
+        mean = self._weighted_mean(first, weights) if self._centering else self.mean
+        self._shift(first, self._whitened((self.mean - mean)[:, None])[:, 0])
+        self.mean, self._since_mean = mean, 0
+        if self._whitens and self.count <= SETTLED and not self._is_settled:
             some = evenly_weighted(weights, SAMPLE)
             whitening = Whitening.learned(unit_norm(self._centered(some)).cpu())
             there = copy(whitening).to(self._device)
@@ -253,44 +243,24 @@ class RouteFeatures:
                 norms.copy_(strips.norm(dim=2).clamp_(min=1e-12) * (norms > 0))
                 self._floats[:, places] = unit_norm(strips)
             self._whitening, self._there = whitening, there
-        self._latest = self._floats[:, max(0, self.count - LATEST) : self.count].cpu().clone()
-
-    def _update_mean(self) -> None:
-        """Take the present mean for rounded features, and round them again."""
-        mean = self._weighted_mean(0, change_weights(self._changes[: self.count]))
-        change = self._whitened((self._mean - mean)[:, None])[:, 0].to(self._device)
-        for low in range(0, self.count, PIECE):
-            piece = slice(low, min(low + PIECE, self.count))
-            norms = self._norms[:, piece]
-            moved = [
-                _moved(*each) for each in zip(self._float32(piece), norms, change, strict=True)
-            ]
-            strips = torch.stack([unit for unit, _ in moved])
-            norms.copy_(torch.stack([lengths for _, lengths in moved]))
-            if isinstance(self.strips, torch.Tensor):
-                self.strips[:, piece] = strips
-            else:
-                self.strips.write(low, strips.cpu())
-        self._mean, self._since_mean = mean, 0
         last = slice(max(0, self.count - LATEST), self.count)
-        self._latest = self._float32(last).cpu().clone()
+        self.latest = self._float32(last).cpu().clone()
 
-    def _shift(self, first: int, to: int, change: torch.Tensor) -> None:
+    def _shift(self, first: int, change: torch.Tensor) -> None:
         """
         Add to features, and make them unit norm again; zero features stay zero.
 
-        :param first: place from which on; the last one ends up as the last of ``count``.
-        :param to: place where they are written to, at most ``first``.
+        :param first: place from which on; it becomes place 0, the last one the last of ``count``.
         :param change: shape (W, d).
         """
         change = change.to(self._device)
-        for j in range(len(self.strips)):
-            strips, norms = self._floats[j], self._norms[j]
-            for low in range(to, self.count, PIECE):
-                high = min(low + PIECE, self.count)
-                source = slice(low + first - to, high + first - to)
-                unit, lengths = _moved(strips[source], norms[source], change[j])
-                strips[low:high], norms[low:high] = unit, lengths
+        for low in range(0, self.count, PIECE):
+            piece = slice(low, min(low + PIECE, self.count))
+            source = slice(piece.start + first, piece.stop + first)
+            strips, norms = self._float32(source), self._norms[:, source]
+            moved = [_moved(*each) for each in zip(strips, norms, change, strict=True)]
+            self._write(low, torch.stack([unit for unit, _ in moved]))
+            self._norms[:, piece] = torch.stack([lengths for _, lengths in moved])
 
 
 def _moved(

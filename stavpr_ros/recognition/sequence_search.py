@@ -1,11 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The window of the query, and the search of mode robust over it.
-
-How the change of two images grows with the number of places in between is learned from the map
-(:mod:`stavpr_ros.recognition.map_change`), so that the query's changes show how fast it moves.
-"""
+"""The window of the query, and the search of mode robust over it."""
 
 from collections import deque
 from collections.abc import Callable
@@ -14,25 +9,18 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.alignment.lm_dtw import padded_width, SequenceMatch
 from stavpr_ros.alignment.path import NO_PATH
 from stavpr_ros.checks import no_nan
 from stavpr_ros.compilation import kernel
-from stavpr_ros.recognition.map_change import APART, MapChange
+from stavpr_ros.recognition.map_change import ImageChange
 from stavpr_ros.recognition.match import NO_SHARES
 from stavpr_ros.recognition.place_filter import CLOSE, NEGLIGIBLE, PlaceFilter
-from stavpr_ros.recognition.robust import FilterSettings, LEAST_DISTINCT
+from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.sessions import Sequences, SessionLayout
 import torch
 
-SPREAD, SCALE = 0.25, 0.4  # deviations of the logarithm: of each change, of all in other light
-NOISE = 0.15  # deviation of what noise adds to all changes
-LEAST_LIKELY = -8.0  # logarithm of the least likelihood of a speed, without its exponent
-SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
-OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
 STANDS = 0.05  # relative probability of a standstill, below which the camera moves
-FLOOR = 1e-3  # least relative probability of a speed
 BAND = 5  # places to either side of the filter's path that its refinement considers
 START_DEVIATION = 3.0  # places, of the path at the oldest image of the window
 STEPS = np.array([0.03, 0.12, 0.7, 0.12, 0.03])  # probability of 2 places less than the path, ...
@@ -65,7 +53,9 @@ class SequenceBuffer:
     ) -> None:
         self.length, self.k, self._copies = int(length), k, copies
         self._row_width = row_width
-        self._first = self._known = self._count = 0
+        self.first = 0  # index of the first place that is not evicted
+        self.known = 0  # places with an entry in any row of the window; all others are +inf
+        self._count = 0
         self._stamps: deque[int] = deque(maxlen=self.length)
         self._allocate(places, torch.device(device))
 
@@ -91,16 +81,6 @@ class SequenceBuffer:
         return tuple(self._stamps)
 
     @property
-    def first(self) -> int:
-        """Index of the first place that is not evicted: the number of evicted places."""
-        return self._first
-
-    @property
-    def known(self) -> int:
-        """Places with an entry in any row of the window; all others are +inf."""
-        return self._known
-
-    @property
     def oldest(self) -> int:
         """Row of ``memory`` where the window begins."""
         return self._count % self.length
@@ -123,7 +103,7 @@ class SequenceBuffer:
             if not values.sum() > -np.inf:
                 no_nan(values, 'image distances')
             entries[:, :m], entries[:, m:] = values, np.inf
-        self._known = max(self._known, m)
+        self.known = max(self.known, m)
         self._stamps.append(stamp)
         self._count += 1
 
@@ -147,7 +127,7 @@ class SequenceBuffer:
         """Empty the window."""
         self.memory.fill_(torch.inf)
         self._stamps.clear()
-        self._known = self._count = 0
+        self.known = self._count = 0
 
     def grow(self, places: int) -> None:
         """Make room for more places; in the rows of the window they are +inf."""
@@ -160,8 +140,8 @@ class SequenceBuffer:
         kept = self.places - count
         self.memory[:, :kept] = self.memory[:, count : self.places].clone()
         self.memory[:, kept : self.places] = torch.inf
-        self._known = max(0, self._known - count)
-        self._first += count
+        self.known = max(0, self.known - count)
+        self.first += count
 
 
 def _no_sequences() -> Sequences:
@@ -195,106 +175,8 @@ Search = Callable[[int], WindowMatch]
 """Matches a full window; the argument is the radius in places of the non-maximum suppression."""
 
 
-class ImageChange(MapChange):
-    """
-    Changes of the query, read by those of the map.
-
-    :param places: places that there is room for.
-    """
-
-    def __init__(self, places: int, settings: FilterSettings) -> None:
-        super().__init__(places, settings)
-        self.reset()
-
-    def _update_curve(self) -> None:
-        super()._update_curve()
-        speeds = np.array(self._settings.speeds)
-        left = np.maximum(1 - self.curve, 0)  # of the similarity: it shrinks in one ratio further
-        ratio = min(left[-1] / left[-2], 1) if left[-2] > 0 else 0.0
-        beyond = np.arange(1, int(np.ceil(APART * speeds.max())) - APART + 1)
-        curve = np.append(self.curve, self.curve[-1] + left[-1] * (1 - ratio**beyond))
-        changes = np.interp(np.outer(speeds, range(1, APART + 1)), np.arange(len(curve)), curve)
-        changes += OFFSET
-        covariances = SPREAD**2 * np.eye(APART) + SCALE**2
-        covariances = covariances + NOISE**2 / (changes[:, :, None] * changes[:, None])
-        # by speed, and images apart
-        self._expected, self._precisions = np.log(changes), np.linalg.inv(covariances)
-
-    def reset(self) -> None:
-        """Forget the query."""
-        self._last: np.ndarray | None = None
-        self._latest: deque[float] = deque(maxlen=SMOOTHED)
-        self._moving: deque[np.ndarray] = deque(maxlen=APART + 1)  # images that were no standstill
-        self._by_apart: deque[list[float]] = deque(maxlen=SMOOTHED)  # their latest changes
-
-    def next_query(self, strips: np.ndarray) -> float:
-        """Return the change of the query's next image (W, d) from the one before, 1 at first."""
-        change = 1.0 if self._last is None else change_between(strips, self._last)
-        self._last = strips
-        if not self.is_standstill(change):
-            self._moving.append(strips)
-        return change
-
-    def recenter_query(self, strips: np.ndarray) -> None:
-        """Take the query's last image (W, d) again: its mean has changed. None after a reset."""
-        if self._last is not None:
-            self._last = strips
-
-    def is_standstill(self, change: float) -> bool:
-        """Whether the query's images are equal up to noise: the camera stands, or it is dark."""
-        return bool(change < self.standstill)
-
-    def distinct(self, n: int) -> np.ndarray:
-        """Return which of n places count, (n,), bool: of a standstill one; all if few would."""
-        distinct = ~self._equal[:n]
-        return distinct if np.count_nonzero(distinct) >= LEAST_DISTINCT else np.ones(n, bool)
-
-    def stood(self) -> np.ndarray:
-        """Return the places where the map's camera stood, (places there is room for,), bool."""
-        stood = self._equal.copy()
-        stood[:-1] |= self._equal[1:]
-        return stood
-
-    def stretches(self, first: int, end: int) -> np.ndarray:
-        """Return the number of the stretch of equal places that each is in, (end - first,)."""
-        return np.cumsum(~self._equal[first:end])
-
-    def weight(self, change: float) -> float:
-        """Return the exponent alpha of the image's likelihood."""
-        s = self._settings
-        relative = change / max(float(self.curve[1]), 1e-6)
-        return s.weight * min(s.most_change, max(s.least_change, relative))
-
-    def speed_weights(self, change: float) -> np.ndarray:
-        """Return the relative probability of each speed after another change, (V,)."""
-        self._latest.append(change)
-        seen = np.log(sum(self._latest) / len(self._latest) + OFFSET)
-        off = (seen - self._expected[:, 0]) / self._settings.change_deviation
-        return np.asarray(np.exp(-0.5 * off**2) + FLOOR)
-
-    def speed_likelihoods(self, change: float) -> np.ndarray:
-        """
-        Return the likelihood of each speed after another change, of the most likely one 1, (V,).
-
-        The camera has some speed off the map as well: that likelihood is 1. So places that pass
-        more slowly or faster than the images change lose against being off the map. Compared are
-        the logarithms of the changes of images 1 to ``APART`` apart, each the mean of the latest
-        ones, with those on the curve of the map. Light makes all of them smaller or larger, and
-        noise larger: both count as Gaussian errors that the changes have in common.
-        """
-        if len(self._moving) <= APART or not self._settings.speed_weight:
-            return np.ones(len(self._expected))
-        newest = self._moving[-1]
-        before = [self._moving[-1 - apart] for apart in range(2, APART + 1)]
-        self._by_apart.append([change, *(change_between(newest, image) for image in before)])
-        off = np.log(np.mean(self._by_apart, axis=0) + OFFSET) - self._expected
-        logs = -0.5 * np.einsum('vi,vij,vj->v', off, self._precisions, off)
-        likely = np.exp(self._settings.speed_weight * np.maximum(logs - logs.max(), LEAST_LIKELY))
-        return np.asarray(likely)
-
-
 @kernel
-def _see(
+def _window_likelihoods(
     z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int,
     likelihoods: np.ndarray, moves: np.ndarray,
 ) -> None:  # fmt: skip
@@ -424,12 +306,19 @@ class FilterSearch:
         weight = 0.0
         if not (self.filter.count and self.change.is_standstill(change)):
             weight = self.change.weight(change)
-            weights, likelihoods = self._speeds_seen(change)
+            weights = likelihoods = np.ones(len(self._speeds))
+            if self.filter.count:  # of the first image no change is known
+                weights = self.change.speed_weights(change)
+                likelihoods = self.change.speed_likelihoods(change)
             if weights[0] < STANDS * weights.max():
                 z = self._moving(z)
             self.filter.update(z, weight, weights, likelihoods)
-        elif self.change.unlit(self._by_place(len(z))):
-            self.filter.update(z, 0.0, *np.ones((2, len(self._speeds))))
+        else:
+            by_place = self.filter.places_of_states()[: len(z)]
+            if self._layout is not None:
+                by_place = by_place[self._layout.columns]
+            if self.change.is_dark_stretch(by_place):
+                self.filter.update(z, 0.0, *np.ones((2, len(self._speeds))))
         self._images.append(self.filter.count - 1)
         self._weights.append(weight)
 
@@ -443,16 +332,6 @@ class FilterSearch:
         if isinstance(z, torch.Tensor):
             return torch.where(torch.from_numpy(stood).to(z.device), z.clamp(min=0), z)
         return np.where(stood, np.maximum(z, 0), z) if stood.any() else z
-
-    def _by_place(self, n: int) -> np.ndarray:
-        probabilities = self.filter.places_of_states()[:n]
-        return probabilities if self._layout is None else probabilities[self._layout.columns]
-
-    def _speeds_seen(self, change: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return relative probability and likelihood of each speed, (V,) each."""
-        if not self.filter.count:  # of the first image no change is known
-            return np.ones(len(self._speeds)), np.ones(len(self._speeds))
-        return self.change.speed_weights(change), self.change.speed_likelihoods(change)
 
     def __call__(self, nms_radius: int) -> WindowMatch:
         return self.at(self._middle, nms_radius)
@@ -515,7 +394,8 @@ class FilterSearch:
         z = self.buffer.at(inside)
         exponents = np.array(self._weights) * self._levels[level]
         likelihoods, moves = np.empty(places.shape), np.empty((len(path), len(STEPS)))
-        _see(z, path, exponents, np.array(self._images), n, likelihoods, moves)
+        images = np.array(self._images)
+        _window_likelihoods(z, path, exponents, images, n, likelihoods, moves)
         masses = np.empty(places.shape)
         masses[0] = np.exp(-0.5 * (offsets / START_DEVIATION) ** 2)
         _smooth(likelihoods, moves, masses)

@@ -17,7 +17,7 @@ from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.match import ranked_candidates
 from stavpr_ros.recognition.place_filter import Belief
-from stavpr_ros.recognition.robust import FilterSettings, z_normalized
+from stavpr_ros.recognition.robust import FilterSettings
 import torch
 
 Sequences = tuple[np.ndarray, np.ndarray]
@@ -50,10 +50,6 @@ class SessionLayout:
         is_gap = np.ones(self.width, bool)
         is_gap[self.columns] = False
         self.gaps = np.flatnonzero(is_gap)
-
-    def z_normalized(self, row: np.ndarray, counted: np.ndarray) -> np.ndarray:
-        """Return a row with mean 0 and deviation 1 of the counted places of each session, (n,)."""
-        return np.concatenate([z_normalized(row[run], counted=counted[run]) for run in self.runs])
 
     def spread(self, row: torch.Tensor) -> torch.Tensor:
         """Return distances to places (n,) as those to columns, (width,)."""
