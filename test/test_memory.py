@@ -93,7 +93,7 @@ def test_growing_map_may_leave_the_features_to_another_owner(small_map):
         growing.add(kept[i : i + 1], i + 1)
     growing.forget(2)
     snapshot = growing.snapshot()
-    assert growing.memory < 50 * 1000 < snapshot.features.strips.nbytes
+    assert growing.features.strips.data_ptr() == kept.strips[:, 2:].data_ptr()  # not a copy
     assert torch.equal(snapshot.features.strips, kept.strips[:, 2:40])
     assert snapshot.stamps.tolist() == list(range(3, 41))
     assert growing.dimension == kept.dimension
