@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The closures of a drive for the benchmark of the pose graph: recognition, then their edges."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 import pickle
@@ -64,17 +65,22 @@ class SharedViews(EdgeEstimator):
         return self.views[key]
 
 
-def recognize(drive: LapDrive, images: np.ndarray) -> list[Matched]:
+def recognize(
+    drive: LapDrive,
+    images: Sequence[np.ndarray] | np.ndarray,
+    camera: Camera | None = CAMERA,
+    exclude: int = 50,
+) -> list[Matched]:
     """Recognize a drive and return its pairs."""
     own = [drive.images[:, 0] == lap for lap in range(drive.images[-1, 0] + 1)]
     laps = np.array([0, *np.cumsum([drive.images[lap, 1].max() + 1 for lap in own])])
-    pipeline = Pipeline(PipelineSettings(backend='cpu', exclude_places=50), 'loop_closure')
+    pipeline = Pipeline(PipelineSettings(backend='cpu', exclude_places=exclude), 'loop_closure')
     odometry, found = planar_poses(drive.odometry), []
     image_of = {int(stamp): i for i, stamp in enumerate(drive.stamps)}
     route: Any = None  # pairs without their map can be kept in a file
     for i, (lap, number) in enumerate(drive.images.tolist()):
         record = ImageRecord.of_image(images[laps[lap] + number], int(drive.stamps[i]))
-        match = pipeline.process(record, int(drive.stamps[i]), odometry[i], CAMERA)
+        match = pipeline.process(record, int(drive.stamps[i]), odometry[i], camera)
         for each in (match, match.late):
             pair = pipeline.matched_pair(each) if each is not None else None
             if pair is None or each is None:
@@ -98,12 +104,17 @@ def recognized(drive: LapDrive, images: np.ndarray, path: Path) -> list[Matched]
     return found
 
 
-def with_edges(drive: LapDrive, pairs: list[Matched], estimator: EdgeEstimator) -> list[Found]:
+def with_edges(
+    drive: LapDrive,
+    pairs: list[Matched],
+    estimator: EdgeEstimator,
+    camera: Camera | None = CAMERA,
+) -> list[Found]:
     """Return the closures of pairs, in their order."""
     found = []
     for each in pairs:
         began = time.thread_time()
-        edge = estimator.estimate(each.pair, CAMERA, CAMERA)
+        edge = estimator.estimate(each.pair, camera, camera)
         took = time.thread_time() - began
         stamps = int(drive.stamps[each.query]), int(drive.stamps[each.place])
         appearance = edge.source is Source.NONE

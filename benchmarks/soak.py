@@ -99,23 +99,34 @@ def image_message(image: np.ndarray) -> Any:
 
 
 def publish(
-    images: list[Any], arguments: argparse.Namespace, each_minute: Callable[[], None]
-) -> dict[str, Any]:
-    """Publish images at ``arguments.rate`` for ``arguments.seconds``; return the figures."""
+    names: list[str],
+    topic: str,
+    qos: Any,
+    images: list[Any],
+    arguments: argparse.Namespace,
+    each_minute: Callable[[], None] = lambda: None,
+) -> tuple[list[dict[str, Any]], float]:
+    """
+    Publish images at ``arguments.rate`` for ``arguments.seconds``.
+
+    :param names: of the nodes that subscribe.
+    :returns: figures of each node; images per second.
+    """
     import rclpy
-    from rclpy.qos import qos_profile_sensor_data, QoSProfile
+    from rclpy.qos import QoSProfile
     from stavpr_msgs.msg import PlaceMatch
     from stavpr_ros.ros.process import Discovery, ros_node, spin_until
 
-    found = Latencies()
+    found = [Latencies() for _ in names]
     total = round(arguments.seconds * arguments.rate)
     with ros_node(lambda: rclpy.create_node('camera'), []) as node:
-        node.create_subscription(
-            PlaceMatch, '/stavpr/match', found.on_match, QoSProfile(depth=1000)
-        )
-        publisher = node.create_publisher(type(images[0]), 'image', qos_profile_sensor_data)
-        spin_until(node, lambda: publisher.get_subscription_count() == 1)
-        discovery = Discovery(node, lambda: node.get_subscriptions_info_by_topic('/image'))
+        for name, one in zip(names, found, strict=True):
+            node.create_subscription(
+                PlaceMatch, f'/{name}/match', one.on_match, QoSProfile(depth=1000)
+            )
+        publisher = node.create_publisher(type(images[0]), topic, qos)
+        spin_until(node, lambda: publisher.get_subscription_count() == len(names))
+        discovery = Discovery(node, lambda: node.get_subscriptions_info_by_topic(f'/{topic}'))
         spin_until(node, discovery.done)
         began = time.monotonic()
         each_minute()
@@ -124,17 +135,27 @@ def publish(
         def publish_next() -> None:
             message, now = next(messages), time.time_ns()
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, 10**9)
-            found.sent[now] = time.monotonic()
+            for one in found:
+                one.sent[now] = time.monotonic()
             publisher.publish(message)
 
         messages = islice(cycle(images), total)
         timer = node.create_timer(1 / arguments.rate, publish_next)
-        spin_until(node, lambda: len(found.sent) == total)
+        spin_until(node, lambda: len(found[0].sent) == total)
         rate = total / (time.monotonic() - began)
         node.destroy_timer(timer)
         end = time.monotonic() + SETTLED
-        spin_until(node, lambda: found.statuses.total() == total or time.monotonic() > end)
-        return found.figures(total, PlaceMatch.DROPPED) | {'rate_hz': rate}
+        spin_until(
+            node,
+            lambda: all(one.statuses.total() == total for one in found) or time.monotonic() > end,
+        )
+        return [one.figures(total, PlaceMatch.DROPPED) for one in found], rate
+
+
+def about(load: float) -> dict[str, Any]:
+    """Return machine and versions of a run."""
+    machine = {'load_before': load, 'cpu': cpu_model(), 'cores': os.cpu_count()}
+    return machine | {'commit': commit(), **versions()}
 
 
 def main() -> None:
@@ -154,6 +175,7 @@ def main() -> None:
     )
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
+    from rclpy.qos import qos_profile_sensor_data
     from stavpr_lab.demonstration.live import executable, private_domain
     from stavpr_ros.ros.process import prepare_transport
 
@@ -171,17 +193,18 @@ def main() -> None:
         resident: list[float] = []
         images = [image_message(image) for image in texture_route(IMAGES)]
         try:
-            figures = publish(
-                images, arguments, lambda: resident.append(round(memory(node.pid), 1))
-            )
-            figures |= {'memory_mb_start': resident[0], 'memory_mb_end': memory(node.pid)}
+            (figures,), rate = publish(
+                ['stavpr'], 'image', qos_profile_sensor_data, images, arguments,
+                lambda: resident.append(round(memory(node.pid), 1)),
+            )  # fmt: skip
+            figures |= {'rate_hz': rate, 'memory_mb_start': resident[0]}
+            figures['memory_mb_end'] = memory(node.pid)
         finally:
             node.send_signal(signal.SIGINT)
             node.wait()
     name = Path(arguments.map).name if arguments.map else f'{PLACES} places'
     figures |= {'memory_mb_by_minute': resident, 'map': name, 'parameters': arguments.parameter}
-    figures |= {'load_before': load, 'cpu': cpu_model(), 'cores': os.cpu_count()}
-    figures |= {'commit': commit(), **versions()}
+    figures |= about(load)
     text = json.dumps(figures, indent=2)
     print(text)
     if arguments.output:
