@@ -223,7 +223,7 @@ def test_first_right_match_counts_images_since_start():
 
 
 def test_process_of_matches_is_measured_beside_process_without():
-    run = Run('cpu', 0.001)
+    run = Run('cpu', PEAKS)
     stages.process_stages(run, 2 * stages.DRIVEN, 'int8', 0)
     ((row, _),) = run.rows
     assert (row.stage, [peer.name for peer in row.peers]) == ('process', ['without matches'])
