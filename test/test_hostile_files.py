@@ -64,7 +64,7 @@ def test_running_node_refuses_hostile_files_and_goes_on(nodes, robot, route, map
         ('pipe', 'it is a pipe, expected a regular file'),
         ('zero', 'is no file in the maps folder'),
         ('sparse', 'a sparse file'),
-        ('program', 'allow_torchscript'),
+        ('program', 'is no usable ONNX model'),
         ('located', "unknown 'model'"),
         ('../.bashrc', 'is no file in the maps folder'),
     ):
