@@ -10,7 +10,7 @@ from pathlib import Path
 import pickle
 import threading
 
-from checkpoints import Hostile, old_file
+from checkpoints import Call, Global, Hostile, OldPickle
 import numpy as np
 import pytest
 from stavpr_lab.features import PublishedSettings, weights
@@ -255,7 +255,7 @@ ENTRIES = {'epoch': 3, 'state_dict': {'module.a.weight': WEIGHT}, 'best': torch.
         saved({'a.weight': WEIGHT}),
         saved({'a.weight': nn.Parameter(WEIGHT)}),
         saved(ENTRIES),
-        old_file(ENTRIES | {'best': None}),
+        OldPickle().file(ENTRIES | {'best': None}),
     ],
     ids=['plain', 'parameters', 'with entries', 'Python 2'],
 )
@@ -268,7 +268,7 @@ def test_read_checkpoint_of_every_format(tmp_path, content):
 @pytest.mark.filterwarnings('ignore:Detected pickle protocol')
 def test_read_checkpoint_executes_nothing(tmp_path):
     mark = tmp_path / 'executed'
-    old = old_file({'state_dict': Hostile(str(mark))})
+    old = OldPickle().file({'state_dict': Call(Global('posix', 'mkdir'), (str(mark),))})
     for hostile in (saved({'a.weight': Hostile(str(mark))}), pickle.dumps(Hostile(str(mark)))):
         with pytest.raises(
             UnavailableError, match=r'some\.pth cannot be read as a file of weights'
@@ -282,7 +282,7 @@ def test_read_checkpoint_executes_nothing(tmp_path):
 @pytest.mark.parametrize(
     ('cut', 'text'),
     [(0, b''), (0, b'no model'), (0, b'<!DOCTYPE html>'), (-100, saved(WEIGHT)),
-     (-4, old_file({'a.weight': WEIGHT}))],
+     (-4, OldPickle().file({'a.weight': WEIGHT}))],
 )  # fmt: skip
 def test_read_checkpoint_of_other_files_fails(tmp_path, cut, text):
     with pytest.raises(UnavailableError, match=r'pth cannot be read as a file of weights: .'):
@@ -302,7 +302,7 @@ def test_read_checkpoint_without_parameters_fails(tmp_path, content, kind):
 def test_read_checkpoint_with_damage_fails_or_reads(tmp_path, content):
     """Damage anywhere is an error of ours, or harmless; never one of torch's or Python's."""
     rng = np.random.default_rng(0)
-    for file in (content, old_file({'a.weight': WEIGHT})):
+    for file in (content, OldPickle().file({'a.weight': WEIGHT})):
         for _ in range(60):
             damaged = bytearray(file)
             damaged[rng.integers(len(file))] ^= 1 << rng.integers(8)

@@ -4,9 +4,6 @@
 
 from collections import OrderedDict
 from dataclasses import dataclass
-import io
-import os
-import pickle
 import struct
 
 import numpy as np
@@ -44,71 +41,92 @@ def random_parameters(
     return parameters
 
 
-class OldPickle(pickle._Pickler):
+class OldPickle:
     """Pickles as of Python 2 (byte strings, long numbers); storages are kept for later."""
 
-    dispatch = pickle._Pickler.dispatch.copy()
+    def __init__(self) -> None:
+        self.storages: dict[str, torch.Tensor] = {}
 
-    def __init__(self, storages: dict[str, torch.Tensor]) -> None:
-        self.stream, self.storages = io.BytesIO(), storages
-        super().__init__(self.stream, protocol=2)
+    def file(self, content: object) -> bytes:
+        """Return the whole file: five pickles, then the numbers of all storages."""
+        system = {
+            'protocol_version': PROTOCOL,
+            'little_endian': True,
+            'type_sizes': {'int': 4, 'long': 4},
+        }
+        parts = [self.pickle(part) for part in (MAGIC, PROTOCOL, system, content)]
+        parts.append(self.pickle(sorted(self.storages)))
+        for _, tensor in sorted(self.storages.items()):
+            parts += [struct.pack('<q', tensor.numel()), tensor.numpy().tobytes()]
+        return b''.join(parts)
 
-    def save_bytes_string(self, text: str) -> None:
-        self.write(pickle.SHORT_BINSTRING + bytes([len(text)]) + text.encode())
+    def pickle(self, value: object) -> bytes:
+        return b'\x80\x02' + self._emit(value) + b'.'
 
-    def save_long_number(self, number: int) -> None:
-        size = number.bit_length() // 8 + 1
-        self.write(pickle.LONG1 + bytes([size]) + number.to_bytes(size, 'little', signed=True))
+    def _emit(self, value: object) -> bytes:
+        match value:
+            case None:
+                return b'N'
+            case bool():
+                return b'\x88' if value else b'\x89'
+            case int():
+                size = value.bit_length() // 8 + 1
+                return b'\x8a' + bytes([size]) + value.to_bytes(size, 'little', signed=True)
+            case float():
+                return b'G' + struct.pack('>d', value)
+            case str():
+                return b'U' + bytes([len(value)]) + value.encode()
+            case Global():
+                return f'c{value.module}\n{value.name}\n'.encode()
+            case Call():
+                return self._emit(value.function) + self._emit(value.arguments) + b'R'
+            case OrderedDict():
+                return self._emit(
+                    Call(Global('collections', 'OrderedDict'), ([list(x) for x in value.items()],))
+                )
+            case dict():
+                items = b''.join(self._emit(part) for item in value.items() for part in item)
+                return b'}(' + items + b'u'
+            case list():
+                return b'](' + b''.join(map(self._emit, value)) + b'e'
+            case tuple():
+                return b'(' + b''.join(map(self._emit, value)) + b't'
+            case torch.Tensor():
+                return self._tensor(value)
+        raise TypeError(type(value))
 
-    dispatch[str] = save_bytes_string
-    dispatch[int] = save_long_number
-
-    def persistent_id(self, value: object) -> tuple[object, ...] | None:
-        if not isinstance(value, Storage):
-            return None
-        key, size = value.key, self.storages[value.key].numel()
-        return ('storage', torch.cuda.FloatStorage, key, 'cuda:0', size, None)
-
-    def reducer_override(self, value: object) -> object:
-        if isinstance(value, OrderedDict):
-            return OrderedDict, ([list(item) for item in value.items()],)
-        if not isinstance(value, torch.Tensor):
-            return NotImplemented
+    def _tensor(self, tensor: torch.Tensor) -> bytes:
         key = str(94000000 + len(self.storages))
-        expanded = not any(value.stride())  # of one element
-        self.storages[key] = value.as_strided((1,), (1,)) if expanded else value.contiguous()
-        strides = value.stride() if expanded else value.contiguous().stride()
-        return torch._utils._rebuild_tensor, (Storage(key), 0, tuple(value.shape), strides)
+        expanded = not any(tensor.stride())  # of one element
+        self.storages[key] = tensor.as_strided((1,), (1,)) if expanded else tensor.contiguous()
+        kind = Global('torch.cuda', 'FloatStorage')
+        size = self.storages[key].numel()
+        storage = self._emit(('storage', kind, key, 'cuda:0', size, None)) + b'Q'
+        strides = tensor.stride() if expanded else tensor.contiguous().stride()
+        view = b'(' + storage + b''.join(map(self._emit, (0, tuple(tensor.shape), strides))) + b't'
+        return self._emit(Global('torch._utils', '_rebuild_tensor')) + view + b'R'
 
 
 @dataclass
-class Storage:
-    key: str
+class Global:
+    module: str
+    name: str
 
 
-def old_file(content: object) -> bytes:
-    """Return a file of before torch 1.6: five pickles, then the numbers of all storages."""
-    storages: dict[str, torch.Tensor] = {}
-    sizes = {'int': 4, 'long': 4}
-    system = {'protocol_version': PROTOCOL, 'little_endian': True, 'type_sizes': sizes}
-    parts = []
-    for part in (MAGIC, PROTOCOL, system, content, None):
-        pickler = OldPickle(storages)
-        pickler.dump(sorted(storages) if part is None else part)
-        parts.append(pickler.stream.getvalue())
-    for _, tensor in sorted(storages.items()):
-        parts += [struct.pack('<q', tensor.numel()), tensor.numpy().tobytes()]
-    return b''.join(parts)
+@dataclass
+class Call:
+    function: Global
+    arguments: tuple[object, ...]
 
 
 @dataclass
 class Hostile:
-    """Makes a folder when it is unpickled."""
+    """Writes a file when it is unpickled."""
 
     path: str
 
     def __reduce__(self):
-        return (os.mkdir, (self.path,))
+        return (open, (self.path, 'w'))
 
 
 def places365_file(parameters: dict[str, torch.Tensor]) -> bytes:
@@ -120,4 +138,4 @@ def places365_file(parameters: dict[str, torch.Tensor]) -> bytes:
             older = older.replace(f'.{part}.', f'.{part[:-1]}.{part[-1]}.')
         old[f'module.{older}'] = value
     entries = {'epoch': 90, 'arch': 'densenet161', 'state_dict': old, 'best_prec1': 56.1}
-    return old_file(entries)
+    return OldPickle().file(entries)

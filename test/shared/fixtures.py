@@ -208,8 +208,8 @@ def vgg_parameters():
 @pytest.fixture(scope='session')
 def vgg_file(vgg_parameters, tmp_path_factory) -> Path:
     """Their checkpoint, of Python 2 as the published one."""
-    from checkpoints import old_file
+    from checkpoints import OldPickle
 
     path = tmp_path_factory.mktemp('weights') / 'vgg16.pth'
-    path.write_bytes(old_file(OrderedDict(vgg_parameters)))
+    path.write_bytes(OldPickle().file(OrderedDict(vgg_parameters)))
     return path
