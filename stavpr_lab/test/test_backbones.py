@@ -5,6 +5,8 @@
 from dataclasses import replace
 
 import cv2
+from fixtures import route_images
+from map_examples import VERSION2
 import networks
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from stavpr_lab.features.paper_networks import (
 from stavpr_lab.features.weights import load_parameters
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.registry import backbone_class, settings_class
+from stavpr_ros.mapping import load_map
 import torch
 from torch import nn
 
@@ -185,3 +188,15 @@ def test_load_parameters_of_other_network_is_rejected(densenet_parameters, chang
 def test_published_settings_out_of_range_are_rejected(kind, bad):
     with pytest.raises(SettingsError):
         settings_class(kind)(**bad)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'weights'), [('vgg16', 'vgg_file'), ('densenet161_places365', 'densenet_file')]
+)
+def test_features_extracted_now_are_those_of_a_kept_map(kind, weights, request):
+    """Maps of ``route_images(8)``, of the random weights of the fixtures."""
+    kept = load_map(VERSION2 / f'{kind}.stavpr')
+    model = str(request.getfixturevalue(weights))
+    query = kept.extractor(model=model).extract(route_images(8))
+    torch.testing.assert_close(query.strips, kept.features.strips, rtol=0, atol=1e-5)
+    torch.testing.assert_close(query.weights, kept.features.weights, rtol=0, atol=1e-5)
