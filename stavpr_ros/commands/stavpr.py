@@ -76,10 +76,10 @@ def main(args: list[str] | None = None) -> int:
         return 0
     command = COMMANDS.get(name) or all_commands().get(name)
     if command is None:
-        remedy = f'choose from {", ".join(all_commands())}'
+        reason = f'unknown command {name!r}; choose from {", ".join(all_commands())}'
         if name in PACKAGES:
-            remedy = f'it is in the package {PACKAGES[name]}, which is not installed'
-        print(f'stavpr: unknown command {name!r}: {remedy}', file=sys.stderr)
+            reason = f'{name} is in the package {PACKAGES[name]}, which is not installed'
+        print(f'stavpr: {reason}', file=sys.stderr)
         return 2
     missing = [module for module in ROS_MODULES if importlib.util.find_spec(module) is None]
     if missing and command.needs_ros:

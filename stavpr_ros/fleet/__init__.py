@@ -9,11 +9,12 @@ import this package. docs/fleet.md explains it.
 
 from stavpr_ros.fleet.addresses import open_city_map, upload
 from stavpr_ros.fleet.city_map import CityMap
-from stavpr_ros.fleet.recognizer import FleetRecognizer
+from stavpr_ros.fleet.recognizer import FleetMap, FleetRecognizer
 from stavpr_ros.fleet.store import MemoryStore, PlaceStore
 
 __all__ = [
     'CityMap',
+    'FleetMap',
     'FleetRecognizer',
     'MemoryStore',
     'PlaceStore',

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Addresses of maps: ``faiss:FILE``, ``qdrant:FOLDER``, ``qdrant://HOST:PORT/COLLECTION``."""
 
-from stavpr_ros.fleet.city_map import CityMap
 from stavpr_ros.fleet.faiss_store import FaissStore, upload_to_faiss
 from stavpr_ros.fleet.qdrant_store import (
     EdgePoints,
@@ -11,18 +10,19 @@ from stavpr_ros.fleet.qdrant_store import (
     server_points,
     upload_to_qdrant,
 )
+from stavpr_ros.fleet.recognizer import FleetMap
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stores import Store
 
 
-def open_city_map(address: str) -> CityMap:
+def open_city_map(address: str) -> FleetMap:
     """
     Open the map at an address; places are fetched on use.
 
     :raises StavprError: no map there, it cannot be reached, or a package is missing.
     """
     scheme, _, rest = address.partition(':')
-    return CityMap.of(FaissStore(rest) if scheme == 'faiss' else QdrantStore(_points(address)))
+    return FleetMap.of(FaissStore(rest) if scheme == 'faiss' else QdrantStore(_points(address)))
 
 
 def upload(place_map: PlaceMap, address: str, force: bool = False) -> None:

@@ -3,17 +3,13 @@
 """A map whose places are elsewhere: what was fetched of them is known."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Self, TYPE_CHECKING
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.fleet.store import PlaceStore, sample_places
 from stavpr_ros.mapping import Place, PlaceMap
-from stavpr_ros.recognition import RecognizerSettings
 import torch
-
-if TYPE_CHECKING:
-    from stavpr_ros.fleet.recognizer import FleetRecognizer
 
 
 class RemoteFeatures(LocalFeatures):
@@ -89,12 +85,6 @@ class CityMap(PlaceMap):
         )
         made.remember(sample_places(n), sample)
         return made
-
-    def recognizer(self, settings: RecognizerSettings) -> 'FleetRecognizer':
-        """Return a recognizer of this map, as the pipeline expects of a map in a store."""
-        from stavpr_ros.fleet.recognizer import FleetRecognizer
-
-        return FleetRecognizer(self, settings)
 
     def remember(self, places: np.ndarray, fetched: PlaceMap) -> None:
         """Keep stamps, poses and identifiers of places that were fetched."""

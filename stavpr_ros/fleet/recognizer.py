@@ -363,3 +363,11 @@ def _changes_from_before(strips: np.ndarray) -> np.ndarray:
     similarity = np.einsum('wnd,wnd->wn', strips[:, 1:], strips[:, :-1])
     similarity[~(strips[:, 1:].any(axis=2) | strips[:, :-1].any(axis=2))] = 1
     return np.append(np.float32(1), 1 - similarity.mean(axis=0)).astype(np.float32)
+
+
+class FleetMap(CityMap):
+    """A city's map that makes its recognizer, as the pipeline expects of a map in a store."""
+
+    def recognizer(self, settings: RecognizerSettings) -> FleetRecognizer:
+        """Return a recognizer of this map; see :class:`FleetRecognizer`."""
+        return FleetRecognizer(self, settings)
