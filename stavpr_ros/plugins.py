@@ -3,6 +3,7 @@
 """What other packages add: the entry points of a group."""
 
 from functools import cache
+from importlib import import_module
 from importlib.metadata import entry_points
 import logging
 from typing import Any
@@ -18,6 +19,12 @@ FEATURES = 'stavpr.features'
 
 STORES = 'stavpr.stores'
 """Schemes of addresses of maps; see :class:`stavpr_ros.mapping.stores.Store`."""
+
+
+def resolve(target: str) -> Any:
+    """Import and return the object that ``package.module:name`` names."""
+    module, name = target.split(':')
+    return getattr(import_module(module), name)
 
 
 @cache

@@ -9,7 +9,6 @@ Imports neither torch nor OpenCV, so that parameters and command-line options lo
 from collections.abc import Sequence
 import dataclasses
 from dataclasses import dataclass
-import importlib
 import json
 from typing import Any, ClassVar, Protocol, TYPE_CHECKING
 
@@ -262,8 +261,7 @@ def backbone_class(kind: str) -> Any:
 
     :raises SettingsError: no such kind.
     """
-    module, name = _kind(kind).backbone.split(':')
-    return getattr(importlib.import_module(module), name)
+    return plugins.resolve(_kind(kind).backbone)
 
 
 def settings_from_json(kind: str, text: str, model: str = '') -> Any:

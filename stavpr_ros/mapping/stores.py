@@ -4,14 +4,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 
 from stavpr_ros import plugins
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.place_map import PlaceMap
 
-BUILT_IN = ('faiss', 'qdrant', 'qdrant+https')
-"""Schemes of ``stavpr_ros.fleet``, found without entry points."""
+FLEET = 'stavpr_ros.fleet.addresses:STORE'
+BUILT_IN = {'faiss': FLEET, 'qdrant': FLEET, 'qdrant+https': FLEET}
+"""Schemes and their stores as MODULE:NAME, found without entry points and imported on use."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Store:
 
 def schemes() -> list[str]:
     """Return the schemes that have a store."""
-    return [*BUILT_IN, *(name for name in plugins.load(plugins.STORES) if name not in BUILT_IN)]
+    return list(BUILT_IN | plugins.load(plugins.STORES))
 
 
 def is_address(path: str) -> bool:
@@ -49,8 +49,6 @@ def store_of(address: str) -> Store:
         known = ', '.join(f'{name}:' for name in schemes())
         raise SettingsError(f'{address} is no address: expected one that begins with {known}')
     scheme = address.partition(':')[0]
-    if scheme in BUILT_IN:
-        store: Store = import_module('stavpr_ros.fleet.addresses').STORE
-        return store
-    added: Store = plugins.load(plugins.STORES)[scheme]
-    return added
+    target = BUILT_IN.get(scheme)
+    store: Store = plugins.resolve(target) if target else plugins.load(plugins.STORES)[scheme]
+    return store
