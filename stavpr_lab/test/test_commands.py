@@ -6,6 +6,7 @@ import json
 import math
 import signal
 import subprocess
+import sys
 import time
 from types import SimpleNamespace
 
@@ -393,3 +394,12 @@ def test_demo_with_invalid_slam_options_exits_with_usage(options, capsys):
         demo.main(options)
     assert raised.value.code == 2
     assert 'usage' in capsys.readouterr().err
+
+
+def test_demonstration_imports_no_package_of_the_extra_evaluation():
+    code = (
+        'import sys; sys.modules.update(dict.fromkeys(("sklearn", "jinja2")))\n'
+        'import stavpr_lab.commands.demo, stavpr_lab.demonstration.plots\n'
+        'import stavpr_lab.demonstration.loops, stavpr_lab.demonstration.recordings'
+    )
+    subprocess.run([sys.executable, '-c', code], check=True)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from sklearn.metrics import average_precision_score, precision_recall_curve
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.alignment import aligned_index
 from stavpr_ros.errors import InputError
@@ -327,6 +326,9 @@ def _sklearn_metrics(scores: np.ndarray, correct: np.ndarray) -> tuple[float, fl
     finite = np.isfinite(scores)
     # scikit-learn takes finite values only: queries without a match come last
     confidence = -np.where(finite, scores, scores[finite].max(initial=0.0) + 1)
+    # here, since the demonstration imports this module and its set-up has no scikit-learn
+    from sklearn.metrics import average_precision_score, precision_recall_curve
+
     precision, recall, _ = precision_recall_curve(correct, confidence)
     average = average_precision_score(correct, confidence)
     f1 = 2 * precision * recall / np.maximum(precision + recall, np.finfo(float).tiny)
