@@ -42,7 +42,8 @@ def runtime(cuda_runtime):
 @pytest.mark.skipif(SIMULATOR, reason='this is the simulator')
 def test_kernels_in_simulator_pass():
     root = Path(__file__).resolve().parents[1]
-    environment = os.environ | {'NUMBA_ENABLE_CUDASIM': '1'}
+    # without the options of `colcon test`, which name its cache and its report
+    environment = os.environ | {'NUMBA_ENABLE_CUDASIM': '1', 'PYTEST_ADDOPTS': ''}
     files = [str(Path(__file__).with_name(name)) for name in FILES]
     command = [sys.executable, '-m', 'pytest', '-q', '-rs', '-p', 'no:cacheprovider']
     command += ['-c', str(root / 'pytest.ini')]
