@@ -44,6 +44,7 @@ LINT = [
     'ruff>=0.9',
 ]
 
+
 def files_in(folder: str) -> list[str]:
     """List the files of a folder, relative to this one."""
     return sorted(path for path in glob(f'{folder}/*') if Path(path).is_file())
