@@ -4,10 +4,11 @@
 
 from stavpr_slam.pose_graph.alignment import align_maps
 from stavpr_slam.pose_graph.closures import Closure
-from stavpr_slam.pose_graph.consistency import ConsistencySettings
+from stavpr_slam.pose_graph.clusters import ConsistencySettings
 from stavpr_slam.pose_graph.graph import GraphEdge, GraphSettings, PoseGraph
-from stavpr_slam.pose_graph.odometry import ChainSettings, OdometryNoise
+from stavpr_slam.pose_graph.keyframes import ChainSettings
 from stavpr_slam.pose_graph.offline import optimize
+from stavpr_slam.pose_graph.path_errors import OdometryNoise
 
 __all__ = [
     'ChainSettings',

@@ -9,7 +9,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.trajectory import SECOND
 from stavpr_slam.pose_graph.closures import Closure
 from stavpr_slam.pose_graph.graph import GraphSettings, PoseGraph
-from stavpr_slam.pose_graph.odometry import ChainSettings
+from stavpr_slam.pose_graph.keyframes import ChainSettings
 
 # Deviations of a closure by appearance alone: the query is taken to be where the place is.
 # Measured on synthetic streets with two lanes: .9 m along, 2 m across.

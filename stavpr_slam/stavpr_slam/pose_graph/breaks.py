@@ -2,21 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where closures prove that the odometry missed a motion: the robot was carried."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 import math
 
 import numpy as np
-from stavpr_slam.pose_graph.consistency import Cluster, ConsistencySettings
+from stavpr_slam.pose_graph.clusters import Cluster, ConsistencySettings
 from stavpr_slam.pose_graph.cycles import Cycles
-from stavpr_slam.pose_graph.odometry import KeyframeChain, OdometryNoise
+from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
 STANDING = math.log(
     10
 )  # evidence of the odometry that stands: else it does in a tenth of the images
 PAUSE = 4.0  # times the usual time between keyframes: the robot was carried then
-REACH = 100.0  # meters without closures that a run continues after
+MOST = 40  # places of a break that are tried
 CLEAR = 4.0  # a closure belongs to the side that it deviates from so many times less
 WRONG_SIDE = 0.1  # cost of a closure on the wrong side of a break, in logarithms of a change
 
@@ -34,60 +34,44 @@ class Break:
     stamp: int
 
 
-def find_break(
-    chain: KeyframeChain,
-    clusters: list[Cluster],
-    conflicts: np.ndarray,
-    noise: OdometryNoise,
-    settings: ConsistencySettings,
-    changes: Mapping[int, float],
-) -> Break | None:
+def candidates(chain: KeyframeChain, clusters: Sequence[Cluster], least: int) -> list[int]:
     """
-    Return the break between two long runs of closures that contradict each other; None = none.
+    Return nodes that a session could begin at: the first ones of clusters of a weight, in order.
 
-    In a run, each cluster agrees with the one before it. Over a short way this is a sharp test,
-    while over laps odometry may have drifted as far as a robot is carried.
-
-    :param conflicts: which clusters contradict each other, shape (n, n), bool.
-    :param changes: how much the images of stamps (ns) differ from the images before them.
+    Of many, :data:`MOST` in equal steps.
     """
-    queries = np.array([cluster.members[0].query for cluster in clusters], int)
-    for session in range(chain.sessions):
-        own = [
-            (clusters[i].members[0].stamp, i)
-            for i in np.flatnonzero(chain.session[queries] == session).tolist()
-            if clusters[i].weight >= settings.support
-        ]
-        runs: list[list[int]] = []
-        for _, i in sorted(own):
-            since = clusters[i].members[0].at - REACH
-            agreeing = [
-                run for run in runs
-                if clusters[run[-1]].members[-1].at >= since and not conflicts[i, run[-1]]
-            ]  # fmt: skip
-            if agreeing:
-                max(agreeing, key=lambda run: clusters[run[-1]].members[-1].at).append(i)
-            else:
-                runs.append([i])
-        long = [run for run in runs if _is_long([clusters[i] for i in run], settings)]
-        for before, after in pairwise(long):
-            last, first = clusters[before[-1]], clusters[after[0]]
-            if conflicts[before[-1], after[0]] and _begin(last) < _begin(first):
-                return _locate(chain, clusters, (last, first), noise, settings, changes)
-    return None
+    found = sorted({each.members[0].query for each in clusters if each.weight >= least})
+    nodes = [b for a, b in pairwise(found) if chain.session[a] == chain.session[b]]
+    return [nodes[i] for i in np.unique(np.linspace(0, len(nodes) - 1, MOST).astype(int)) if nodes]
 
 
-def _is_long(run: list[Cluster], settings: ConsistencySettings) -> bool:
-    way = run[-1].members[-1].at - run[0].members[0].at
-    weight = sum(cluster.weight for cluster in run)
-    return weight >= settings.break_support and way >= settings.break_distance
+def neighbors(
+    chain: KeyframeChain, accepted: Sequence[Cluster], node: int, settings: ConsistencySettings
+) -> tuple[Cluster, Cluster] | None:
+    """
+    Return the last cluster before a break and the first one behind it.
+
+    :param accepted: clusters that agree if there is a break.
+    :returns: None without clusters enough on both sides.
+    """
+    own = [each for each in accepted if chain.session[each.members[0].query] == chain.session[node]]
+    own.sort(key=lambda each: each.members[0].at)
+    sides = [each for each in own if each.members[0].query < node], [
+        each for each in own if each.members[0].query >= node
+    ]
+    for side in sides:
+        length = side[-1].members[-1].at - side[0].members[0].at if side else 0.0
+        weight = sum(each.weight for each in side)
+        if weight < settings.break_support or length < settings.break_distance:
+            return None
+    return sides[0][-1], sides[1][0]
 
 
-def _locate(
+def locate(
     chain: KeyframeChain,
-    clusters: list[Cluster],
+    clusters: Sequence[Cluster],
     ends: tuple[Cluster, Cluster],
-    noise: OdometryNoise,
+    scale: float,
     settings: ConsistencySettings,
     changes: Mapping[int, float],
 ) -> Break:
@@ -128,7 +112,7 @@ def _locate(
             if stamps[0] <= each.stamp <= stamps[-1] and chain.session[each.query] == session
         ]
         old, new = (
-            Cycles(chain, [cluster.representative, *near]).deviations(0, noise)[1:]
+            Cycles(chain, [cluster.representative, *near]).deviations(0, scale)[1:]
             for cluster in ends
         )
         at = np.array([each.stamp for each in near])
@@ -142,7 +126,3 @@ def _locate(
         return Break(int(own[np.searchsorted(stamps, stamp)]), stamp)
     node = int(nodes[len(nodes) // 2]) if len(nodes) else first.query
     return Break(node, int(chain.stamps[node]))
-
-
-def _begin(cluster: Cluster) -> int:
-    return cluster.members[0].stamp

@@ -22,7 +22,7 @@ class Closure:
         empty = the place is on the same drive.
     :param changes: stamps (ns) of the images of the window, the newest last, and how much each
         differs from the image before it; more than usual where the robot was carried.
-    :param verified: whether keypoints confirm that it is the same place; None = not tried.
+    :param query_robot, place_robot: whose odometry the stamps are of.
     """
 
     query_stamp: int
@@ -33,7 +33,8 @@ class Closure:
     map_id: str = ''
     place_pose: np.ndarray | None = None
     changes: tuple[tuple[int, float], ...] = ()
-    verified: bool | None = None
+    query_robot: str = ''
+    place_robot: str = ''
 
     def checked(self) -> 'Closure':
         """
@@ -67,7 +68,6 @@ class ResolvedClosure:
     :param covariance: in the axes of the query's node, rotation first, shape (6, 6).
     :param at: distance travelled at the query, m.
     :param number: of the closure, in the order of arrival.
-    :param weight: 1; less where keypoints should have confirmed it, and did not.
     """
 
     query: int
@@ -78,4 +78,3 @@ class ResolvedClosure:
     number: int
     stamp: int
     is_independent: bool
-    weight: float = 1.0

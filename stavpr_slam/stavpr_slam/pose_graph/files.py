@@ -11,6 +11,7 @@ from stavpr_ros.mapping.trajectory import SECOND
 from stavpr_ros.mapping.transforms import inverse, to_poses
 from stavpr_ros.output_file import FileKind, Force, write_output
 from stavpr_slam.pose_graph.graph import PoseGraph
+from stavpr_slam.pose_graph.path_errors import path_errors
 
 TUM_HEADER = '# timestamp tx ty tz qx qy qz qw\n'
 TUM = FileKind('trajectory', lambda head: head.startswith(TUM_HEADER.encode()))
@@ -38,15 +39,12 @@ def g2o_text(graph: PoseGraph) -> str:
     lines = ['# g2o: accepted closures only']
     poses = to_poses(graph.solved)
     lines += [f'VERTEX_SE3:QUAT {i} {_numbers(pose)}' for i, pose in enumerate(poses)]
-    T, previous = graph.chain.transforms, graph.chain.previous
-    travelled, noise = graph.chain.travelled, graph.noise
-    for node in range(count):
-        before = int(previous[node])
-        if before < 0:
-            continue
-        step = max(float(travelled[node] - travelled[before]), 0.05)
-        variance = np.repeat([noise.rotation**2 * step, noise.translation**2 * step], 3)
-        lines.append(_edge(before, node, inverse(T[before]) @ T[node], np.diag(variance)))
+    chain = graph.chain
+    nodes = np.flatnonzero(chain.previous[:count] >= 0)
+    before, T = chain.previous[nodes], chain.transforms
+    spread, _ = path_errors(chain, nodes, before)
+    for node, start, covariance in zip(nodes, before, graph.scale**2 * spread, strict=True):
+        lines.append(_edge(start, node, inverse(T[start]) @ T[node], covariance))
     for edge in graph.used.values():
         lines.append(_edge(edge.place, edge.query, edge.transform, edge.covariance))
     return '\n'.join(lines) + '\n'

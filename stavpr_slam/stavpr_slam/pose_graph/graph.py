@@ -9,18 +9,17 @@ from typing import NamedTuple
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_slam.pose_graph.acceptance import Acceptance, independent
-from stavpr_slam.pose_graph.breaks import Break
+from stavpr_slam.pose_graph.acceptance import Acceptance
 from stavpr_slam.pose_graph.closures import Closure, ResolvedClosure
-from stavpr_slam.pose_graph.consistency import Cluster, ConsistencySettings
-from stavpr_slam.pose_graph.odometry import ChainSettings, KeyframeChain, OdometryNoise
-from stavpr_slam.pose_graph.sessions import extended, placed, session_pairs, tie, Ties
-from stavpr_slam.pose_graph.solver import CAUCHY, Solver, WIDE
+from stavpr_slam.pose_graph.clusters import ConsistencySettings, ends
+from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
+from stavpr_slam.pose_graph.path_errors import OdometryNoise
+from stavpr_slam.pose_graph.sessions import extended, placed, tie, Ties
+from stavpr_slam.pose_graph.solver import Problem, Solver
 from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
-MEMORY = 100  # latest closures by which keypoints are rated
-FAR = 8.0  # whitened deviations of a new edge from which all nodes are solved anew
+ROUNDS = 5  # of comparing all clusters together, and solving again
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,8 @@ class GraphSettings:
     """
     Settings of a :class:`PoseGraph`.
 
-    :param noise: errors of the odometry; their factor is estimated if ``adapt``.
+    :param noise: errors of the odometry where its messages have none; their factor is estimated
+        if ``adapt``.
     """
 
     keyframes: ChainSettings = field(default_factory=ChainSettings)
@@ -44,22 +44,6 @@ class GraphEdge:
     query: int
     place: int
     accepted: bool
-
-
-class Arranged(NamedTuple):
-    """
-    What is solved.
-
-    :param ties: of the sessions.
-    :param edges: by their numbers.
-    :param initial: transforms of all nodes, shape (N, 4, 4).
-    :param moved: whether these are not the last estimate.
-    """
-
-    ties: Ties
-    edges: dict[int, ResolvedClosure]
-    initial: np.ndarray
-    moved: bool
 
 
 class PoseGraph:
@@ -79,40 +63,37 @@ class PoseGraph:
 
     def reset(self) -> None:
         """Forget everything."""
-        self.chain = KeyframeChain(self.settings.keyframes)
+        self.chain = KeyframeChain(self.settings.keyframes, self.settings.noise)
         self._acceptance = Acceptance(
-            self.chain, self.settings.noise, self.settings.consistency, self.settings.adapt
+            self.chain, self.settings.consistency, self.settings.adapt
         )
         self._solver.restart()
         self._pending: list[Closure] = []
         self._known: list[Closure] = []  # those between nodes
         self._changes: dict[int, float] = {}  # of images by their stamps
-        self._tried, self._missed = 0, 0.0  # latest closures, and the share not confirmed of them
         self._ties = Ties()
         self._edges: dict[int, ResolvedClosure] = {}
         self.solved = np.zeros((0, 4, 4))
         self.counts: Counter[str] = Counter()
 
     @property
-    def noise(self) -> OdometryNoise:
-        """Return the errors of the odometry as estimated."""
-        return self._acceptance.noise
-
-    @property
     def scale(self) -> float:
-        """Return the factor of these errors that the clusters have."""
+        """Return the factor on the errors of the odometry that the closures have shown."""
         return self._acceptance.scale
 
-    def add_odometry(self, stamp: int, pose: np.ndarray) -> bool:
+    def add_odometry(
+        self, stamp: int, pose: np.ndarray, robot: str = '', covariance: np.ndarray | None = None
+    ) -> bool:
         """
         Add an odometry; return whether it became a keyframe.
 
         :param stamp: ns.
         :param pose: shape (7,).
+        :param covariance: of the message, (6, 6), see :meth:`KeyframeChain.add`.
         :raises InputError: it is not finite; it is counted and left out.
         """
         try:
-            return self.chain.add(stamp, pose)
+            return self.chain.add(stamp, pose, robot, covariance)
         except InputError:
             self.counts['invalid odometry'] += 1
             raise
@@ -138,11 +119,13 @@ class PoseGraph:
         """Find the nodes of the closures that wait."""
         waiting = []
         for closure in self._pending:
-            query = self.chain.find(closure.query_stamp)
+            query = self.chain.find(closure.query_stamp, closure.query_robot)
             place = self._place(closure)
             if query is None or place is None:
-                ahead = max(closure.query_stamp, closure.place_stamp * (not closure.map_id))
-                if self.chain.is_ahead(ahead):
+                ahead = self.chain.is_ahead
+                if ahead(closure.query_stamp, closure.query_robot) or (
+                    not closure.map_id and ahead(closure.place_stamp, closure.place_robot)
+                ):
                     waiting.append(closure)
                 else:
                     self.counts['unknown stamp'] += 1
@@ -154,33 +137,20 @@ class PoseGraph:
             measured = matrices(closure.pose)
             newest = closure.changes[0][0] if closure.changes else closure.query_stamp
             # the frame of the pose moves with the query: its covariance in these axes changes by
-            # the small way between image and keyframe, which is left out
+            # the short motion between image and keyframe, which is left out
             covariance = body_covariance(closure.covariance, measured)
             resolved = ResolvedClosure(
                 i, j, to_place @ measured @ inverse(to_query), covariance,
                 float(self.chain.travelled[i] + np.linalg.norm(to_query[:3, 3])),
                 len(self._known), (closure.query_stamp + newest) // 2, closure.is_independent,
-                self._weight(closure),
             )  # fmt: skip
             self._known.append(closure)
             self._acceptance.add(resolved)
         self._pending = waiting
 
-    def _weight(self, closure: Closure) -> float:
-        """
-        Return how far a closure supports others: the share that keypoints miss of right ones.
-
-        That share depends on the light: of the latest closures, where they confirm few.
-        """
-        if closure.verified is None:
-            return 1.0
-        self._tried = min(self._tried + 1, MEMORY)
-        self._missed += (1 - closure.verified - self._missed) / self._tried
-        return 1.0 if closure.verified else self._missed
-
     def _place(self, closure: Closure) -> tuple[int, np.ndarray] | None:
         if not closure.map_id:
-            return self.chain.find(closure.place_stamp)
+            return self.chain.find(closure.place_stamp, closure.place_robot)
         assert closure.place_pose is not None
         node = self.chain.fixed(closure.map_id, closure.place_stamp, closure.place_pose)
         return node, np.eye(4)
@@ -197,17 +167,17 @@ class PoseGraph:
             return self.solved
         if self._acceptance.has_changed:
             self._decide()
-        ties, edges, initial, moved = self._settle(final)
-        if moved:
-            self._solver.restart()
-        if final or moved:
-            kernels = (WIDE, CAUCHY) if moved else (CAUCHY,)
-            initial = self._solver.solve(
-                self.chain, initial, edges, self.noise, ties.links, kernels
-            )
-        if not final:
-            initial = self._solver.update(self.chain, initial, edges, self.noise, ties.links)
-        self.solved, self._ties, self._edges = initial, ties, edges
+        ties, initial = self._arranged()
+        for _ in range(ROUNDS):
+            if not self._acceptance.refute(initial, ties, final):
+                break
+            ended = self._acceptance.ended_break()
+            if ended is not None:
+                self._merge_session(ended)  # only refuted closures proved it
+            ties, initial = self._arranged()
+        self._solve(ties, initial, final)
+        if self._acceptance.confirm(self.solved, ties):
+            self._solve(ties, self.solved, final)
         return self.solved
 
     def _decide(self) -> None:
@@ -215,90 +185,55 @@ class PoseGraph:
         self._acceptance.compare()
         ended = self._acceptance.ended_break()
         if ended is not None:
-            self._unsplit(ended)  # later closures are against it
+            self._merge_session(ended)  # later closures are against it
             return
         found = self._acceptance.new_break(self._changes)
         if found:
-            self._split(found)
+            # closures on both sides of a break are no clusters any more
+            self.chain.split(found.node, found.stamp)
+            self._rebuild()
         if self._acceptance.adapt():
             self._solver.restart()
 
-    def _settle(self, final: bool) -> Arranged:
-        """Reject clusters that all others together refute, and breaks that only they proved."""
-        arranged = self._arrange()
-        while self._acceptance.refute(arranged.initial, arranged.ties, final):
-            self._solver.restart()
-            arranged = self._arrange()
-        ended = self._acceptance.ended_break()
-        if ended is None:
-            return arranged
-        self._unsplit(ended)
-        return self._settle(final)
+    def _merge_session(self, node: int) -> None:
+        self.chain.merge_session(node)
+        self._rebuild()
 
-    def _arrange(self) -> Arranged:
-        """Tie the sessions by the accepted closures."""
-        accepted = self._acceptance.accepted
-        ties = tie(self.chain, accepted, self.settings.consistency.join_support)
-        moved = ties.moved_since(self._ties)
-        edges = self._select(accepted, ties)
-        if moved:
-            return Arranged(ties, edges, placed(self.chain, accepted, ties), True)
-        initial = extended(self.chain, self.solved, ties)
-        far, session = self._far(edges, initial), self.chain.session
-        if any(session[edge.query] != session[edge.place] for edge in far):
-            initial = placed(self.chain, accepted, ties)
-        # such edges would have no influence on the robust solution
-        return Arranged(ties, edges, initial, bool(far))
-
-    def _split(self, at: Break) -> None:
-        """Begin a session; closures on both sides of a break are no clusters any more."""
-        self.chain.split(at.node, at.stamp)
-        self._begin_anew()
-
-    def _unsplit(self, node: int) -> None:
-        self.chain.unsplit(node)
-        self._begin_anew()
-
-    def _begin_anew(self) -> None:
+    def _rebuild(self) -> None:
         """Find the nodes and clusters of all closures again."""
         self._solver.restart()
         waiting, self._pending = self._pending, self._known
         self._known, self._edges = [], {}
         self._acceptance.restart()
-        self._tried, self._missed = 0, 0.0
         self._resolve()
         self._pending = waiting
         self._acceptance.compare_all()
 
-    def _select(self, accepted: list[Cluster], ties: Ties) -> dict[int, ResolvedClosure]:
-        """
-        Return the edges of the solution by their numbers.
+    def _arranged(self) -> tuple[Ties, np.ndarray]:
+        """Tie the sessions by the accepted closures; return initial transforms of all nodes."""
+        accepted = self._acceptance.accepted
+        ties = tie(self.chain, accepted, self.settings.consistency.join_support)
+        if ties.moved_since(self._ties):
+            return ties, placed(self.chain, accepted, ties)
+        return ties, extended(self.chain, self.solved, ties)
 
-        Where even the least errors of the odometry explain the first loops, the closures measure
-        them less precisely than the odometry, and would add their own errors.
-        """
-        query, place = session_pairs(self.chain, accepted)
-        precise = self._acceptance.is_precise
-        return {
+    def _solve(self, ties: Ties, initial: np.ndarray, final: bool) -> None:
+        """Estimate all nodes by the accepted closures."""
+        chain, accepted = self.chain, self._acceptance.accepted
+        allowed = ties.allow(*(chain.session[each] for each in ends(accepted)))
+        edges = {
             each.number: each
-            for cluster, a, b in zip(accepted, query, place, strict=True)
-            if ties.allows(a, b) and not (precise and a == b)
-            for each in independent(cluster)
-        }
-
-    def _far(
-        self, edges: dict[int, ResolvedClosure], initial: np.ndarray
-    ) -> list[ResolvedClosure]:
-        """Return the new edges that are far from the estimate."""
-        new = [edge for number, edge in edges.items() if number not in self._edges]
-        if not new:
-            return []
-        query, place = [e.query for e in new], [e.place for e in new]
-        error = inverse(np.array([e.transform for e in new]))
-        error = error @ inverse(initial[place]) @ initial[query]
-        deviation = np.sqrt([np.diag(e.covariance)[3:].max() for e in new])
-        far = np.linalg.norm(error[:, :3, 3], axis=1) > FAR * deviation
-        return [edge for edge, is_far in zip(new, far, strict=True) if is_far]
+            for cluster, counts in zip(accepted, allowed, strict=True) if counts
+            for each in cluster.independent
+        }  # fmt: skip
+        moved = ties.moved_since(self._ties)
+        problem = Problem(chain, initial, edges, self._acceptance.scale, ties.links)
+        if final or moved:
+            self.solved = self._solver.solve(problem)
+            problem = replace(problem, initial=self.solved)
+        if not final:
+            self.solved = self._solver.update(problem)
+        self._ties, self._edges = ties, edges
 
     # results
 
@@ -308,7 +243,7 @@ class PoseGraph:
         found = self._acceptance
         return [
             GraphEdge(each.query, each.place, bool(taken))
-            for cluster, taken in zip(found.clusters, found.chosen, strict=False)
+            for cluster, taken in zip(found.clusters, found.taken, strict=True)
             for each in cluster.members
         ]
 
@@ -342,14 +277,16 @@ class PoseGraph:
         """Return the number of closures that wait for their odometry."""
         return len(self._pending)
 
-    def at(self, stamp: int, odometry: np.ndarray | None = None) -> np.ndarray | None:
+    def at(
+        self, stamp: int, odometry: np.ndarray | None = None, robot: str = ''
+    ) -> np.ndarray | None:
         """
         Return the corrected pose at a stamp (ns), shape (7,); None = unknown.
 
         :param odometry: at the stamp, shape (7,); without it, that between keyframes is
             interpolated.
         """
-        found = self.chain.find(stamp)
+        found = self.chain.find(stamp, robot)
         if found is None or found[0] >= len(self.solved):
             return None
         node, motion = found
@@ -357,13 +294,11 @@ class PoseGraph:
             motion = inverse(self.chain.transforms[node]) @ matrices(odometry)
         return to_poses(self.solved[node] @ motion)
 
-    def map_to_odom(self) -> np.ndarray:
+    def map_to_odom(self, robot: str = '') -> np.ndarray:
         """Return the transform from the newest odometry's frame to the map, shape (7,)."""
-        node = self.chain.newest
-        if node < 0 or not len(self.solved):
-            return np.array([0, 0, 0, 0, 0, 0, 1.0])
+        node = self.chain.newest(robot)
         while node >= len(self.solved):
             node = int(self.chain.previous[node])
-            if node < 0:
-                node = len(self.solved) - 1
+        if node < 0:
+            return np.array([0, 0, 0, 0, 0, 0, 1.0])
         return to_poses(self.solved[node] @ inverse(self.chain.transforms[node]))

@@ -8,16 +8,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from stavpr_ros.mapping.transforms import inverse
-from stavpr_slam.pose_graph.consistency import Cluster
-from stavpr_slam.pose_graph.odometry import KeyframeChain
+from stavpr_slam.pose_graph.clusters import Cluster, ends
+from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
 
 @dataclass(frozen=True)
 class Ties:
     """
-    How sessions hang together.
+    How sessions are tied together.
 
-    :param joins: pairs of sessions that closures join.
+    :param joins: pairs of sessions that closures join, the lower one first.
     :param links: first node of each session that no closure joins to others: the node that it is
         tied to loosely; -1 = it is the anchor.
     """
@@ -29,18 +29,10 @@ class Ties:
         """Return whether a session is joined or tied otherwise than before."""
         return self.joins != before.joins or not before.links.items() <= self.links.items()
 
-    def allows(self, a: int, b: int) -> bool:
-        """Return whether closures between two sessions count."""
-        return a == b or (min(a, b), max(a, b)) in self.joins
-
-
-def session_pairs(
-    chain: KeyframeChain, clusters: Sequence[Cluster]
-) -> tuple[list[int], list[int]]:
-    """Return the sessions of the queries and of the places of clusters."""
-    ends = [(cluster.representative.query, cluster.representative.place) for cluster in clusters]
-    query, place = chain.session[np.array(ends, int).reshape(-1, 2)].T.tolist()
-    return query, place
+    def allow(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return whether closures between sessions count, shape (n,), bool."""
+        pairs = zip(np.minimum(a, b).tolist(), np.maximum(a, b).tolist(), strict=True)
+        return np.array([pair[0] == pair[1] or pair in self.joins for pair in pairs], bool)
 
 
 def tie(chain: KeyframeChain, accepted: Sequence[Cluster], least: int) -> Ties:
@@ -49,42 +41,19 @@ def tie(chain: KeyframeChain, accepted: Sequence[Cluster], least: int) -> Ties:
 
     :param least: closures that join two sessions.
     """
-    session = chain.session
-    weights: dict[tuple[int, int], float] = defaultdict(float)
-    for a, b, cluster in zip(*session_pairs(chain, accepted), accepted, strict=True):
-        weights[min(a, b), max(a, b)] += cluster.weight
+    session, weights = chain.session, defaultdict[tuple[int, int], int](int)
+    for cluster, *pair in zip(accepted, *(session[each] for each in ends(accepted)), strict=True):
+        weights[int(min(pair)), int(max(pair))] += cluster.weight
     joins = frozenset(pair for pair, w in weights.items() if pair[0] != pair[1] and w >= least)
-    anchor = KeyframeChain.FIXED if any(a < 0 for a, _ in joins) else 0
-    reached, links = {anchor}, {}
-    starts = np.flatnonzero((chain.previous < 0) & (session >= 0)).tolist()
-    starts.sort(key=lambda node: (session[node] != 0, node))
-    left = [int(session[node]) for node in starts]
-    start_of = dict(zip(left, starts, strict=True))
-    if anchor == 0:
-        links[start_of[0]] = -1
-    while True:
-        reached |= _connected(reached, joins)
-        left = [number for number in left if number not in reached]
-        if not left:
-            return Ties(joins, links)
-        node = start_of[left[0]]
-        links[node] = _before(chain, node)
-        reached.add(left[0])
-
-
-def _connected(reached: set[int], joins: frozenset[tuple[int, int]]) -> set[int]:
-    found = set(reached)
-    while True:
-        more = {s for pair in joins if found & set(pair) for s in pair} - found
-        if not more:
-            return found
-        found |= more
-
-
-def _before(chain: KeyframeChain, node: int) -> int:
-    """Return the keyframe before a node in the order of arrival; -1 = none."""
-    earlier = np.flatnonzero(chain.session[:node] >= 0)
-    return int(earlier[-1]) if len(earlier) else -1
+    reached, links = {each for pair in joins for each in pair if each < 0}, {}
+    for node in chain.starts().tolist():
+        while more := {each for pair in joins if reached & set(pair) for each in pair} - reached:
+            reached |= more
+        if session[node] not in reached:
+            reached.add(int(session[node]))
+            earlier = np.flatnonzero(session[:node] >= 0)
+            links[node] = int(earlier[-1]) if len(earlier) else -1
+    return Ties(joins, links)
 
 
 def extended(chain: KeyframeChain, solved: np.ndarray, ties: Ties) -> np.ndarray:
@@ -94,64 +63,54 @@ def extended(chain: KeyframeChain, solved: np.ndarray, ties: Ties) -> np.ndarray
     :param solved: the last estimate, shape (n, 4, 4).
     :returns: shape (N, 4, 4).
     """
-    T, known = chain.transforms, len(solved)
-    result = np.empty((len(chain), 4, 4))
+    T, known, number = chain.transforms, len(solved), np.arange(len(chain))
+    result = T.copy()
     result[:known] = solved
-    for node in range(known, len(chain)):
-        before = int(chain.previous[node])
-        if before >= 0:
-            result[node] = result[before] @ inverse(T[before]) @ T[node]
-        else:
-            result[node] = _start(chain, node, result, ties)
+    for session in np.unique(chain.session[known:]).tolist():
+        own = number[(chain.session == session) & (number >= known)]
+        before = int(chain.previous[own[0]])
+        if session >= 0:
+            if before < 0:
+                moved = _start(chain, int(own[0]), result, ties) @ inverse(T[own[0]])
+            else:
+                moved = result[before] @ inverse(T[before])
+            result[own] = moved @ T[own]
     return result
 
 
 def placed(chain: KeyframeChain, accepted: Sequence[Cluster], ties: Ties) -> np.ndarray:
     """Return the odometry of all nodes (N, 4, 4), each session where its closures vote for."""
     T, session = chain.transforms, chain.session
-    result = np.empty((len(chain), 4, 4))
-    known: set[int] = set()
-    for number in _order(chain, ties):
-        own = session == number
-        if number == KeyframeChain.FIXED:
-            result[own] = T[own]
+    result = T.copy()
+    known = {KeyframeChain.FIXED}
+    starts = {int(session[node]): int(node) for node in chain.starts()}
+    roots = [int(session[node]) for node in ties.links]
+    while len(known) <= len(starts):
+        joined = [each for pair in ties.joins if known & set(pair) for each in set(pair) - known]
+        left = [each for each in roots if each not in known]
+        number = min(joined) if joined else left[0]
+        votes, own = _votes(chain, accepted, number, known, result), session == number
+        node = starts[number]
+        if len(votes):
+            moved = votes[_medoid(votes, T[own])]
         else:
-            result[own] = _voted(chain, accepted, number, known, result, ties) @ T[own]
+            moved = _start(chain, node, result, ties) @ inverse(T[node])
+        result[own] = moved @ T[own]
         known.add(number)
     return result
 
 
-def _order(chain: KeyframeChain, ties: Ties) -> list[int]:
-    """Return the sessions, each after one that it is joined or tied to."""
-    order: list[int] = []
-    roots = [int(chain.session[node]) for node in ties.links]
-    if any(a < 0 for a, _ in ties.joins):
-        roots.insert(0, KeyframeChain.FIXED)
-    for root in roots:
-        order.append(root)
-        i = len(order) - 1
-        while i < len(order):
-            order += sorted(
-                s for pair in ties.joins if order[i] in pair for s in pair if s not in order
-            )
-            i += 1
-    numbers = [int(s) for s in np.unique(chain.session)]
-    return order + [number for number in numbers if number not in order]
-
-
 def _start(chain: KeyframeChain, node: int, result: np.ndarray, ties: Ties) -> np.ndarray:
     """Return where a session begins that nothing joins: where the last one ended."""
-    if chain.session[node] < 0:
-        return chain.transforms[node]
     link = ties.links.get(node, -1)
     return chain.transforms[node] if link < 0 else result[link]
 
 
-def _voted(
+def _votes(
     chain: KeyframeChain, accepted: Sequence[Cluster], number: int, known: set[int],
-    result: np.ndarray, ties: Ties,
+    result: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Return the transform of a session into the map that its closures agree on best."""
+    """Return the transforms of a session into the map by its closures, shape (n, 4, 4)."""
     votes = []
     for cluster in accepted:
         edge = cluster.representative
@@ -162,11 +121,7 @@ def _voted(
         elif p == number and q in known and q != number:
             pose = result[edge.query] @ inverse(edge.transform)
             votes.append(pose @ inverse(chain.transforms[edge.place]))
-    if votes:
-        return votes[_medoid(np.array(votes), chain.transforms[chain.session == number])]
-    node = int(np.flatnonzero(chain.session == number)[0])
-    turned: np.ndarray = _start(chain, node, result, ties) @ inverse(chain.transforms[node])
-    return turned
+    return np.array(votes)
 
 
 def _medoid(votes: np.ndarray, transforms: np.ndarray) -> int:

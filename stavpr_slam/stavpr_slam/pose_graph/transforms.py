@@ -1,17 +1,10 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Angles, covariances, logarithms and adjoints of rigid transforms, many at once."""
+"""Covariances, logarithms and adjoints of rigid transforms, many at once."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from stavpr_ros.mapping.transforms import cross
-
-
-def angles(transforms: np.ndarray) -> np.ndarray:
-    """Return the angles of rotation of transforms (..., 4, 4), radians."""
-    trace = np.trace(transforms[..., :3, :3], axis1=-2, axis2=-1)
-    result: np.ndarray = np.arccos(np.clip((trace - 1) / 2, -1, 1))
-    return result
 
 
 def planar_poses(poses: np.ndarray) -> np.ndarray:
@@ -60,4 +53,15 @@ def adjoints(motions: np.ndarray) -> np.ndarray:
     result = np.zeros((len(motions), 6, 6))
     result[:, :3, :3] = result[:, 3:, 3:] = R
     result[:, 3:, :3] = cross(motions[:, :3, 3]) @ R
+    return result
+
+
+def exponentials(twists: np.ndarray) -> np.ndarray:
+    """Return the motions (n, 4, 4) of twists (n, 6), the inverse of :func:`logarithms`."""
+    angle = np.maximum(np.linalg.norm(twists[:, :3], axis=1), 1e-4)[:, None, None]
+    hat, result = cross(twists[:, :3]), np.tile(np.eye(4), (len(twists), 1, 1))
+    result[:, :3, :3] = Rotation.from_rotvec(twists[:, :3]).as_matrix()
+    once = (1 - np.cos(angle)) / angle**2 * hat
+    twice = (angle - np.sin(angle)) / angle**3 * (hat @ hat)
+    result[:, :3, 3] = ((np.eye(3) + once + twice) @ twists[:, 3:, None])[:, :, 0]
     return result

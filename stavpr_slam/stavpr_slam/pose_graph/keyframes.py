@@ -1,0 +1,294 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes of the odometry, and the sessions between its breaks."""
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping.trajectory import checked_pose, SECOND
+from stavpr_ros.mapping.transforms import inverse, matrices
+from stavpr_slam.pose_graph.path_errors import given_growth, LEAST, OdometryNoise, step_errors
+from stavpr_slam.pose_graph.track import OdometryTrack
+
+STILL = 0.05  # meters that a standing robot moves at most
+
+
+@dataclass(frozen=True)
+class ChainSettings:
+    """
+    When the odometry becomes a keyframe, and when it breaks.
+
+    :param distance: meters between keyframes.
+    :param angle: radians between keyframes.
+    :param max_gap: seconds without odometry that begin a new session.
+    :param max_speed: meters per second; a faster motion begins a new session.
+    """
+
+    distance: float = 1.0
+    angle: float = 0.1
+    max_gap: float = 5.0
+    max_speed: float = 60.0
+
+
+@dataclass(eq=False)
+class Recording:
+    """
+    Odometry without a break, of one robot.
+
+    :param stamps, nodes: of its keyframes, ns.
+    :param tail, still: stamp and pose of the newest odometry, and of the one that later ones have
+        not moved from.
+    :param stood: longest time that it stood since the last keyframe, and its middle, ns.
+    :param spread: covariance of the odometry at the last keyframe as in its message, (6, 6).
+    """
+
+    robot: str
+    track: OdometryTrack
+    tail: tuple[int, np.ndarray]
+    still: tuple[int, np.ndarray]
+    spread: np.ndarray | None
+    stamps: list[int] = field(default_factory=list)
+    nodes: list[int] = field(default_factory=list)
+    stood: tuple[int, int] = (0, 0)
+
+    def note_standing(self, stamp: int, pose: np.ndarray) -> None:
+        """Update ``stood``."""
+        since, at = self.still
+        if np.linalg.norm(pose[:3] - at[:3]) > STILL:
+            self.still = stamp, pose
+        elif stamp - since > self.stood[0]:
+            self.stood = stamp - since, (stamp + since) // 2
+
+
+class KeyframeChain:
+    """
+    Keyframes of the odometry in sessions, and fixed places of a map; all are nodes of the graph.
+
+    Arrays of N nodes: ``stamps`` (ns), ``transforms`` in the odometry of its session, or in the
+    map, (N, 4, 4), ``travelled`` (m), ``session`` (negative = fixed), ``recording`` (the session
+    before splits), ``previous`` (the node before in its session, -1 = none), ``stood`` (how long
+    the odometry stood before the node, and the middle of that time, (N, 2), ns), and for
+    :mod:`path_errors` ``origin`` (3,), ``spread`` (6, 6), and ``bent`` (6, 3).
+    """
+
+    FIXED = -1
+
+    def __init__(self, settings: ChainSettings, noise: OdometryNoise) -> None:
+        self._settings, self._noise = settings, noise
+        self._nodes = np.zeros(1024, [
+            ('stamps', np.int64), ('transforms', np.float64, (4, 4)), ('travelled', np.float64),
+            ('session', np.int32), ('recording', np.int32), ('previous', np.int64),
+            ('stood', np.int64, 2), ('origin', np.float64, 3), ('spread', np.float64, (6, 6)),
+            ('bent', np.float64, (6, 3)),
+        ])  # fmt: skip
+        self._count = 0
+        self._recordings: list[Recording] = []
+        self._current: dict[str, Recording] = {}  # of each robot
+        self.sessions = 0
+        self._fixed: dict[tuple[str, int], int] = {}
+        # first nodes after splits: the stamps, and the nodes before
+        self._cuts: dict[int, tuple[int, int]] = {}
+        self.breaks: list[str] = []
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        if name.startswith('_') or name not in (self._nodes.dtype.names or ()):
+            raise AttributeError(name)
+        return self._nodes[name][: self._count]
+
+    def newest(self, robot: str = '') -> int:
+        """Return the newest keyframe of a robot; -1 = none."""
+        return self._current[robot].nodes[-1] if robot in self._current else -1
+
+    def add(
+        self, stamp: int, pose: np.ndarray, robot: str = '', covariance: np.ndarray | None = None
+    ) -> bool:
+        """
+        Add the odometry of a robot; return whether it is a new keyframe.
+
+        :param stamp: ns.
+        :param pose: of the base in the frame of the odometry, shape (7,).
+        :param covariance: as in ``geometry_msgs/PoseWithCovariance``, shape (6, 6). Where it does
+            not grow between keyframes, the errors of the settings apply.
+        :raises InputError: an invalid pose or stamp; nothing is changed.
+        """
+        pose = checked_pose(pose)
+        if stamp <= 0:
+            raise InputError(f'odometry with stamp {stamp}: expected nanoseconds above 0')
+        current = self._current.get(robot)
+        cause = self._break(current, stamp, pose)
+        if current is None or cause:
+            if current is not None:
+                self.breaks.append(cause)
+            track = OdometryTrack(self._settings.distance, self._settings.angle)
+            current = Recording(robot, track, (stamp, pose), (stamp, pose), covariance)
+            self._current[robot] = current
+            self._recordings.append(current)
+            self.sessions += 1
+            track.add(stamp, pose, True)
+            self._append(current, stamp, pose, -1, covariance)
+            return True
+        if stamp <= current.tail[0]:
+            return False
+        node = current.nodes[-1]
+        step = inverse(self.transforms[node]) @ matrices(pose)
+        near = np.linalg.norm(step[:3, 3]) < self._settings.distance
+        turned = (np.trace(step[:3, :3]) - 1) / 2 < np.cos(self._settings.angle)
+        is_keyframe = bool(turned or not near)
+        current.tail = stamp, pose
+        current.note_standing(stamp, pose)
+        current.track.add(stamp, pose, is_keyframe)
+        if is_keyframe:
+            self._append(current, stamp, pose, node, covariance)
+        return is_keyframe
+
+    def _break(self, current: Recording | None, stamp: int, pose: np.ndarray) -> str:
+        """Return why a new session begins; empty = none does."""
+        if current is None:
+            return 'start'
+        seconds = (stamp - current.tail[0]) / SECOND
+        if seconds < -0.5:
+            return f'the stamps jumped back by {-seconds:.3f} s'
+        if seconds > self._settings.max_gap:
+            return f'no odometry for {seconds:.1f} s'
+        moved = float(np.linalg.norm(pose[:3] - current.tail[1][:3]))
+        if seconds >= 0 and moved > max(2.0, self._settings.max_speed * seconds):
+            return f'the odometry jumped by {moved:.1f} m'
+        return ''
+
+    def _append(
+        self, current: Recording, stamp: int, pose: np.ndarray, previous: int,
+        covariance: np.ndarray | None,
+    ) -> None:  # fmt: skip
+        transform = matrices(pose)
+        node = self._extend(stamp, transform, self.sessions - 1, len(self._recordings) - 1)
+        row, before = self._nodes[node], self._nodes[previous]
+        row['previous'], row['stood'], row['origin'] = previous, current.stood, pose[:3]
+        if previous >= 0:
+            for name in ('session', 'recording', 'origin'):
+                row[name] = before[name]
+            local = np.array([before['transforms'], transform])
+            local[:, :3, 3] -= row['origin']
+            length = np.linalg.norm(local[1, :3, 3] - local[0, :3, 3])
+            row['travelled'] = before['travelled'] + length
+            grown, bent = step_errors(local, self._noise)
+            given = given_growth(current.spread, covariance, local)
+            if given is not None:
+                grown = LEAST * grown + given
+            row['spread'] = before['spread'] + grown
+            row['bent'] = before['bent'] + bent
+        current.spread, current.stood = covariance, (0, 0)
+        current.stamps.append(stamp)
+        current.nodes.append(node)
+
+    def _extend(self, stamp: int, transform: np.ndarray, session: int, recording: int) -> int:
+        if self._count == len(self._nodes):
+            self._nodes = np.concatenate([self._nodes, np.zeros_like(self._nodes)])
+        row = self._nodes[self._count]
+        row['stamps'], row['transforms'] = stamp, transform
+        row['session'], row['recording'], row['previous'] = session, recording, -1
+        self._count += 1
+        return self._count - 1
+
+    def fixed(self, map_id: str, stamp: int, pose: np.ndarray) -> int:
+        """Return the node of a place of a map, whose pose in the map is known, shape (7,)."""
+        key = (map_id, stamp)
+        if key not in self._fixed:
+            transform = matrices(checked_pose(pose))
+            self._fixed[key] = self._extend(stamp, transform, self.FIXED, self.FIXED)
+        return self._fixed[key]
+
+    def find(self, stamp: int, robot: str = '') -> tuple[int, np.ndarray] | None:
+        """
+        Return the keyframe before a stamp, and the transform (4, 4) from it to the stamp.
+
+        After a split it is the keyframe after the stamp, where that is on the same side. None
+        = no odometry at this stamp; the latest recording counts where stamps repeat.
+        """
+        for each in reversed(self._recordings):
+            first, last = each.track.span
+            if each.robot != robot or not first <= stamp <= last:
+                continue
+            i = bisect_right(each.stamps, stamp) - 1
+            if each.stamps[i] == stamp:
+                return each.nodes[i], np.eye(4)
+            node = each.nodes[i]
+            if i + 1 < len(each.nodes):
+                after = each.nodes[i + 1]
+                if stamp >= self._cuts.get(after, (each.stamps[i + 1], 0))[0]:
+                    node = after
+            return node, inverse(self.transforms[node]) @ matrices(each.track.at(stamp))
+        return None
+
+    def trajectory(
+        self, solved: np.ndarray, robot: str = ''
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """
+        Return the odometry of a robot that is kept, and where it is in the map, by its keyframes.
+
+        :param solved: transforms of the first nodes in the map, shape (n, 4, 4).
+        :returns: stamps (m,), ns; transforms of the odometry and in the map, (m, 4, 4) each.
+        """
+        rows = [(np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(0, np.int64))]
+        for each in self._recordings:
+            if each.robot != robot:
+                continue
+            stamps, poses = each.track.kept
+            nodes = np.array(each.nodes)
+            i = np.searchsorted(each.stamps, stamps, 'right') - 1
+            for node, (cut, _) in self._cuts.items():
+                if node in each.nodes:  # what follows the cut is of the session that it begins
+                    at = each.nodes.index(node)
+                    i[(i == at - 1) & (stamps >= cut)] = at
+            known = nodes[i] < len(solved)
+            rows.append((stamps[known], matrices(poses[known]), nodes[i[known]]))
+        stamps, odometry, own = (np.concatenate(each) for each in zip(*rows, strict=True))
+        return stamps, odometry, solved[own] @ inverse(self.transforms[own]) @ odometry
+
+    def is_ahead(self, stamp: int, robot: str = '') -> bool:
+        """Return whether odometry of this stamp may still arrive."""
+        return robot not in self._current or stamp > self._current[robot].tail[0]
+
+    def starts(self) -> np.ndarray:
+        """Return the first nodes of the sessions, in order of arrival."""
+        return np.flatnonzero((self.previous < 0) & (self.session >= 0))
+
+    def split(self, node: int, stamp: int) -> None:
+        """
+        Let a new session begin.
+
+        :param node: its first keyframe.
+        :param stamp: of its first odometry, ns, after the keyframe before.
+        """
+        self.session[:] = self.parted(node)
+        self._cuts[node] = stamp, int(self.previous[node])
+        self.previous[node] = -1
+        self.sessions += 1
+
+    def parted(self, node: int) -> np.ndarray:
+        """Return the sessions of the nodes as they would be after a split at a node, (N,)."""
+        later = (self.session == self.session[node]) & (np.arange(self._count) >= node)
+        return np.where(later, self.sessions, self.session)
+
+    @property
+    def splits(self) -> Sequence[int]:
+        """Return the first nodes of sessions that began by a split."""
+        return list(self._cuts)
+
+    def merge_session(self, node: int) -> None:
+        """Let a session that began by a split at a node be part of the one before again."""
+        ended = self.session[node]
+        self.session[:] = self.rejoined(node)
+        self.session[self.session > ended] -= 1
+        self.sessions -= 1
+        _, self.previous[node] = self._cuts.pop(node)
+
+    def rejoined(self, node: int) -> np.ndarray:
+        """Return the sessions of the nodes as they would be without a split, (N,)."""
+        before = self.session[self._cuts[node][1]]
+        return np.where(self.session == self.session[node], before, self.session)

@@ -1,0 +1,99 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Errors of the odometry along its path, as covariances of rigid motions.
+
+A small error of a step is a twist; in the axes of the start of the odometry, the twists of all
+steps add up (Barfoot, *State Estimation for Robotics*, 7.3). So the covariance of a path between
+two keyframes is the difference of two sums, whatever its shape.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from stavpr_ros.mapping.transforms import cross, inverse
+from stavpr_slam.pose_graph.transforms import adjoints
+
+SHORTEST = 0.05  # meters that a step counts at least
+NEGLIGIBLE = 1e-6  # part of a covariance below which it is numerical noise
+LEAST = 1e-4  # part of the settings' covariance that given ones are increased by: planar ones
+
+
+@dataclass(frozen=True)
+class OdometryNoise:
+    """
+    Errors of an odometry, as deviations that grow with the distance.
+
+    :param translation: meters per square root of a meter.
+    :param rotation: radians per square root of a meter.
+    :param bias: of the rotation, radians per meter: as much as its random error after a kilometer.
+    """
+
+    translation: float = 0.05
+    rotation: float = 0.012
+    bias: float = 0.0004
+
+
+class Nodes(Protocol):
+    """Arrays of a :class:`KeyframeChain` that paths are computed from."""
+
+    transforms: np.ndarray
+    origin: np.ndarray
+    spread: np.ndarray
+    bent: np.ndarray
+
+
+def step_errors(ends: np.ndarray, noise: OdometryNoise) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the errors of a step in the axes of the start.
+
+    :param ends: the two keyframes in these axes, shape (2, 4, 4).
+    :returns: covariance of the twist, rotation first, (6, 6), and the twists by biases of the
+        rotation of one deviation about each axis, as columns, (6, 3).
+    """
+    lever = cross((ends[:1, :3, 3] + ends[1:, :3, 3]) / 2)[0]
+    length = float(np.linalg.norm(ends[1, :3, 3] - ends[0, :3, 3]))
+    moves = np.concatenate([np.eye(3), lever])
+    spread = noise.rotation**2 * moves @ moves.T
+    spread[3:, 3:] += noise.translation**2 * np.eye(3)
+    return max(length, SHORTEST) * spread, noise.bias * length * moves @ ends[1, :3, :3]
+
+
+def given_growth(
+    before: np.ndarray | None, after: np.ndarray | None, ends: np.ndarray
+) -> np.ndarray | None:
+    """
+    Return how far covariances of messages grow in a step, in the axes of the start, (6, 6).
+
+    :param before, after: as in ``geometry_msgs/PoseWithCovariance``, shape (6, 6).
+    :returns: None where they are unknown or do not grow as those of a filter.
+    """
+    if before is None or after is None or not np.isfinite(before + after).all():
+        return None
+    sums = []
+    for covariance, pose in zip((before, after), ends, strict=True):
+        change = np.zeros((6, 6))
+        change[:3, 3:] = change[3:, :3] = np.eye(3)
+        change[3:, 3:] = cross(pose[None, :3, 3])[0]
+        sums.append(change @ covariance @ change.T)
+    grown: np.ndarray = sums[1] - sums[0]
+    values = np.linalg.eigvalsh((grown + grown.T) / 2)
+    return grown if values[-1] > 0 and values[0] > -NEGLIGIBLE * values[-1] else None
+
+
+def path_errors(
+    chain: Nodes, start: np.ndarray, end: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the errors of the motion between nodes of one session, in the axes of the start.
+
+    :param start, end: n nodes, in any order.
+    :returns: covariances, rotation first, (n, 6, 6); twists by biases, (n, 6, 3).
+    """
+    local = chain.transforms[start].copy()
+    local[:, :3, 3] -= chain.origin[start]
+    turn = adjoints(inverse(local))
+    sign = np.where(end >= start, 1.0, -1.0)[:, None, None]
+    spread = turn @ (sign * (chain.spread[end] - chain.spread[start])) @ turn.swapaxes(-1, -2)
+    return spread, turn @ (chain.bent[end] - chain.bent[start])
