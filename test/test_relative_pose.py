@@ -200,17 +200,33 @@ def test_edge_with_wrong_focal_length_is_rejected_or_near(factor):
     query = pose(0.4, -0.7, math.radians(3))
     wrong = replace(CAMERA, focal=(CAMERA.focal[0] * factor, CAMERA.focal[1] * factor))
     edge = EdgeEstimator().estimate(scene(CAMERA, query), wrong, wrong)
-    assert edge.source in (Source.PNP, Source.ALIGNED)
-    assert np.abs(edge.pose[:2] - query[:2]).max() < 0.8
-    assert np.linalg.eigvalsh(edge.covariance).min() > 0
+    assert edge.source in (Source.PNP, Source.REFUTED)
+    if edge.has_pose:
+        assert np.abs(edge.pose[:2] - query[:2]).max() < 0.8
+        assert np.linalg.eigvalsh(edge.covariance).min() > 0
 
 
-def test_edge_of_other_images_is_aligned_with_the_reason():
+@pytest.mark.parametrize('method', ['auto', 'pnp'])
+def test_edge_that_keypoints_do_not_confirm_has_no_pose(method, monkeypatch):
+    """Images of another place, and a query farther away than the neighbors of the place."""
     other = scene(CAMERA, pose(0), seed=9)
     pair = replace(scene(CAMERA, pose(0)), query=other.query)
-    for method, source in (('auto', Source.ALIGNED), ('pnp', Source.NONE)):
-        edge = EdgeEstimator(method).estimate(pair, CAMERA, CAMERA)
-        assert (edge.source, 'fewer than 14' in edge.reason) == (source, True)
+    far = scene(CAMERA, pose(0.5))
+    monkeypatch.setattr('stavpr_ros.relative_pose.estimator.REACH', 0.1)
+    for case, words in ((pair, 'fewer than 14'), (far, 'more than 0.4 m from the place')):
+        edge = EdgeEstimator(method).estimate(case, CAMERA, CAMERA)
+        assert (edge.source, edge.has_pose, edge.independent) == (Source.REFUTED, False, False)
+        assert words in edge.reason
+        assert edge.inliers >= 0
+
+
+def test_edge_with_an_obstacle_is_dropped_only_where_pnp_is_possible():
+    pair, estimator = scene(CAMERA, pose(0.3)), EdgeEstimator()
+    edge = estimator.estimate(pair, CAMERA, CAMERA, 'a reason')
+    assert (edge.source, edge.has_pose, edge.inliers) == (Source.DROPPED, False, -1)
+    assert (edge.independent, edge.reason) == (False, 'PnP: a reason')
+    assert estimator.estimate(pair, CAMERA, CAMERA).independent
+    assert estimator.estimate(pair, None, CAMERA, 'a reason').source is Source.ALIGNED
 
 
 def test_estimator_keeps_landmarks_of_places_until_the_map_changes(monkeypatch):
