@@ -27,9 +27,9 @@ LEAST_BASELINE = 0.05  # meters between the place and a neighbor
 # Places between independent edges: their errors have views, or odometry, in common.
 APART = {Source.PNP: 5, Source.ALIGNED: 10}
 REACH = 2.0  # a query is at most so many times as far from the place as its neighbors
-# The Jacobian misses what all landmarks of a place have in common, such as errors of its odometry:
-# the deviation of an observation in pixels, and what is added in position (m) and rotation (rad).
-NOISE, SHIFT, TURN = 2.0, 0.2, math.radians(0.4)
+# The deviation of a keypoint in pixels; and what is added in position (m) and rotation (rad), for
+# what all landmarks of a place have in common, such as errors of the motions between its views.
+NOISE, SHIFT, TURN = 0.8, 0.03, math.radians(0.05)
 
 Value = TypeVar('Value')
 

@@ -236,12 +236,10 @@ def _edge_faults(health: Health) -> Iterator[Finding]:
     """Yield the finding on loop closures that PnP had no time for."""
     edges = health.counts.edges.recent
     if dropped := edges['dropped']:
-        closures = _of(edges.total(), 'loop closure')
-        yield WARN, (
-            f'{dropped} of {closures} without a relative pose {RECENTLY}: PnP is slower than they '
-            f'come, more than {MOST_WAITING} waited; set max_rate or keyframe_distance, or free '
-            'a processor core'
-        )
+        text = f'{dropped} of {_of(edges.total(), "loop closure")} without a relative pose'
+        why = f'PnP is slower than they come, more than {MOST_WAITING} waited'
+        remedy = 'set max_rate or keyframe_distance, or free a processor core'
+        yield WARN, f'{text} {RECENTLY}: {why}; {remedy}'
 
 
 def _of(count: int, noun: str) -> str:
