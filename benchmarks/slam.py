@@ -97,10 +97,10 @@ def pass_errors(drive: LapDrive, poses: np.ndarray) -> np.ndarray:
 
 def edge_errors(drive: LapDrive, found: list[Found]) -> dict[str, list[list[float]]]:
     """
-    Return all edges that are published, by source, 6 numbers each.
+    Return all edges that are published, by source, 5 numbers each.
 
-    The errors along, across (m) and of the heading (rad), the NEES, and the true distance of the
-    query: from the place, and across, m.
+    The errors along, across (m) and of the heading (rad), the NEES, and how far across the query
+    truly is (m).
     """
     rows: dict[str, list[list[float]]] = {'PNP': [], 'ALIGNED': []}
     for each in found:
@@ -111,8 +111,7 @@ def edge_errors(drive: LapDrive, found: list[Found]) -> dict[str, list[list[floa
         yaw = Rotation.from_quat(pose[3:]).as_euler('ZYX')[0] - np.arctan2(true[1, 0], true[0, 0])
         off = np.array([*(pose[:2] - true[:2, 3]), (yaw + np.pi) % (2 * np.pi) - np.pi])
         nees = off @ np.linalg.solve(each.edge.covariance[np.ix_(i, i)], off)
-        where = float(np.hypot(*true[:2, 3])), float(true[1, 3])
-        rows[each.edge.source.name].append([*off.tolist(), float(nees), *where])
+        rows[each.edge.source.name].append([*off.tolist(), float(nees), float(true[1, 3])])
     return rows
 
 

@@ -16,7 +16,7 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.relative_pose import landmarks
 from stavpr_ros.relative_pose.edge import Source
 from stavpr_ros.relative_pose.estimator import APART, EdgeEstimator
-from stavpr_ros.relative_pose.landmarks import triangulate, View
+from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import AROUND, MatchedPair
 from stavpr_ros.relative_pose.pnp import LEAST_INLIERS, solve_pnp
@@ -106,6 +106,43 @@ def test_pnp_covariance_fits_the_errors(seed):
             error = np.concatenate([found.matrix[:3, 3] - true[:3, 3], turn])
             squares.append(error @ np.linalg.solve(0.25 * found.covariance, error))
     assert 4 < np.mean(squares) < 9
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_deviations_of_landmarks_fit_the_errors_of_their_depths(seed):
+    """Of views with a noise of half a pixel, errors of inverse depths are as large as stated."""
+    points, noise = points_ahead(200, seed), 0.5
+    poses = [pose(x) for x in (0, -3, -2, -1, 1, 2, 3)]
+    views = views_of(points, poses, noise)
+    neighbors = list(zip(views[1:], motions(poses[1:], poses[0]), strict=True))
+    found = triangulate(views[0], neighbors, 3)
+    exact = views_of(points, poses)[0]
+    rows = [np.flatnonzero((exact.descriptors == own).all(1))[0] for own in found.descriptors]
+    true = in_camera(points, poses[0], CAMERA)
+    depths = true[true[:, 2] > 0.5][rows, 2]
+    errors = (found.points[:, 2] / depths - 1) / found.deviations / noise
+    assert len(errors) > 100
+    assert 0.5 < np.median(np.abs(errors)) / 0.6745 < 1.5
+
+
+def test_pnp_with_noisy_depths_is_unbiased_and_its_covariance_fits_the_errors():
+    """Errors of the depths must not draw the query to the place: 8 cm of 1 m if left out."""
+    dice, focal, noise, sigma = np.random.default_rng(0), 200.0, 0.5, 0.01
+    errors, squares = [], []
+    for _ in range(60):
+        rays = np.column_stack([dice.uniform(-0.6, 0.6, (120, 2)), np.ones(120)])
+        rho = 1 / dice.uniform(12, 40, 120)
+        moved = rays / rho[:, None] - (1, 0, 0)
+        seen = moved[:, :2] / moved[:, 2:] + noise / focal * dice.normal(size=(120, 2))
+        measured = np.maximum(rho + noise * sigma * dice.normal(size=120), 0.002)
+        points, descriptors = rays / measured[:, None], dice.random((120, 128), np.float32)
+        own = Landmarks(points, points, sigma / measured, descriptors, np.empty((0, 4, 4)))
+        found = solve_pnp(View(seen, descriptors, focal), [own])
+        turn = Rotation.from_matrix(found.matrix[:3, :3]).as_rotvec()
+        errors.append(np.concatenate([found.matrix[:3, 3] - (1, 0, 0), turn]))
+        squares.append(errors[-1] @ np.linalg.solve(noise**2 * found.covariance, errors[-1]))
+    assert np.abs(np.mean(errors, axis=0)[:3]).max() < 0.02
+    assert 4 < np.mean(squares) < 8
 
 
 def test_pnp_counts_each_keypoint_once_and_rejects_other_points():
