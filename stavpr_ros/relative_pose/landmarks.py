@@ -98,7 +98,7 @@ def triangulate(
     rho = np.full(len(place.rays), LEAST_SHARE)
     for limit in PIXELS:
         for _ in range(2):
-            rho, information = seen.depths(motions, rho, use)
+            rho, information, variance = seen.depths(motions, rho, use)
             off, ahead = seen.residuals(motions, rho)
             use = ahead & (np.linalg.norm(off, axis=1) * place.focal < limit)
         if limit != PIXELS[-1]:
@@ -108,7 +108,7 @@ def triangulate(
     good = information * MOST_SHIFT**2 > 1
     rays = np.column_stack([place.rays, np.ones(len(place.rays))])
     points = rays[good] / rho[good, None]
-    deviations = 1 / (place.focal * np.sqrt(information[good]) * rho[good])
+    deviations = np.sqrt(variance[good]) / (place.focal * rho[good])
     return Landmarks(points, points, deviations, place.descriptors[good], motions)
 
 
