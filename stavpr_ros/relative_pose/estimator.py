@@ -27,6 +27,9 @@ LEAST_BASELINE = 0.05  # meters between the place and a neighbor
 # Places between independent edges: their errors have views, or odometry, in common.
 APART = {Source.PNP: 5, Source.ALIGNED: 10}
 REACH = 2.0  # a query is at most so many times as far from the place as its neighbors
+# Meters: with a larger deviation of the position, keypoints do not determine it. Wrong places that
+# reached LEAST_INLIERS had 4 m and more; 2 of 1,741 right ones had more than 1 m.
+MOST_DEVIATION = 1.0
 # The deviation of a keypoint in pixels; and what is added in position (m) and rotation (rad), for
 # what all landmarks of a place have in common, such as errors of the motions between its views.
 NOISE, SHIFT, TURN = 0.8, 0.03, math.radians(0.05)
@@ -112,14 +115,17 @@ class EdgeEstimator:
         """
         query, landmarks, reach = self._seen(pair, query_camera, place_camera)
         found = solve_pnp(query, landmarks)
-        reason = ''
         if found.matrix is None:
             reason = f'PnP: {found.inliers} inliers are fewer than {LEAST_INLIERS}'
         elif np.linalg.norm(found.matrix[:3, 3]) > reach:
             reason = f'PnP: more than {reach:.1f} m from the place'
-        if reason:
-            return Edge(Source.REFUTED, reason, inliers=found.inliers)
-        return _edge(found, query_camera, place_camera)
+        else:
+            edge = _edge(found, query_camera, place_camera)
+            deviation = math.sqrt(np.linalg.eigvalsh(edge.covariance[:3, :3])[-1])
+            if deviation <= MOST_DEVIATION:
+                return edge
+            reason = f'PnP: the keypoints determine the position to {deviation:.1f} m only'
+        return Edge(Source.REFUTED, reason, inliers=found.inliers)
 
     def _seen(
         self, pair: MatchedPair, query_camera: Camera, place_camera: Camera
