@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from results import environment, RESULTS, ROOT
 from scipy.spatial.transform import Rotation
-from slam_page import markdown
-from slam_pairs import CAMERA, Found, recognized, SharedViews, with_edges
+from slam_page import markdown, NEAR
+from slam_pairs import CAMERA, Found, measured, recognized, SharedViews, with_edges
 from stavpr_lab.demonstration.slam import trajectory_errors
 from stavpr_lab.demonstration.street.laps import CARRIED, drive_laps, LapDrive
 from stavpr_ros.mapping.transforms import inverse, matrices
@@ -37,7 +37,7 @@ from tqdm import tqdm
 DRIFTS = {'large': 1.0, 'small': 0.06}  # factors on the errors of the odometry
 FALSE = {'random 30': (0.3, False), 'coherent 30': (0.3, True), 'coherent 50': (0.5, True)}
 WRONG_PAIRS = 200  # of each world
-FAR, NEAR = 30.0, 6.0  # meters: a pair of wrong places; a right closure
+FAR = 30.0  # meters: a pair of wrong places
 PASSES = 4.0  # meters: images of two laps whose relative position is compared
 ONLINE = 60  # images after the first closure behind a break that are watched
 LEAST_ATE = 2.5  # meters: of a carried robot
@@ -62,7 +62,8 @@ def falsified(drive: LapDrive, found: list[Found], kind: str, seed: int) -> list
     for each in found:
         known |= {each.query, each.place}
         place = false.place(each.place, known)
-        result.append(replace(each.closure, place_stamp=int(drive.stamps[place])))
+        if each.closure is not None:
+            result.append(replace(each.closure, place_stamp=int(drive.stamps[place])))
     return result
 
 
@@ -95,17 +96,22 @@ def pass_errors(drive: LapDrive, poses: np.ndarray) -> np.ndarray:
 
 
 def edge_errors(drive: LapDrive, found: list[Found]) -> dict[str, list[list[float]]]:
-    """Return for each source along, across (m), heading (rad) and NEES of right edges."""
+    """
+    Return all edges that are published, by source, 5 numbers each.
+
+    The errors along, across (m) and of the heading (rad), the NEES, and how far across the query
+    truly is (m).
+    """
     rows: dict[str, list[list[float]]] = {'PNP': [], 'ALIGNED': []}
     for each in found:
         true = relative(drive.truth, each.query, each.place)
-        if each.edge.source is Source.NONE or np.hypot(*true[:2, 3]) > NEAR:
+        if not each.edge.has_pose:
             continue
         pose, i = each.edge.pose, [0, 1, 5]
         yaw = Rotation.from_quat(pose[3:]).as_euler('ZYX')[0] - np.arctan2(true[1, 0], true[0, 0])
-        off = np.array([*(pose[:2] - true[:2, 3]), yaw])
+        off = np.array([*(pose[:2] - true[:2, 3]), (yaw + np.pi) % (2 * np.pi) - np.pi])
         nees = off @ np.linalg.solve(each.edge.covariance[np.ix_(i, i)], off)
-        rows[each.edge.source.name].append([*off.tolist(), float(nees)])
+        rows[each.edge.source.name].append([*off.tolist(), float(nees), float(true[1, 3])])
     return rows
 
 
@@ -119,7 +125,7 @@ def biases(drive: LapDrive, found: list[Found]) -> dict[str, list[float]]:
             continue
         spacing = each.pair.spacing
         rows['late' if each.is_late else 'place_index'].append(float(-true[0, 3] / spacing))
-        if each.edge.source is not Source.NONE:
+        if each.edge.has_pose:
             rows['edge'].append(float((each.edge.pose[0] - true[0, 3]) / spacing))
     return rows
 
@@ -141,7 +147,7 @@ def measure_drift(drive: LapDrive, found: list[Found], seed: int) -> dict[str, A
     """Return the errors of a drive, without and with false closures."""
     odometry = planar_poses(drive.odometry)
     began = time.thread_time()
-    poses, graph = optimize(drive.stamps, odometry, [each.closure for each in found])
+    poses, graph = optimize(drive.stamps, odometry, measured(found))
     before = ate(drive, odometry)
     right = [
         np.hypot(*relative(drive.truth, each.query, each.place)[:2, 3]) < NEAR for each in found
@@ -172,7 +178,7 @@ def measure_sessions(drive: LapDrive, found: list[Found], seed: int) -> dict[str
     """Return the error of two sessions, without and with false closures."""
     odometry, row = planar_poses(drive.odometry), {}
     for kind in ('', 'random 30', 'coherent 30'):
-        closures = falsified(drive, found, kind, seed) if kind else [f.closure for f in found]
+        closures = falsified(drive, found, kind, seed) if kind else measured(found)
         poses, _ = optimize(drive.stamps, odometry, closures)
         row[kind or 'after'] = ate(drive, poses)
     return row
@@ -181,7 +187,7 @@ def measure_sessions(drive: LapDrive, found: list[Found], seed: int) -> dict[str
 def measure_carried(drive: LapDrive, found: list[Found]) -> dict[str, Any]:
     """Return the error of a carried robot, and how soon it was small."""
     odometry = planar_poses(drive.odometry)
-    poses, final = optimize(drive.stamps, odometry, [each.closure for each in found])
+    poses, final = optimize(drive.stamps, odometry, measured(found))
     behind = [
         each.known
         for each in found
@@ -192,7 +198,8 @@ def measure_carried(drive: LapDrive, found: list[Found]) -> dict[str, Any]:
     for i in range(first + ONLINE + 1):
         graph.add_odometry(int(drive.stamps[i]), odometry[i])
         while waiting and waiting[0].known <= i:
-            graph.add_closure(waiting.pop(0).closure)
+            if (closure := waiting.pop(0).closure) is not None:
+                graph.add_closure(closure)
         if i >= first or i % 20 == 0:
             graph.update()
         if i >= first:

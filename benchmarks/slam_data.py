@@ -18,7 +18,7 @@ from data import data_folder
 import numpy as np
 from results import environment, RESULTS, ROOT, table
 from slam import ate, DRIFTS
-from slam_pairs import recognize, with_edges
+from slam_pairs import measured, recognize, with_edges
 from stavpr_lab.demonstration.street.laps import LapDrive, RingWorld
 from stavpr_lab.demonstration.street.traverses import LENGTH
 from stavpr_lab.evaluation.ground_truth import GroundTruth
@@ -89,7 +89,7 @@ def measure(
         drive, recognize(drive, images, None, exclude), EdgeEstimator(), camera=None
     )
     odometry = planar_poses(drive.odometry)
-    poses, graph = optimize(drive.stamps, odometry, [each.closure for each in found])
+    poses, graph = optimize(drive.stamps, odometry, measured(found))
     before, after = ate(drive, odometry), ate(drive, poses)
     counts = {'closures': len(found), 'rejected': graph.rejected}
     return {'before': before, 'after': after, 'ratio': after / before, **counts}, poses

@@ -9,6 +9,7 @@ import numpy as np
 from results import heading, table
 from scipy.stats import chi2
 
+NEAR, LANE = 6.0, 1.5  # meters: of a right closure; across, on the other lane
 BOUND = float(chi2.ppf(0.95, 3))  # of along, across and heading
 TEXT = """\
 Worlds of `make demo SLAM=world` (600 m, three laps, lap 2 on the other lane with a detour and a
@@ -127,7 +128,7 @@ def _edge_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
     add('pairs of wrong places accepted', '0', ('', f'{sum(wrong)} of {len(wrong)}'))
     edges = {
         (name, source): np.concatenate(
-            [np.array(row['edges'][source]).reshape(-1, 4) for row in own[name]]
+            [np.array(row['edges'][source]).reshape(-1, 5) for row in own[name]]
         )
         for name in drifts
         for source in ('PNP', 'ALIGNED')
@@ -140,9 +141,22 @@ def _edge_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
             f'{np.percentile(np.abs(edges[name, "PNP"][:, column]), 90) / unit:.2f}'
             for name in drifts
         ))  # fmt: skip
-    for source, title in (('PNP', 'PnP'), ('ALIGNED', 'aligned')):
-        inside = [edges[name, source][:, 3] < BOUND for name in drifts]
-        add(f'{title}: inside the bound of 95 % (NEES)', '90 to 99 %', (
+    add('PnP: mean error across, away from the place, other lane, m', '.05', (
+        f'{np.mean(each[:, 1] * np.sign(each[:, 4]), where=np.abs(each[:, 4]) > LANE):.3f}'
+        for each in (edges[name, 'PNP'] for name in drifts)
+    ))  # fmt: skip
+    for source, title, marks in (
+        ('PNP', 'PnP', ('2 to 4', '92 to 97 %')), ('ALIGNED', 'aligned', ('', '90 to 99 %'))
+    ):  # fmt: skip
+        of = [edges[name, source] for name in drifts]
+        add(f'{title}: of the published edges, off by more than 6 m', '0', (
+            f'{np.sum(np.hypot(*each[:, :2].T) > NEAR)} of {len(each)}' for each in of
+        ))  # fmt: skip
+        add(f'{title}: mean NEES of 3', marks[0], (
+            f'{each[:, 3].mean():.2f}' if len(each) else '' for each in of
+        ))  # fmt: skip
+        inside = [each[:, 3] < BOUND for each in of]
+        add(f'{title}: inside the bound of 95 % (NEES)', marks[1], (
             f'{100 * each.mean():.1f} % of {len(each)}' if len(each) else '' for each in inside
         ))  # fmt: skip
     for kind, title in (('edge', 'edge'), ('place_index', '`place_index`')):

@@ -41,14 +41,18 @@ class Matched:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A closure: when it was known, the images of it, the pair, its edge, and the measurement."""
+    """
+    A closure: when it was known, the images of it, the pair, its edge, and the measurement.
+
+    ``closure`` is None where PnP refuted the place: it is no edge of the graph.
+    """
 
     known: int
     query: int
     place: int
     pair: MatchedPair
     edge: Edge
-    closure: Closure
+    closure: Closure | None
     seconds: float
     is_late: bool
 
@@ -104,6 +108,11 @@ def recognized(drive: LapDrive, images: np.ndarray, path: Path) -> list[Matched]
     return found
 
 
+def measured(found: list[Found]) -> list[Closure]:
+    """Return the closures that are edges of the graph."""
+    return [each.closure for each in found if each.closure is not None]
+
+
 def with_edges(
     drive: LapDrive,
     pairs: list[Matched],
@@ -117,15 +126,10 @@ def with_edges(
         edge = estimator.estimate(each.pair, camera, camera)
         took = time.thread_time() - began
         stamps = int(drive.stamps[each.query]), int(drive.stamps[each.place])
-        appearance = edge.source is Source.NONE
-        closure = Closure(
-            *stamps,
-            IDENTITY if appearance else edge.pose,
-            APPEARANCE if appearance else edge.covariance,
-            edge.independent,
-            changes=each.changes,
-            verified=edge.verified,
-        )
+        pose = (edge.pose, edge.covariance) if edge.has_pose else (IDENTITY, APPEARANCE)
+        closure = None
+        if edge.source is not Source.REFUTED:
+            closure = Closure(*stamps, *pose, edge.independent, changes=each.changes)
         found.append(
             Found(each.known, each.query, each.place, each.pair, edge, closure, took, each.is_late)
         )

@@ -31,6 +31,7 @@ HEALTHY = {
     'missing_images': 0,
     'drops': {},
     'recent_drops': {},
+    'recent_edges': {},
     'statuses': {'no match': 990, 'match': 2000},
     'recent_statuses': {'no match': 99, 'match': 200},
     'status': 'match',
@@ -58,6 +59,7 @@ def statuses(changes):
         'received': Tally(Counter({'': state['received']}), rate=state['rate'], age=state['age']),
         'missing': Tally(recent=Counter({'': state['missing_images']})),
         'dropped': Tally(Counter(state['drops']), Counter(state['recent_drops'])),
+        'edges': Tally(Counter(state['recent_edges']), Counter(state['recent_edges'])),
         'answered': Tally(
             Counter(state['statuses']), Counter(state['recent_statuses']), rate=29.9, age=0.03
         ),
@@ -178,6 +180,12 @@ CASES = {
         (WARN, 'set max_rate or keyframe_*, a smaller map', SLOW | {'precision': 'int8'}),
         (WARN, 'one takes 11.5 ms, which is fast enough: they arrive in bursts; raise', FULL),
         (WARN, 'none was finished; check for a map being loaded', FULL | {'times': {}}),
+        (OK, 'ms an image', {'recent_edges': {'pnp': 5, 'refuted': 2}}),
+        (
+            WARN,
+            '2 of 5 loop closures without a relative pose in the last 10 s: PnP is slower',
+            {'recent_edges': {'pnp': 3, 'dropped': 2}},
+        ),
         (ERROR, '2 images failed', {'recent_drops': {'queue full': 120, 'internal error': 2}}),
         (OK, 'ms an image', {'drops': {'internal error': 2, 'queue full': 7}}),
         (OK, 'ms an image', {'recent_drops': {'max_rate': 90, 'not ready': 3}}),
@@ -270,10 +278,12 @@ def test_values_of_map_are_complete():
 
 
 def test_values_of_recognition_are_complete():
-    assert ' '.join(values('recognition')) == (
+    found = values('recognition', recent_edges={'pnp': 3, 'dropped': 2})
+    assert ' '.join(found) == (
         'operation=localization mode=robust min_probability=0.500 window=20 length=20 '
         'last_status=match last_reason=none last_place=17 last_distance=0.422 '
-        'last_answer_age_s=0.030 camera=not needed last_edge_reason=none '
+        'last_answer_age_s=0.030 camera=not needed edges_pnp=3 edges_dropped=2 '
+        'edges_dropped_10s=2 last_edge_reason=none '
         'statuses_no_match=990 statuses_match=2000'
     )
     nothing = {'mode': 'paper', 'threshold': -1.0, 'place': -1, 'distance': math.nan, 'status': ''}

@@ -187,8 +187,9 @@ def test_match_message_with_an_edge_names_its_pair(places):
     assert found.pose.pose == pose_message(pose)
     np.testing.assert_array_equal(found.pose.covariance[::7], np.arange(6.0))
     assert (found.inliers, found.is_independent) == (-1, False)
-    none = match_message(HEADER, accepted(), places, edge=Edge(Source.NONE, 'why'), frame='base')
-    assert (none.has_relative_pose, none.relative_pose.reason) == (False, 'why')
+    for source in (Source.NONE, Source.REFUTED, Source.DROPPED):
+        none = match_message(HEADER, accepted(), places, edge=Edge(source, 'why'), frame='base')
+        assert (none.has_relative_pose, none.relative_pose.reason) == (False, 'why')
 
 
 # ------------------------------------------------ candidates, loop closures, poses

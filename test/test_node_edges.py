@@ -3,6 +3,7 @@
 """Edges over ROS: loop closures with camera_info and odometry, and their source and frames."""
 
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,12 +12,15 @@ from sensor_msgs.msg import CameraInfo
 from stavpr_msgs.msg import LoopClosure, PlaceMatch, RelativePose
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.camera import FORWARD
+from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
+from stavpr_ros.ros import edges
 from stavpr_ros.ros.camera import camera_of, mount_of
-from stavpr_ros.ros.edges import EdgePublisher
+from stavpr_ros.ros.edges import EdgePublisher, MOST_WAITING, WaitingClosure
 
+LAST = MOST_WAITING + 3  # of so many closures that three are dropped
 MOUNT = '0.1 0 1.2 -1.5708 0 -1.5708'
 
 
@@ -133,7 +137,80 @@ def test_images_do_not_wait_for_edges(closing, monkeypatch):
     monkeypatch.setattr(EdgePublisher, 'put', noting)
     matches, closures = closing(info(), camera_transform=MOUNT)
     assert [c.header.stamp for c in closures] == [m.header.stamp for m in matches]
-    sources = {closure.relative_pose.source for closure in closures}
-    assert RelativePose.PNP in sources
-    assert {m.relative_pose.source for m in matches} == {RelativePose.ALIGNED}
+    assert {closure.relative_pose.source for closure in closures} == {RelativePose.PNP}
+    assert not any(match.has_relative_pose for match in matches)
+    assert {m.relative_pose.source for m in matches} == {RelativePose.NONE}
+    assert {m.relative_pose.reason for m in matches} == {
+        'the loop closure of this header has it, by PnP'
+    }
     assert {camera.focal for camera in seen if camera} == {(300.0, 300.0)}
+
+
+@pytest.fixture
+def queue(monkeypatch):
+    """Return a publisher of edges whose first PnP waits, what it has published, and its counts."""
+    free, started, ending = threading.Event(), threading.Event(), threading.Event()
+
+    def slow(self, pair, query_camera, place_camera):
+        started.set()
+        free.wait(60)
+        return Edge(Source.PNP)
+
+    monkeypatch.setattr(EdgeEstimator, '_pnp', slow)
+    published, statistics, last = [], Statistics(), threading.Event()
+
+    def publish(message):
+        published.append(message)
+        if message.query_index == LAST:
+            last.set()
+
+    publisher, camera = EdgePublisher('auto', publish, statistics, ending), object()
+    pair = SimpleNamespace(
+        pose=lambda place: np.array([0, 0, 0, 0, 0, 0, 1.0]), place=0, query=object(),
+        thumbnails={0: b'JPEG'}, source=object(), spacing=1e-9,
+    )  # fmt: skip
+
+    def put(number):
+        message = LoopClosure(query_index=number)
+        publisher.put(WaitingClosure(message, pair, camera, camera))
+        assert number or started.wait(60)
+
+    yield SimpleNamespace(
+        put=put, free=free, publisher=publisher, published=published, statistics=statistics,
+        last=last,
+    )  # fmt: skip
+    free.set()
+    publisher.stop()
+
+
+def test_oldest_closures_are_dropped_in_order_while_too_many_wait(queue):
+    """Three more than may wait: the three oldest behind the one in process have no pose."""
+    for number in range(LAST + 1):
+        queue.put(number)
+    queue.free.set()
+    assert queue.last.wait(60)
+    assert [message.query_index for message in queue.published] == list(range(LAST + 1))
+    sources = [message.relative_pose.source for message in queue.published]
+    dropped = [RelativePose.DROPPED] * 3
+    assert sources[:5] == [RelativePose.PNP, *dropped, RelativePose.PNP]
+    assert set(sources[5:]) == {RelativePose.PNP}
+    found = queue.published[1]
+    assert found.relative_pose.reason == 'PnP: dropped, 66 newer closures are waiting'
+    assert not found.has_relative_pose
+    assert queue.statistics.counts().edges.total == {'pnp': MOST_WAITING + 1, 'dropped': 3}
+
+
+@pytest.mark.parametrize(('seconds', 'source'), [(60.0, Source.PNP), (0.0, Source.DROPPED)])
+def test_flush_publishes_waiting_closures_by_pnp_until_its_time_is_over(
+    queue, monkeypatch, seconds, source
+):
+    monkeypatch.setattr(edges, 'FLUSH_TIME', seconds)
+    for number in range(3):
+        queue.put(number)
+    worker, call = queue.publisher._worker, queue.publisher._worker.call
+    monkeypatch.setattr(worker, 'call', lambda do: (call(do), queue.free.set())[0])
+    queue.publisher.flush()
+    sources = [message.relative_pose.source for message in queue.published]
+    assert sources == [Source.PNP, source, source]
+    reasons = {message.relative_pose.reason for message in queue.published[1:]}
+    assert reasons == {'PnP: dropped at deactivation' if source is Source.DROPPED else ''}

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Edges: landmarks and PnP of synthetic geometry, alignment by odometry, cameras, fallbacks."""
+"""Edges: from images, alignment by odometry, cameras, fallbacks."""
 
 from dataclasses import replace
 import math
@@ -11,116 +11,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import encode_thumbnail, load_map, merge_maps, save_map, thumbnail_of
-from stavpr_ros.mapping.camera import Camera, FORWARD
+from stavpr_ros.mapping.camera import FORWARD
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.relative_pose import landmarks
 from stavpr_ros.relative_pose.edge import Source
 from stavpr_ros.relative_pose.estimator import APART, EdgeEstimator
-from stavpr_ros.relative_pose.landmarks import triangulate, View
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import AROUND, MatchedPair
-from stavpr_ros.relative_pose.pnp import LEAST_INLIERS, solve_pnp
+from stavpr_ros.relative_pose.pnp import LEAST_INLIERS
+from test_pnp import CAMERA, in_camera, points_ahead, pose, SIZE
 
-SIZE = 320, 240
 SPACING = 1.0  # meters between places
 PLACE, PLACES, LENGTH = 10, 21, 11
-CAMERA = Camera(*SIZE, (200.0, 200.0), (159.5, 119.5))
 MATRIX = np.array([[200.0, 0, 159.5], [0, 200, 119.5], [0, 0, 1]])
 MOUNTED = replace(CAMERA, mount=(0.4, -0.2, 1.1, *FORWARD[3:]))
 DISTORTED = replace(CAMERA, model='plumb_bob', distortion=(-0.2, 0.05, 0.001, -0.001, 0.0))
-
-
-def pose(x, y=0.0, yaw=0.0):
-    return np.array([x, y, 0, 0, 0, math.sin(yaw / 2), math.cos(yaw / 2)])
-
-
-def points_ahead(count, seed=0):
-    """Return points on both sides of the way ahead, in the base's frame, (count, 3)."""
-    rng = np.random.default_rng(seed)
-    side = np.where(rng.random(count) < 0.5, -1, 1)
-    return np.column_stack(
-        [rng.uniform(4, 45, count), side * rng.uniform(1, 9, count), rng.uniform(-1, 5, count)]
-    )
-
-
-# ------------------------------------------------ landmarks and PnP, without images
-
-
-def views_of(points, poses, noise=0.0, seed=1):
-    """Return ideal views of points with a descriptor each, (m, 3), from poses of the base."""
-    rng = np.random.default_rng(seed)
-    descriptors = rng.uniform(0, 100, (len(points), 128)).astype(np.float32)
-    views = []
-    for each in poses:
-        seen = in_camera(points, each, CAMERA)
-        known = seen[:, 2] > 0.5
-        rays = seen[known, :2] / seen[known, 2:]
-        views.append(
-            View(rays + noise / 200 * rng.normal(size=rays.shape), descriptors[known], 200.0)
-        )
-    return views
-
-
-def in_camera(points, base, camera):
-    to = inverse(matrices(base) @ matrices(np.array(camera.mount)))
-    return points @ to[:3, :3].T + to[:3, 3]
-
-
-def motions(poses, center):
-    mount = matrices(np.array(FORWARD))
-    own = matrices(center) @ mount
-    return [inverse(matrices(each) @ mount) @ own for each in poses]
-
-
-def test_triangulate_of_exact_views_returns_the_points():
-    poses = [pose(x) for x in (-2, -1, 0, 1, 2)]
-    points = points_ahead(200)
-    views = views_of(points, poses)
-    around = [0, 1, 3, 4]
-    neighbors = list(zip([views[i] for i in around], motions([poses[i] for i in around], poses[2]),
-                         strict=True))  # fmt: skip
-    found = triangulate(views[2], neighbors, 2)
-    assert len(found.points) > 140  # others are far ahead, without parallax
-    true = in_camera(points, poses[2], CAMERA)
-    away = np.linalg.norm(found.points[:, None] - true, axis=2).min(axis=1)
-    assert away.max() < 1e-3
-
-
-@pytest.mark.parametrize('seed', range(3))
-def test_pnp_covariance_fits_the_errors(seed):
-    """Of 60 noisy queries, the mean normalized square of the errors is near its 6 dimensions."""
-    points, center = points_ahead(80, seed), pose(0)
-    views = views_of(points, [center, *[pose(x) for x in (-4, -3, 3, 4)]])
-    around = motions([pose(x) for x in (-4, -3, 3, 4)], center)
-    landmarks = triangulate(views[0], list(zip(views[1:], around, strict=True)), 2)
-    mount = matrices(np.array(FORWARD))
-    squares = []
-    for query in (pose(0.6, 1.2, 0.05), pose(-0.4, -0.5, -0.03)):
-        true = inverse(mount) @ matrices(query) @ mount
-        for trial in range(30):
-            view = views_of(points, [query])[0]
-            noise = 0.5 / 200 * np.random.default_rng(trial).normal(size=view.rays.shape)
-            view = replace(view, rays=view.rays + noise)
-            found = solve_pnp(view, [landmarks])
-            turn = Rotation.from_matrix(found.matrix[:3, :3] @ true[:3, :3].T).as_rotvec()
-            error = np.concatenate([found.matrix[:3, 3] - true[:3, 3], turn])
-            squares.append(error @ np.linalg.solve(0.25 * found.covariance, error))
-    assert 4 < np.mean(squares) < 9
-
-
-def test_pnp_counts_each_keypoint_once_and_rejects_other_points():
-    points = points_ahead(60)
-    center, aside = pose(0), [pose(-2), pose(2)]
-    views = views_of(points, [center, *aside])
-    around = list(zip(views[1:], motions(aside, center), strict=True))
-    landmarks = triangulate(views[0], around, 1)
-    query = views_of(points, [pose(0.5, 0.5)])[0]
-    once, twice = solve_pnp(query, [landmarks]), solve_pnp(query, [landmarks, landmarks])
-    assert once.inliers == twice.inliers > 30
-    few = replace(landmarks, points=landmarks.points[:11], descriptors=landmarks.descriptors[:11])
-    assert solve_pnp(query, [few, few]).matrix is None
-    other = np.random.default_rng(3).permutation(landmarks.points)
-    assert solve_pnp(query, [replace(landmarks, points=other)]).inliers < LEAST_INLIERS
 
 
 # ------------------------------------------------ from images to edges
@@ -200,17 +105,42 @@ def test_edge_with_wrong_focal_length_is_rejected_or_near(factor):
     query = pose(0.4, -0.7, math.radians(3))
     wrong = replace(CAMERA, focal=(CAMERA.focal[0] * factor, CAMERA.focal[1] * factor))
     edge = EdgeEstimator().estimate(scene(CAMERA, query), wrong, wrong)
-    assert edge.source in (Source.PNP, Source.ALIGNED)
-    assert np.abs(edge.pose[:2] - query[:2]).max() < 0.8
-    assert np.linalg.eigvalsh(edge.covariance).min() > 0
+    assert edge.source in (Source.PNP, Source.REFUTED)
+    if edge.has_pose:
+        assert np.abs(edge.pose[:2] - query[:2]).max() < 0.8
+        assert np.linalg.eigvalsh(edge.covariance).min() > 0
 
 
-def test_edge_of_other_images_is_aligned_with_the_reason():
+@pytest.mark.parametrize('method', ['auto', 'pnp'])
+def test_edge_that_keypoints_do_not_confirm_has_no_pose(method, monkeypatch):
+    """Images of another place, and a query farther away than the neighbors of the place."""
     other = scene(CAMERA, pose(0), seed=9)
     pair = replace(scene(CAMERA, pose(0)), query=other.query)
-    for method, source in (('auto', Source.ALIGNED), ('pnp', Source.NONE)):
-        edge = EdgeEstimator(method).estimate(pair, CAMERA, CAMERA)
-        assert (edge.source, 'fewer than 14' in edge.reason) == (source, True)
+    far = scene(CAMERA, pose(0.5))
+    monkeypatch.setattr('stavpr_ros.relative_pose.estimator.REACH', 0.1)
+    for case, words in ((pair, 'fewer than 14'), (far, 'more than 0.4 m from the place')):
+        edge = EdgeEstimator(method).estimate(case, CAMERA, CAMERA)
+        assert (edge.source, edge.has_pose, edge.independent) == (Source.REFUTED, False, False)
+        assert words in edge.reason
+        assert edge.inliers >= 0
+
+
+def test_edge_that_keypoints_do_not_determine_has_no_pose(monkeypatch):
+    monkeypatch.setattr('stavpr_ros.relative_pose.estimator.MOST_DEVIATION', 0.02)
+    edge = EdgeEstimator().estimate(scene(CAMERA, pose(0.5)), CAMERA, CAMERA)
+    assert (edge.source, edge.has_pose, edge.inliers >= LEAST_INLIERS) == (
+        Source.REFUTED, False, True,
+    )  # fmt: skip
+    assert 'determine the position to 0.0 m only' in edge.reason
+
+
+def test_edge_with_an_obstacle_is_dropped_only_where_pnp_is_possible():
+    pair, estimator = scene(CAMERA, pose(0.3)), EdgeEstimator()
+    edge = estimator.estimate(pair, CAMERA, CAMERA, 'a reason')
+    assert (edge.source, edge.has_pose, edge.inliers) == (Source.DROPPED, False, -1)
+    assert (edge.independent, edge.reason) == (False, 'PnP: a reason')
+    assert estimator.estimate(pair, CAMERA, CAMERA).independent
+    assert estimator.estimate(pair, None, CAMERA, 'a reason').source is Source.ALIGNED
 
 
 def test_estimator_keeps_landmarks_of_places_until_the_map_changes(monkeypatch):

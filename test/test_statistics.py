@@ -30,6 +30,17 @@ def stream(clock, seconds, hertz, event):
         event()
 
 
+def test_edges_are_counted_by_source_with_the_last_reason(clock, statistics):
+    for source, reason in (('PNP', ''), ('REFUTED', 'PnP: 3 inliers')):
+        statistics.closed(source, reason)
+    counts = statistics.counts()
+    assert (counts.edges.total, counts.edge_reason) == ({'pnp': 1, 'refuted': 1}, 'PnP: 3 inliers')
+    clock.now += RECENT + 1
+    statistics.restart()
+    counts = statistics.counts()
+    assert (counts.edges.count, counts.edges.recent, counts.edge_reason) == (2, {}, '')
+
+
 def answer(statistics, status='match', reason='', place=0, distance=0.5, **stages):
     statistics.answered(status, reason, place, distance, stages)
 

@@ -50,6 +50,8 @@ class ImageCounts:
     answered: Tally = field(default_factory=Tally)  # by status in lower case, as 'no match'
     dropped: Tally = field(default_factory=Tally)  # without a result, by cause, as 'queue full'
     missing: Tally = field(default_factory=Tally)  # by the stamps and the camera's rate: estimate
+    edges: Tally = field(default_factory=Tally)  # of loop closures, by source in lower case
+    edge_reason: str = ''  # why the last edge is not by PnP; empty = it is
     status: str = ''  # of the last result, as are reason, place and distance
     reason: str = ''
     place: int = -1  # -1 = none
@@ -80,7 +82,9 @@ class Statistics:
         """Begin another activation: totals stay, recent events and the last result are gone."""
         with self._lock:
             self._start = self._clock()
-            self._counts = replace(self._counts, status='', reason='', place=-1, distance=math.nan)
+            self._counts = replace(
+                self._counts, status='', reason='', place=-1, distance=math.nan, edge_reason=''
+            )
             self._last: dict[str, float] = {}  # time of the last event by kind
             # time, name and number of the events by kind
             self._recent: defaultdict[str, deque[tuple[float, str, int]]] = defaultdict(deque)
@@ -119,6 +123,12 @@ class Statistics:
         with self._lock:
             self._add('dropped', cause, count)
 
+    def closed(self, source: str, reason: str) -> None:
+        """Count a loop closure by the source of its edge; reason: why it is not PnP."""
+        with self._lock:
+            self._add('edges', source.lower())
+            self._counts.edge_reason = reason
+
     def stepped(self, ahead: float, missing: int) -> None:
         """Count a gap or jump back of the stamps, and missing images, see :class:`StampWatch`."""
         with self._lock:
@@ -145,6 +155,7 @@ class Statistics:
                 answered=self._tally('answered', now),
                 dropped=self._tally('dropped', now),
                 missing=self._tally('missing', now),
+                edges=self._tally('edges', now),
             )
 
     def _add(self, kind: str, name: str = '', number: int = 1) -> None:

@@ -39,8 +39,13 @@ class Observations:
 
     def depths(
         self, motions: np.ndarray, rho: np.ndarray, use: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the inverse depths of the k keypoints, and their information, (k,) each."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """
+        Return the inverse depths of the k keypoints, (k,), with information and variance.
+
+        Both are for a noise of one in the rays: the information of the neighbors alone, the
+        variance with the noise of the place as well, which all neighbors have in common.
+        """
         base, slope = self._turned(motions), motions[self.neighbor, :3, 3]
         # (base + rho slope)_xy = seen (base + rho slope)_z
         a = slope[:, :2] - self.seen * slope[:, 2:]
@@ -49,7 +54,10 @@ class Observations:
         weight, k = use / depth**2, len(rho)
         information = np.bincount(self.keypoint, weight * (a * a).sum(axis=1), k)
         rho = np.bincount(self.keypoint, weight * (a * b).sum(axis=1), k)
-        return np.maximum(rho / np.maximum(information, 1e-12), LEAST_SHARE), information
+        known = np.maximum(information, 1e-12)
+        common = [np.bincount(self.keypoint, weight * each, k) for each in a.T]
+        variance = 1 / known + np.sum(np.square(common), axis=0) / known**2
+        return np.maximum(rho / known, LEAST_SHARE), information, variance
 
     def residuals(self, motions: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how far observations are off, (m, 2), and whether they are ahead, (m,)."""

@@ -15,6 +15,8 @@ class Source(enum.IntEnum):
     NONE = 0
     ALIGNED = 1
     PNP = 2
+    REFUTED = 3
+    DROPPED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,8 +24,8 @@ class Edge:
     """
     The pose of the query's base in the base of the place.
 
-    :param source: what it follows from; ``NONE`` has no pose.
-    :param reason: why the source is ``NONE``, or not ``PNP``; empty = it is ``PNP``.
+    :param source: what it follows from; only ``ALIGNED`` and ``PNP`` have a pose.
+    :param reason: why the source is not ``PNP``; empty = it is ``PNP``.
     :param pose: x y z (meters) and quaternion x y z w, shape (7,).
     :param covariance: of x y z and of rotations about the fixed axes of the place, shape (6, 6).
     :param inliers: of PnP, -1 = not tried.
@@ -40,6 +42,6 @@ class Edge:
     independent: bool = False
 
     @property
-    def verified(self) -> bool | None:
-        """Whether keypoints confirm that it is the same place; None = PnP was not tried."""
-        return self.source is Source.PNP if self.inliers >= 0 else None
+    def has_pose(self) -> bool:
+        """Whether there is a relative pose."""
+        return self.source in (Source.ALIGNED, Source.PNP)

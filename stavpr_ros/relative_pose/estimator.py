@@ -27,9 +27,12 @@ LEAST_BASELINE = 0.05  # meters between the place and a neighbor
 # Places between independent edges: their errors have views, or odometry, in common.
 APART = {Source.PNP: 5, Source.ALIGNED: 10}
 REACH = 2.0  # a query is at most so many times as far from the place as its neighbors
-# The Jacobian misses what all landmarks of a place have in common, such as errors of its odometry:
-# the deviation of an observation in pixels, and what is added in position (m) and rotation (rad).
-NOISE, SHIFT, TURN = 2.0, 0.2, math.radians(0.4)
+# Meters: with a larger deviation of the position, keypoints do not determine it. Wrong places that
+# reached LEAST_INLIERS had 4 m and more; 2 of 1,741 right ones had more than 1 m.
+MOST_DEVIATION = 1.0
+# The deviation of a keypoint in pixels; and what is added in position (m) and rotation (rad), for
+# what all landmarks of a place have in common, such as errors of the motions between its views.
+NOISE, SHIFT, TURN = 0.8, 0.03, math.radians(0.05)
 
 Value = TypeVar('Value')
 
@@ -54,20 +57,23 @@ class EdgeEstimator:
         pair: MatchedPair,
         query_camera: Camera | None,
         place_camera: Camera | None,
-        in_time: bool = True,
+        obstacle: str = '',
     ) -> Edge:
         """
         Return the edge of a pair, and whether it is independent of those before.
 
+        Where PnP is possible, nothing else replaces it: an edge that keypoints do not confirm has
+        no pose.
+
         :param query_camera, place_camera: of the two images; None = unknown.
-        :param in_time: there is time for PnP.
+        :param obstacle: why there is no time for PnP; empty = there is.
         """
-        edge = self._estimated(pair, query_camera, place_camera, in_time)
+        edge = self._estimated(pair, query_camera, place_camera, obstacle)
         return replace(edge, independent=self._is_independent(pair, edge))
 
     def _is_independent(self, pair: MatchedPair, edge: Edge) -> bool:
         """Return whether the query has moved far enough since the last independent edge."""
-        if edge.source is Source.NONE:
+        if not edge.has_pose:
             return False
         base = matrices(pair.pose(pair.place)) @ matrices(edge.pose)
         last = self._last
@@ -83,40 +89,43 @@ class EdgeEstimator:
         pair: MatchedPair,
         query_camera: Camera | None,
         place_camera: Camera | None,
-        in_time: bool,
+        obstacle: str,
     ) -> Edge:
         if self.method == 'none':
             return Edge(Source.NONE, 'parameter relative_pose is none')
         if self.method == 'aligned':
             return replace(align(pair), reason='parameter relative_pose is aligned')
-        edge = Edge(Source.NONE, 'PnP: too many closures are waiting')
-        if in_time:
-            edge = self._pnp(pair, query_camera, place_camera)
-        if edge.source is Source.PNP or self.method == 'pnp':
-            return edge
-        other = align(pair)
-        reason = f'{edge.reason}; {other.reason}' if other.reason else edge.reason
-        return replace(other, reason=reason, inliers=edge.inliers)
-
-    def _pnp(
-        self, pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None
-    ) -> Edge:
-        """Return the edge by PnP; without a pose, and with a reason, where it is impossible."""
-        if query_camera is None or place_camera is None:
-            of = 'the camera' if query_camera is None else 'the camera of the map'
-            return Edge(Source.NONE, f'PnP: the intrinsics of {of} are unknown')
         try:
-            query, landmarks, reach = self._seen(pair, query_camera, place_camera)
+            cameras = needed_by_pnp(pair, query_camera, place_camera)
+            if obstacle:
+                return Edge(Source.DROPPED, f'PnP: {obstacle}')
+            return self._pnp(pair, *cameras)
         except InputError as error:
-            return Edge(Source.NONE, f'PnP: {error}')
+            reason = f'PnP: {error}'
+        if self.method == 'pnp':
+            return Edge(Source.NONE, reason)
+        other = align(pair)
+        return replace(other, reason=f'{reason}; {other.reason}' if other.reason else reason)
+
+    def _pnp(self, pair: MatchedPair, query_camera: Camera, place_camera: Camera) -> Edge:
+        """
+        Return the edge by PnP, or one that it refutes.
+
+        :raises InputError: the images or their surroundings do not permit PnP.
+        """
+        query, landmarks, reach = self._seen(pair, query_camera, place_camera)
         found = solve_pnp(query, landmarks)
         if found.matrix is None:
             reason = f'PnP: {found.inliers} inliers are fewer than {LEAST_INLIERS}'
-            return Edge(Source.NONE, reason, inliers=found.inliers)
-        if np.linalg.norm(found.matrix[:3, 3]) > reach:
+        elif np.linalg.norm(found.matrix[:3, 3]) > reach:
             reason = f'PnP: more than {reach:.1f} m from the place'
-            return Edge(Source.NONE, reason, inliers=found.inliers)
-        return _edge(found, query_camera, place_camera)
+        else:
+            edge = _edge(found, query_camera, place_camera)
+            deviation = math.sqrt(np.linalg.eigvalsh(edge.covariance[:3, :3])[-1])
+            if deviation <= MOST_DEVIATION:
+                return edge
+            reason = f'PnP: the keypoints determine the position to {deviation:.1f} m only'
+        return Edge(Source.REFUTED, reason, inliers=found.inliers)
 
     def _seen(
         self, pair: MatchedPair, query_camera: Camera, place_camera: Camera
@@ -124,12 +133,9 @@ class EdgeEstimator:
         """
         Return the query, landmarks in the frame of the place, and how far they serve (m).
 
-        :raises InputError: something is missing.
+        :raises InputError: the intrinsics are of another size, or the place has no neighbors.
         """
-        if np.isnan(pair.pose(pair.place)).any():
-            raise InputError('the place has no pose')
-        if pair.query is None or not pair.thumbnails.get(pair.place):
-            raise InputError('query or place has no thumbnail')
+        assert pair.query is not None
         source = self._source
         if source is None or source[0] is not pair.source or source[1] != place_camera:
             self._source = pair.source, place_camera
@@ -185,6 +191,24 @@ class EdgeEstimator:
             return None if image is None else self._view(image, camera)
 
         return _kept(self._views, index, VIEWS, make)
+
+
+def needed_by_pnp(
+    pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None
+) -> tuple[Camera, Camera]:
+    """
+    Return the cameras of query and place.
+
+    :raises InputError: something that PnP needs is unknown.
+    """
+    if query_camera is None or place_camera is None:
+        of = 'the camera' if query_camera is None else 'the camera of the map'
+        raise InputError(f'the intrinsics of {of} are unknown')
+    if np.isnan(pair.pose(pair.place)).any():
+        raise InputError('the place has no pose')
+    if pair.query is None or not pair.thumbnails.get(pair.place):
+        raise InputError('query or place has no thumbnail')
+    return query_camera, place_camera
 
 
 def _kept(

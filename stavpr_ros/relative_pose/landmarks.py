@@ -41,18 +41,22 @@ class Landmarks:
     Points that a place shows, in its optical frame.
 
     :param points: shape (m, 3), meters, float64.
+    :param rays: from the camera of the place to the points, shape (m, 3), meters.
+    :param deviations: of their inverse depths, relative to these, for a noise of one pixel, (m,).
     :param descriptors: of the place's keypoints, shape (m, 128), float32.
     :param motions: from that frame to those of the neighbors, refined, shape (neighbors, 4, 4).
     """
 
     points: np.ndarray
+    rays: np.ndarray
+    deviations: np.ndarray
     descriptors: np.ndarray
     motions: np.ndarray
 
     def seen_from(self, motion: np.ndarray) -> 'Landmarks':
         """Return the points in another frame, to which this one has the transform (4, 4)."""
-        points = self.points @ motion[:3, :3].T + motion[:3, 3]
-        return replace(self, points=points)
+        rays, points = (each @ motion[:3, :3].T for each in (self.rays, self.points))
+        return replace(self, points=points + motion[:3, 3], rays=rays)
 
 
 def view_of(image: np.ndarray, camera: Camera) -> View:
@@ -94,7 +98,7 @@ def triangulate(
     rho = np.full(len(place.rays), LEAST_SHARE)
     for limit in PIXELS:
         for _ in range(2):
-            rho, information = seen.depths(motions, rho, use)
+            rho, information, variance = seen.depths(motions, rho, use)
             off, ahead = seen.residuals(motions, rho)
             use = ahead & (np.linalg.norm(off, axis=1) * place.focal < limit)
         if limit != PIXELS[-1]:
@@ -103,7 +107,9 @@ def triangulate(
                 motions, rho = used.refined(motions, rho, prior, trust, place.focal)
     good = information * MOST_SHIFT**2 > 1
     rays = np.column_stack([place.rays, np.ones(len(place.rays))])
-    return Landmarks(rays[good] / rho[good, None], place.descriptors[good], motions)
+    points = rays[good] / rho[good, None]
+    deviations = np.sqrt(variance[good]) / (place.focal * rho[good])
+    return Landmarks(points, points, deviations, place.descriptors[good], motions)
 
 
 def _observed(place: View, neighbors: Sequence[tuple[View, np.ndarray]]) -> Observations:

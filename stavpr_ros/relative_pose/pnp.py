@@ -14,6 +14,9 @@ from stavpr_ros.relative_pose.landmarks import Landmarks, RATIO, View
 LEAST_INLIERS = 14  # keypoints of the query; 1,000 pairs of wrong places had 12 at most
 PIXELS = 2.5  # of an inlier, off its landmark
 ITERATIONS, CONFIDENCE = 500, 0.999
+STEPS = 6  # of Gauss and Newton
+LEAST_SCALE = 0.05  # of an inverse depth, relative to the triangulated one
+LEAST_DEPTH = 0.05  # meters
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,8 +25,8 @@ class PnpPose:
     The pose of a query's camera in the optical frame of a place.
 
     :param matrix: (4, 4); None = fewer than ``LEAST_INLIERS``, or not near the place.
-    :param covariance: of the position and the rotation about the fixed axes of the place, by the
-        Jacobian alone, for a noise of one pixel, shape (6, 6).
+    :param covariance: of the position and the rotation about the fixed axes of the place, for a
+        noise of one pixel in the query and in the views of the landmarks, shape (6, 6).
     :param inliers: matches that the pose explains.
     :param error: root mean square of their distances, pixels of the thumbnail; NaN = none.
     """
@@ -39,58 +42,131 @@ NOTHING = PnpPose(None, np.full((6, 6), np.nan), 0, float('nan'))
 
 def solve_pnp(query: View, landmarks: Sequence[Landmarks]) -> PnpPose:
     """
-    Find the pose of a query: EPnP in RANSAC, and its refinement with the inliers.
+    Find the pose of a query: EPnP in RANSAC, refined with the inliers and their depths.
 
     :param landmarks: of the place, and of others near by in its frame: a point that several of
         them have is an inlier once.
     """
-    pairs = [mutual_matches(query.descriptors, each.descriptors, RATIO) for each in landmarks]
-    mine = np.concatenate([own for own, _ in pairs])
-    if len(np.unique(mine)) < LEAST_INLIERS:
+    matches = _matched(query, landmarks)
+    if matches.count < LEAST_INLIERS:
         return NOTHING
-    points = np.concatenate(
-        [each.points[theirs] for each, (_, theirs) in zip(landmarks, pairs, strict=True)]
-    )
-    pixels = np.ascontiguousarray(query.rays[mine] * query.focal)
     matrix = np.diag([query.focal, query.focal, 1.0])
     try:
         found, turn, shift, inliers = cv2.solvePnPRansac(
-            points, pixels, matrix, None, iterationsCount=ITERATIONS, reprojectionError=PIXELS,
-            confidence=CONFIDENCE, flags=cv2.SOLVEPNP_EPNP,
+            matches.points, matches.pixels, matrix, None, iterationsCount=ITERATIONS,
+            reprojectionError=PIXELS, confidence=CONFIDENCE, flags=cv2.SOLVEPNP_EPNP,
         )  # fmt: skip
     except cv2.error:  # points in a line
         return NOTHING
     if not found or inliers is None:
         return NOTHING
-    count = 0
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+    chosen = inliers.ravel()
     for _ in range(2):  # the second time with the inliers of the refined pose
-        chosen = inliers.ravel()
-        turn, shift = cv2.solvePnPRefineLM(
-            points[chosen], pixels[chosen], matrix, None, turn, shift
-        )
-        off = cv2.projectPoints(points, turn, shift, matrix, None)[0][:, 0] - pixels
-        motion = np.eye(4)
-        motion[:3, :3], motion[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-        ahead = points @ motion[2, :3] + motion[2, 3] > 0
+        used = matches.chosen(chosen)
+        try:
+            motion, covariance = _refined(used, motion)
+        except np.linalg.LinAlgError:  # the landmarks do not determine a pose
+            return NOTHING
+        off, ahead = matches.residuals(motion)
         distances = np.linalg.norm(off, axis=1)
-        inliers = np.flatnonzero(ahead & (distances < PIXELS))
-        count = len(np.unique(mine[inliers]))
+        chosen = np.flatnonzero(ahead & (distances < PIXELS))
+        count = matches.chosen(chosen).count
         if count < LEAST_INLIERS:
             return PnpPose(None, NOTHING.covariance, count, np.nan)
     pose = inverse(motion)
-    error = float(np.sqrt(np.mean(distances[inliers] ** 2)))
+    error = float(np.sqrt(np.mean(distances[chosen] ** 2)))
+    axes = np.kron(np.eye(2), pose[:3, :3])
     # observations of one keypoint are not independent
-    covariance = _covariance(pose, points[inliers], query.focal) * len(inliers) / count
-    return PnpPose(pose, covariance, count, error)
+    covariance *= len(used.keypoint) / used.count
+    return PnpPose(pose, axes @ covariance @ axes.T, count, error)
 
 
-def _covariance(pose: np.ndarray, points: np.ndarray, focal: float) -> np.ndarray:
-    """Return the inverse of the information of observations with a noise of one pixel, (6, 6)."""
-    away = points - pose[:3, 3]
-    x, y, z = (away @ pose[:3, :3]).T
-    zero = np.zeros_like(z)
-    projection = focal * np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]])
-    turned = projection.transpose(2, 0, 1) @ pose[:3, :3].T
-    # a motion of the query by d and its turn by w move a point by w x away - d, reversed
-    jacobian = np.concatenate([-turned, turned @ cross(away)], axis=2).reshape(-1, 6)
-    return np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+@dataclass(frozen=True, eq=False)
+class _Matches:
+    """
+    Keypoints of a query and the landmarks that they match, m pairs; see :class:`Landmarks`.
+
+    :param keypoint: number of the keypoint, shape (m,); pixels: from the principal point, (m, 2).
+    :param focal: focal length, pixels of the thumbnail.
+    """
+
+    keypoint: np.ndarray
+    pixels: np.ndarray
+    points: np.ndarray
+    rays: np.ndarray
+    deviations: np.ndarray
+    focal: float
+
+    @property
+    def count(self) -> int:
+        """Return the number of keypoints."""
+        return len(np.unique(self.keypoint))
+
+    def chosen(self, use: np.ndarray) -> '_Matches':
+        """Return the pairs of these indices."""
+        arrays = (self.keypoint, self.pixels, self.points, self.rays, self.deviations)
+        keypoint, pixels, points, rays, deviations = (each[use] for each in arrays)
+        return _Matches(keypoint, pixels, points, rays, deviations, self.focal)
+
+    def residuals(self, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far landmarks are off, pixels, (m, 2), and whether they are ahead, (m,)."""
+        x, y, z = (self.points @ motion[:3, :3].T + motion[:3, 3]).T
+        ahead = z > 0
+        z = np.where(ahead, z, 1.0)
+        return self.focal * np.stack([x / z, y / z], axis=1) - self.pixels, ahead
+
+
+def _matched(query: View, landmarks: Sequence[Landmarks]) -> _Matches:
+    """Match the query with the landmarks of each place."""
+    pairs = [mutual_matches(query.descriptors, each.descriptors, RATIO) for each in landmarks]
+    mine = np.concatenate([own for own, _ in pairs])
+    points, rays, deviations = (
+        np.concatenate(
+            [getattr(own, name)[theirs] for own, (_, theirs) in zip(landmarks, pairs, strict=True)]
+        )
+        for name in ('points', 'rays', 'deviations')
+    )
+    pixels = np.ascontiguousarray(query.rays[mine] * query.focal)
+    return _Matches(mine, pixels, points, rays, deviations, query.focal)
+
+
+def _refined(used: _Matches, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Refine a pose together with the inverse depths of its landmarks: maximum likelihood.
+
+    With the landmarks as they were triangulated, the errors of their depths would shorten the
+    motion (regression dilution). Residuals, of depths as well, have Cauchy's weights.
+
+    :param motion: from the frame of the landmarks to that of the query, (4, 4).
+    :returns: the motion, and the covariance of its translation and rotation (6, 6), for a noise of
+        one pixel.
+    :raises LinAlgError: the landmarks do not determine it.
+    """
+    shift = np.zeros(len(used.points))  # of inverse depths, in deviations
+    for _ in range(STEPS):
+        scale = np.maximum(1 + shift * used.deviations, LEAST_SCALE)
+        points = used.points + used.rays * (1 / scale - 1)[:, None]
+        x, y, z = moved = (points @ motion[:3, :3].T + motion[:3, 3]).T
+        z = np.maximum(z, LEAST_DEPTH)
+        off = used.focal * np.stack([x / z, y / z], axis=1) - used.pixels
+        zero = np.zeros_like(z)
+        projection = np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]])
+        projection = used.focal * projection.transpose(2, 0, 1)
+        by_pose = np.concatenate([projection, -projection @ cross(moved.T)], axis=2)
+        slope = -used.rays * (used.deviations / scale**2)[:, None] @ motion[:3, :3].T
+        by_depth = np.einsum('mij,mj->mi', projection, slope)
+        weight = 1 / (1 + (off**2).sum(axis=1) + shift**2)
+        own = weight * ((by_depth**2).sum(axis=1) + 1)
+        pull = weight * ((by_depth * off).sum(axis=1) + shift)
+        mixed = weight[:, None] * np.einsum('mij,mi->mj', by_pose, by_depth)
+        normal = np.einsum('m,mij,mik->jk', weight, by_pose, by_pose)
+        normal -= (mixed / own[:, None]).T @ mixed  # Schur complement
+        right = np.einsum('m,mij,mi->j', weight, by_pose, off) - mixed.T @ (pull / own)
+        step = -np.linalg.solve(normal, right)
+        shift -= (pull + mixed @ step) / own
+        change = np.eye(4)
+        change[:3, :3], change[:3, 3] = cv2.Rodrigues(step[3:])[0], step[:3]
+        motion = change @ motion
+    return motion, np.linalg.inv(normal)

@@ -124,8 +124,9 @@ def _values(health: Health) -> dict[str, dict[str, Value]]:
             'last_distance': counts.distance,
             'last_answer_age_s': counts.answered.age,
             'camera': health.camera,
-            **{_key('edges', source): count for source, count in health.edges.sources.items()},
-            'last_edge_reason': health.edges.reason or None,
+            **{_key('edges', source): count for source, count in counts.edges.total.items()},
+            f'edges_dropped_{RECENT}s': counts.edges.recent['dropped'],
+            'last_edge_reason': counts.edge_reason or None,
             **{_key('statuses', name): count for name, count in counts.answered.total.items()},
         },
         'processing': {

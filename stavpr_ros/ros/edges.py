@@ -3,21 +3,27 @@
 """Loop closures are completed with their relative poses on a thread of its own, in order."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 import threading
+import time
 import traceback
 
 from rclpy.logging import get_logger
 from stavpr_msgs.msg import LoopClosure
+from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.camera import Camera
+from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.relative_pose.edge import Edge, Source
-from stavpr_ros.relative_pose.estimator import EdgeEstimator
+from stavpr_ros.relative_pose.estimator import EdgeEstimator, needed_by_pnp
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import MatchedPair
 from stavpr_ros.ros.input import Worker
 from stavpr_ros.ros.output import relative_pose_message
+from stavpr_ros.signals import time_left
 
-MOST_WAITING = 64  # closures; while there are more, edges are aligned only
+MOST_WAITING = 64  # closures; while there are more, the oldest goes without a relative pose
+FLUSH_TIME = 2.0  # seconds of PnP at deactivation, less than the end of the node waits
 
 
 @dataclass(frozen=True)
@@ -30,40 +36,38 @@ class WaitingClosure:
     place_camera: Camera | None
 
 
-@dataclass(frozen=True)
-class EdgeCounts:
-    """
-    Edges since the start of the node.
-
-    :param sources: number of edges of each source, in lower case.
-    :param reason: why the last edge is not of PnP; '' = it is, or there was none.
-    """
-
-    sources: dict[str, int]
-    reason: str = ''
-
-
 class EdgePublisher:
     """
     Publishes loop closures in their order, each when its edge is ready; images never wait.
 
     :param method: parameter relative_pose.
     :param publish: called with each closure, on the thread.
+    :param statistics: counts the edges by source.
     :param ending: set when the node ends.
 
-    ``aligns``: edges may be aligned by odometry; ``counts``: the edges so far.
+    ``aligns``: edges may be aligned by odometry.
     """
 
     def __init__(
-        self, method: str, publish: Callable[[LoopClosure], None], ending: threading.Event
+        self,
+        method: str,
+        publish: Callable[[LoopClosure], None],
+        statistics: Statistics,
+        ending: threading.Event,
     ) -> None:
         self._estimator, self._publish = EdgeEstimator(method), publish
         self.aligns = method in ('auto', 'aligned')
+        self._statistics = statistics
         self._worker = Worker(self._complete, 2**31, ending)
-        self.counts = EdgeCounts({})
 
-    def aligned(self, pair: MatchedPair) -> Edge:
-        """Return the edge by odometry alone, at once, if the method permits it."""
+    def immediate(
+        self, pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None
+    ) -> Edge:
+        """Return the edge of a match, which waits for nothing: by odometry, or without a pose."""
+        if self._estimator.method == 'auto':
+            with suppress(InputError):
+                needed_by_pnp(pair, query_camera, place_camera)
+                return Edge(Source.NONE, 'the loop closure of this header has it, by PnP')
         if self.aligns:
             return align(pair)
         return Edge(Source.NONE, f'parameter relative_pose is {self._estimator.method}')
@@ -73,11 +77,13 @@ class EdgePublisher:
         self._worker.put(closure)
 
     def flush(self) -> None:
-        """Publish the waiting closures, aligned only."""
+        """Publish the waiting closures, after ``FLUSH_TIME`` seconds without PnP."""
 
         def complete() -> None:
+            end = time.monotonic() + time_left(FLUSH_TIME)
             for closure in self._worker.clear():
-                self._complete(closure, in_time=False)
+                late = time.monotonic() >= end
+                self._complete(closure, 'dropped at deactivation' if late else '')
 
         self._worker.call(complete).result()
 
@@ -85,18 +91,18 @@ class EdgePublisher:
         """End the thread; return whether it has ended."""
         return self._worker.stop()
 
-    def _complete(self, closure: WaitingClosure, in_time: bool = True) -> None:
-        in_time = in_time and self._worker.waiting < MOST_WAITING
+    def _complete(self, closure: WaitingClosure, obstacle: str = '') -> None:
+        if (waiting := self._worker.waiting) >= MOST_WAITING:
+            obstacle = f'dropped, {waiting} newer closures are waiting'
         try:
             edge = self._estimator.estimate(
-                closure.pair, closure.query_camera, closure.place_camera, in_time
+                closure.pair, closure.query_camera, closure.place_camera, obstacle
             )
-        except Exception as error:  # an edge less must not be a closure less
+        except Exception as error:  # a failed edge must not lose its closure
             get_logger('stavpr_edges').error(f'no edge: {traceback.format_exc()}')
             edge = Edge(Source.NONE, f'internal error: {type(error).__name__}: {error}')
-        sources, name = self.counts.sources, edge.source.name.lower()
-        self.counts = EdgeCounts({**sources, name: sources.get(name, 0) + 1}, edge.reason)
+        self._statistics.closed(edge.source.name, edge.reason)
         message = closure.message
-        message.has_relative_pose = edge.source is not Source.NONE
+        message.has_relative_pose = edge.has_pose
         message.relative_pose = relative_pose_message(edge, message, message.pose_child_frame)
         self._publish(message)

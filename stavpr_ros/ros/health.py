@@ -11,7 +11,7 @@ from stavpr_msgs.msg import MapInfo
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.pipeline import NOT_A_KEYFRAME
 from stavpr_ros.pipeline.statistics import ImageCounts, RECENT
-from stavpr_ros.ros.edges import EdgeCounts
+from stavpr_ros.ros.edges import MOST_WAITING
 from stavpr_ros.ros.input import InputStatus
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -46,7 +46,6 @@ class Health:
     missing: str = ''  # prerequisite of a match
     odometry_fault: str = ''  # why no odometry can arrive on its topic
     camera: str = 'not needed'  # whether the camera of the edges is known, or why not
-    edges: EdgeCounts = field(default_factory=lambda: EdgeCounts({}))
     contrast: float = math.nan  # standard deviation of the last image, of 255; NaN = unknown
 
     @property
@@ -77,7 +76,7 @@ def findings(health: Health, node: str) -> dict[str, list[Finding]]:
         'input': [*_silence(health), *_image_faults(health)] or [(OK, normal)],
         'map': of_map,
         'recognition': [_recognition_finding(health)],
-        'processing': [_processing_finding(health)],
+        'processing': [_processing_finding(health), *_edge_faults(health)],
     }
 
 
@@ -231,6 +230,16 @@ def _processing_finding(health: Health) -> Finding:
         why = f'{takes}, so {1e3 / mean:.1f} per second are possible: {remedy}'
     dropped = f'{_of(drops["queue full"], "image")} dropped {RECENTLY}, the queue was full'
     return WARN, f'{dropped}: {rate:.1f} images per second arrive{why}'
+
+
+def _edge_faults(health: Health) -> Iterator[Finding]:
+    """Yield the finding on loop closures that PnP had no time for."""
+    edges = health.counts.edges.recent
+    if dropped := edges['dropped']:
+        text = f'{dropped} of {_of(edges.total(), "loop closure")} without a relative pose'
+        why = f'PnP is slower than they come, more than {MOST_WAITING} waited'
+        remedy = 'set max_rate or keyframe_distance, or free a processor core'
+        yield WARN, f'{text} {RECENTLY}: {why}; {remedy}'
 
 
 def _of(count: int, noun: str) -> str:

@@ -28,7 +28,7 @@ from stavpr_msgs.msg import (
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.pipeline.overlay import draw_match
 from stavpr_ros.recognition import Match, Status
-from stavpr_ros.relative_pose.edge import Edge, Source
+from stavpr_ros.relative_pose.edge import Edge
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, until_shutdown
 from std_msgs.msg import Float32, Header, Int32
 
@@ -128,7 +128,7 @@ def match_message(
         message.session = place.session
         message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
         if edge is not None:
-            message.has_relative_pose = edge.source is not Source.NONE
+            message.has_relative_pose = edge.has_pose
             first, length = match.first_image_index, len(match.window_stamps)
             pair = AlignedPlaces(
                 query_index=first + (length - 1) // 2 if first >= 0 else -1,

@@ -96,7 +96,7 @@ class Runtime:
         self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size, settings.robot_id)
         self._edges = EdgePublisher(
-            settings.relative_pose, self._output.publish_closure, node.ending
+            settings.relative_pose, self._output.publish_closure, self._statistics, node.ending
         )
         self._pipeline: Pipeline | None = None
         self._views = Visualization(node, lambda: self.worker.call(self._publish_route))
@@ -299,7 +299,6 @@ class Runtime:
             window=pipeline.window_fill,
             missing=pipeline.missing,
             camera='not needed' if camera is None else camera.state,
-            edges=self._edges.counts,
             odometry_fault='' if odometry is None else odometry.fault(),
             contrast=pipeline.contrast,
         )
@@ -376,8 +375,9 @@ class Runtime:
     ) -> PlaceMatch:
         """Publish a match; its closure, and that of its late match, when their edges are ready."""
         pair = self.pipeline.matched_pair(match, self._edges.aligns)
-        # a match does not wait for PnP
-        edge = self._edges.aligned(pair) if pair is not None else None
+        edge = None
+        if pair is not None:
+            edge = self._edges.immediate(pair, camera, self._place_camera(pair, camera))
         message = self._output.publish(header, match, self.pipeline.places, frames, edge)
         self._put_closure(header, match, frames, pair, camera)
         if match.late is not None:
@@ -408,8 +408,12 @@ class Runtime:
             header, match, places, self.settings.robot_id, frames, query
         )
         if message is not None:
-            place_camera = places.camera if is_map else camera
+            place_camera = self._place_camera(pair, camera)
             self._edges.put(WaitingClosure(message, pair, camera, place_camera))
+
+    def _place_camera(self, pair: MatchedPair, camera: Camera | None) -> Camera | None:
+        """Return the camera of the map; a route has that of the query."""
+        return pair.source.camera if self.pipeline.operation == 'localization' else camera
 
     def _publish_route(self) -> None:
         """Publish the route for a new subscriber, in the frame of the last image if it grows."""

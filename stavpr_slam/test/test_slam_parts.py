@@ -125,6 +125,25 @@ def test_pose_graph_accepts_closures_before_and_after_recognition_restarts():
     assert error(np.pad(found, ((0, 0), (0, 5))), truth) < error(odometry, truth) / 2
 
 
+@pytest.mark.parametrize(
+    ('source', 'has_pose', 'expected'),
+    [
+        (RelativePose.NONE, False, (False, True)),
+        (RelativePose.ALIGNED, True, (True, True)),
+        (RelativePose.PNP, True, (True, True)),
+        (RelativePose.REFUTED, False, (False, False)),
+        (RelativePose.DROPPED, False, (False, False)),
+        (RelativePose.REFUTED, True, (False, False)),  # of a publisher of another version
+    ],
+)
+def test_closure_of_each_source(source, has_pose, expected):
+    """Appearance replaces a relative pose that could not be measured, not one refuted."""
+    message = LoopClosure(query_index=9, place_index=2, has_relative_pose=has_pose)
+    message.relative_pose.source = source
+    found = tuple(closure_of(message, appearance) is not None for appearance in (False, True))
+    assert found == expected
+
+
 def test_pose_graph_with_stamps_that_jump_back_begins_a_session():
     truth = circle(1)
     odometry, graph = odometry_of(truth), PoseGraph()

@@ -26,10 +26,13 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
     """
     Return a loop closure as a measurement; None = it measures nothing.
 
-    :param appearance: whether a closure without a relative pose counts as one at the same place,
-        with a covariance of meters.
+    :param appearance: whether a closure whose relative pose could not be measured counts as one at
+        the same place, with a covariance of meters; those that PnP refuted, or was not tried on,
+        never do.
     """
     relative = message.relative_pose
+    if relative.source in (RelativePose.REFUTED, RelativePose.DROPPED):
+        return None
     on_map = message.query_index < 0 and message.has_poses
     # a late closure has the window, and so the changes, of the closure published before it
     known: dict[str, Any] = {
@@ -40,7 +43,6 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
             for pair in message.pairs
             if math.isfinite(pair.query_change) and not message.is_late
         ),
-        'verified': relative.source == RelativePose.PNP if relative.inliers >= 0 else None,
     }
     if message.has_relative_pose and relative.source != RelativePose.NONE:
         covariance = np.array(relative.pose.covariance).reshape(6, 6)

@@ -1,0 +1,144 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Landmarks and PnP of synthetic geometry, without images."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from stavpr_ros.mapping.camera import Camera, FORWARD
+from stavpr_ros.mapping.transforms import inverse, matrices
+from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View
+from stavpr_ros.relative_pose.pnp import LEAST_INLIERS, solve_pnp
+
+SIZE = 320, 240
+CAMERA = Camera(*SIZE, (200.0, 200.0), (159.5, 119.5))
+
+
+def pose(x, y=0.0, yaw=0.0):
+    return np.array([x, y, 0, 0, 0, math.sin(yaw / 2), math.cos(yaw / 2)])
+
+
+def points_ahead(count, seed=0):
+    """Return points on both sides of the way ahead, in the base's frame, (count, 3)."""
+    rng = np.random.default_rng(seed)
+    side = np.where(rng.random(count) < 0.5, -1, 1)
+    return np.column_stack(
+        [rng.uniform(4, 45, count), side * rng.uniform(1, 9, count), rng.uniform(-1, 5, count)]
+    )
+
+
+def views_of(points, poses, noise=0.0, seed=1):
+    """Return ideal views of points with a descriptor each, (m, 3), from poses of the base."""
+    rng = np.random.default_rng(seed)
+    descriptors = rng.uniform(0, 100, (len(points), 128)).astype(np.float32)
+    views = []
+    for each in poses:
+        seen = in_camera(points, each, CAMERA)
+        known = seen[:, 2] > 0.5
+        rays = seen[known, :2] / seen[known, 2:]
+        views.append(
+            View(rays + noise / 200 * rng.normal(size=rays.shape), descriptors[known], 200.0)
+        )
+    return views
+
+
+def in_camera(points, base, camera):
+    to = inverse(matrices(base) @ matrices(np.array(camera.mount)))
+    return points @ to[:3, :3].T + to[:3, 3]
+
+
+def motions(poses, center):
+    mount = matrices(np.array(FORWARD))
+    own = matrices(center) @ mount
+    return [inverse(matrices(each) @ mount) @ own for each in poses]
+
+
+def test_triangulate_of_exact_views_returns_the_points():
+    poses = [pose(x) for x in (-2, -1, 0, 1, 2)]
+    points = points_ahead(200)
+    views = views_of(points, poses)
+    around = [0, 1, 3, 4]
+    neighbors = list(zip([views[i] for i in around], motions([poses[i] for i in around], poses[2]),
+                         strict=True))  # fmt: skip
+    found = triangulate(views[2], neighbors, 2)
+    assert len(found.points) > 140  # others are far ahead, without parallax
+    true = in_camera(points, poses[2], CAMERA)
+    away = np.linalg.norm(found.points[:, None] - true, axis=2).min(axis=1)
+    assert away.max() < 1e-3
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_pnp_covariance_fits_the_errors(seed):
+    """Of 60 noisy queries, the mean normalized square of the errors is near its 6 dimensions."""
+    points, center = points_ahead(80, seed), pose(0)
+    views = views_of(points, [center, *[pose(x) for x in (-4, -3, 3, 4)]])
+    around = motions([pose(x) for x in (-4, -3, 3, 4)], center)
+    landmarks = triangulate(views[0], list(zip(views[1:], around, strict=True)), 2)
+    mount = matrices(np.array(FORWARD))
+    squares = []
+    for query in (pose(0.6, 1.2, 0.05), pose(-0.4, -0.5, -0.03)):
+        true = inverse(mount) @ matrices(query) @ mount
+        for trial in range(30):
+            view = views_of(points, [query])[0]
+            noise = 0.5 / 200 * np.random.default_rng(trial).normal(size=view.rays.shape)
+            view = replace(view, rays=view.rays + noise)
+            found = solve_pnp(view, [landmarks])
+            turn = Rotation.from_matrix(found.matrix[:3, :3] @ true[:3, :3].T).as_rotvec()
+            error = np.concatenate([found.matrix[:3, 3] - true[:3, 3], turn])
+            squares.append(error @ np.linalg.solve(0.25 * found.covariance, error))
+    assert 4 < np.mean(squares) < 9
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_deviations_of_landmarks_fit_the_errors_of_their_depths(seed):
+    """Of views with a noise of half a pixel, errors of inverse depths are as large as stated."""
+    points, noise = points_ahead(200, seed), 0.5
+    poses = [pose(x) for x in (0, -3, -2, -1, 1, 2, 3)]
+    views = views_of(points, poses, noise)
+    neighbors = list(zip(views[1:], motions(poses[1:], poses[0]), strict=True))
+    found = triangulate(views[0], neighbors, 3)
+    exact = views_of(points, poses)[0]
+    rows = [np.flatnonzero((exact.descriptors == own).all(1))[0] for own in found.descriptors]
+    true = in_camera(points, poses[0], CAMERA)
+    depths = true[true[:, 2] > 0.5][rows, 2]
+    errors = (found.points[:, 2] / depths - 1) / found.deviations / noise
+    assert len(errors) > 100
+    assert 0.5 < np.median(np.abs(errors)) / 0.6745 < 1.5
+
+
+def test_pnp_with_noisy_depths_is_unbiased_and_its_covariance_fits_the_errors():
+    """Errors of the depths must not draw the query to the place: 8 cm of 1 m if left out."""
+    dice, focal, noise, sigma = np.random.default_rng(0), 200.0, 0.5, 0.01
+    errors, squares = [], []
+    for _ in range(60):
+        rays = np.column_stack([dice.uniform(-0.6, 0.6, (120, 2)), np.ones(120)])
+        rho = 1 / dice.uniform(12, 40, 120)
+        moved = rays / rho[:, None] - (1, 0, 0)
+        seen = moved[:, :2] / moved[:, 2:] + noise / focal * dice.normal(size=(120, 2))
+        measured = np.maximum(rho + noise * sigma * dice.normal(size=120), 0.002)
+        points, descriptors = rays / measured[:, None], dice.random((120, 128), np.float32)
+        own = Landmarks(points, points, sigma / measured, descriptors, np.empty((0, 4, 4)))
+        found = solve_pnp(View(seen, descriptors, focal), [own])
+        turn = Rotation.from_matrix(found.matrix[:3, :3]).as_rotvec()
+        errors.append(np.concatenate([found.matrix[:3, 3] - (1, 0, 0), turn]))
+        squares.append(errors[-1] @ np.linalg.solve(noise**2 * found.covariance, errors[-1]))
+    assert np.abs(np.mean(errors, axis=0)[:3]).max() < 0.02
+    assert 4 < np.mean(squares) < 8
+
+
+def test_pnp_counts_each_keypoint_once_and_rejects_other_points():
+    points = points_ahead(60)
+    center, aside = pose(0), [pose(-2), pose(2)]
+    views = views_of(points, [center, *aside])
+    around = list(zip(views[1:], motions(aside, center), strict=True))
+    landmarks = triangulate(views[0], around, 1)
+    query = views_of(points, [pose(0.5, 0.5)])[0]
+    once, twice = solve_pnp(query, [landmarks]), solve_pnp(query, [landmarks, landmarks])
+    assert once.inliers == twice.inliers > 30
+    few = replace(landmarks, points=landmarks.points[:11], descriptors=landmarks.descriptors[:11])
+    assert solve_pnp(query, [few, few]).matrix is None
+    other = np.random.default_rng(3).permutation(landmarks.points)
+    assert solve_pnp(query, [replace(landmarks, points=other)]).inliers < LEAST_INLIERS
