@@ -179,6 +179,8 @@ def test_pose_graph_over_ros_corrects_saves_and_survives_bad_input(peer, running
     saved = peer.call(peer.save, SaveMap.Request(path='drive.tum'))
     assert saved.success, saved.message
     assert 'maps folder' in peer.call(peer.save, SaveMap.Request(path='../drive.tum')).message
+    wrong = peer.call(peer.save, SaveMap.Request(path='drive.txt'))
+    assert 'expected a name that ends in .g2o' in wrong.message
     peer.wait_until(lambda: peer.paths and len(peer.paths[-1].poses) == 2 * LAP)
     tum = np.loadtxt(tmp_path / 'drive.tum')
     assert error(tum[:, 1:], truth) < 1

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+import gc
 import math
 from typing import Any
 
@@ -20,7 +21,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 from stavpr_msgs.msg import LoopClosure
 from stavpr_msgs.srv import SaveMap
-from stavpr_ros.errors import InputError, SettingsError, StavprError
+from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_ros.pipeline.maps_folder import inside, maps_folder
 from stavpr_ros.ros.diagnostics import one_status
@@ -32,7 +33,7 @@ from stavpr_slam.pose_graph import ChainSettings, GraphSettings
 from stavpr_slam.pose_graph.solver import load_gtsam
 from stavpr_slam.ros.correction import LEVER, LimitedCorrection
 from stavpr_slam.ros.graph_messages import closure_of, edge_markers, path_bytes
-from stavpr_slam.ros.graph_process import GraphProcess, Snapshot
+from stavpr_slam.ros.graph_process import GraphProcess, RobotClosure, RobotOdometry, Snapshot
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -99,6 +100,7 @@ class PoseGraphNode(ManagedNode):
         if len({*self._robots}) < max(len(self._robots), 1):
             raise SettingsError(f'robots = {self._robots}: expected different names, or one ""')
         load_gtsam()
+        gc.freeze()  # collecting what is imported would take .15 s, without any odometry
         keyframes = ChainSettings(given['keyframe_distance'], max_gap=given['max_odometry_gap'])
         self._settings = GraphSettings(keyframes)
         self._tf_type: Any = tf_message() if given['publish_tf'] else None
@@ -215,7 +217,7 @@ class PoseGraphNode(ManagedNode):
         assert self._graph is not None
         pose, stamp = odometry_pose(message), nanoseconds(message.header.stamp)
         self.counts['odometry'] += 1
-        self._graph.add(odometry=(robot, stamp, pose.tolist()))
+        self._graph.add(RobotOdometry(robot, stamp, pose.tolist()))
         if not np.isfinite(pose).all() or not pose[3:].any():
             return  # the graph counts it
         self._child_frames[robot] = message.child_frame_id
@@ -235,35 +237,28 @@ class PoseGraphNode(ManagedNode):
     def _on_closure(self, message: LoopClosure) -> None:
         assert self._graph is not None
         self.counts['closures'] += 1
-        try:
-            query, place = self._robots_of(message)
-            frame, expected = message.relative_pose.frame, self._child_frames[query]
-            if message.has_relative_pose and expected not in ('', frame):
-                raise InputError(
-                    f'the relative pose is of frame {frame!r}, the odometry of {expected!r}: set '
-                    'camera_transform of the recognition node'
-                )
-            closure = closure_of(message, self._appearance)
-        except InputError as error:
-            self._reject('closures', str(error))
-            return
-        if closure is None:
-            self.counts['without relative pose'] += 1
-            return
-        if place != query:  # its stamp is of the odometry of the other robot, not of a map
-            closure = replace(closure, map_id='', place_pose=None)
-        self._graph.add(closure=(closure, query, place))
-
-    def _robots_of(self, message: LoopClosure) -> tuple[str, str]:
-        """Return the robots of the query, and of the place: it names the session of a map."""
-        query = message.robot_id if self._robots != [''] else ''
-        if query not in self._robots:
-            raise InputError(
-                f'a closure has robot_id {query!r}: expected one of the parameter robots, '
-                f'{self._robots}; set robot_id of the recognition node'
+        robot, edge = message.robot_id if self._robots != [''] else '', message.relative_pose
+        expected = self._child_frames.get(robot, '')
+        if robot not in self._robots:
+            self._reject(
+                'closures',
+                f'a closure has robot_id {robot!r}: expected one of the parameter robots, '
+                f'{self._robots}; set robot_id of the recognition node',
             )
-        is_other = message.query_index < 0 and message.place_session in self._robots
-        return query, message.place_session if is_other else query
+        elif message.has_relative_pose and expected not in ('', edge.frame):
+            self._reject(
+                'closures',
+                f'the relative pose is of frame {edge.frame!r}, the odometry of {expected!r}: set '
+                'camera_transform of the recognition node',
+            )
+        elif (closure := closure_of(message, self._appearance)) is None:
+            self.counts['without relative pose'] += 1
+        elif message.query_index < 0 and message.place_session in self._robots:
+            # the stamp of the place is of that robot's odometry, not of a map with fixed poses
+            closure = replace(closure, map_id='', place_pose=None)
+            self._graph.add(RobotClosure(robot, message.place_session, closure))
+        else:
+            self._graph.add(RobotClosure(robot, robot, closure))
 
     def _reject(self, kind: str, problem: str) -> None:
         self.counts[f'invalid {kind}'] += 1
@@ -309,10 +304,7 @@ class PoseGraphNode(ManagedNode):
             path = inside(self._folder, request.path)
             if self._graph is None:
                 raise StavprError(f'the node is {self.state}: configure it')
-            snapshot = self._graph.save(str(path), request.overwrite)
-            response.places = snapshot.saved
-            if snapshot.failure:
-                raise StavprError(snapshot.failure)
+            response.places = self._graph.save(path, request.overwrite)
             response.success, response.message = True, f'{response.places} nodes to {path}'
         except StavprError as error:
             response.success, response.message = False, str(error)

@@ -6,6 +6,7 @@ The pose graph in a process of its own, since GTSAM holds the interpreter lock w
 Nothing here imports ROS. Parent and child exchange a :class:`Request` and a :class:`Snapshot`.
 """
 
+from collections import deque
 from collections.abc import Callable
 import ctypes
 from multiprocessing import get_context
@@ -26,20 +27,31 @@ from stavpr_slam.pose_graph import Closure, GraphSettings, PoseGraph
 from stavpr_slam.pose_graph.files import save_graph
 
 PERIOD = 1.0  # seconds between two requests without closures, and at least between two paths
-PATH_RATE = 50_000  # poses of paths per second, at most
-MAX_WAITING = 100_000  # odometry, and closures, that wait for the child
+MAX_WAITING = 100_000  # odometry and closures that wait for the child
 PR_SET_PDEATHSIG = 1  # of prctl(2)
 STOP_SECONDS = 3.0  # for the thread to end once the child is killed
 
-Odometry = tuple[str, int, list[float]]  # robot, stamp (ns), pose of 7 numbers
-Between = tuple[Closure, str, str]  # closure, robot of the query, robot of the place
+
+class RobotOdometry(NamedTuple):
+    """The odometry of a robot at a stamp (ns): x y z and quaternion x y z w."""
+
+    robot: str
+    stamp: int
+    pose: list[float]
+
+
+class RobotClosure(NamedTuple):
+    """A closure between an image of a robot and a place of the same or another one."""
+
+    query_robot: str
+    place_robot: str
+    closure: Closure
 
 
 class Request(NamedTuple):
     """Input, and what to return; ``save`` is a file and whether to overwrite it, or None."""
 
-    odometry: list[Odometry]
-    closures: list[Between]
+    inputs: list[RobotOdometry | RobotClosure]
     with_paths: bool
     save: tuple[str, Force] | None
 
@@ -61,9 +73,9 @@ class Snapshot(NamedTuple):
     :param corrections: from the odometry's frame to the map, (4, 4), by robot.
     :param values: counts and estimates for the diagnostics.
     :param breaks: reasons why the odometry was interrupted, since the graph began.
-    :param invalid: kind and reason of each rejected input.
-    :param failure: why the solution or the file failed; empty = it did not.
-    :param saved: nodes written.
+    :param invalid: kind, ``odometry`` or ``closures``, and reason of each rejected input.
+    :param failure: why the solution failed; empty = it did not.
+    :param saved: nodes written, or why they were not.
     """
 
     corrections: dict[str, np.ndarray]
@@ -71,7 +83,7 @@ class Snapshot(NamedTuple):
     breaks: list[str]
     invalid: list[tuple[str, str]]
     failure: str
-    saved: int
+    saved: int | str
     paths: Paths | None
 
 
@@ -89,43 +101,43 @@ class GraphServer:
 
     def serve(self, request: Request) -> Snapshot:
         """Add the input of a request, solve, and return the result."""
-        graph, saved, failure, paths = self._graph, 0, '', None
-        invalid: list[tuple[str, str]] = []
-        for robot, stamp, pose in request.odometry:
+        graph, failure, paths, invalid = self._graph, '', None, []
+        saved: int | str = 0
+        for item in request.inputs:
+            kind = 'closures' if isinstance(item, RobotClosure) else 'odometry'
             try:
-                self._add_odometry(robot, stamp, np.array(pose))
+                self._add(item)
             except InputError as error:
-                invalid.append(('odometry', str(error)))
-        for closure, _, _ in request.closures:
-            try:
-                graph.add_closure(closure)
-            except InputError as error:
-                invalid.append(('closures', str(error)))
+                invalid.append((kind, str(error)))
         try:
-            if request.odometry or request.closures:
+            if request.inputs:
                 graph.update()
             if request.save:
-                graph.update(final=True)
-                if not len(graph.solved):
-                    raise StavprError('the graph is empty: there was no odometry')
-                saved = save_graph(graph, *request.save)
-            for robot in {robot for robot, _, _ in request.odometry}:
-                correction = matrices(graph.map_to_odom())
-                self._corrections[robot] = correction @ self._origins.get(robot, np.eye(4))
+                saved = self._save(*request.save)
+            for robot, origin in self._origins.items():
+                self._corrections[robot] = matrices(graph.map_to_odom()) @ origin
             if request.with_paths and len(graph.solved):
                 paths = self._paths()
-        except StavprError as error:
-            failure = str(error)
         except Exception as error:  # one solution failed: the next may succeed
-            failure = f'{type(error).__name__}: {error}'
-        return Snapshot(
-            self._corrections, self._values(), graph.chain.breaks, invalid, failure, saved, paths
-        )
+            failure = saved = f'{type(error).__name__}: {error}'
+        breaks = graph.chain.breaks
+        return Snapshot(self._corrections, self._values(), breaks, invalid, failure, saved, paths)
 
-    def _add_odometry(self, robot: str, stamp: int, pose: np.ndarray) -> None:
-        if robot in self._origins:
-            pose = to_poses(self._origins[robot] @ matrices(checked_pose(pose)))
-        self._graph.add_odometry(stamp, pose)
+    def _add(self, item: RobotOdometry | RobotClosure) -> None:
+        if isinstance(item, RobotClosure):
+            self._graph.add_closure(item.closure)
+            return
+        pose = matrices(checked_pose(np.array(item.pose)))
+        origin = self._origins.setdefault(item.robot, np.eye(4))
+        self._graph.add_odometry(item.stamp, to_poses(origin @ pose))
+
+    def _save(self, path: str, force: Force) -> int | str:
+        if not len(self._graph.update(final=True)):
+            return 'the graph is empty: there was no odometry'
+        try:
+            return save_graph(self._graph, path, force)
+        except StavprError as error:
+            return str(error)
 
     def _values(self) -> dict[str, Any]:
         graph = self._graph
@@ -143,19 +155,14 @@ class GraphServer:
 
     def _paths(self) -> Paths:
         graph, solved = self._graph, self._graph.solved
-        stamps, odometry, corrected = graph.chain.trajectory(solved)
+        stamps, before, after = graph.chain.trajectory(solved)
         known = [e for e in graph.edges if max(e.query, e.place) < len(solved)]
         ends = np.array([(e.query, e.place) for e in known], int).reshape(-1, 2)
-        taken = np.array([e.accepted for e in known], bool)
-        points = solved[ends, :3, 3]
-        return Paths(
-            stamps, to_poses(odometry), to_poses(corrected), points[taken], points[~taken]
-        )
+        taken, points = np.array([e.accepted for e in known], bool), solved[ends, :3, 3]
+        return Paths(stamps, to_poses(before), to_poses(after), points[taken], points[~taken])
 
 
-def run_server(
-    connection: Connection, parent: int, settings: GraphSettings, origins: dict[str, np.ndarray]
-) -> None:
+def run_server(connection: Connection, parent: int, *given: Any) -> None:
     """Serve requests until the parent has ended; in the child."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal, which the parent obeys
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -163,7 +170,7 @@ def run_server(
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
     if os.getppid() != parent:
         return
-    server = GraphServer(settings, origins)
+    server = GraphServer(*given)
     try:
         while True:
             connection.send(server.serve(connection.recv()))
@@ -188,46 +195,46 @@ class GraphProcess:
         on_lost: Callable[[str], None],
     ) -> None:
         self._settings, self._on_snapshot, self._on_lost = settings, on_snapshot, on_lost
-        self._wake = threading.Condition()  # of the input, and of the child
+        self._wake = threading.Condition()  # of the inbox, and of the child
         self._turn = threading.Lock()  # of requests
-        self._odometry: list[Odometry] = []
-        self._closures: list[Between] = []
+        self._inbox: deque[RobotOdometry | RobotClosure] = deque(maxlen=MAX_WAITING)
+        self.dropped = 0  # input that waited for too long
         self._child: Any = None
         self._connection: Connection | None = None
         self._origins: dict[str, np.ndarray] = {}
-        self._resetting = self._stopping = self._has_new_paths = False
+        self._resetting = self._stopping = self._has_closures = self._has_changed = False
         self._paths_due = 0.0
-        self.dropped = 0  # input that waited for too long
         self._thread = threading.Thread(target=self._run, name='graph', daemon=True)
         self._thread.start()
 
-    def add(self, odometry: Odometry | None = None, closure: Between | None = None) -> None:
-        """Hand over odometry or a closure; the oldest is dropped if too much waits."""
+    def add(self, item: RobotOdometry | RobotClosure) -> None:
+        """Hand over odometry or a closure; the oldest input is dropped if too much waits."""
         with self._wake:
-            self._odometry += [odometry] if odometry else []
-            self._closures += [closure] if closure else []
-            for waiting in (self._odometry, self._closures):
-                if len(waiting) > MAX_WAITING:
-                    del waiting[0]
-                    self.dropped += 1
-            if closure:
+            self.dropped += len(self._inbox) == MAX_WAITING
+            self._inbox.append(item)
+            if isinstance(item, RobotClosure):
+                self._has_closures = True
                 self._wake.notify()
 
-    def save(self, path: str, force: Force) -> Snapshot:
+    def save(self, path: str, force: Force) -> int:
         """
-        Solve all at once and write a file; it takes as long as the solution.
+        Solve all at once and write a file, which takes its time; return the number of nodes.
 
-        :raises UnavailableError: the child has ended meanwhile.
+        :raises UnavailableError: it cannot be written, or the child has ended meanwhile.
         """
         try:
-            return self._request((path, force))
+            saved = self._request((path, force)).saved
         except (EOFError, OSError):
-            raise UnavailableError('the graph was reset or lost before it was saved') from None
+            saved = 'the graph was reset or lost before it was saved'
+        if isinstance(saved, str):
+            raise UnavailableError(saved)
+        return saved
 
     def reset(self) -> None:
         """Forget everything, even in the middle of a solution."""
         with self._wake:
-            self._odometry, self._closures, self._resetting = [], [], True
+            self._inbox.clear()
+            self._resetting = True
             self._end()
 
     def stop(self) -> None:
@@ -264,21 +271,20 @@ class GraphProcess:
         with self._turn:
             with self._wake:
                 connection = self._connection
-                if connection is None or self._resetting:
+                if connection is None or self._is_ending:
                     raise EOFError
-                odometry, self._odometry = self._odometry, []
-                closures, self._closures = self._closures, []
-            self._has_new_paths |= bool(odometry or closures)
-            is_due = self._has_new_paths and time.monotonic() >= self._paths_due
-            connection.send(Request(odometry, closures, is_due or save is not None, save))
+                inputs, self._has_closures = [*self._inbox], False
+                self._inbox.clear()
+            self._has_changed |= bool(inputs)
+            is_due = self._has_changed and time.monotonic() >= self._paths_due
+            connection.send(Request(inputs, is_due or save is not None, save))
             snapshot: Snapshot = connection.recv()
             with self._wake:
                 if self._is_ending:
                     raise EOFError
                 self._origins = snapshot.corrections
             if snapshot.paths is not None:
-                wait = max(PERIOD, len(snapshot.paths.stamps) / PATH_RATE)
-                self._has_new_paths, self._paths_due = False, time.monotonic() + wait
+                self._has_changed, self._paths_due = False, time.monotonic() + PERIOD
             self._on_snapshot(snapshot)
             return snapshot
 
@@ -295,7 +301,7 @@ class GraphProcess:
                 while True:
                     self._request()
                     with self._wake:
-                        self._wake.wait_for(lambda: self._closures or self._is_ending, PERIOD)
+                        self._wake.wait_for(lambda: self._has_closures or self._is_ending, PERIOD)
             except (EOFError, OSError) as error:
                 problem = str(error)
             with self._wake:
