@@ -245,6 +245,22 @@ def test_pose_graph_without_its_process_reports_and_begins_anew(peer, running):
     assert peer.values['lost_graphs'] == '1'
 
 
+def test_pose_graph_with_closures_of_a_map_corrects_into_its_frame(peer, running):
+    """The map is 100 m off; its places have no session."""
+    truth = circle()
+    peer.drive(truth)
+    for query in range(LAP, 2 * LAP):
+        message = closure_message(truth, query)
+        message.query_index, message.map_id, message.has_poses = -1, 'abc', True
+        place = truth[query - LAP] + [100, 0, 0]
+        message.place_pose = pose_message(planar_poses(place[None])[0])
+        peer.closures.publish(message)
+    peer.wait_until(lambda: peer.count('accepted_closures') > 0.9 * LAP)
+    peer.wait_until(lambda: peer.paths and len(peer.paths[-1].poses) == 2 * LAP)
+    last = pose_array(peer.paths[-1].poses[-1].pose)
+    np.testing.assert_allclose(last[:2], truth[-1, :2] + [100, 0], atol=1)
+
+
 def test_pose_graph_diagnoses_closures_that_it_cannot_use(peer, running):
     truth = circle()
 

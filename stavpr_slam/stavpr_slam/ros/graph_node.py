@@ -238,6 +238,7 @@ class PoseGraphNode(ManagedNode):
         assert self._graph is not None
         self.counts['closures'] += 1
         robot, edge = message.robot_id if self._robots != [''] else '', message.relative_pose
+        others = {*self._robots} - {'', robot}
         expected = self._child_frames.get(robot, '')
         if robot not in self._robots:
             self._reject(
@@ -253,7 +254,7 @@ class PoseGraphNode(ManagedNode):
             )
         elif (closure := closure_of(message, self._appearance)) is None:
             self.counts['without relative pose'] += 1
-        elif message.query_index < 0 and message.place_session in self._robots:
+        elif message.query_index < 0 and message.place_session in others:
             # the stamp of the place is of that robot's odometry, not of a map with fixed poses
             closure = replace(closure, map_id='', place_pose=None)
             self._graph.add(RobotClosure(robot, message.place_session, closure))
@@ -326,7 +327,7 @@ class PoseGraphNode(ManagedNode):
             'state': self.state,
             **self._values,
             **{name.replace(' ', '_'): count for name, count in counts.items()},
-            'last_problem': next(reversed(self._problems.values()), ''),
+            'last_problem': '; '.join(self._problems.values()),
         }
         level, text = self._health(counts, graph)
         self._diagnostics.publish(one_status(self, 'graph', level, text, values))

@@ -302,15 +302,15 @@ class GraphProcess:
                     self._request()
                     with self._wake:
                         self._wake.wait_for(lambda: self._has_closures or self._is_ending, PERIOD)
-            except (EOFError, OSError) as error:
-                problem = str(error)
+            except Exception as error:  # the end of the child, or of memory
+                problem = f'{type(error).__name__}: {error}'
             with self._wake:
                 self._end()
                 if self._is_ending:
                     continue
             if self._child is not None:
                 self._child.join()
-                problem = f'exit code {self._child.exitcode}'
+                problem += f', exit code {self._child.exitcode}'
             self._on_lost(
                 f'the process of the pose graph has ended ({problem}; -9 = killed, as when memory '
                 'runs out): the graph is lost and begins anew, ~/odometry goes on with the last '
