@@ -329,8 +329,8 @@ def test_path_bytes_are_those_of_the_message(frame, count):
 
 def test_edge_markers_are_lines_of_accepted_and_of_rejected_edges():
     ends = np.arange(12.0).reshape(2, 2, 3)
-    rejected, accepted = edge_markers('map', ends, ends[:0]).markers
-    assert rejected.action == Marker.DELETE
+    accepted, rejected = edge_markers('map', ends, ends[:0]).markers
+    assert (accepted.id, rejected.id, rejected.action) == (0, 1, Marker.DELETE)
     assert [(p.x, p.y, p.z) for p in accepted.points] == [tuple(row) for row in ends.reshape(4, 3)]
     assert accepted.color.g > accepted.color.r
 

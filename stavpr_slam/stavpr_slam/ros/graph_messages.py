@@ -16,10 +16,7 @@ from stavpr_slam.pose_graph.alignment import APPEARANCE, IDENTITY
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-COLORS = {
-    True: ColorRGBA(r=0.1, g=0.7, b=0.2, a=0.8),
-    False: ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.5),
-}
+ACCEPTED, REJECTED = ColorRGBA(r=0.1, g=0.7, b=0.2, a=0.8), ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.5)
 
 
 def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
@@ -88,12 +85,12 @@ def path_bytes(frame: str, stamps: np.ndarray, poses: np.ndarray) -> bytes:
 def edge_markers(frame: str, accepted: np.ndarray, rejected: np.ndarray) -> MarkerArray:
     """Return the ends of edges, (m, 2, 3), as lines: accepted ones green, rejected ones red."""
     markers = MarkerArray()
-    for number, ends in enumerate((rejected, accepted)):
+    for number, (ends, color) in enumerate(((accepted, ACCEPTED), (rejected, REJECTED))):
         marker = Marker(ns='closures', id=number, type=Marker.LINE_LIST, action=Marker.ADD)
         marker.header.frame_id = frame
         marker.pose.orientation.w = 1.0
         marker.scale.x = 0.15
-        marker.color = COLORS[bool(number)]
+        marker.color = color
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in ends.reshape(-1, 3).tolist()]
         if not marker.points:
             marker.action = Marker.DELETE
