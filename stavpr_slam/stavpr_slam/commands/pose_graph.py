@@ -24,9 +24,9 @@ exit codes: 0 stopped by a signal; 1 an invalid parameter, or GTSAM is not insta
 def main(args: list[str] | None = None) -> int:
     """Run the node until it is stopped."""
     arguments = sys.argv[1:] if args is None else args
-    from stavpr_slam.ros.graph_node import PARAMETERS
-
     if arguments[:1] in (['-h'], ['--help']):
+        from stavpr_slam.ros.graph_node import PARAMETERS
+
         rows = (
             f'  {name} (default {default!r})\n      {sentence}\n'
             for name, (default, sentence) in PARAMETERS.items()

@@ -8,6 +8,7 @@ Nothing here imports ROS. Parent and child exchange a :class:`Request` and a :cl
 
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 import ctypes
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -104,10 +105,10 @@ class GraphServer:
         graph, failure, paths, invalid = self._graph, '', None, []
         saved: int | str = 0
         for item in request.inputs:
-            kind = 'closures' if isinstance(item, RobotClosure) else 'odometry'
             try:
                 self._add(item)
             except InputError as error:
+                kind = 'closures' if isinstance(item, RobotClosure) else 'odometry'
                 invalid.append((kind, str(error)))
         try:
             if request.inputs:
@@ -171,11 +172,9 @@ def run_server(connection: Connection, parent: int, *given: Any) -> None:
     if os.getppid() != parent:
         return
     server = GraphServer(*given)
-    try:
+    with suppress(EOFError, OSError):
         while True:
             connection.send(server.serve(connection.recv()))
-    except (EOFError, OSError):
-        return
 
 
 class GraphProcess:
