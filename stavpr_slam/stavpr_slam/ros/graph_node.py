@@ -56,8 +56,8 @@ PARAMETERS = {
     ),
     'max_correction_speed': (
         0.0,
-        'm/s at which the corrected pose of the robot moves at most when the graph changes; it turns '
-        f'by at most 1/{LEVER:g} of this number in rad/s; 0 = at once',
+        'm/s at which the corrected pose of the robot moves at most when the graph changes; it '
+        f'turns by at most 1/{LEVER:g} of this number in rad/s; 0 = at once',
     ),
     'keyframe_distance': (1.0, 'meters between keyframes, above 0'),
     'max_odometry_gap': (5.0, 'seconds without odometry that begin a new session, above 0'),

@@ -3,7 +3,8 @@
 """
 The pose graph in a process of its own, since GTSAM holds the interpreter lock while it solves.
 
-Nothing here imports ROS. Parent and child exchange a :class:`Request` and a :class:`Snapshot`.
+Nothing here imports ROS. The parent sends the arguments of :meth:`GraphServer.serve`, and the
+child returns a :class:`Snapshot`.
 """
 
 from collections import deque
@@ -49,14 +50,6 @@ class RobotClosure(NamedTuple):
     closure: Closure
 
 
-class Request(NamedTuple):
-    """Input, and what to return; ``save`` is a file and whether to overwrite it, or None."""
-
-    inputs: list[RobotOdometry | RobotClosure]
-    with_paths: bool
-    save: tuple[str, Force] | None
-
-
 class Paths(NamedTuple):
     """Stamps (n,), ns, poses (n, 7), and x y z of the ends of the edges (m, 2, 3)."""
 
@@ -100,24 +93,33 @@ class GraphServer:
         self._graph, self._origins = PoseGraph(settings), origins
         self._corrections = dict(origins)
 
-    def serve(self, request: Request) -> Snapshot:
-        """Add the input of a request, solve, and return the result."""
+    def serve(
+        self,
+        inputs: list[RobotOdometry | RobotClosure],
+        with_paths: bool,
+        save: tuple[str, Force] | None,
+    ) -> Snapshot:
+        """
+        Add input, solve, and return the result.
+
+        :param save: file of the solution, and whether to overwrite it; None = no file.
+        """
         graph, failure, paths, invalid = self._graph, '', None, []
         saved: int | str = 0
-        for item in request.inputs:
+        for item in inputs:
             try:
                 self._add(item)
             except InputError as error:
                 kind = 'closures' if isinstance(item, RobotClosure) else 'odometry'
                 invalid.append((kind, str(error)))
         try:
-            if request.inputs:
+            if inputs:
                 graph.update()
-            if request.save:
-                saved = self._save(*request.save)
+            if save:
+                saved = self._save(*save)
             for robot, origin in self._origins.items():
                 self._corrections[robot] = matrices(graph.map_to_odom()) @ origin
-            if request.with_paths and len(graph.solved):
+            if with_paths and len(graph.solved):
                 paths = self._paths()
         except Exception as error:  # one solution failed: the next may succeed
             failure = saved = f'{type(error).__name__}: {error}'
@@ -174,7 +176,7 @@ def run_server(connection: Connection, parent: int, *given: Any) -> None:
     server = GraphServer(*given)
     with suppress(EOFError, OSError):
         while True:
-            connection.send(server.serve(connection.recv()))
+            connection.send(server.serve(*connection.recv()))
 
 
 class GraphProcess:
@@ -276,7 +278,7 @@ class GraphProcess:
                 self._inbox.clear()
             self._has_changed |= bool(inputs)
             is_due = self._has_changed and time.monotonic() >= self._paths_due
-            connection.send(Request(inputs, is_due or save is not None, save))
+            connection.send((inputs, is_due or save is not None, save))
             snapshot: Snapshot = connection.recv()
             with self._wake:
                 if self._is_ending:
