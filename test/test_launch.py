@@ -27,6 +27,7 @@ FIXED = {
     'loop_closure': {'operation': 'loop_closure'},
     'multi_camera': {},
     'nav2': {'autostart': False},
+    'pose_graph': {'operation': 'loop_closure'},
 }
 GIVEN = {'cameras': 'front'}  # required arguments
 TEXTS = {bool: ('true', True), int: ('3', 3), float: ('1', 1.0), str: ('2', '2')}
@@ -132,6 +133,7 @@ def test_launch_file_has_an_argument_for_every_parameter(load, name):
     launch, fixed = load(name), FIXED[name]
     common = {'image', 'odom', 'namespace', 'params_file', 'use_sim_time'}
     own = {'replay': REPLAY, 'multi_camera': {'cameras'}}
+    own['pose_graph'] = {'max_correction_speed', 'correct_tf'}
     expected = (set(BY_NAME) - set(fixed)) | common | own.get(name, set())
     assert set(launch.arguments) == expected
     for argument in launch.arguments.values():
@@ -176,6 +178,18 @@ def test_launch_for_nav2_has_a_manager_without_bond(load):
         {'autostart': True, 'node_names': ['stavpr'], 'bond_timeout': 0.0}
     ]
     assert words(manager.namespace) == '${namespace}'
+
+
+def test_launch_of_pose_graph_has_the_odometry_of_the_node(load):
+    (graph,) = load('pose_graph').nodes
+    assert Path(executable(graph.executable)).parent.name == graph.package == 'stavpr_slam'
+    assert [(topic, words(to)) for topic, to in graph.remappings] == [('odom', '${odom}')]
+    assert words(graph.namespace) == '${namespace}'
+    values = {name: (words(v.first), v.value_type) for name, v in graph.parameters[0].items()}
+    assert values == {
+        'max_correction_speed': ('${max_correction_speed}', float),
+        'publish_tf': ('${correct_tf}', bool),
+    }
 
 
 @pytest.mark.parametrize(

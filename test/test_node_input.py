@@ -7,6 +7,7 @@ import array
 from builtin_interfaces.msg import Time
 import cv2
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
@@ -86,7 +87,9 @@ def test_keyframes_by_distance_and_angle_use_odometry(robot, start, route):
 
 
 def test_wrongly_remapped_odometry_and_a_covered_lens_are_diagnosed(robot, start, publish, route):
-    """The topic with odometry is named; a topic of another type too."""
+    """The topic with odometry is named, not that of a pose graph; a topic of another type too."""
+    publish(Odometry, '/pose_graph/odometry')
+    publish(TransformStamped, '/pose_graph/map_to_odom')
     start('-r', 'odom:=/wheel', keyframe_distance=1.0)
     found = 'nothing is published on /wheel, odometry is on /odom: remap odom'
     robot.until_diagnosed('input', WARN, found)

@@ -270,6 +270,9 @@ def misdirected(node: Node, topic: str) -> str:
     """
     Return why no odometry can arrive on a topic; empty if it can, or if there is none anywhere.
 
+    Odometry beside a topic ``map_to_odom`` is that of a pose graph: its corrections, made from the
+    loop closures, must not come back as odometry.
+
     :param topic: after remapping.
     """
     publishers = node.get_publishers_info_by_topic(topic)
@@ -277,10 +280,13 @@ def misdirected(node: Node, topic: str) -> str:
     if ODOMETRY in types:
         return ''
     found = f'{", ".join(types)} is published' if types else 'nothing is published'
+    topics = dict(node.get_topic_names_and_types())
     others = [
         name
-        for name, kinds in node.get_topic_names_and_types()
-        if ODOMETRY in kinds and node.count_publishers(name)
+        for name, kinds in topics.items()
+        if ODOMETRY in kinds
+        and node.count_publishers(name)
+        and f'{name.rpartition("/")[0]}/map_to_odom' not in topics
     ]
     if not (types or others):
         return ''

@@ -12,7 +12,8 @@ A lifecycle node that configures and activates itself. It corrects the odometry 
 (nav_msgs/Odometry) by the loop closures of recognition nodes: ~/path_before and ~/path
 (nav_msgs/Path), ~/odometry in the map frame, ~/map_to_odom, ~/edges (visualization_msgs/
 MarkerArray: accepted green, rejected red), /diagnostics. Services: ~/save (stavpr_msgs/SaveMap, a
-file .g2o or .tum in the maps folder), ~/reset. Requires GTSAM: pip install gtsam.
+file .g2o or .tum in the maps folder), ~/reset. The graph is in a process of its own. Requires
+GTSAM: pip install gtsam.
 
 parameters:
 {parameters}
@@ -23,9 +24,9 @@ exit codes: 0 stopped by a signal; 1 an invalid parameter, or GTSAM is not insta
 def main(args: list[str] | None = None) -> int:
     """Run the node until it is stopped."""
     arguments = sys.argv[1:] if args is None else args
-    from stavpr_slam.ros.graph_node import PARAMETERS
-
     if arguments[:1] in (['-h'], ['--help']):
+        from stavpr_slam.ros.graph_node import PARAMETERS
+
         rows = (
             f'  {name} (default {default!r})\n      {sentence}\n'
             for name, (default, sentence) in PARAMETERS.items()

@@ -3,23 +3,20 @@
 """Messages of the pose graph: loop closures in; paths, poses and markers out."""
 
 import math
+import struct
 from typing import Any
 
-from geometry_msgs.msg import Point, PoseStamped
-from nav_msgs.msg import Path
+from geometry_msgs.msg import Point
 import numpy as np
 from stavpr_msgs.msg import LoopClosure, RelativePose
-from stavpr_ros.mapping.transforms import to_poses
-from stavpr_ros.ros.output import nanoseconds, pose_message, time_message
-from stavpr_slam.pose_graph import Closure, PoseGraph
+from stavpr_ros.mapping.trajectory import SECOND
+from stavpr_ros.ros.output import nanoseconds
+from stavpr_slam.pose_graph import Closure
 from stavpr_slam.pose_graph.alignment import APPEARANCE, IDENTITY
-from std_msgs.msg import ColorRGBA, Header
+from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-COLORS = {
-    True: ColorRGBA(r=0.1, g=0.7, b=0.2, a=0.8),
-    False: ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.5),
-}
+ACCEPTED, REJECTED = ColorRGBA(r=0.1, g=0.7, b=0.2, a=0.8), ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.5)
 
 
 def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
@@ -62,43 +59,41 @@ def pose_array(pose: object) -> np.ndarray:
     return np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w])
 
 
-def path_message(frame: str, stamps: np.ndarray, poses: np.ndarray) -> Path:
-    """Return a path of poses (N, 7) at stamps (N,), ns."""
-    stamp = time_message(int(stamps[-1])) if len(stamps) else time_message(0)
-    path = Path(header=Header(frame_id=frame, stamp=stamp))
-    path.poses = [
-        PoseStamped(
-            header=Header(frame_id=frame, stamp=time_message(own)), pose=pose_message(pose)
-        )
-        for own, pose in zip(stamps.tolist(), poses, strict=True)
-    ]
-    return path
+def path_bytes(frame: str, stamps: np.ndarray, poses: np.ndarray) -> bytes:
+    """
+    Return a ``nav_msgs/Path`` as it is serialized (CDR, little endian).
+
+    A message of 100,000 poses takes 3.6 s to make, and 0.6 s of the interpreter lock to publish.
+
+    :param stamps: ns, shape (n,).
+    :param poses: shape (n, 7).
+    """
+    name, count = frame.encode() + b'\0', len(stamps)
+    newest = divmod(int(stamps[-1]) if count else 0, SECOND)
+    head = struct.pack(f'<iII{len(name)}s', *newest, len(name), name)
+    head += bytes(-len(head) % 4) + struct.pack('<I', count)
+    parts = [b'\0\1\0\0', head]
+    # numbers of 8 bytes are aligned: the name before them is padded, in the first pose differently
+    for offset, part in ((len(head), slice(0, 1)), (0, slice(1, None))):
+        size = len(name) + -(offset + 12 + len(name)) % 8
+        kind = [('stamp', '<u4', 2), ('size', '<u4'), ('name', f'S{size}'), ('pose', '<f8', 7)]
+        rows = np.zeros(len(stamps[part]), np.dtype(kind))
+        rows['stamp'] = np.stack(np.divmod(stamps[part], SECOND), axis=-1)
+        rows['size'], rows['name'], rows['pose'] = len(name), name, poses[part]
+        parts.append(rows.tobytes())
+    return b''.join(parts)
 
 
-def path_messages(
-    frame: str, stamps: np.ndarray, odometry: np.ndarray, corrected: np.ndarray
-) -> tuple[Path, Path]:
-    """Return the path of the odometry, and the corrected one; transforms are (N, 4, 4) each."""
-    return (
-        path_message(frame, stamps, to_poses(odometry)),
-        path_message(frame, stamps, to_poses(corrected)),
-    )
-
-
-def edge_markers(graph: PoseGraph, frame: str) -> MarkerArray:
-    """Return accepted edges as green lines, rejected ones as red lines."""
+def edge_markers(frame: str, accepted: np.ndarray, rejected: np.ndarray) -> MarkerArray:
+    """Return the ends of edges, (m, 2, 3), as lines: accepted ones green, rejected ones red."""
     markers = MarkerArray()
-    for number, accepted in enumerate(COLORS):
+    for number, (ends, color) in enumerate(((accepted, ACCEPTED), (rejected, REJECTED))):
         marker = Marker(ns='closures', id=number, type=Marker.LINE_LIST, action=Marker.ADD)
         marker.header.frame_id = frame
         marker.pose.orientation.w = 1.0
         marker.scale.x = 0.15
-        marker.color = COLORS[accepted]
-        for edge in graph.edges:
-            if edge.accepted == accepted and max(edge.query, edge.place) < len(graph.solved):
-                for node in (edge.query, edge.place):
-                    x, y, z = graph.solved[node][:3, 3].tolist()
-                    marker.points.append(Point(x=x, y=y, z=z))
+        marker.color = color
+        marker.points = [Point(x=x, y=y, z=z) for x, y, z in ends.reshape(-1, 3).tolist()]
         if not marker.points:
             marker.action = Marker.DELETE
         markers.markers.append(marker)

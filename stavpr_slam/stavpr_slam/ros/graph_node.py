@@ -3,9 +3,11 @@
 """The pose-graph node: odometry and loop closures in, corrected poses out."""
 
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+import gc
 import math
-import threading
-import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -19,7 +21,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 from stavpr_msgs.msg import LoopClosure
 from stavpr_msgs.srv import SaveMap
-from stavpr_ros.errors import InputError, SettingsError, StavprError
+from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_ros.pipeline.maps_folder import inside, maps_folder
 from stavpr_ros.ros.diagnostics import one_status
@@ -27,9 +29,11 @@ from stavpr_ros.ros.navigation import tf_message, transform_message
 from stavpr_ros.ros.output import nanoseconds, pose_message
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, repeat_responses
 from stavpr_ros.ros.subscriptions import odometry_pose
-from stavpr_slam.pose_graph import ChainSettings, GraphSettings, PoseGraph
-from stavpr_slam.pose_graph.files import save_graph
-from stavpr_slam.ros.graph_messages import closure_of, edge_markers, path_messages
+from stavpr_slam.pose_graph import ChainSettings, GraphSettings
+from stavpr_slam.pose_graph.solver import load_gtsam
+from stavpr_slam.ros.correction import LEVER, LimitedCorrection
+from stavpr_slam.ros.graph_messages import closure_of, edge_markers, path_bytes
+from stavpr_slam.ros.graph_process import GraphProcess, RobotClosure, RobotOdometry, Snapshot
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -37,10 +41,7 @@ from visualization_msgs.msg import MarkerArray
 ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-PERIOD = 1.0  # seconds between two diagnostics, and at least between two paths
-SHARE = 0.1  # of the time, at most, for the publication of paths and edges
-MAX_INBOX = 100_000  # messages that wait for the worker
-STOP_TIMEOUT = 30.0  # seconds for the worker to end
+PERIOD = 1.0  # seconds between two diagnostics
 PARAMETERS = {
     'autostart': (True, 'configure and activate at the start'),
     'loop_closure_topics': (
@@ -48,6 +49,16 @@ PARAMETERS = {
         'topics of stavpr_msgs/LoopClosure, one for each recognition node',
     ),
     'map_frame': ('map', 'frame of the corrected poses'),
+    'robots': (
+        [''],
+        'names of the robots of one graph; "" = one robot without a name; a robot NAME has its '
+        'odometry on NAME/odom, and ~/NAME/odometry, ~/NAME/map_to_odom',
+    ),
+    'max_correction_speed': (
+        0.0,
+        'm/s at which the corrected pose of the robot moves at most when the graph changes; it '
+        f'turns by at most 1/{LEVER:g} of this number in rad/s; 0 = at once',
+    ),
     'keyframe_distance': (1.0, 'meters between keyframes, above 0'),
     'max_odometry_gap': (5.0, 'seconds without odometry that begin a new session, above 0'),
     'appearance_edges': (
@@ -61,15 +72,15 @@ PARAMETERS = {
 
 class PoseGraphNode(ManagedNode):
     """
-    Corrects the odometry by loop closures.
+    Corrects the odometry of one or several robots by loop closures.
 
-    A lifecycle node. A worker thread solves; callbacks only hand over and publish the latest
-    odometry in the map frame.
+    A lifecycle node. The graph is in a process of its own; callbacks hand over, and publish the
+    newest odometry in the map frame.
 
     :raises StavprError: an invalid parameter, or GTSAM is not installed.
     """
 
-    THREADS = 4
+    THREADS = 5
 
     def __init__(self, **options: Any) -> None:
         super().__init__('pose_graph', **options)
@@ -83,32 +94,32 @@ class PoseGraphNode(ManagedNode):
         for name in ('keyframe_distance', 'max_odometry_gap'):
             if not (math.isfinite(given[name]) and given[name] > 0):
                 raise SettingsError(f'{name} = {given[name]}: expected a number above 0')
+        self._speed, self._robots = given['max_correction_speed'], list(given['robots'])
+        if not (math.isfinite(self._speed) and self._speed >= 0):
+            raise SettingsError(f'max_correction_speed = {self._speed}: expected 0 or more m/s')
+        if len({*self._robots}) < max(len(self._robots), 1):
+            raise SettingsError(f'robots = {self._robots}: expected different names, or one ""')
+        load_gtsam()
+        gc.freeze()  # collecting what is imported would take .15 s, without any odometry
         keyframes = ChainSettings(given['keyframe_distance'], max_gap=given['max_odometry_gap'])
-        self._graph = PoseGraph(GraphSettings(keyframes))
+        self._settings = GraphSettings(keyframes)
         self._tf_type: Any = tf_message() if given['publish_tf'] else None
-        self._lock = threading.Lock()  # of the graph
-        self._wake = threading.Condition()  # of the inbox
-        self._inbox: list[Odometry | LoopClosure] = []
-        self._worker: threading.Thread | None = None
-        self._running = False
+        self._graph: GraphProcess | None = None
         self._entities: list[Any] = []
-        self._correction = np.eye(4)  # from the odometry's frame to the map
-        self._odometry_frame = self._child_frame = ''
-        self.counts: Counter[str] = Counter()
-        self.problem = ''
+        self._publishers: list[Any] = []
+        self._forget()
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        group = MutuallyExclusiveCallbackGroup()
-        self.create_timer(PERIOD, self._publish_diagnostics, group, steady)
-        services = MutuallyExclusiveCallbackGroup()
+        group = MutuallyExclusiveCallbackGroup
+        self.create_timer(PERIOD, self._publish_diagnostics, group(), steady)
         for kind, name, serve in (
             (SaveMap, '~/save', self._save),
             (Trigger, '~/reset', self._reset),
         ):
-            repeat_responses(self.create_service(kind, name, serve, callback_group=services))
+            repeat_responses(self.create_service(kind, name, serve, callback_group=group()))
         self._start: Timer | None = None
         if given['autostart']:
-            self._start = self.create_timer(0.0, self._on_start, services, steady)
+            self._start = self.create_timer(0.0, self._on_start, group(), steady)
 
     def _on_start(self) -> None:
         assert self._start is not None
@@ -119,46 +130,51 @@ class PoseGraphNode(ManagedNode):
     # life cycle
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Create the publishers."""
-        make = self.create_lifecycle_publisher
+        """Create the publishers, and start the process of the graph."""
+
+        def make(*given: Any) -> Any:
+            self._publishers.append(self.create_lifecycle_publisher(*given))
+            return self._publishers[-1]
+
         self._path_before = make(Path, '~/path_before', LATCHED)
         self._path = make(Path, '~/path', LATCHED)
         self._edges = make(MarkerArray, '~/edges', LATCHED)
-        self._odometry = make(Odometry, '~/odometry', 50)
-        self._transform = make(TransformStamped, '~/map_to_odom', LATCHED)
-        self._publishers = [
-            self._path_before, self._path, self._edges, self._odometry, self._transform
-        ]  # fmt: skip
-        self._tf: Any = None
-        if self._tf_type is not None:
-            self._tf = make(self._tf_type, '/tf', 100)
-            self._publishers.append(self._tf)
+        self._tf: Any = make(self._tf_type, '/tf', 100) if self._tf_type else None
+        self._outputs = {
+            robot: (
+                make(Odometry, f'~/{robot}/odometry'.replace('//', '/'), 50),
+                make(TransformStamped, f'~/{robot}/map_to_odom'.replace('//', '/'), LATCHED),
+            )
+            for robot in self._robots
+        }
+        self._graph = GraphProcess(self._settings, self._on_snapshot, self._on_lost)
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Subscribe, and start the worker."""
+        """Subscribe."""
         result = super().on_activate(state)
         group = MutuallyExclusiveCallbackGroup()
-        subscribe = self.create_subscription
-        self._entities = [
-            subscribe(Odometry, 'odom', self._on_odometry, ODOMETRY_QOS, callback_group=group),
-            *(
-                subscribe(LoopClosure, topic, self._hand_over, CLOSURE_QOS, callback_group=group)
-                for topic in self._topics
-            ),
-        ]
-        self._running = True
-        self._worker = threading.Thread(target=self._work, name='graph', daemon=True)
-        self._worker.start()
+
+        def subscribe(kind: type, topic: str, use: Callable[..., None], qos: QoSProfile) -> None:
+            self._entities.append(
+                self.create_subscription(kind, topic, use, qos, callback_group=group)
+            )
+
+        for robot in self._robots:
+            topic = f'{robot}/odom'.lstrip('/')
+            subscribe(Odometry, topic, partial(self._on_odometry, robot), ODOMETRY_QOS)
+        for topic in self._topics:
+            subscribe(LoopClosure, topic, self._on_closure, CLOSURE_QOS)
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Unsubscribe, and end the worker; the graph stays."""
-        self._stop()
+        """Unsubscribe; the graph stays."""
+        self._unsubscribe()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Forget the graph."""
+        self._stop()
         self._forget()
         for publisher in self._publishers:
             self.destroy_publisher(publisher)
@@ -166,139 +182,119 @@ class PoseGraphNode(ManagedNode):
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """End the worker."""
+        """End the process of the graph."""
         self._stop()
         return super().on_shutdown(state)
 
     def destroy_node(self) -> None:
-        """End the worker, and destroy the node."""
+        """End the process of the graph, and destroy the node."""
         self.ending.set()
         self._stop()
         super().destroy_node()
 
-    def _stop(self) -> None:
+    def _unsubscribe(self) -> None:
         for subscription in self._entities:
             self.destroy_subscription(subscription)
         self._entities = []
-        with self._wake:
-            self._running = False
-            self._wake.notify()
-        if self._worker is not None:
-            self._worker.join(STOP_TIMEOUT)
-            self._worker = None
+
+    def _stop(self) -> None:
+        self._unsubscribe()
+        if self._graph is not None:
+            self._graph.stop()
 
     def _forget(self) -> None:
-        with self._wake:
-            self._inbox.clear()
-        with self._lock:
-            self._graph.reset()
-            self._correction = np.eye(4)
-        self.problem = ''
+        self._corrections = {robot: LimitedCorrection(self._speed) for robot in self._robots}
+        self._child_frames = dict.fromkeys(self._robots, '')
+        self._values: dict[str, Any] = {}
+        self._broken = 0  # breaks of the odometry that are logged
+        self.counts: Counter[str] = Counter()
+        self._problems: dict[str, str] = {}  # the last ones, by kind
+        self._lost = ''  # why the graph before this one was lost
 
-    # callbacks
+    # input
 
-    def _hand_over(self, message: Odometry | LoopClosure) -> None:
-        with self._wake:
-            if len(self._inbox) >= MAX_INBOX:
-                del self._inbox[0]
-                self.counts['dropped'] += 1
-            self._inbox.append(message)
-            if isinstance(message, LoopClosure):
-                self._wake.notify()
-
-    def _on_odometry(self, message: Odometry) -> None:
-        self._hand_over(message)
-        pose = odometry_pose(message)
+    def _on_odometry(self, robot: str, message: Odometry) -> None:
+        assert self._graph is not None
+        pose, stamp = odometry_pose(message), nanoseconds(message.header.stamp)
+        self.counts['odometry'] += 1
+        self._graph.add(RobotOdometry(robot, stamp, pose.tolist()))
         if not np.isfinite(pose).all() or not pose[3:].any():
-            return  # the worker counts it
-        corrected = to_poses(self._correction @ matrices(pose))
+            return  # the graph counts it
+        self._child_frames[robot] = message.child_frame_id
+        odometry = matrices(pose)
+        correction = self._corrections[robot].at(stamp, odometry)
         result = Odometry(child_frame_id=message.child_frame_id, twist=message.twist)
         result.header = Header(stamp=message.header.stamp, frame_id=self._frame)
-        result.pose.pose = pose_message(corrected)
+        result.pose.pose = pose_message(to_poses(correction @ odometry))
         result.pose.covariance = message.pose.covariance
-        self._odometry.publish(result)
+        transform = transform_message(to_poses(correction), self._frame, message.header.frame_id)
+        transform.header.stamp = message.header.stamp
+        for publisher, output in zip(self._outputs[robot], (result, transform), strict=True):
+            publisher.publish(output)
         if self._tf is not None:
-            correction = to_poses(self._correction)
-            transform = transform_message(correction, self._frame, message.header.frame_id)
-            transform.header.stamp = message.header.stamp
             self._tf.publish(self._tf_type(transforms=[transform]))
 
-    # worker
-
-    def _work(self) -> None:
-        published, due = True, 0.0
-        while True:
-            with self._wake:
-                self._wake.wait_for(lambda: self._closures() or not self._running, PERIOD)
-                if not self._running:
-                    return
-                inbox, self._inbox = self._inbox, []
-            try:
-                with self._lock:
-                    for message in inbox:
-                        self._take(message)
-                    if inbox:
-                        self._graph.update()
-                        self._correction = matrices(self._graph.map_to_odom())
-                published = published and not inbox
-                began = time.monotonic()
-                if not published and began >= due:
-                    self._publish_graph()
-                    published, took = True, time.monotonic() - began
-                    due = began + max(PERIOD, took / SHARE)
-            except Exception as error:  # one update failed: the next may succeed
-                self.counts['failed updates'] += 1
-                self.problem = f'{type(error).__name__}: {error}'
-                self.get_logger().error(f'no update: {self.problem}', throttle_duration_sec=10.0)
-
-    def _closures(self) -> bool:
-        return any(isinstance(message, LoopClosure) for message in self._inbox)
-
-    def _take(self, message: Odometry | LoopClosure) -> None:
-        """Add a message to the graph; invalid input is counted and logged."""
-        graph = self._graph
-        try:
-            if isinstance(message, Odometry):
-                self.counts['odometry'] += 1
-                breaks = len(graph.chain.breaks)
-                graph.add_odometry(nanoseconds(message.header.stamp), odometry_pose(message))
-                if len(graph.chain.breaks) > breaks:
-                    self.get_logger().warning(f'new session: {graph.chain.breaks[-1]}')
-                self._odometry_frame = message.header.frame_id
-                self._child_frame = message.child_frame_id
-                return
-            self.counts['closures'] += 1
-            frame = message.relative_pose.frame
-            if message.has_relative_pose and self._child_frame not in ('', frame):
-                raise InputError(
-                    f'the relative pose is of frame {frame!r}, the odometry of '
-                    f'{self._child_frame!r}: set camera_transform of the recognition node'
-                )
-            closure = closure_of(message, self._appearance)
-            if closure is None:
-                self.counts['without relative pose'] += 1
-            else:
-                graph.add_closure(closure)
-        except InputError as error:
-            self.counts['invalid'] += 1
-            self.problem = str(error)
-            self.get_logger().warning(f'input rejected: {error}', throttle_duration_sec=10.0)
-
-    def _publish_graph(self) -> None:
-        with self._lock:
-            if not len(self._graph.solved):
-                return
-            trajectory = self._graph.chain.trajectory(self._graph.solved)
-            markers = edge_markers(self._graph, self._frame)
-            transform = transform_message(
-                self._graph.map_to_odom(), self._frame, self._odometry_frame
+    def _on_closure(self, message: LoopClosure) -> None:
+        assert self._graph is not None
+        self.counts['closures'] += 1
+        robot, edge = message.robot_id if self._robots != [''] else '', message.relative_pose
+        others = {*self._robots} - {'', robot}
+        expected = self._child_frames.get(robot, '')
+        if robot not in self._robots:
+            self._reject(
+                'closures',
+                f'a closure has robot_id {robot!r}: expected one of the parameter robots, '
+                f'{self._robots}; set robot_id of the recognition node',
             )
-        before, after = path_messages(self._frame, *trajectory)  # a second of long drives
-        transform.header.stamp = after.header.stamp
-        self._path_before.publish(before)
-        self._path.publish(after)
-        self._edges.publish(markers)
-        self._transform.publish(transform)
+        elif message.has_relative_pose and expected not in ('', edge.frame):
+            self._reject(
+                'closures',
+                f'the relative pose is of frame {edge.frame!r}, the odometry of {expected!r}: set '
+                'camera_transform of the recognition node',
+            )
+        elif (closure := closure_of(message, self._appearance)) is None:
+            self.counts['without relative pose'] += 1
+        elif message.query_index < 0 and message.place_session in others:
+            # the stamp of the place is of that robot's odometry, not of a map with fixed poses
+            closure = replace(closure, map_id='', place_pose=None)
+            self._graph.add(RobotClosure(robot, message.place_session, closure))
+        else:
+            self._graph.add(RobotClosure(robot, robot, closure))
+
+    def _reject(self, kind: str, problem: str) -> None:
+        self.counts[f'invalid {kind}'] += 1
+        self._problems[kind] = problem
+        self.get_logger().warning(f'input rejected: {problem}', throttle_duration_sec=10.0)
+
+    # the graph
+
+    def _on_snapshot(self, snapshot: Snapshot) -> None:
+        """Aim at new corrections, and publish paths and edges; on the thread of the graph."""
+        for robot, correction in snapshot.corrections.items():
+            self._corrections[robot].aim(correction, len(snapshot.breaks))
+        for text in snapshot.breaks[self._broken :]:
+            self.get_logger().warning(f'new session: {text}')
+        self._broken = len(snapshot.breaks)
+        for kind, problem in snapshot.invalid:
+            self._reject(kind, problem)
+        self._values = snapshot.values
+        if snapshot.failure:
+            self.counts['failed updates'] += 1
+            self._problems['updates'] = snapshot.failure
+            self.get_logger().error(f'no update: {snapshot.failure}', throttle_duration_sec=10.0)
+        if snapshot.values['accepted_closures']:
+            self._lost = ''
+        if snapshot.paths is not None and self.state == 'active':
+            stamps, before, after, *edges = snapshot.paths
+            self._path_before.publish(path_bytes(self._frame, stamps, before))
+            self._path.publish(path_bytes(self._frame, stamps, after))
+            self._edges.publish(edge_markers(self._frame, *edges))
+
+    def _on_lost(self, problem: str) -> None:
+        self._lost = self._problems['process'] = problem
+        self.counts = Counter({'lost graphs': self.counts['lost graphs'] + 1})
+        self._values, self._broken = {}, 0
+        self.get_logger().error(problem)
 
     # services and diagnostics
 
@@ -307,18 +303,9 @@ class PoseGraphNode(ManagedNode):
             if not request.path:
                 raise StavprError("path = '' is no file: set a name that ends in .g2o or .tum")
             path = inside(self._folder, request.path)
-            with self._wake:
-                inbox, self._inbox = self._inbox, []
-            with self._lock:
-                for message in inbox:
-                    self._take(message)
-                self._graph.update()
-                self._graph.update(final=True)
-                if not len(self._graph.solved):
-                    raise StavprError('the graph is empty: there was no odometry')
-                response.places = save_graph(self._graph, path, request.overwrite)
-            if self.state == 'active':
-                self._publish_graph()
+            if self._graph is None:
+                raise StavprError(f'the node is {self.state}: configure it')
+            response.places = self._graph.save(path, request.overwrite)
             response.success, response.message = True, f'{response.places} nodes to {path}'
         except StavprError as error:
             response.success, response.message = False, str(error)
@@ -326,37 +313,50 @@ class PoseGraphNode(ManagedNode):
         return response
 
     def _reset(self, request: Any, response: Any) -> Any:
+        if self._graph is not None:
+            self._graph.reset()
         self._forget()
         response.success, response.message = True, 'the graph is empty'
         return response
 
     def _publish_diagnostics(self) -> None:
-        graph = self._graph
-        unknown = graph.counts['unknown stamp']
-        values: dict[str, object] = {
+        counts, graph = Counter(self.counts), Counter(self._values)
+        if self._graph is not None and self._graph.dropped:
+            counts['dropped'] = self._graph.dropped
+        values = {
             'state': self.state,
-            'nodes': len(graph.chain),
-            'sessions': graph.chain.sessions,
-            'breaks': '; '.join(graph.chain.breaks[-3:]),
-            'breaks_by_closures': graph.splits,
-            'accepted_closures': graph.accepted,
-            'rejected_closures': graph.rejected,
-            'waiting_closures': graph.pending,
-            'closures_of_unknown_stamps': unknown,
-            'comparisons_left_out': graph.uncompared,
-            'odometry_error_factor': f'{graph.scale:.2f}',
-            'last_problem': self.problem,
-            **{name.replace(' ', '_'): count for name, count in self.counts.items()},
+            **self._values,
+            **{name.replace(' ', '_'): count for name, count in counts.items()},
+            'last_problem': '; '.join(self._problems.values()),
         }
-        level, text = DiagnosticStatus.OK, f'{graph.accepted} closures accepted'
-        if self.state != 'active':
-            text = f'the node is {self.state}'
-        elif not self.counts['odometry']:
-            level = DiagnosticStatus.WARN
-            text = 'no odometry: remap odom to the topic of nav_msgs/Odometry'
-        elif self.counts['closures'] and unknown > graph.accepted:
-            level = DiagnosticStatus.WARN
-            text = 'most closures have stamps without odometry: is it of the same clock?'
-        elif self.counts['failed updates']:
-            level, text = DiagnosticStatus.WARN, f'updates failed: {self.problem}'
+        level, text = self._health(counts, graph)
         self._diagnostics.publish(one_status(self, 'graph', level, text, values))
+
+    def _health(self, counts: Counter[str], graph: Counter[str]) -> tuple[bytes, str]:
+        """Return the level of the diagnostics and the reason with its remedy."""
+        usable = sum(graph[f'{name}_closures'] for name in ('accepted', 'rejected', 'waiting'))
+        useless = {
+            f'invalid: {self._problems.get("closures")}': counts['invalid closures'],
+            'of stamps without odometry: is it of the same clock?': graph[
+                'closures_of_unknown_stamps'
+            ],
+            'without a usable relative pose, see relative_pose.reason of the closures: check '
+            'camera_info, camera_transform and the odometry': counts['without relative pose'],
+        }
+        reason = max(useless, key=lambda text: useless[text])
+        level, text = DiagnosticStatus.WARN, f'{graph["accepted_closures"]} closures accepted'
+        if self.state != 'active':
+            level, text = DiagnosticStatus.OK, f'the node is {self.state}'
+        elif self._lost:
+            level, text = DiagnosticStatus.ERROR, self._lost
+        elif not counts['odometry']:
+            text = 'no odometry: remap odom to the topic of nav_msgs/Odometry'
+        elif counts['invalid odometry'] > counts['odometry'] / 2:
+            text = f'most odometry is invalid: {self._problems["odometry"]}'
+        elif useless[reason] > usable:
+            text = f'{useless[reason]} of {counts["closures"]} closures are {reason}'
+        elif counts['failed updates']:
+            text = f'updates failed: {self._problems["updates"]}'
+        else:
+            level = DiagnosticStatus.OK
+        return level, text

@@ -1,0 +1,321 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The pose graph in a process of its own, since GTSAM holds the interpreter lock while it solves.
+
+Nothing here imports ROS. The parent sends the arguments of :meth:`GraphServer.serve`, and the
+child returns a :class:`Snapshot`.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+import ctypes
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+import os
+import signal
+import sys
+import threading
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+from stavpr_ros.errors import InputError, StavprError, UnavailableError
+from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.mapping.transforms import matrices, to_poses
+from stavpr_ros.output_file import Force
+from stavpr_slam.pose_graph import Closure, GraphSettings, PoseGraph
+from stavpr_slam.pose_graph.files import save_graph
+
+PERIOD = 1.0  # seconds between two requests without closures, and at least between two paths
+MAX_WAITING = 100_000  # odometry and closures that wait for the child
+PR_SET_PDEATHSIG = 1  # of prctl(2)
+STOP_SECONDS = 3.0  # for the thread to end once the child is killed
+
+
+class RobotOdometry(NamedTuple):
+    """The odometry of a robot at a stamp (ns): x y z and quaternion x y z w."""
+
+    robot: str
+    stamp: int
+    pose: list[float]
+
+
+class RobotClosure(NamedTuple):
+    """A closure between an image of a robot and a place of the same or another one."""
+
+    query_robot: str
+    place_robot: str
+    closure: Closure
+
+
+class Paths(NamedTuple):
+    """Stamps (n,), ns, poses (n, 7), and x y z of the ends of the edges (m, 2, 3)."""
+
+    stamps: np.ndarray
+    odometry: np.ndarray
+    corrected: np.ndarray
+    accepted: np.ndarray
+    rejected: np.ndarray
+
+
+class Snapshot(NamedTuple):
+    """
+    The graph after a request.
+
+    :param corrections: from the odometry's frame to the map, (4, 4), by robot.
+    :param values: counts and estimates for the diagnostics.
+    :param breaks: reasons why the odometry was interrupted, since the graph began.
+    :param invalid: kind, ``odometry`` or ``closures``, and reason of each rejected input.
+    :param failure: why the solution failed; empty = it did not.
+    :param saved: nodes written, or why they were not.
+    """
+
+    corrections: dict[str, np.ndarray]
+    values: dict[str, Any]
+    breaks: list[str]
+    invalid: list[tuple[str, str]]
+    failure: str
+    saved: int | str
+    paths: Paths | None
+
+
+class GraphServer:
+    """
+    The graph in the child.
+
+    :param origins: from the odometry's frame to the map, (4, 4), by robot: where a graph that
+        replaces a lost one begins.
+    """
+
+    def __init__(self, settings: GraphSettings, origins: dict[str, np.ndarray]) -> None:
+        self._graph, self._origins = PoseGraph(settings), origins
+        self._corrections = dict(origins)
+
+    def serve(
+        self,
+        inputs: list[RobotOdometry | RobotClosure],
+        with_paths: bool,
+        save: tuple[str, Force] | None,
+    ) -> Snapshot:
+        """
+        Add input, solve, and return the result.
+
+        :param save: file of the solution, and whether to overwrite it; None = no file.
+        """
+        graph, failure, paths, invalid = self._graph, '', None, []
+        saved: int | str = 0
+        for item in inputs:
+            try:
+                self._add(item)
+            except InputError as error:
+                kind = 'closures' if isinstance(item, RobotClosure) else 'odometry'
+                invalid.append((kind, str(error)))
+        try:
+            if inputs:
+                graph.update()
+            if save:
+                saved = self._save(*save)
+            for robot, origin in self._origins.items():
+                self._corrections[robot] = matrices(graph.map_to_odom()) @ origin
+            if with_paths and len(graph.solved):
+                paths = self._paths()
+        except Exception as error:  # one solution failed: the next may succeed
+            failure = saved = f'{type(error).__name__}: {error}'
+        breaks = graph.chain.breaks
+        return Snapshot(self._corrections, self._values(), breaks, invalid, failure, saved, paths)
+
+    def _add(self, item: RobotOdometry | RobotClosure) -> None:
+        if isinstance(item, RobotClosure):
+            self._graph.add_closure(item.closure)
+            return
+        pose = matrices(checked_pose(np.array(item.pose)))
+        origin = self._origins.setdefault(item.robot, np.eye(4))
+        self._graph.add_odometry(item.stamp, to_poses(origin @ pose))
+
+    def _save(self, path: str, force: Force) -> int | str:
+        if not len(self._graph.update(final=True)):
+            return 'the graph is empty: there was no odometry'
+        try:
+            return save_graph(self._graph, path, force)
+        except StavprError as error:
+            return str(error)
+
+    def _values(self) -> dict[str, Any]:
+        graph = self._graph
+        return {
+            'nodes': len(graph.chain),
+            'sessions': graph.chain.sessions,
+            'breaks': '; '.join(graph.chain.breaks[-3:]),
+            'breaks_by_closures': graph.splits,
+            'accepted_closures': graph.accepted,
+            'rejected_closures': graph.rejected,
+            'waiting_closures': graph.pending,
+            'closures_of_unknown_stamps': graph.counts['unknown stamp'],
+            'odometry_error_factor': f'{graph.scale:.2f}',
+        }
+
+    def _paths(self) -> Paths:
+        graph, solved = self._graph, self._graph.solved
+        stamps, before, after = graph.chain.trajectory(solved)
+        known = [e for e in graph.edges if max(e.query, e.place) < len(solved)]
+        ends = np.array([(e.query, e.place) for e in known], int).reshape(-1, 2)
+        taken, points = np.array([e.accepted for e in known], bool), solved[ends, :3, 3]
+        return Paths(stamps, to_poses(before), to_poses(after), points[taken], points[~taken])
+
+
+def run_server(connection: Connection, parent: int, *given: Any) -> None:
+    """Serve requests until the parent has ended; in the child."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal, which the parent obeys
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    if sys.platform == 'linux':  # GTSAM may solve for long before the end of the pipe is noticed
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
+    if os.getppid() != parent:
+        return
+    server = GraphServer(*given)
+    with suppress(EOFError, OSError):
+        while True:
+            connection.send(server.serve(*connection.recv()))
+
+
+class GraphProcess:
+    """
+    Feeds the child from a thread, and starts another one when it has ended.
+
+    A graph that replaces a lost one begins where the last correction leads to.
+
+    :param on_snapshot: called with each result, one at a time.
+    :param on_lost: called with the reason and the remedy when the child has ended.
+    """
+
+    def __init__(
+        self,
+        settings: GraphSettings,
+        on_snapshot: Callable[[Snapshot], None],
+        on_lost: Callable[[str], None],
+    ) -> None:
+        self._settings, self._on_snapshot, self._on_lost = settings, on_snapshot, on_lost
+        self._wake = threading.Condition()  # of the inbox, and of the child
+        self._turn = threading.Lock()  # of requests
+        self._inbox: deque[RobotOdometry | RobotClosure] = deque(maxlen=MAX_WAITING)
+        self.dropped = 0  # input that waited for too long
+        self._child: Any = None
+        self._connection: Connection | None = None
+        self._origins: dict[str, np.ndarray] = {}
+        self._resetting = self._stopping = self._has_closures = self._has_changed = False
+        self._paths_due = 0.0
+        self._thread = threading.Thread(target=self._run, name='graph', daemon=True)
+        self._thread.start()
+
+    def add(self, item: RobotOdometry | RobotClosure) -> None:
+        """Hand over odometry or a closure; the oldest input is dropped if too much waits."""
+        with self._wake:
+            self.dropped += len(self._inbox) == MAX_WAITING
+            self._inbox.append(item)
+            if isinstance(item, RobotClosure):
+                self._has_closures = True
+                self._wake.notify()
+
+    def save(self, path: str, force: Force) -> int:
+        """
+        Solve all at once and write a file, which takes its time; return the number of nodes.
+
+        :raises UnavailableError: it cannot be written, or the child has ended meanwhile.
+        """
+        try:
+            saved = self._request((path, force)).saved
+        except (EOFError, OSError):
+            saved = 'the graph was reset or lost before it was saved'
+        if isinstance(saved, str):
+            raise UnavailableError(saved)
+        return saved
+
+    def reset(self) -> None:
+        """Forget everything, even in the middle of a solution."""
+        with self._wake:
+            self._inbox.clear()
+            self._resetting = True
+            self._end()
+
+    def stop(self) -> None:
+        """End the child and the thread."""
+        with self._wake:
+            self._stopping = True
+            self._end()
+        self._thread.join(STOP_SECONDS)
+
+    @property
+    def _is_ending(self) -> bool:
+        return self._stopping or self._resetting
+
+    def _start(self) -> None:
+        self._child, context = None, get_context('spawn')
+        self._connection, other = context.Pipe()
+        given = other, os.getpid(), self._settings, self._origins
+        child = context.Process(target=run_server, args=given, daemon=True)
+        child.start()
+        other.close()
+        self._child = child
+
+    def _end(self) -> None:
+        if self._child is not None:
+            self._child.kill()
+        self._wake.notify()
+
+    def _request(self, save: tuple[str, Force] | None = None) -> Snapshot:
+        """
+        Exchange a request and its result.
+
+        :raises EOFError, OSError: the child has ended.
+        """
+        with self._turn:
+            with self._wake:
+                connection = self._connection
+                if connection is None or self._is_ending:
+                    raise EOFError
+                inputs, self._has_closures = [*self._inbox], False
+                self._inbox.clear()
+            self._has_changed |= bool(inputs)
+            is_due = self._has_changed and time.monotonic() >= self._paths_due
+            connection.send((inputs, is_due or save is not None, save))
+            snapshot: Snapshot = connection.recv()
+            with self._wake:
+                if self._is_ending:
+                    raise EOFError
+                self._origins = snapshot.corrections
+            if snapshot.paths is not None:
+                self._has_changed, self._paths_due = False, time.monotonic() + PERIOD
+            self._on_snapshot(snapshot)
+            return snapshot
+
+    def _run(self) -> None:
+        while True:
+            try:
+                with self._wake:
+                    if self._stopping:
+                        return
+                    if self._resetting:
+                        self._origins, self._resetting = {}, False
+                    # from this thread: PR_SET_PDEATHSIG is of the thread that starts the child
+                    self._start()
+                while True:
+                    self._request()
+                    with self._wake:
+                        self._wake.wait_for(lambda: self._has_closures or self._is_ending, PERIOD)
+            except Exception as error:  # the end of the child, or of memory
+                problem = f'{type(error).__name__}: {error}'
+            with self._wake:
+                self._end()
+                if self._is_ending:
+                    continue
+            if self._child is not None:
+                self._child.join()
+                problem += f', exit code {self._child.exitcode}'
+            self._on_lost(
+                f'the process of the pose graph has ended ({problem}; -9 = killed, as when memory '
+                'runs out): the graph is lost and begins anew, ~/odometry goes on with the last '
+                'correction; free memory, or raise keyframe_distance'
+            )
+            with self._wake:
+                self._wake.wait_for(lambda: self._is_ending, PERIOD)
