@@ -2,15 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridges to other SLAM systems: moved edges, poses, and each bridge as a process."""
 
+from collections import Counter
 import json
 import os
 from pathlib import Path
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 from bridge_target import AHEAD, closures, DEVIATIONS, Drive, EDGES, KEYFRAME, stamp_of
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from interface_packages import build_interfaces
 import numpy as np
@@ -27,7 +29,7 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.ros.output import nanoseconds
 from stavpr_slam.commands.bridge import main
 from stavpr_slam.pose_graph import Closure
-from stavpr_slam.ros.bridges.bridge import interfaces
+from stavpr_slam.ros.bridges.bridge import Bridge, interfaces
 from stavpr_slam.ros.bridges.external_keyframes import ExternalKeyframes, keyframe_edge
 from stavpr_slam.ros.graph_messages import pose_array
 from test_pose_graph import LAP
@@ -96,6 +98,22 @@ def test_bridge_without_target_is_usage_error(target, capsys):
 def test_interfaces_of_missing_package_is_error_that_names_it():
     with pytest.raises(UnavailableError, match=r'package other_msgs \(its source\): install'):
         interfaces('other_msgs', 'its source')
+
+
+@pytest.mark.parametrize(
+    ('counts', 'level', 'text'),
+    [
+        ({}, DiagnosticStatus.WARN, 'no closures on /stavpr/loop_closure: remap it'),
+        ({'closures': 91, 'invalid': 91}, DiagnosticStatus.WARN, 'the closures are invalid'),
+        ({'closures': 9, 'waiting': 9}, DiagnosticStatus.WARN, 'no keyframes of the target'),
+        ({'closures': 9, 'waiting': 1, 'sent': 8}, DiagnosticStatus.OK, '8 closures sent'),
+    ],
+)
+def test_status_of_bridge_that_sends_nothing_is_warning_with_remedy(counts, level, text):
+    bridge = SimpleNamespace(counts=Counter(counts), resolve_topic_name='/{}'.format)
+    found, sentence = Bridge.status(bridge)
+    assert found == level
+    assert text in sentence
 
 
 def test_pose_bridges_publish_pose_on_map(tmp_path):

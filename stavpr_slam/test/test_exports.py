@@ -16,6 +16,8 @@ from stavpr_ros.commands.map import main
 from stavpr_ros.mapping import save_map
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.trajectory import SECOND
+from stavpr_ros.sources.bag_writer import write_bag
+from stavpr_ros.sources.frame import ImageRecord
 from stavpr_slam.pose_graph.files import save_graph
 from test_pose_graph import circle, closure, LAP, solve
 
@@ -118,18 +120,21 @@ def test_colmap_pairs_are_neighbors_same_places_and_closures(route):
     assert min(place for _, place in pairs) == 1  # place 0 has no image
 
 
-def test_colmap_images_are_those_of_the_folders(route):
-    save_map(replace(route, stamps=np.zeros(PLACES, np.int64)), 'route.stavpr', force=True)
-    for name, session in (('day', range(12)), ('night', range(12, PLACES))):
-        Path(name).mkdir()
-        for place in session:
-            cv2.imwrite(f'{name}/place {place}.png', route_images(PLACES)[place][..., ::-1])
-    ids = tuple(f'place {place}.png' for place in range(PLACES))
+def test_colmap_images_are_those_of_folder_and_bag(route):
+    """By the names of the files, and by the stamps of the messages."""
+    images = route_images(PLACES)
+    Path('day').mkdir()
+    for place in range(12):
+        cv2.imwrite(f'day/{place}.png', images[place][..., ::-1])
+    night = [ImageRecord.of_image(images[i], (i + 1) * SECOND) for i in range(11, PLACES)]
+    write_bag('night', '/image', night)
+    ids = tuple(f'{place % 12}.png' for place in range(PLACES))
     save_map(replace(route, ids=ids), 'route.stavpr', force=True)
     assert main(['colmap', 'route.stavpr', 'model', '--images', 'day', 'night']) == 0
     assert len(list(Path('model/images').iterdir())) == PLACES
-    found = cv2.imread('model/images/000013.jpg').astype(int)[..., ::-1]
-    assert np.argmin([np.abs(found - image).mean() for image in route_images(PLACES)]) == 13
+    for place in (1, 13):
+        found = cv2.imread(f'model/images/{place:06d}.jpg').astype(int)[..., ::-1]
+        assert np.argmin([np.abs(found - image).mean() for image in images]) == place
 
 
 @pytest.mark.parametrize(

@@ -107,17 +107,20 @@ class Bridge(Node):
         if cause:
             self.counts[cause] += 1
 
-    def on_timer(self) -> None:
-        """Publish the diagnostics."""
+    def status(self) -> tuple[bytes, str]:
+        """Return the level of the diagnostics, and their sentence."""
         counts = self.counts
-        level, text = DiagnosticStatus.OK, f'{counts["sent"]} closures sent'
         causes = [(counts[cause], cause) for cause in REMEDIES if counts[cause]]
         if not counts['closures']:
-            level = DiagnosticStatus.WARN
-            text = f'no closures on {self.resolve_topic_name("stavpr/loop_closure")}: remap it'
-        elif not counts['sent'] and causes:
-            level, text = DiagnosticStatus.WARN, REMEDIES[max(causes)[1]]
-        self._diagnostics.publish(one_status(self, 'bridge', level, text, counts))
+            topic = self.resolve_topic_name('stavpr/loop_closure')
+            return DiagnosticStatus.WARN, f'no closures on {topic}: remap it'
+        if not counts['sent'] and causes:
+            return DiagnosticStatus.WARN, REMEDIES[max(causes)[1]]
+        return DiagnosticStatus.OK, f'{counts["sent"]} closures sent'
+
+    def on_timer(self) -> None:
+        """Publish the diagnostics."""
+        self._diagnostics.publish(one_status(self, 'bridge', *self.status(), self.counts))
 
 
 class EdgeBridge(Bridge):
