@@ -12,7 +12,7 @@ COMMANDS = 'stavpr.commands'
 """Tables of commands; see :mod:`stavpr_ros.commands`."""
 
 MAP_TOOLS = 'stavpr.map_tools'
-"""Functions that ``stavpr map`` calls: ``align`` and ``plot``."""
+"""Functions that ``stavpr map`` calls: ``align``, ``colmap`` and ``plot``."""
 
 FEATURES = 'stavpr.features'
 """Kinds of features; see :class:`stavpr_ros.features.registry.Kind`."""

@@ -24,6 +24,12 @@ setup(
         (f'lib/{NAME}', sorted(glob('scripts/*'))),
     ],
     python_requires='>=3.11',
-    install_requires=['gtsam>=4.2', 'numpy>=1.26', 'scipy>=1.11', 'stavpr_ros'],
+    install_requires=[
+        'gtsam>=4.2',
+        'numpy>=1.26',
+        'opencv-python-headless>=4.6',
+        'scipy>=1.11',
+        'stavpr_ros',
+    ],
     zip_safe=False,
 )

@@ -18,7 +18,8 @@ from stavpr_ros.output_file import ARRAYS, atomic_output, MAP, PNG, require_repl
 if TYPE_CHECKING:
     from stavpr_ros.mapping import PlaceMap
 
-TOOLS = {'align': 'stavpr_slam', 'plot': 'stavpr_lab'}  # and the packages that have them
+# Tools of other packages, and the packages that provide them.
+TOOLS = {'align': 'stavpr_slam', 'colmap': 'stavpr_slam', 'plot': 'stavpr_lab'}
 
 EPILOG = """
 examples:
@@ -27,6 +28,7 @@ examples:
   map convert old.stavpr new.stavpr --storage float16
   map compact route.stavpr small.stavpr --drop-duplicates
   map export route.stavpr arrays.npz
+  map colmap route.stavpr hloc --images drive.bag
   map merge both.stavpr day.stavpr night.stavpr
   map sessions both.stavpr day.stavpr --keep day
   map recover route.stavpr.journal
@@ -97,6 +99,22 @@ def _parser() -> argparse.ArgumentParser:
         help='also as precision int8 holds them, for its fastest start; of 1,000 places or more',
     )
     add('export', _export, 'Write the arrays of a map for NumPy.', 'map', 'output', force=force)
+    text = 'Write images, pairs and poses of a map to a folder for COLMAP and hloc.'
+    action = add('colmap', _colmap, text, 'map', 'folder')
+    action.add_argument(
+        '--images',
+        nargs='+',
+        default=[],
+        metavar='PATH',
+        help='folder of images or bag of each session, in their order; without it, thumbnails',
+    )
+    action.add_argument('--topic', help="the bags' image topic, if there are several")
+    action.add_argument(
+        '--closures',
+        default='',
+        metavar='FILE',
+        help='also pairs of the loop closures that `record --loop-closures` wrote',
+    )
     text = 'Make one map of several: each is a session of it.'
     action = add('merge', _merge, text, 'output', force=force)
     action.add_argument('maps', nargs='+', metavar='MAP')
@@ -145,7 +163,7 @@ def _tool(name: str) -> Callable[..., Any]:
     tools = plugins.load(plugins.MAP_TOOLS)
     if name not in tools:
         raise UnavailableError(
-            f'--{name} needs the package {TOOLS[name]}, which is not installed: build it, or '
+            f'{name} needs the package {TOOLS[name]}, which is not installed: build it, or '
             '`pip install .` in the repository'
         )
     tool: Callable[..., Any] = tools[name]
@@ -308,6 +326,14 @@ def _export(arguments: argparse.Namespace) -> None:
     with atomic_output(arguments.output, ARRAYS, arguments.force) as file:
         np.savez(file, **found)  # type: ignore[arg-type]
     print(f'{arguments.output}: {len(place_map)} places; numpy.load reads it')
+
+
+def _colmap(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.mapping import load_map
+
+    export, place_map = _tool('colmap'), load_map(arguments.map)
+    options = arguments.images, arguments.topic, arguments.closures
+    print(export(place_map, arguments.folder, *options))
 
 
 def _recover(arguments: argparse.Namespace) -> int:

@@ -25,6 +25,7 @@ from stavpr_slam.ros.graph_messages import pose_array
 from test_pose_graph import circle, LAP, planar_poses, SECOND
 
 EDGES = 10
+AHEAD = 3  # images that the place is ahead of the query
 KEYFRAME = 4  # images, and a keyframe is 0.3 s after an image
 DEVIATIONS = np.array([0.2, 0.1, 0.3, 0.01, 0.02, 0.03])
 TIMEOUT = 120.0
@@ -54,7 +55,7 @@ def closures(drive: Drive, on_map: bool) -> list[LoopClosure]:
     """Return closures with known errors; every other one is not independent, one is aligned."""
     found = []
     for i, query in enumerate(range(LAP + 1, LAP + 1 + 2 * EDGES * KEYFRAME, KEYFRAME)):
-        place = query - LAP + 1
+        place = query - LAP + AHEAD
         message = LoopClosure(query_index=-1 if on_map else query, place_index=place)
         message.has_relative_pose = message.has_poses = True
         message.query_pose = pose_message(to_poses(drive.at(query)))
@@ -77,9 +78,8 @@ class Target(Node):
     def __init__(self, target: str) -> None:
         super().__init__('target')
         self.edges: list[dict] = []
-        self.keyframes = {'rtabmap': self._rtabmap, 'pose_graph_tools': self._graph}.get(
-            target, self._swarm
-        )()
+        targets = {'rtabmap': self._rtabmap, 'hydra': self._hydra, 'kimera': self._kimera}
+        self.keyframes = targets.get(target, self._swarm)()
         topics = {'odom': Odometry, 'stavpr/loop_closure': LoopClosure}
         self.odometry, self.closures = (
             self.create_publisher(kind, topic, QOS) for topic, kind in topics.items()
@@ -114,24 +114,62 @@ class Target(Node):
 
         return publisher, publish
 
-    def _graph(self):
-        from pose_graph_tools_msgs.msg import PoseGraph, PoseGraphEdge, PoseGraphNode
+    def _hydra(self):
+        """
+        Interpret edges as Hydra does: between the nodes nearest to two stamps, within 1 s.
+
+        MIT-SPARK/Hydra src/backend/external_loop_closure_receiver.cpp: key_from, key_to are stamps
+        in ns, the pose is to_T_from; src/backend/backend_module.cpp: a between factor (to, from).
+        """
+
+        def add(edge) -> None:
+            def nearest(key: int) -> int:
+                assert key <= max(self.stamps.values())
+                found = min(self.stamps, key=lambda number: abs(self.stamps[number] - key))
+                assert abs(self.stamps[found] - key) < SECOND
+                return found
+
+            self._add_graph_edge(nearest(edge.key_to), nearest(edge.key_from), edge)
+
+        return self._graph('pose_graph', 'external_loop_closures', add)
+
+    def _kimera(self):
+        """
+        Interpret edges as Kimera does.
+
+        MIT-SPARK/Kimera-PGMO kimera_pgmo/src/kimera_pgmo_interface.cpp: key_from, key_to are keys
+        of nodes, the pose is from_T_to, a between factor (from, to).
+        """
+
+        def add(edge) -> None:
+            assert {edge.key_from, edge.key_to} <= self.stamps.keys()
+            self._add_graph_edge(edge.key_from, edge.key_to, edge)
+
+        return self._graph('pose_graph_incremental', 'pose_graph_incremental', add)
+
+    def _add_graph_edge(self, first: int, second: int, edge) -> None:
+        assert (edge.robot_from, edge.robot_to, edge.type) == (3, 3, edge.LOOPCLOSE)
+        covariance = np.array(edge.covariance).reshape(6, 6)
+        self._add(first, second, pose_array(edge.pose), covariance, edge.type)
+
+    def _graph(self, nodes: str, edges: str, add):
+        from pose_graph_tools_msgs.msg import PoseGraph, PoseGraphNode
+
+        self.stamps: dict[int, int] = {}  # of nodes, by their numbers
 
         def on_graph(message) -> None:
             for edge in message.edges:
-                covariance = np.array(edge.covariance).reshape(6, 6)
-                assert (edge.robot_from, edge.robot_to) == (3, 3)
-                assert edge.type == PoseGraphEdge.LOOPCLOSE
-                self._add(edge.key_from, edge.key_to, pose_array(edge.pose), covariance, edge.type)
+                add(edge)
 
-        self.create_subscription(PoseGraph, 'external_loop_closures', on_graph, QOS)
-        publisher = self.create_publisher(PoseGraph, 'pose_graph', QOS)
+        self.create_subscription(PoseGraph, edges, on_graph, QOS)
+        publisher = self.create_publisher(PoseGraph, nodes, QOS)
 
         def publish(number: int, stamp: int, pose) -> None:
-            nodes = [PoseGraphNode(robot_id=robot, key=number + robot - 3) for robot in (3, 4)]
-            for node in nodes:
+            self.stamps[number] = stamp
+            known = [PoseGraphNode(robot_id=robot, key=number + robot - 3) for robot in (3, 4)]
+            for node in known:
                 node.header.stamp = time_message(stamp)
-            publisher.publish(PoseGraph(nodes=nodes))
+            publisher.publish(PoseGraph(nodes=known))
 
         return publisher, publish
 
@@ -173,11 +211,12 @@ class Target(Node):
 
         return publishers[0], publish
 
-    def _add(self, place: int, query: int, pose, covariance: np.ndarray, kind: int) -> None:
+    def _add(self, first: int, second: int, pose, covariance: np.ndarray, kind: int) -> None:
+        """Note an edge; pose: of the second node in the frame of the first one."""
         deviations = np.sqrt(np.linalg.eigvalsh(covariance)).tolist()
         self.edges.append(
             {
-                'place': place, 'query': query, 'pose': np.asarray(pose).tolist(), 'type': kind,
+                'nodes': [first, second], 'pose': np.asarray(pose).tolist(), 'type': kind,
                 'deviations': deviations,
             }
         )  # fmt: skip

@@ -2,15 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridges to other SLAM systems: moved edges, poses, and each bridge as a process."""
 
+from collections import Counter
 import json
 import os
 from pathlib import Path
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
-from bridge_target import closures, DEVIATIONS, Drive, EDGES, KEYFRAME, stamp_of
-from diagnostic_msgs.msg import DiagnosticArray
+from bridge_target import AHEAD, closures, DEVIATIONS, Drive, EDGES, KEYFRAME, stamp_of
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from interface_packages import build_interfaces
 import numpy as np
@@ -27,9 +29,10 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.ros.output import nanoseconds
 from stavpr_slam.commands.bridge import main
 from stavpr_slam.pose_graph import Closure
-from stavpr_slam.pose_graph.foreign import ForeignKeyframes, keyframe_edge
-from stavpr_slam.ros.bridges.bridge import interfaces
+from stavpr_slam.ros.bridges.bridge import Bridge, interfaces
+from stavpr_slam.ros.bridges.external_keyframes import ExternalKeyframes, keyframe_edge
 from stavpr_slam.ros.graph_messages import pose_array
+from test_pose_graph import LAP
 
 COVARIANCE = np.diag([0.2, 0.1, 0.3, 0.01, 0.02, 0.03]) ** 2
 
@@ -56,20 +59,20 @@ def test_keyframe_edge_covariance_is_that_of_samples():
     dice = np.random.default_rng(0)
     start = matrices(np.array([1.0, 2, 0, 0, 0, 0.6, 0.8]))
     before = matrices(np.array([0.5, 0, 0, 0, 0.6, 0, 0.8]))
-    way = matrices(np.array([3.0, 1, 0, 0, 0, 0, 1]))  # a long one, so that its lever counts
-    edge = keyframe_edge(closure(to_poses(start)), (1, before), (2, inverse(way)))
+    motion = matrices(np.array([3.0, 1, 0, 0, 0, 0, 1]))  # a long one, so that its lever counts
+    edge = keyframe_edge(closure(to_poses(start)), (1, before), (2, inverse(motion)))
     samples = dice.multivariate_normal(np.zeros(6), COVARIANCE, 20000)
     moved = np.tile(start, (20000, 1, 1))
     moved[:, :3, :3] = Rotation.from_rotvec(samples[:, 3:]).as_matrix() @ start[:3, :3]
     moved[:, :3, 3] += samples[:, :3]
-    end = before @ moved @ way
+    end = before @ moved @ motion
     turns = Rotation.from_matrix(end[:, :3, :3] @ edge.transform[:3, :3].T).as_rotvec()
     errors = np.concatenate([end[:, :3, 3] - edge.transform[:3, 3], turns], axis=1)
     np.testing.assert_allclose(np.cov(errors.T), edge.covariance, atol=2e-3)
 
 
-def test_foreign_keyframes_near_returns_nearest_with_motion():
-    keyframes = ForeignKeyframes(max_gap=2.0)
+def test_external_keyframes_near_returns_nearest_with_motion():
+    keyframes = ExternalKeyframes(max_gap=2.0)
     at = lambda x: np.array([x, 0, 0, 0, 0, 0, 1.0])  # noqa: E731
     keyframes.add_odometry(SECOND, at(1.0))
     keyframes.add(3 * SECOND // 2, 5)  # before the odometry after it
@@ -95,6 +98,22 @@ def test_bridge_without_target_is_usage_error(target, capsys):
 def test_interfaces_of_missing_package_is_error_that_names_it():
     with pytest.raises(UnavailableError, match=r'package other_msgs \(its source\): install'):
         interfaces('other_msgs', 'its source')
+
+
+@pytest.mark.parametrize(
+    ('counts', 'level', 'text'),
+    [
+        ({}, DiagnosticStatus.WARN, 'no closures on /stavpr/loop_closure: remap it'),
+        ({'closures': 91, 'invalid': 91}, DiagnosticStatus.WARN, 'the closures are invalid'),
+        ({'closures': 9, 'waiting': 9}, DiagnosticStatus.WARN, 'no keyframes of the target'),
+        ({'closures': 9, 'waiting': 1, 'sent': 8}, DiagnosticStatus.OK, '8 closures sent'),
+    ],
+)
+def test_status_of_bridge_that_sends_nothing_is_warning_with_remedy(counts, level, text):
+    bridge = SimpleNamespace(counts=Counter(counts), resolve_topic_name='/{}'.format)
+    found, sentence = Bridge.status(bridge)
+    assert found == level
+    assert text in sentence
 
 
 def test_pose_bridges_publish_pose_on_map(tmp_path):
@@ -148,7 +167,9 @@ def test_pose_bridges_publish_pose_on_map(tmp_path):
         assert [each.header.frame_id for each in (priors[0], poses[0])] == ['base_link', 'map']
         first = poses[0].pose
         np.testing.assert_allclose(
-            matrices(pose_array(first.pose)), Drive().at(sent[0].place_index + 99), atol=1e-6
+            matrices(pose_array(first.pose)),
+            Drive().at(sent[0].place_index - AHEAD + LAP),
+            atol=1e-6,
         )
         assert nanoseconds(poses[1].header.stamp) == nanoseconds(
             sent[-2].relative_pose.query_stamp
@@ -170,11 +191,11 @@ def overlay(tmp_path_factory):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize('case', ['rtabmap', 'pose_graph_tools', 'swarm_slam', 'swarm_slam map'])
+@pytest.mark.parametrize('case', ['rtabmap', 'hydra', 'kimera', 'swarm_slam', 'swarm_slam map'])
 def test_bridge_passes_edges_to_target(case, overlay, tmp_path):
     """The bridge and the target are processes; edges are between keyframes 0.3 s from images."""
     target, _, on_map = case.partition(' ')
-    options = ['-p', 'robot_id:=3'] if target == 'pose_graph_tools' else []
+    options = ['-p', 'robot_id:=3'] if target in ('hydra', 'kimera') else []
     options += ['-p', 'place_robot_id:=1'] if on_map else []
     options = ['--ros-args', *options] if options else []
     tests = str(Path(__file__).parent)
@@ -195,16 +216,16 @@ def test_bridge_passes_edges_to_target(case, overlay, tmp_path):
             process.terminate()
     assert bridge.wait(TIMEOUT) == 0
     drive = Drive()
-    queries = [1 + 100 + 2 * KEYFRAME * i for i in range(EDGES)]
+    queries = [1 + LAP + 2 * KEYFRAME * i for i in range(EDGES)]
     if target == 'swarm_slam':
         del queries[1]  # aligned by odometry
     assert len(edges) == len(queries)
     for edge, query in zip(edges, queries, strict=True):
-        numbers = edge['place'], edge['query']
-        images = [(number - 1) * KEYFRAME + 0.3 for number in numbers]
-        assert abs(images[1] - query) <= KEYFRAME / 2
-        assert abs(images[0] - (query - 99)) <= KEYFRAME / 2
+        images = [(number - 1) * KEYFRAME + 0.3 for number in edge['nodes']]
+        assert abs(max(images) - query) <= KEYFRAME / 2
+        assert abs(min(images) - (query - LAP + AHEAD)) <= KEYFRAME / 2
         truth = inverse(drive.at(images[0])) @ drive.at(images[1])
+        assert np.linalg.norm(truth[:3, 3]) > 5  # so that the other direction differs
         np.testing.assert_allclose(
             matrices(np.array(edge['pose'])), truth, atol=0.02
         )  # chords of the odometry

@@ -11,7 +11,8 @@ from stavpr_ros.signals import run_until_signal
 TARGETS = {
     'rtabmap': ('rtabmap', 'RtabmapBridge'),
     'rtabmap_global_pose': ('rtabmap', 'GlobalPoseBridge'),
-    'pose_graph_tools': ('pose_graph_tools', 'PoseGraphToolsBridge'),
+    'hydra': ('pose_graph_tools', 'HydraBridge'),
+    'kimera': ('pose_graph_tools', 'KimeraBridge'),
     'swarm_slam': ('swarm_slam', 'SwarmSlamBridge'),
     'robot_localization': ('poses', 'RobotLocalizationBridge'),
 }
@@ -24,7 +25,7 @@ on the topic `odom`. Counts and remedies are in /diagnostics.
 
 targets and their parameters:
 {targets}
-Only rtabmap requires rtabmap_msgs, pose_graph_tools pose_graph_tools_msgs, swarm_slam
+Only rtabmap requires rtabmap_msgs, hydra and kimera pose_graph_tools_msgs, swarm_slam
 cslam_common_interfaces. For Nav2: parameter publish_initialpose of the recognition node.
 
 exit codes: 0 stopped by a signal; 1 an invalid parameter, or a missing package; 2 usage

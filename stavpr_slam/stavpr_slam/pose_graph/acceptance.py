@@ -16,9 +16,6 @@ from stavpr_slam.pose_graph.sessions import Ties
 
 SCALES = np.geomspace(0.05, 2.0, 16)  # factors on the errors of the odometry that are tried
 LEAST_CLUSTERS = 6  # that these are estimated from
-# A break explains at least this share of the closures that stay rejected: of many wrong ones, some
-# agree at random.
-UNEXPLAINED = float(__import__("os").environ.get("UNX","0.25"))
 SAMPLE, CYCLES = 120, 60  # clusters at most for that: compared, and whose cycles are used
 CAUTION = 1.5  # factor on the estimated errors of the odometry where closures are compared
 SAME = 0.7, 1.4  # a factor that changes by less is the same
@@ -126,7 +123,7 @@ class Acceptance:
         """
         chain, settings = self._chain, self._settings
         least, best, sides = self._weight(chain.session), 0, None
-        if self._total() - least < settings.break_support / 2:
+        if self._total() - least < settings.break_gain:
             return None
         for node in candidates(chain, self.clusters, settings.support):
             if any(
@@ -151,8 +148,7 @@ class Acceptance:
 
     def _is_proved(self, weight: int, without: int) -> bool:
         """Return whether a break is proved, by the weights that agree with and without it."""
-        rejected = UNEXPLAINED * (self._total() - weight)
-        return weight - without >= max(self._settings.break_support / 2, rejected)
+        return weight - without >= self._settings.break_gain
 
     def adapt(self) -> bool:
         """

@@ -24,6 +24,7 @@ class ConsistencySettings:
     :param join_support: least closures that join two sessions.
     :param break_support, break_distance: closures, and meters that the query travels, in each of
         two runs that contradict each other, which prove that the odometry has a break between.
+    :param break_gain: closures more that agree if there is a break.
     """
 
     gap: float = 15.0
@@ -32,6 +33,7 @@ class ConsistencySettings:
     join_support: int = 8
     break_support: int = 32
     break_distance: float = 40.0
+    break_gain: int = 24
 
 
 @dataclass(eq=False)

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pose graphs as text: g2o, and trajectories in the format of the TUM benchmark."""
+"""Pose graphs as text: g2o, and trajectories in the formats of TUM and KITTI."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.trajectory import SECOND
-from stavpr_ros.mapping.transforms import inverse, to_poses
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.output_file import FileKind, Force, write_output
 from stavpr_slam.pose_graph.graph import PoseGraph
 from stavpr_slam.pose_graph.path_errors import path_errors
 
 TUM_HEADER = '# timestamp tx ty tz qx qy qz qw\n'
 TUM = FileKind('trajectory', lambda head: head.startswith(TUM_HEADER.encode()))
+KITTI = FileKind('trajectory', lambda head: len(head.split(b'\n')[0].split()) == 12)
 G2O = FileKind('g2o file', lambda head: head.startswith((b'VERTEX_SE3:QUAT', b'# g2o')))
 
 
@@ -31,6 +32,16 @@ def tum_text(stamps: np.ndarray, poses: np.ndarray) -> str:
         if np.isfinite(pose).all()
     ]
     return TUM_HEADER + '\n'.join(lines) + '\n'
+
+
+def kitti_text(poses: np.ndarray) -> str:
+    """
+    Return a trajectory in the format of KITTI odometry: the rows of (3, 4) matrices.
+
+    :param poses: of the base (x ahead, z up) in the frame of the graph, shape (N, 7). The poses of
+        the benchmark are of its left camera (z ahead, y down) in the frame of the first one.
+    """
+    return '\n'.join(_numbers(row.ravel()) for row in matrices(poses)[:, :3]) + '\n'
 
 
 def g2o_text(graph: PoseGraph) -> str:
@@ -65,7 +76,9 @@ def _numbers(values: np.ndarray) -> str:
 
 def save_graph(graph: PoseGraph, path: str, force: Force = False) -> int:
     """
-    Write the graph, ``.g2o``, or its trajectory, ``.tum``; return the number of nodes.
+    Write the graph, ``.g2o``, or its trajectory; return the number of nodes.
+
+    ``.tum`` and ``.kitti`` have the same poses, one of each odometry that is kept.
 
     :raises SettingsError: another suffix.
     :raises OutputError: it cannot be written, or exists.
@@ -73,15 +86,16 @@ def save_graph(graph: PoseGraph, path: str, force: Force = False) -> int:
     suffix = Path(path).suffix
     kinds: dict[str, tuple[FileKind, Callable[[], str]]] = {
         '.g2o': (G2O, lambda: g2o_text(graph)),
-        '.tum': (TUM, lambda: _trajectory(graph)),
+        '.tum': (TUM, lambda: tum_text(*_trajectory(graph))),
+        '.kitti': (KITTI, lambda: kitti_text(_trajectory(graph)[1])),
     }
     if suffix not in kinds:
-        raise SettingsError(f'{path}: expected a name that ends in .g2o or .tum')
+        raise SettingsError(f'{path}: expected a name that ends in .kitti, .g2o or .tum')
     kind, text = kinds[suffix]
     write_output(path, text(), kind, force)
     return len(graph.solved)
 
 
-def _trajectory(graph: PoseGraph) -> str:
+def _trajectory(graph: PoseGraph) -> tuple[np.ndarray, np.ndarray]:
     stamps, _, corrected = graph.chain.trajectory(graph.solved)
-    return tum_text(stamps, to_poses(corrected))
+    return stamps, to_poses(corrected)

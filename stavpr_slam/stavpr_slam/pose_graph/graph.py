@@ -19,7 +19,7 @@ from stavpr_slam.pose_graph.solver import Problem, Solver
 from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
-ROUNDS = 5  # of comparing all clusters together, and solving again
+ROUNDS = 50  # of comparing all clusters together at most
 
 
 @dataclass(frozen=True)

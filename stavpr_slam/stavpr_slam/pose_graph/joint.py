@@ -88,6 +88,7 @@ class Loops:
         self.ends = np.array([[edge.query, edge.place] for edge in edges])
         self._nodes, self._back = nodes, inverse(np.array([edge.transform for edge in edges]))
         self._X, self._errors = nodes.transforms[self.ends], nodes.errors[self.ends]
+        self._start = self._X, self._errors
         self._turn = adjoints(self._X[:, 0])
         measured = np.array([edge.covariance for edge in edges])
         self.measured = self._turn @ measured @ self._turn.swapaxes(1, 2)
@@ -106,9 +107,10 @@ class Loops:
 
     def move(self, errors: np.ndarray) -> None:
         """Linearize at other errors of the ends, shape (2, n, 6)."""
-        for i, new in enumerate(errors):
-            self._X[:, i] = exponentials(new - self._errors[:, i]) @ self._X[:, i]
-            self._errors[:, i] = new
+        X, start = self._start
+        self._errors = errors.swapaxes(0, 1)
+        moved = exponentials((self._errors - start).reshape(-1, 6)).reshape(*X.shape)
+        self._X = moved @ X
         self._turn = adjoints(self._X[:, 0])
 
 
@@ -138,23 +140,25 @@ def _refuted(loops: Loops, weights: np.ndarray) -> list[int]:
     whole[np.arange(n), np.arange(n)] += loops.measured
     flat = whole.transpose(0, 2, 1, 3).reshape(6 * n, 6 * n)
     P = np.linalg.inv(flat).reshape(n, 6, n, 6)
-    taken = np.arange(n)
+    taken, off, moved = np.arange(n), loops.misclosures(), False
     while True:
-        for _ in range(ITERATIONS):
-            pulled = np.einsum('iajb,jb->ia', P, loops.misclosures()[taken])
-            loops.move(-np.einsum('enjab,jb->ena', ends[:, :, taken], pulled))
-        off = loops.misclosures()
         pulled = np.einsum('iajb,jb->ia', P, off[taken])
         own = P[np.arange(len(taken)), :, np.arange(len(taken))]
         squared = _squared(pulled, own)
         over = np.where(squared > REFUTED, squared / weights[taken], 0.0)
-        if not over.any():
+        if over.any():
+            worst, moved = int(np.argmax(over)), False
+            rest = np.arange(len(taken)) != worst
+            gone, core = P[rest, :, worst], np.linalg.inv(P[worst, :, worst])
+            P = P[rest][:, :, rest] - np.einsum('iab,bc,jdc->iajd', gone, core, gone)
+            taken = taken[rest]
+        elif moved:
             break
-        worst = int(np.argmax(over))
-        rest = np.arange(len(taken)) != worst
-        gone, core = P[rest, :, worst], np.linalg.inv(P[worst, :, worst])
-        P = P[rest][:, :, rest] - np.einsum('iab,bc,jdc->iajd', gone, core, gone)
-        taken = taken[rest]
+        else:
+            for _ in range(ITERATIONS):
+                pulled = np.einsum('iajb,jb->ia', P, loops.misclosures()[taken])
+                loops.move(-np.einsum('enjab,jb->ena', ends[:, :, taken], pulled))
+            off, moved = loops.misclosures(), True
     left = np.setdiff1d(np.arange(n), taken)
     gain = np.einsum('ljab,jbkc->lakc', shared[np.ix_(left, taken)], P)
     off = off[left] - np.einsum('lakc,kc->la', gain, off[taken])

@@ -3,6 +3,7 @@
 """What all bridges have in common: parameters, loop closures in, counts, diagnostics."""
 
 from collections import Counter
+from collections.abc import Iterable
 import importlib
 import math
 from typing import Any, ClassVar
@@ -18,7 +19,11 @@ from stavpr_ros.ros.diagnostics import one_status
 from stavpr_ros.ros.output import nanoseconds
 from stavpr_ros.ros.subscriptions import odometry_pose
 from stavpr_slam.pose_graph import Closure
-from stavpr_slam.pose_graph.foreign import ForeignKeyframes, keyframe_edge, KeyframeEdge
+from stavpr_slam.ros.bridges.external_keyframes import (
+    ExternalKeyframes,
+    keyframe_edge,
+    KeyframeEdge,
+)
 from stavpr_slam.ros.graph_messages import closure_of, pose_array
 
 CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
@@ -28,6 +33,8 @@ MAX_PENDING = 1000  # closures that wait for keyframes
 REMEDIES = {
     'without_relative_pose': 'the closures are of appearance alone: set camera_info and odom of '
     'the recognition node',
+    'invalid': 'the closures are invalid, as the log states',
+    'waiting': 'no keyframes of the target: is it running, and are its topics remapped?',
     'no_keyframe': 'no keyframe near the stamps of the images: is it the same clock and odometry?',
     'on_a_map': 'the places are of a map, not of this drive: use operation loop_closure',
     'not_on_a_map': 'the places are of this drive: use operation localization, a map with poses',
@@ -100,17 +107,20 @@ class Bridge(Node):
         if cause:
             self.counts[cause] += 1
 
-    def on_timer(self) -> None:
-        """Publish the diagnostics."""
+    def status(self) -> tuple[bytes, str]:
+        """Return the level of the diagnostics, and their sentence."""
         counts = self.counts
-        level, text = DiagnosticStatus.OK, f'{counts["sent"]} closures sent'
         causes = [(counts[cause], cause) for cause in REMEDIES if counts[cause]]
         if not counts['closures']:
-            level = DiagnosticStatus.WARN
-            text = f'no closures on {self.resolve_topic_name("stavpr/loop_closure")}: remap it'
-        elif not counts['sent'] and causes:
-            level, text = DiagnosticStatus.WARN, REMEDIES[max(causes)[1]]
-        self._diagnostics.publish(one_status(self, 'bridge', level, text, counts))
+            topic = self.resolve_topic_name('stavpr/loop_closure')
+            return DiagnosticStatus.WARN, f'no closures on {topic}: remap it'
+        if not counts['sent'] and causes:
+            return DiagnosticStatus.WARN, REMEDIES[max(causes)[1]]
+        return DiagnosticStatus.OK, f'{counts["sent"]} closures sent'
+
+    def on_timer(self) -> None:
+        """Publish the diagnostics."""
+        self._diagnostics.publish(one_status(self, 'bridge', *self.status(), self.counts))
 
 
 class EdgeBridge(Bridge):
@@ -141,7 +151,9 @@ class EdgeBridge(Bridge):
         other = int(self.given.get('place_robot_id', -1))
         self.place_robot = self.robot if other < 0 else other
         gap = self.seconds('max_keyframe_gap')
-        self.keyframes = {robot: ForeignKeyframes(gap) for robot in (self.robot, self.place_robot)}
+        self.keyframes = {
+            robot: ExternalKeyframes(gap) for robot in (self.robot, self.place_robot)
+        }
         topics = {self.place_robot: 'place_odom', self.robot: 'odom'}
         for robot, topic in topics.items():
             self.create_subscription(
@@ -159,11 +171,16 @@ class EdgeBridge(Bridge):
         """Return whether the target takes edges; they wait until it does."""
         return True
 
-    def on_keyframe(self, robot: int, stamp: int, number: int) -> None:
-        """Note a keyframe of the target, and send the closures that waited for it."""
-        if robot in self.keyframes and stamp > 0:
-            self.keyframes[robot].add(stamp, number)
-            self._send_pending()
+    def add_keyframes(self, keyframes: Iterable[tuple[int, int, int]]) -> None:
+        """
+        Add keyframes of the target, and send the closures that waited for them.
+
+        :param keyframes: robot, stamp (ns), and number of each; those of other robots are ignored.
+        """
+        for robot, stamp, number in keyframes:
+            if robot in self.keyframes and stamp > 0:
+                self.keyframes[robot].add(stamp, number)
+        self._send_pending()
 
     def on_timer(self) -> None:
         """Send what waited for the target, and publish the diagnostics."""

@@ -9,8 +9,8 @@ import numpy as np
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.mapping.transforms import to_poses
 from stavpr_ros.ros.output import nanoseconds, pose_message
-from stavpr_slam.pose_graph.foreign import body_information, KeyframeEdge
 from stavpr_slam.ros.bridges.bridge import EdgeBridge, interfaces
+from stavpr_slam.ros.bridges.external_keyframes import body_information, KeyframeEdge
 from stavpr_slam.ros.bridges.poses import PoseBridge
 
 PACKAGE = 'rtabmap_msgs', 'ros-jazzy-rtabmap-msgs'
@@ -47,7 +47,7 @@ class RtabmapBridge(EdgeBridge):
 
     def _on_info(self, message: Any) -> None:
         if message.ref_id > 0:
-            self.on_keyframe(self.robot, nanoseconds(message.header.stamp), message.ref_id)
+            self.add_keyframes([(self.robot, nanoseconds(message.header.stamp), message.ref_id)])
 
     def send(self, edge: KeyframeEdge, message: LoopClosure) -> None:
         """Request the link from the place to the query."""

@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.ros.output import nanoseconds
-from stavpr_slam.pose_graph.foreign import KeyframeEdge
 from stavpr_slam.ros.bridges.bridge import EdgeBridge, interfaces
+from stavpr_slam.ros.bridges.external_keyframes import KeyframeEdge
 from stavpr_slam.ros.bridges.rtabmap import transform_of
 
 
@@ -50,7 +50,7 @@ class SwarmSlamBridge(EdgeBridge):
             )
 
     def _on_keyframe_odom(self, message: Any, robot: int) -> None:
-        self.on_keyframe(robot, nanoseconds(message.odom.header.stamp), message.id)
+        self.add_keyframes([(robot, nanoseconds(message.odom.header.stamp), message.id)])
 
     def send(self, edge: KeyframeEdge, message: LoopClosure) -> None:
         """Publish the closure; keyframe 0 is the place."""

@@ -29,7 +29,7 @@ class KeyframeEdge:
     covariance: np.ndarray
 
 
-class ForeignKeyframes:
+class ExternalKeyframes:
     """
     Keyframes by their stamps, with the odometry there.
 
@@ -119,7 +119,7 @@ def keyframe_edge(
     """
     before, after = place[1], inverse(query[1])
     measured = matrices(closure.pose)
-    # t' = A (t + R b): an error of the rotation R also moves the end of the way b
+    # t' = A (t + R b): an error of the rotation R also moves the end of the motion b
     x, y, z = measured[:3, :3] @ after[:3, 3]
     jacobian = np.eye(6)
     jacobian[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
