@@ -322,6 +322,13 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             choices=('auto', 'none', 'aligned', 'pnp'),
         ),
         NodeParameter(
+            'verifier',
+            '',
+            'Function package.module:name that accepts or refutes each match before it gets a '
+            'relative pose, see stavpr_ros.relative_pose.verification; empty = none.',
+            when='start',
+        ),
+        NodeParameter(
             'camera_transform',
             '',
             'Pose of the optical frame of the camera (z ahead, x right) in the base of the robot, '

@@ -12,7 +12,9 @@ import pytest
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.place_map import decode_thumbnail
+from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.relative_pose.edge import Edge, Source
+from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.pair import MatchedPair
 from stavpr_ros.relative_pose.verification import load_verifier, verified_edge
 
@@ -83,6 +85,17 @@ def test_verifier_returns_edge_of_its_own(pair):
 def test_invalid_answer_of_verifier_fails(pair, answer, message):
     with pytest.raises(InputError, match=message):
         verify(pair, answer)
+
+
+def test_estimator_without_time_does_not_call_verifier(pair):
+    estimator = EdgeEstimator('aligned', lambda *_: pytest.fail('called'))
+    edge = estimator.estimate(pair, None, None, 'many are waiting')
+    assert (edge.source, edge.reason) == (Source.DROPPED, 'verifier: many are waiting')
+
+
+def test_verifier_can_be_named_at_the_start_only():
+    """Who can call services of the node cannot name code."""
+    assert BY_NAME['verifier'].when == 'start'
 
 
 def test_load_verifier_imports_by_name(monkeypatch):

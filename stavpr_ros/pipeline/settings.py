@@ -210,6 +210,7 @@ class NodeSettings:
     publish_tf: bool
     publish_initialpose: bool
     relative_pose: str
+    verifier: str
     camera_transform: str
     pipeline: PipelineSettings
 

@@ -40,7 +40,7 @@ class EdgePublisher:
     """
     Publishes loop closures in their order, each when its edge is ready; images never wait.
 
-    :param method: parameter relative_pose.
+    :param estimator: makes the edges, on the thread.
     :param publish: called with each closure, on the thread.
     :param statistics: counts the edges by source.
     :param ending: set when the node ends.
@@ -50,13 +50,13 @@ class EdgePublisher:
 
     def __init__(
         self,
-        method: str,
+        estimator: EdgeEstimator,
         publish: Callable[[LoopClosure], None],
         statistics: Statistics,
         ending: threading.Event,
     ) -> None:
-        self._estimator, self._publish = EdgeEstimator(method), publish
-        self.aligns = method in ('auto', 'aligned')
+        self._estimator, self._publish = estimator, publish
+        self.aligns = estimator.method in ('auto', 'aligned')
         self._statistics = statistics
         self._worker = Worker(self._complete, 2**31, ending)
 
@@ -64,6 +64,8 @@ class EdgePublisher:
         self, pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None
     ) -> Edge:
         """Return the edge of a match, which waits for nothing: by odometry, or without a pose."""
+        if self._estimator.verifier is not None:
+            return Edge(Source.NONE, 'the loop closure of this header has it, verified')
         if self._estimator.method == 'auto':
             with suppress(InputError):
                 needed_by_pnp(pair, query_camera, place_camera)

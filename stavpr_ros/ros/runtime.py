@@ -23,7 +23,9 @@ from stavpr_ros.pipeline.saving import recover_maps, save_recorded_map
 from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
+from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.pair import MatchedPair
+from stavpr_ros.relative_pose.verification import load_verifier
 from stavpr_ros.ros.camera import CameraInput
 from stavpr_ros.ros.edges import EdgePublisher, WaitingClosure
 from stavpr_ros.ros.health import Health
@@ -95,8 +97,12 @@ class Runtime:
         self._navigation = Navigation(node, settings)
         self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size, settings.robot_id)
+        verifier = load_verifier(settings.verifier) if settings.verifier else None
         self._edges = EdgePublisher(
-            settings.relative_pose, self._output.publish_closure, self._statistics, node.ending
+            EdgeEstimator(settings.relative_pose, verifier),
+            self._output.publish_closure,
+            self._statistics,
+            node.ending,
         )
         self._pipeline: Pipeline | None = None
         self._views = Visualization(node, lambda: self.worker.call(self._publish_route))
