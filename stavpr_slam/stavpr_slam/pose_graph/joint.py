@@ -12,6 +12,7 @@ in Geodetic Networks*, 1968).
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import block_diag
 from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph.closures import ResolvedClosure
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
@@ -21,7 +22,7 @@ REFUTED = 11.3  # squared deviations: 99 % for motion in a plane, of three dimen
 CERTAIN = 100.0  # odds from which a single closure is right
 LARGEST = 300  # loops that are compared together; more are divided into interleaved groups
 ITERATIONS = 2  # of Gauss and Newton after each edge that is left out
-UNKNOWN = np.diag([3.0] * 3 + [1e3] * 3) ** 2  # of the pose of a session, rad and m
+UNKNOWN = np.repeat([3.0, 1e3], 3) ** 2  # variances of the pose of a session, rad and m
 
 
 class NodeErrors:
@@ -29,7 +30,8 @@ class NodeErrors:
     Errors of the nodes by the odometry, as twists in the axes of the map, and their covariances.
 
     ``transforms`` are those of the linearization, (N, 4, 4), about the middle of the map;
-    ``errors`` the twists that they have by the odometry, (N, 6).
+    ``errors`` the twists that they have by the odometry, (N, 6); ``loose`` which of S sessions with
+    an unknown pose they are of, (N, S).
 
     :param solved: transforms of all nodes in the map, shape (N, 4, 4).
     :param scale: factor on the errors of the odometry.
@@ -62,13 +64,13 @@ class NodeErrors:
         self.errors = summed(moved)
         self._spread, self._bent = scale**2 * summed(spread), scale * summed(bent)
         self._session, self._recording = chain.session, chain.recording
-        self._loose = ~np.isin(chain.session, list(anchors)) & (chain.session >= 0)
+        loose = sorted(set(chain.session[chain.session >= 0].tolist()) - anchors)
+        self.loose = (chain.session[:, None] == loose).astype(float)
 
     def covariance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return the covariances between nodes (n,) and (m,), shape (n, m, 6, 6)."""
+        """Return those between nodes (n,) and (m,) of known sessions, shape (n, m, 6, 6)."""
         a, b = a[:, None], b[None]
         result = self._spread[np.minimum(a, b)]
-        result[self._loose[a] & self._loose[b]] += UNKNOWN
         result[self._session[a] != self._session[b]] = 0
         bent = self._bent[a] @ self._bent[b].swapaxes(2, 3)
         bent[self._recording[a] != self._recording[b]] = 0
@@ -82,36 +84,99 @@ class NodeErrors:
 
 
 class Loops:
-    """The misclosures of n loops, which edges close, and their covariances."""
+    """
+    The misclosures of n loops, which edges close, with their precision.
+
+    The poses of loose sessions are unknowns beside them (as in universal kriging): as large
+    covariances they would leave no digits for those of the closures.
+    """
 
     def __init__(self, nodes: NodeErrors, edges: Sequence[ResolvedClosure]) -> None:
+        self._nodes = nodes
         self.ends = np.array([[edge.query, edge.place] for edge in edges])
-        self._nodes, self._back = nodes, inverse(np.array([edge.transform for edge in edges]))
+        self._back = inverse(np.array([edge.transform for edge in edges]))
         self._X, self._errors = nodes.transforms[self.ends], nodes.errors[self.ends]
         self._start = self._X, self._errors
         self._turn = adjoints(self._X[:, 0])
         measured = np.array([edge.covariance for edge in edges])
         self.measured = self._turn @ measured @ self._turn.swapaxes(1, 2)
+        loose = nodes.loose[self.ends]
+        self.loose = np.kron(loose[:, 0] - loose[:, 1], np.eye(6))
+        self._ends_loose = [np.kron(each, np.eye(6)) for each in loose.swapaxes(0, 1)]
 
     def misclosures(self) -> np.ndarray:
-        """Return the misclosures by the odometry in the axes of the map, shape (n, 6)."""
+        """Return the misclosures by the odometry in the axes of the map, shape (6 n,)."""
         query, place = self._X[:, 0], self._X[:, 1]
         off = self._turn @ logarithms(self._back @ inverse(place) @ query)[:, :, None]
-        result: np.ndarray = off[:, :, 0] - self._errors[:, 0] + self._errors[:, 1]
-        return result
+        return (off[:, :, 0] - self._errors[:, 0] + self._errors[:, 1]).ravel()
 
     def end_covariances(self, others: 'Loops') -> np.ndarray:
-        """Return those of the errors of the ends with other loops, shape (2, n, m, 6, 6)."""
+        """Return those of the errors of the ends with other loops, shape (2, 6 n, 6 m)."""
         covariance, (query, place) = self._nodes.covariance, others.ends.T
-        return np.array([covariance(own, query) - covariance(own, place) for own in self.ends.T])
+        found = [covariance(own, query) - covariance(own, place) for own in self.ends.T]
+        shape = 2, 6 * len(self.ends), 6 * len(others.ends)
+        return np.array(found).transpose(0, 1, 3, 2, 4).reshape(shape)
 
-    def move(self, errors: np.ndarray) -> None:
-        """Linearize at other errors of the ends, shape (2, n, 6)."""
+    def covariance(self) -> np.ndarray:
+        """Return that of the misclosures, shape (6 n, 6 n)."""
+        query, place = self.end_covariances(self)
+        return query - place + block_diag(*self.measured)
+
+    def move(self, ends: np.ndarray, given: 'Given') -> None:
+        """
+        Linearize at what loops imply.
+
+        :param ends: covariances of the ends with these loops, shape (2, 6 n, 6 m).
+        """
+        errors = [
+            -(own @ given.pulled + loose @ given.sessions).reshape(-1, 6)
+            for own, loose in zip(ends, self._ends_loose, strict=True)
+        ]
         X, start = self._start
-        self._errors = errors.swapaxes(0, 1)
+        self._errors = np.array(errors).swapaxes(0, 1)
         moved = exponentials((self._errors - start).reshape(-1, 6)).reshape(*X.shape)
         self._X = moved @ X
         self._turn = adjoints(self._X[:, 0])
+
+
+class Given:
+    """
+    What the misclosures of m loops imply.
+
+    :param precision: inverse of their covariance, shape (6 m, 6 m).
+    :param loose: unknown poses in each of them, shape (6 m, 6 S).
+    :param off: the misclosures, shape (6 m,).
+    """
+
+    def __init__(self, precision: np.ndarray, loose: np.ndarray, off: np.ndarray) -> None:
+        self._precision, self._loose, self._off = precision, loose, off
+        self._weighed = precision @ loose
+        prior = np.tile(UNKNOWN, loose.shape[1] // 6)
+        self._unknown = np.linalg.inv(np.diag(1 / prior) + loose.T @ self._weighed)
+        self.sessions = self._unknown @ (self._weighed.T @ off)
+        self.pulled = precision @ (off - loose @ self.sessions)
+
+    def deviations(self) -> np.ndarray:
+        """Return the squared deviations of the loops, each from what the others imply, (m,)."""
+        m = len(self._off) // 6
+        blocks = self._precision.reshape(m, 6, m, 6)[np.arange(m), :, np.arange(m)]
+        weighed = self._weighed.reshape(m, 6, -1)
+        blocks = blocks - weighed @ self._unknown @ weighed.swapaxes(1, 2)
+        return _squared(self.pulled.reshape(m, 6), blocks)
+
+    def predicted(
+        self, off: np.ndarray, own: np.ndarray, shared: np.ndarray, loose: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return how far another loop is from what these imply, (6,), and the covariance, (6, 6).
+
+        :param off, own: its misclosure, and the covariance of that.
+        :param shared: covariance with these loops, shape (6, 6 m).
+        :param loose: unknown poses in it, shape (6, 6 S).
+        """
+        left = loose - shared @ self._weighed
+        covariance = own - shared @ self._precision @ shared.T + left @ self._unknown @ left.T
+        return off - shared @ self.pulled - loose @ self.sessions, covariance
 
 
 def refuted(
@@ -134,43 +199,48 @@ def refuted(
 
 
 def _refuted(loops: Loops, weights: np.ndarray) -> list[int]:
-    ends, n = loops.end_covariances(loops), len(weights)
-    shared = ends[0] - ends[1]
-    whole = shared.copy()
-    whole[np.arange(n), np.arange(n)] += loops.measured
-    flat = whole.transpose(0, 2, 1, 3).reshape(6 * n, 6 * n)
-    P = np.linalg.inv(flat).reshape(n, 6, n, 6)
-    taken, off, moved = np.arange(n), loops.misclosures(), False
+    ends, whole = loops.end_covariances(loops), loops.covariance()
+    precision = np.linalg.inv(whole)
+    taken, off, moved = np.arange(len(weights)), loops.misclosures(), False
+
+    def rows(numbers: np.ndarray) -> np.ndarray:
+        return (6 * numbers[:, None] + np.arange(6)).ravel()
+
     while True:
-        pulled = np.einsum('iajb,jb->ia', P, off[taken])
-        own = P[np.arange(len(taken)), :, np.arange(len(taken))]
-        squared = _squared(pulled, own)
+        own = rows(taken)
+        given = Given(precision, loops.loose[own], off[own])
+        squared = given.deviations()
         over = np.where(squared > REFUTED, squared / weights[taken], 0.0)
         if over.any():
-            worst, moved = int(np.argmax(over)), False
-            rest = np.arange(len(taken)) != worst
-            gone, core = P[rest, :, worst], np.linalg.inv(P[worst, :, worst])
-            P = P[rest][:, :, rest] - np.einsum('iab,bc,jdc->iajd', gone, core, gone)
+            gone, moved = np.array([np.argmax(over)]), False
+            rest = np.delete(np.arange(len(taken)), gone)
+            a, b = rows(rest), rows(gone)
+            core = np.linalg.solve(precision[np.ix_(b, b)], precision[np.ix_(b, a)])
+            precision = precision[np.ix_(a, a)] - precision[np.ix_(a, b)] @ core
             taken = taken[rest]
         elif moved:
             break
         else:
             for _ in range(ITERATIONS):
-                pulled = np.einsum('iajb,jb->ia', P, loops.misclosures()[taken])
-                loops.move(-np.einsum('enjab,jb->ena', ends[:, :, taken], pulled))
-            off, moved = loops.misclosures(), True
-    left = np.setdiff1d(np.arange(n), taken)
-    gain = np.einsum('ljab,jbkc->lakc', shared[np.ix_(left, taken)], P)
-    off = off[left] - np.einsum('lakc,kc->la', gain, off[taken])
-    own = whole[left, left] - np.einsum('lakc,lkdc->lad', gain, shared[np.ix_(left, taken)])
-    return [int(i) for i, each in zip(left, _squared(off, own), strict=True) if each > REFUTED]
+                loops.move(ends[:, :, own], given)
+                off, moved = loops.misclosures(), True
+                given = Given(precision, loops.loose[own], off[own])
+    left = []
+    for i in np.setdiff1d(np.arange(len(weights)), taken).tolist():
+        one = rows(np.array([i]))
+        missed, covariance = given.predicted(
+            off[one], whole[np.ix_(one, one)], whole[np.ix_(one, own)], loops.loose[one]
+        )
+        if _squared(missed[None], covariance[None])[0] > REFUTED:
+            left.append(i)
+    return left
 
 
 def predicted(
     nodes: NodeErrors, edges: Sequence[ResolvedClosure], others: Sequence[ResolvedClosure]
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return how far edges are from what the odometry and others imply, and the odds that they are right.
+    Return how far edges are from what odometry and others imply, and the odds that they are right.
 
     Odds by Bayes' rule: the density of the misclosure by the prediction, and that of a wrong
     place, which is anywhere on the map; as many of the edges are right as there are others.
@@ -180,25 +250,20 @@ def predicted(
     squared, odds = np.zeros((2, len(edges)))
     if not edges or not others:
         return squared + np.inf, odds
-    known = Loops(nodes, others)
-    off, n = known.misclosures().ravel(), len(others)
-    ends = known.end_covariances(known)
-    whole = ends[0] - ends[1]
-    whole[np.arange(n), np.arange(n)] += known.measured
-    P = np.linalg.inv(whole.transpose(0, 2, 1, 3).reshape(6 * n, 6 * n))
+    known = Loops(nodes, others[:: -(-len(others) // LARGEST)])
+    given = Given(np.linalg.inv(known.covariance()), known.loose, known.misclosures())
     for i, edge in enumerate(edges):
         loop = Loops(nodes, [edge])
         query, place = loop.end_covariances(known)
-        shared = (query - place)[0].transpose(1, 0, 2).reshape(6, 6 * n)
-        query, place = loop.end_covariances(loop)
-        own = (query - place)[0, 0] + loop.measured[0] - shared @ P @ shared.T
-        missed = loop.misclosures()[0] - shared @ P @ off
+        missed, own = given.predicted(
+            loop.misclosures(), loop.covariance(), query - place, loop.loose
+        )
         back = adjoints(inverse(nodes.transforms[edge.query][None]))[0]
         missed, own = back @ missed, back @ own @ back.T
-        squared[i] = missed @ np.linalg.solve(own, missed)
+        squared[i] = _squared(missed[None], own[None])[0]
         turn, shift = (np.linalg.eigvalsh(own[k : k + 3, k : k + 3]) for k in (0, 3))
         volume = np.sqrt(2 * np.pi * shift[1] * shift[2] * turn[2])
-        odds[i] = nodes.area / volume * np.exp(-squared[i] / 2) * n / len(edges)
+        odds[i] = nodes.area / volume * np.exp(-squared[i] / 2) * len(others) / len(edges)
     return squared, odds
 
 

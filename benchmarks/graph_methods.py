@@ -1,0 +1,294 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What each rule of the pose graph earns, beside other robust methods on the same drives.
+
+The drives are KITTI's with an appearance detector's closures, most of them false, and worlds of
+the demonstration with edges from their images, a share of them false. A value is the absolute
+trajectory error divided by that with the right closures alone; of each kind of drive the worst
+counts. Writes benchmarks/results/graph_methods.json, and prints the table.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import pairwise
+import json
+import multiprocessing
+import os
+from pathlib import Path
+import tempfile
+import time
+from typing import Any
+from unittest.mock import patch
+
+import gtsam
+import numpy as np
+from results import environment, RESULTS
+from slam import render
+from slam_pairs import recognized, SharedViews, with_edges
+from stavpr_lab.demonstration.slam import trajectory_errors
+from stavpr_lab.demonstration.street.laps import drive_laps
+from stavpr_ros.mapping.transforms import matrices, to_poses
+from stavpr_slam.pose_graph import (
+    acceptance,
+    Closure,
+    consistency,
+    false_places,
+    GraphSettings,
+    OdometryNoise,
+    optimize,
+    runs,
+)
+from stavpr_slam.pose_graph.clusters import ConsistencySettings
+from stavpr_slam.pose_graph.transforms import body_covariance, planar_poses
+from tqdm import tqdm
+
+SAME = np.array([0, 0, 0, 0, 0, 0, 1.0])
+NEARBY = np.diag([3.0] * 3 + [np.radians(20)] * 3) ** 2  # of KITTI's closures
+RIGHT = {'kitti': 10.0, 'world': 6.0}  # meters between the images of a right closure
+KITTI = ('00', '05', '06', '09')
+DRIVES = {  # of a world: factor on the errors of the odometry, and what is special
+    'large drift': (1.0, {}), 'small drift': (0.06, {}),
+    'sessions': (1.0, {'sessions': 2}), 'carried': (1.0, {'carried': True}),
+}  # fmt: skip
+FALSE = {  # share, in runs, images of a run
+    '': (0.0, False, 20), '30 % alone': (0.3, False, 20), '30 % in runs': (0.3, True, 20),
+    '50 % in runs': (0.5, True, 20), '30 % in runs of 60': (0.3, True, 60),
+}  # fmt: skip
+TRIED = {  # of each kind of drive
+    'large drift': list(FALSE), 'small drift': ['', '50 % in runs'],
+    'sessions': ['', '30 % in runs'], 'carried': [each for each in FALSE if 'alone' not in each],
+}  # fmt: skip
+SIGMAS = OdometryNoise()
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A drive: planar truth (N, 3), odometry (N, 7), closures, and which of them are right."""
+
+    kind: str
+    name: str
+    stamps: np.ndarray
+    truth: np.ndarray
+    odometry: np.ndarray
+    closures: list[Closure]
+    right: np.ndarray
+
+    def error(self, poses: np.ndarray) -> float:
+        """Return the absolute trajectory error of poses (N, 7), m."""
+        known = np.isfinite(poses[:, 0])
+        truth = planar_poses(self.truth)[known]
+        return float(trajectory_errors(self.stamps[known], poses[known], truth)[0])
+
+    def only_right(self) -> 'Drive':
+        """Return the drive with its right closures alone."""
+        pairs = zip(self.closures, self.right, strict=True)
+        return replace(self, closures=[c for c, is_right in pairs if is_right])
+
+
+def kitti(name: str, alpha: str) -> Drive:
+    """Return a drive of the folder kitti_graphs of STAVPR_DATA."""
+    folder = Path(os.environ['STAVPR_DATA']) / 'kitti_graphs' / name
+    odometry, truth = (
+        np.loadtxt(folder / f'{each}.csv', delimiter=',', skiprows=1)
+        for each in ('odometry', 'truth')
+    )
+    pairs = np.loadtxt(folder / f'closures_alpha_{alpha}.csv', int, delimiter=',', skiprows=1)
+    stamps = (np.arange(len(odometry), dtype=np.int64) + 10) * 10**8
+    away = np.linalg.norm(truth[pairs[:, 0], :2] - truth[pairs[:, 1], :2], axis=1)
+    closures = [
+        Closure(int(stamps[query]), int(stamps[place]), SAME, NEARBY) for query, place in pairs
+    ]
+    right = away < RIGHT['kitti']
+    return Drive(
+        'KITTI', f'{name} {alpha}', stamps, truth, planar_poses(odometry), closures, right
+    )
+
+
+def worlds(seed: int, draw: int, folder: Path) -> Iterator[Drive]:
+    """Return the drives of a world: recognized, with edges, and made false."""
+    images = render(seed, folder)
+    for name, (drift, special) in DRIVES.items():
+        drive = drive_laps(seed, draw, drift, **special)
+        path = folder / f'pairs-{seed}-{draw}-{name.replace(" ", "-")}.pkl'
+        found = with_edges(drive, recognized(drive, images, path), SharedViews())
+        for false in TRIED[name]:
+            share, coherent, images_of_run = FALSE[false]
+            with patch.object(false_places, 'RUN', images_of_run):
+                places = false_places.FalsePlaces(share, coherent, 100 * seed + draw)
+                known: set[int] = set()
+                closures, ends = [], []
+                for each in (each for each in found if each.closure is not None):
+                    known |= {each.query, each.place}
+                    place = places.place(each.place, known)
+                    closures.append(replace(each.closure, place_stamp=int(drive.stamps[place])))
+                    ends.append((each.query, place, each.place))
+            query, place, measured = np.array(ends).T
+            away = np.linalg.norm(drive.truth[query, :2] - drive.truth[place, :2], axis=1)
+            right = (away < RIGHT['world']) & (np.abs(place - measured) < 3)
+            yield Drive(
+                name, f'{seed}/{draw} {false}', drive.stamps, drive.truth,
+                planar_poses(drive.odometry), closures, right,
+            )  # fmt: skip
+    SharedViews.views.clear()
+
+
+@contextmanager
+def without(target: Any, name: str, replacement: Any) -> Iterator[None]:
+    """Replace a part of the graph."""
+    with patch.object(target, name, replacement):
+        yield
+
+
+def ours(drive: Drive, settings: GraphSettings | None = None, *replaced: Any) -> np.ndarray:
+    """Return the poses by this graph, perhaps with a part replaced, (N, 7)."""
+    if replaced:
+        with without(*replaced):
+            return ours(drive, settings)
+    return optimize(drive.stamps, drive.odometry, drive.closures, settings)[0]
+
+
+def plain(drive: Drive, kernel: Any = None, gnc: bool = False) -> np.ndarray:
+    """Return the poses by Levenberg-Marquardt on all images, with a robust kernel or GNC."""
+    T, index = matrices(drive.odometry), {int(t): i for i, t in enumerate(drive.stamps)}
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    tight = gtsam.noiseModel.Diagonal.Sigmas(np.full(6, 1e-4))
+    poses = [gtsam.Pose3(each) for each in T]
+    graph.add(gtsam.PriorFactorPose3(0, poses[0], tight))
+    for i, pose in enumerate(poses):
+        values.insert(i, pose)
+    deviations = np.repeat([SIGMAS.rotation, SIGMAS.translation], 3)
+    for i, (a, b) in enumerate(pairwise(poses)):
+        length = max(float(np.linalg.norm(T[i + 1, :3, 3] - T[i, :3, 3])), 0.05)
+        model = gtsam.noiseModel.Diagonal.Sigmas(deviations * np.sqrt(length))
+        graph.add(gtsam.BetweenFactorPose3(i, i + 1, a.between(b), model))
+    known = list(range(graph.size()))
+    for each in drive.closures:
+        Z = matrices(each.pose)
+        model = gtsam.noiseModel.Gaussian.Covariance(body_covariance(each.covariance, Z))
+        if kernel is not None:
+            model = gtsam.noiseModel.Robust.Create(kernel, model)
+        ends = index[each.place_stamp], index[each.query_stamp]
+        graph.add(gtsam.BetweenFactorPose3(*ends, gtsam.Pose3(Z), model))
+    if gnc:
+        options = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
+        options.setLossType(gtsam.GncLossType.TLS)
+        options.setKnownInliers(known)
+        solved = gtsam.GncLMOptimizer(graph, values, options).optimize()
+    else:
+        solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return to_poses(np.array([solved.atPose3(i).matrix() for i in range(len(T))]))
+
+
+ESTIMATORS = gtsam.noiseModel.mEstimator
+
+
+def settings(**given: Any) -> GraphSettings:
+    """Return settings of the graph with other ones of the consistency."""
+    return GraphSettings(consistency=ConsistencySettings(**given))
+
+
+Method = Callable[[Drive], np.ndarray]
+METHODS: dict[str, Method] = {
+    'this graph': ours,
+    'GNC (GTSAM, odometry as known inliers)': lambda drive: plain(drive, gnc=True),
+    'Cauchy kernel': lambda drive: plain(drive, ESTIMATORS.Cauchy.Create(1.0)),
+    'dynamic covariance scaling': lambda drive: plain(drive, ESTIMATORS.DCS.Create(1.0)),
+    'pairwise consistency alone (PCM)': lambda drive: ours(
+        drive, replace(settings(support=1), adapt=False), acceptance, 'refuted', lambda *_: []
+    ),
+    'without clusters': lambda drive: ours(drive, settings(support=1)),
+    'without pairwise consistency': lambda drive: ours(
+        drive, None, consistency.ConsistentSet, 'conflicts',
+        lambda _, clusters, session: np.zeros((len(clusters), len(clusters)), bool),
+    ),
+    'without comparing all together': lambda drive: ours(
+        drive, None, acceptance, 'refuted', lambda *_: []
+    ),
+    'without confirming what is left': lambda drive: ours(
+        drive, None, acceptance.Acceptance, 'confirm', lambda *_: False
+    ),
+    'without estimating the odometry': lambda drive: ours(drive, GraphSettings(adapt=False)),
+    'without a bias of the heading': lambda drive: ours(
+        drive, GraphSettings(noise=OdometryNoise(bias=0.0))
+    ),
+    'without breaks': lambda drive: ours(
+        drive, None, acceptance, 'candidates', lambda *_: []
+    ),
+    'sessions joined by one closure': lambda drive: ours(drive, settings(join_support=1)),
+    'every keyframe a variable': lambda drive: ours(drive, None, runs, 'LONGEST', 1),
+}  # fmt: skip
+
+
+def measure(job: tuple[Drive, str]) -> dict[str, Any]:
+    """Return the error of a method on a drive."""
+    drive, method = job
+    began = time.process_time()
+    try:
+        error = drive.error(METHODS[method](drive))
+    except RuntimeError:  # of GTSAM: it is not solved
+        error = float('inf')
+    return {'kind': drive.kind, 'drive': drive.name, 'method': method, 'error': error,
+            'seconds': time.process_time() - began}  # fmt: skip
+
+
+def reference(drive: Drive) -> dict[str, Any]:
+    """Return the errors of the odometry, and with the right closures alone."""
+    right = drive.only_right()
+    return {'kind': drive.kind, 'drive': drive.name, 'odometry': drive.error(drive.odometry),
+            'closures': len(drive.closures), 'right': len(right.closures),
+            'this graph': drive.error(ours(right)),
+            'least squares': drive.error(plain(right))}  # fmt: skip
+
+
+def table(rows: list[dict[str, Any]], right: list[dict[str, Any]]) -> list[str]:
+    """Return the worst ratio of each method and kind of drive as lines of Markdown."""
+    floor = {}
+    for each in right:
+        best = [each['this graph']] + [each['least squares']] * (each['kind'] == 'KITTI')
+        floor[each['kind'], each['drive']] = min(best)
+    kinds = list(dict.fromkeys(each['kind'] for each in rows))
+    lines = ['| | ' + ' | '.join(kinds) + ' | seconds |', '|---|' + '---|' * (len(kinds) + 1)]
+    for method in dict.fromkeys(each['method'] for each in rows):
+        own = [each for each in rows if each['method'] == method]
+        worst = [
+            max(e['error'] / floor[e['kind'], e['drive']] for e in own if e['kind'] == kind)
+            for kind in kinds
+        ]
+        seconds = sum(each['seconds'] for each in own)
+        cells = ' | '.join(f'{value:.2f}' for value in worst)
+        lines.append(f'| {method} | {cells} | {seconds:.0f} |')
+    return lines
+
+
+def main() -> None:
+    """Measure and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--seeds', type=int, nargs='*', default=[60, 61, 62])
+    parser.add_argument('--draws', type=int, default=1, help='of the odometry (%(default)s)')
+    parser.add_argument('--jobs', type=int, default=1, help='processes (%(default)s)')
+    parser.add_argument('--folder', type=Path, help='keeps images and pairs')
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = given.folder or Path(scratch)
+        drives = [kitti(name, alpha) for name in KITTI for alpha in ('0.00', '0.30')]
+        for seed in given.seeds:
+            for draw in range(given.draws):
+                drives += worlds(seed, draw, folder)
+    jobs = [(drive, method) for method in METHODS for drive in drives]
+    context = multiprocessing.get_context('spawn')
+    with ProcessPoolExecutor(given.jobs, context) as pool:
+        right = list(tqdm(pool.map(reference, drives), total=len(drives), unit='drive'))
+        rows = list(tqdm(pool.map(measure, jobs), total=len(jobs), unit='solution'))
+    lines = table(rows, right)
+    about = environment()
+    result = {'about': about, 'table': lines, 'right closures alone': right, 'rows': rows}
+    (RESULTS / 'graph_methods.json').write_text(json.dumps(result, indent=1) + '\n')
+    print('\n'.join(lines))
+
+
+if __name__ == '__main__':
+    main()
