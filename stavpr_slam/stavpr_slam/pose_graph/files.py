@@ -54,8 +54,9 @@ def g2o_text(graph: PoseGraph) -> str:
     nodes = np.flatnonzero(chain.previous[:count] >= 0)
     before, T = chain.previous[nodes], chain.transforms
     spread, _ = path_errors(chain, nodes, before)
-    for node, start, covariance in zip(nodes.tolist(), before.tolist(), graph.scale**2 * spread, strict=True):
-        lines.append(_edge(start, node, inverse(T[start]) @ T[node], covariance))
+    motions, covariances = inverse(T[before]) @ T[nodes], graph.scale**2 * spread
+    for row in zip(before.tolist(), nodes.tolist(), motions, covariances, strict=True):
+        lines.append(_edge(*row))
     for edge in graph.used.values():
         lines.append(_edge(edge.place, edge.query, edge.transform, edge.covariance))
     return '\n'.join(lines) + '\n'

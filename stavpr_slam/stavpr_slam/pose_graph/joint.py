@@ -30,8 +30,8 @@ class NodeErrors:
     Errors of the nodes by the odometry, as twists in the axes of the map, and their covariances.
 
     ``transforms`` are those of the linearization, (N, 4, 4), about the middle of the map;
-    ``errors`` the twists that they have by the odometry, (N, 6); ``loose`` which of S sessions with
-    an unknown pose they are of, (N, S).
+    ``errors`` the twists that they have by the odometry, (N, 6); ``loose``: in which of S sessions
+    with an unknown pose they are, (N, S).
 
     :param solved: transforms of all nodes in the map, shape (N, 4, 4).
     :param scale: factor on the errors of the odometry.
@@ -160,7 +160,7 @@ class Given:
         """Return the squared deviations of the loops, each from what the others imply, (m,)."""
         m = len(self._off) // 6
         blocks = self._precision.reshape(m, 6, m, 6)[np.arange(m), :, np.arange(m)]
-        weighed = self._weighed.reshape(m, 6, -1)
+        weighed = self._weighed.reshape(m, 6, self._weighed.shape[1])
         blocks = blocks - weighed @ self._unknown @ weighed.swapaxes(1, 2)
         return _squared(self.pulled.reshape(m, 6), blocks)
 
