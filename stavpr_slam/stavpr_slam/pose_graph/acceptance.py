@@ -20,6 +20,7 @@ SAMPLE, CYCLES = 120, 60  # clusters at most for that: compared, and whose cycle
 CAUTION = 1.5  # factor on the estimated errors of the odometry where closures are compared
 SAME = 0.7, 1.4  # a factor that changes by less is the same
 MORE = 1.3  # factor on the number of clusters from which errors and breaks are estimated anew
+FEW = 100  # clusters up to which breaks are searched with each closure, then the less often
 GROWN = 1.05  # factor on the number of clusters from which all are compared together anew
 
 
@@ -40,7 +41,6 @@ class Acceptance:
         self._scaled_at = 0
         # breaks that ended: first nodes, and the weight of all closures then
         self._denied: list[tuple[int, int]] = []
-        self.uncompared = 0  # times that the graph was too ill-conditioned to compare all
         self.scale = 1.0
         self.restart()
 
@@ -51,7 +51,7 @@ class Acceptance:
         self.confirmed: set[int] = set()
         self._refuted: set[int] = set()  # numbers of clusters
         self._changed: set[int] = set()
-        self._compared_at, self._waits = 0, False
+        self._compared_at, self._searched_at, self._waits = 0, 0, False
 
     @property
     def cautious_scale(self) -> float:
@@ -123,8 +123,10 @@ class Acceptance:
         """
         chain, settings = self._chain, self._settings
         least, best, sides = self._weight(chain.session), 0, None
-        if self._total() - least < settings.break_gain:
+        due = self._searched_at + (len(self.clusters) / FEW) ** 2
+        if self._total() - least < settings.break_gain or self._total() < due:
             return None
+        self._searched_at = self._total()
         for node in candidates(chain, self.clusters, settings.support):
             if any(
                 abs(chain.travelled[node] - chain.travelled[ended]) < settings.break_distance

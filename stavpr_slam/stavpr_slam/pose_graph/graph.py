@@ -262,11 +262,6 @@ class PoseGraph:
         return self._edges
 
     @property
-    def uncompared(self) -> int:
-        """Return how often the graph was too ill-conditioned to compare all closures together."""
-        return self._acceptance.uncompared
-
-    @property
     def splits(self) -> int:
         """Return the number of breaks that closures prove."""
         return len(self.chain.splits)

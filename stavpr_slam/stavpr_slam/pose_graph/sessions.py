@@ -19,7 +19,7 @@ class Ties:
 
     :param joins: pairs of sessions that closures join, the lower one first.
     :param links: first node of each session that no closure joins to others: the node that it is
-        tied to loosely; -1 = it is the anchor.
+        tied to loosely; -1 = it is an anchor, the first session of its robot.
     """
 
     joins: frozenset[tuple[int, int]] = frozenset()
@@ -51,8 +51,7 @@ def tie(chain: KeyframeChain, accepted: Sequence[Cluster], least: int) -> Ties:
             reached |= more
         if session[node] not in reached:
             reached.add(int(session[node]))
-            earlier = np.flatnonzero(session[:node] >= 0)
-            links[node] = int(earlier[-1]) if len(earlier) else -1
+            links[node] = chain.before(node)
     return Ties(joins, links)
 
 
