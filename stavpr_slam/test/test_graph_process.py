@@ -34,11 +34,13 @@ def test_server_uses_covariances_of_messages_in_the_frame_of_its_origin():
     assert errors(np.eye(4), False)[4, 4] < 1
 
 
-def test_server_names_the_robot_whose_odometry_breaks():
+def test_server_of_robots_has_breaks_and_paths_of_each_in_no_trajectory_file(tmp_path):
     server = GraphServer(GraphSettings(), {})
     inputs = [odometry(robot, i) for i in range(2) for robot in 'ab']
     snapshot = server.serve([*inputs, odometry('b', 9)], True, None)
     assert snapshot.breaks == [('b', 'no odometry for 8.0 s')]
     assert {'b no odometry for 8.0 s'} == {snapshot.values['breaks']}
     stamps = {robot: rows[0].tolist() for robot, rows in snapshot.paths.trajectories.items()}
+    saved = server.serve([], False, (f'{tmp_path}/drive.tum', False)).saved
+    assert 'ends in .g2o, the file of several robots' in saved
     assert stamps == {'a': [SECOND, 2 * SECOND], 'b': [SECOND, 2 * SECOND, 10 * SECOND]}

@@ -295,14 +295,13 @@ def test_pose_graph_of_robots_has_topics_of_each(peer, graph):
     graph('robots:=[a, b]', 'appearance_edges:=false')
     received: list[Odometry] = []
     peer.node.create_subscription(Odometry, 'pose_graph/b/odometry', received.append, 10)
-    publisher = peer.node.create_publisher(Odometry, 'b/odom', 10)
+    publishers = [peer.node.create_publisher(Odometry, f'{name}/odom', 10) for name in 'ab']
     pose = odometry_of(circle())[0]
-
-    def is_corrected() -> bool:
-        publisher.publish(odometry_message(SECOND, pose))
-        return bool(received)
-
-    peer.wait_until(is_corrected)
+    peer.wait_until(lambda: all(each.get_subscription_count() for each in publishers))
+    publishers[1].publish(odometry_message(SECOND, pose))
+    peer.wait_until(lambda: received)
+    peer.until_diagnosed(DiagnosticStatus.WARN, 'no odometry on a/odom: remap it')
+    publishers[0].publish(odometry_message(SECOND, pose))
     np.testing.assert_allclose(pose_array(received[0].pose.pose), pose)
     peer.closures.publish(LoopClosure(robot_id='c'))
     peer.until_diagnosed(DiagnosticStatus.WARN, 'set robot_id of the recognition node')

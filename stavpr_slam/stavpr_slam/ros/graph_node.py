@@ -209,6 +209,7 @@ class PoseGraphNode(ManagedNode):
     def _forget(self) -> None:
         self._corrections = {robot: LimitedCorrection(self._speed) for robot in self._robots}
         self._child_frames = dict.fromkeys(self._robots, '')
+        self._silent = {*self._robots}  # those without odometry
         self._values: dict[str, Any] = {}
         self._broken = 0  # breaks of the odometry that are logged
         self.counts: Counter[str] = Counter()
@@ -227,6 +228,7 @@ class PoseGraphNode(ManagedNode):
         if not np.isfinite(pose).all() or not pose[3:].any():
             return  # the graph counts it
         self._child_frames[robot] = message.child_frame_id
+        self._silent.discard(robot)
         odometry = matrices(pose)
         correction = self._corrections[robot].at(stamp, odometry)
         result = Odometry(child_frame_id=message.child_frame_id, twist=message.twist)
@@ -364,10 +366,11 @@ class PoseGraphNode(ManagedNode):
             level, text = DiagnosticStatus.OK, f'the node is {self.state}'
         elif self._lost:
             level, text = DiagnosticStatus.ERROR, self._lost
-        elif not counts['odometry']:
-            text = 'no odometry: remap odom to the topic of nav_msgs/Odometry'
         elif counts['invalid odometry'] > counts['odometry'] / 2:
             text = f'most odometry is invalid: {self._problems["odometry"]}'
+        elif self._silent:
+            topics = ', '.join(f'{robot}/odom'.lstrip('/') for robot in sorted(self._silent))
+            text = f'no odometry on {topics}: remap it to the topic of nav_msgs/Odometry'
         elif useless[reason] > usable:
             text = f'{useless[reason]} of {counts["closures"]} closures are {reason}'
         elif counts['failed updates']:

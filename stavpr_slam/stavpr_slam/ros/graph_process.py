@@ -146,6 +146,8 @@ class GraphServer:
     def _save(self, path: str, force: Force) -> int | str:
         if not len(self._graph.update(final=True)):
             return 'the graph is empty: there was no odometry'
+        if '' not in self._origins and not path.endswith('.g2o'):
+            return f'{path}: expected a name that ends in .g2o, the file of several robots'
         try:
             return save_graph(self._graph, path, force)
         except StavprError as error:
