@@ -1,26 +1,34 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The reference map: build, grow, save and load it; keyframes and trajectories."""
+"""
+The reference map: build, grow, save and load it; keyframes and trajectories.
 
-from stavpr_ros.mapping.builder import build_map, extract_features
-from stavpr_ros.mapping.growing_map import GrowingMap
-from stavpr_ros.mapping.keyframes import (
-    image_change,
-    KeyframeSelector,
-    KeyframeSettings,
-    small_gray,
-)
-from stavpr_ros.mapping.map_file import is_map, load_map, open_map, save_map, verify_map
-from stavpr_ros.mapping.merging import merge_maps, select_places, select_session
-from stavpr_ros.mapping.place_map import (
-    descriptor_map,
-    encode_thumbnail,
-    Place,
-    PlaceMap,
-    Session,
-    thumbnail_of,
-)
-from stavpr_ros.mapping.trajectory import distance, rotation, Trajectory
+The names below are imported on first use: the submodule ``transforms`` loads without torch.
+"""
+
+from importlib import import_module
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from stavpr_ros.mapping.builder import build_map, extract_features
+    from stavpr_ros.mapping.growing_map import GrowingMap
+    from stavpr_ros.mapping.keyframes import (
+        image_change,
+        KeyframeSelector,
+        KeyframeSettings,
+        small_gray,
+    )
+    from stavpr_ros.mapping.map_file import is_map, load_map, open_map, save_map, verify_map
+    from stavpr_ros.mapping.merging import merge_maps, select_places, select_session
+    from stavpr_ros.mapping.place_map import (
+        descriptor_map,
+        encode_thumbnail,
+        Place,
+        PlaceMap,
+        Session,
+        thumbnail_of,
+    )
+    from stavpr_ros.mapping.trajectory import distance, rotation, Trajectory
 
 __all__ = [
     'GrowingMap',
@@ -48,3 +56,26 @@ __all__ = [
     'thumbnail_of',
     'verify_map',
 ]
+_NAMES = {
+    'builder': ('build_map', 'extract_features'),
+    'growing_map': ('GrowingMap',),
+    'keyframes': ('image_change', 'KeyframeSelector', 'KeyframeSettings', 'small_gray'),
+    'map_file': ('is_map', 'load_map', 'open_map', 'save_map', 'verify_map'),
+    'merging': ('merge_maps', 'select_places', 'select_session'),
+    'place_map': (
+        'descriptor_map',
+        'encode_thumbnail',
+        'Place',
+        'PlaceMap',
+        'Session',
+        'thumbnail_of',
+    ),
+    'trajectory': ('distance', 'rotation', 'Trajectory'),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _NAMES.items():
+        if name in names:
+            return getattr(import_module(f'{__name__}.{module}'), name)
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

@@ -12,8 +12,8 @@ A lifecycle node that configures and activates itself. It corrects the odometry 
 (nav_msgs/Odometry) by the loop closures of recognition nodes: ~/path_before and ~/path
 (nav_msgs/Path), ~/odometry in the map frame, ~/map_to_odom, ~/edges (visualization_msgs/
 MarkerArray: accepted green, rejected red), /diagnostics. Services: ~/save (stavpr_msgs/SaveMap, a
-file .g2o or .tum in the maps folder), ~/reset. The graph is in a process of its own. Requires
-GTSAM: pip install gtsam.
+file .g2o, .tum or .kitti in the maps folder), ~/reset. The graph is in a process of its own.
+Requires GTSAM: pip install gtsam.
 
 parameters:
 {parameters}

@@ -19,7 +19,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
-from stavpr_msgs.msg import LoopClosure
+from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.mapping.transforms import matrices, to_poses
@@ -33,7 +33,7 @@ from stavpr_slam.pose_graph import ChainSettings, GraphSettings
 from stavpr_slam.pose_graph.solver import load_gtsam
 from stavpr_slam.ros.correction import LEVER, LimitedCorrection
 from stavpr_slam.ros.graph_messages import closure_of, edge_markers, path_bytes
-from stavpr_slam.ros.graph_process import GraphProcess, RobotClosure, RobotOdometry, Snapshot
+from stavpr_slam.ros.graph_process import GraphProcess, RobotOdometry, Snapshot
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -42,6 +42,10 @@ ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PERIOD = 1.0  # seconds between two diagnostics
+UNUSABLE = {  # counts of closures without a measurement, by the source of the relative pose
+    RelativePose.REFUTED: 'refuted closures',
+    RelativePose.DROPPED: 'dropped closures',
+}
 PARAMETERS = {
     'autostart': (True, 'configure and activate at the start'),
     'loop_closure_topics': (
@@ -52,7 +56,8 @@ PARAMETERS = {
     'robots': (
         [''],
         'names of the robots of one graph; "" = one robot without a name; a robot NAME has its '
-        'odometry on NAME/odom, and ~/NAME/odometry, ~/NAME/map_to_odom',
+        'odometry on NAME/odom, and ~/NAME/odometry, ~/NAME/map_to_odom, ~/NAME/path; closures on '
+        'a map whose place_session is another NAME join the two',
     ),
     'max_correction_speed': (
         0.0,
@@ -136,17 +141,16 @@ class PoseGraphNode(ManagedNode):
             self._publishers.append(self.create_lifecycle_publisher(*given))
             return self._publishers[-1]
 
-        self._path_before = make(Path, '~/path_before', LATCHED)
-        self._path = make(Path, '~/path', LATCHED)
         self._edges = make(MarkerArray, '~/edges', LATCHED)
         self._tf: Any = make(self._tf_type, '/tf', 100) if self._tf_type else None
-        self._outputs = {
-            robot: (
-                make(Odometry, f'~/{robot}/odometry'.replace('//', '/'), 50),
-                make(TransformStamped, f'~/{robot}/map_to_odom'.replace('//', '/'), LATCHED),
+        self._outputs, self._paths = {}, {}
+        for robot in self._robots:
+            name = f'~/{robot}/'.replace('//', '/')
+            self._outputs[robot] = (
+                make(Odometry, f'{name}odometry', 50),
+                make(TransformStamped, f'{name}map_to_odom', LATCHED),
             )
-            for robot in self._robots
-        }
+            self._paths[robot] = [make(Path, name + x, LATCHED) for x in ('path_before', 'path')]
         self._graph = GraphProcess(self._settings, self._on_snapshot, self._on_lost)
         return super().on_configure(state)
 
@@ -205,6 +209,7 @@ class PoseGraphNode(ManagedNode):
     def _forget(self) -> None:
         self._corrections = {robot: LimitedCorrection(self._speed) for robot in self._robots}
         self._child_frames = dict.fromkeys(self._robots, '')
+        self._silent = {*self._robots}  # those without odometry
         self._values: dict[str, Any] = {}
         self._broken = 0  # breaks of the odometry that are logged
         self.counts: Counter[str] = Counter()
@@ -216,11 +221,14 @@ class PoseGraphNode(ManagedNode):
     def _on_odometry(self, robot: str, message: Odometry) -> None:
         assert self._graph is not None
         pose, stamp = odometry_pose(message), nanoseconds(message.header.stamp)
+        given = message.pose.covariance
+        covariance = given.tolist() if given.any() else None
         self.counts['odometry'] += 1
-        self._graph.add(RobotOdometry(robot, stamp, pose.tolist()))
+        self._graph.add(RobotOdometry(robot, stamp, pose.tolist(), covariance))
         if not np.isfinite(pose).all() or not pose[3:].any():
             return  # the graph counts it
         self._child_frames[robot] = message.child_frame_id
+        self._silent.discard(robot)
         odometry = matrices(pose)
         correction = self._corrections[robot].at(stamp, odometry)
         result = Odometry(child_frame_id=message.child_frame_id, twist=message.twist)
@@ -253,13 +261,14 @@ class PoseGraphNode(ManagedNode):
                 'camera_transform of the recognition node',
             )
         elif (closure := closure_of(message, self._appearance)) is None:
-            self.counts['without relative pose'] += 1
-        elif message.query_index < 0 and message.place_session in others:
-            # the stamp of the place is of that robot's odometry, not of a map with fixed poses
-            closure = replace(closure, map_id='', place_pose=None)
-            self._graph.add(RobotClosure(robot, message.place_session, closure))
+            self.counts[UNUSABLE.get(edge.source, 'without relative pose')] += 1
         else:
-            self._graph.add(RobotClosure(robot, robot, closure))
+            closure = replace(closure, query_robot=robot, place_robot=robot)
+            if message.query_index < 0 and message.place_session in others:
+                # the stamp of the place is of that robot's odometry, not of a map with fixed poses
+                place = message.place_session
+                closure = replace(closure, map_id='', place_pose=None, place_robot=place)
+            self._graph.add(closure)
 
     def _reject(self, kind: str, problem: str) -> None:
         self.counts[f'invalid {kind}'] += 1
@@ -271,9 +280,10 @@ class PoseGraphNode(ManagedNode):
     def _on_snapshot(self, snapshot: Snapshot) -> None:
         """Aim at new corrections, and publish paths and edges; on the thread of the graph."""
         for robot, correction in snapshot.corrections.items():
-            self._corrections[robot].aim(correction, len(snapshot.breaks))
-        for text in snapshot.breaks[self._broken :]:
-            self.get_logger().warning(f'new session: {text}')
+            breaks = sum(name == robot for name, _ in snapshot.breaks)
+            self._corrections[robot].aim(correction, breaks)
+        for robot, text in snapshot.breaks[self._broken :]:
+            self.get_logger().warning(f'new session{robot and f" of {robot}"}: {text}')
         self._broken = len(snapshot.breaks)
         for kind, problem in snapshot.invalid:
             self._reject(kind, problem)
@@ -285,9 +295,10 @@ class PoseGraphNode(ManagedNode):
         if snapshot.values['accepted_closures']:
             self._lost = ''
         if snapshot.paths is not None and self.state == 'active':
-            stamps, before, after, *edges = snapshot.paths
-            self._path_before.publish(path_bytes(self._frame, stamps, before))
-            self._path.publish(path_bytes(self._frame, stamps, after))
+            trajectories, *edges = snapshot.paths
+            for robot, (stamps, *both) in trajectories.items():
+                for publisher, poses in zip(self._paths[robot], both, strict=True):
+                    publisher.publish(path_bytes(self._frame, stamps, poses))
             self._edges.publish(edge_markers(self._frame, *edges))
 
     def _on_lost(self, problem: str) -> None:
@@ -301,7 +312,9 @@ class PoseGraphNode(ManagedNode):
     def _save(self, request: Any, response: Any) -> Any:
         try:
             if not request.path:
-                raise StavprError("path = '' is no file: set a name that ends in .g2o or .tum")
+                raise StavprError(
+                    "path = '' is no file: set one that ends in .g2o, .tum or .kitti"
+                )
             path = inside(self._folder, request.path)
             if self._graph is None:
                 raise StavprError(f'the node is {self.state}: configure it')
@@ -322,7 +335,7 @@ class PoseGraphNode(ManagedNode):
     def _publish_diagnostics(self) -> None:
         counts, graph = Counter(self.counts), Counter(self._values)
         if self._graph is not None and self._graph.dropped:
-            counts['dropped'] = self._graph.dropped
+            counts['dropped input'] = self._graph.dropped
         values = {
             'state': self.state,
             **self._values,
@@ -342,6 +355,10 @@ class PoseGraphNode(ManagedNode):
             ],
             'without a usable relative pose, see relative_pose.reason of the closures: check '
             'camera_info, camera_transform and the odometry': counts['without relative pose'],
+            'refuted by PnP or the verifier: the recognition node finds wrong places, raise its '
+            'min_probability, or camera_info is not of the images': counts['refuted closures'],
+            'dropped, as PnP is slower than they come: set max_rate or keyframe_distance of the '
+            'recognition node, or free a processor core': counts['dropped closures'],
         }
         reason = max(useless, key=lambda text: useless[text])
         level, text = DiagnosticStatus.WARN, f'{graph["accepted_closures"]} closures accepted'
@@ -349,10 +366,11 @@ class PoseGraphNode(ManagedNode):
             level, text = DiagnosticStatus.OK, f'the node is {self.state}'
         elif self._lost:
             level, text = DiagnosticStatus.ERROR, self._lost
-        elif not counts['odometry']:
-            text = 'no odometry: remap odom to the topic of nav_msgs/Odometry'
         elif counts['invalid odometry'] > counts['odometry'] / 2:
             text = f'most odometry is invalid: {self._problems["odometry"]}'
+        elif self._silent:
+            topics = ', '.join(f'{robot}/odom'.lstrip('/') for robot in sorted(self._silent))
+            text = f'no odometry on {topics}: remap it to the topic of nav_msgs/Odometry'
         elif useless[reason] > usable:
             text = f'{useless[reason]} of {counts["closures"]} closures are {reason}'
         elif counts['failed updates']:

@@ -35,27 +35,29 @@ STOP_SECONDS = 3.0  # for the thread to end once the child is killed
 
 
 class RobotOdometry(NamedTuple):
-    """The odometry of a robot at a stamp (ns): x y z and quaternion x y z w."""
+    """
+    The odometry of a robot at a stamp (ns).
+
+    :param pose: x y z and quaternion x y z w.
+    :param covariance: the 36 numbers of its message; None = not given.
+    """
 
     robot: str
     stamp: int
     pose: list[float]
-
-
-class RobotClosure(NamedTuple):
-    """A closure between an image of a robot and a place of the same or another one."""
-
-    query_robot: str
-    place_robot: str
-    closure: Closure
+    covariance: list[float] | None
 
 
 class Paths(NamedTuple):
-    """Stamps (n,), ns, poses (n, 7), and x y z of the ends of the edges (m, 2, 3)."""
+    """
+    The trajectories, and the edges between them.
 
-    stamps: np.ndarray
-    odometry: np.ndarray
-    corrected: np.ndarray
+    :param trajectories: stamps, ns, (n,), poses of the odometry and corrected ones, (n, 7) each,
+        by robot.
+    :param accepted, rejected: x y z of the ends of the edges, (m, 2, 3).
+    """
+
+    trajectories: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
     accepted: np.ndarray
     rejected: np.ndarray
 
@@ -66,7 +68,7 @@ class Snapshot(NamedTuple):
 
     :param corrections: from the odometry's frame to the map, (4, 4), by robot.
     :param values: counts and estimates for the diagnostics.
-    :param breaks: reasons why the odometry was interrupted, since the graph began.
+    :param breaks: robot and reason of each interruption of the odometry, since the graph began.
     :param invalid: kind, ``odometry`` or ``closures``, and reason of each rejected input.
     :param failure: why the solution failed; empty = it did not.
     :param saved: nodes written, or why they were not.
@@ -74,7 +76,7 @@ class Snapshot(NamedTuple):
 
     corrections: dict[str, np.ndarray]
     values: dict[str, Any]
-    breaks: list[str]
+    breaks: list[tuple[str, str]]
     invalid: list[tuple[str, str]]
     failure: str
     saved: int | str
@@ -91,11 +93,11 @@ class GraphServer:
 
     def __init__(self, settings: GraphSettings, origins: dict[str, np.ndarray]) -> None:
         self._graph, self._origins = PoseGraph(settings), origins
-        self._corrections = dict(origins)
+        self._corrections, self._breaks = dict(origins), list[tuple[str, str]]()
 
     def serve(
         self,
-        inputs: list[RobotOdometry | RobotClosure],
+        inputs: list[RobotOdometry | Closure],
         with_paths: bool,
         save: tuple[str, Force] | None,
     ) -> Snapshot:
@@ -110,7 +112,7 @@ class GraphServer:
             try:
                 self._add(item)
             except InputError as error:
-                kind = 'closures' if isinstance(item, RobotClosure) else 'odometry'
+                kind = 'closures' if isinstance(item, Closure) else 'odometry'
                 invalid.append((kind, str(error)))
         try:
             if inputs:
@@ -118,25 +120,34 @@ class GraphServer:
             if save:
                 saved = self._save(*save)
             for robot, origin in self._origins.items():
-                self._corrections[robot] = matrices(graph.map_to_odom()) @ origin
+                self._corrections[robot] = matrices(graph.map_to_odom(robot)) @ origin
             if with_paths and len(graph.solved):
                 paths = self._paths()
         except Exception as error:  # one solution failed: the next may succeed
             failure = saved = f'{type(error).__name__}: {error}'
-        breaks = graph.chain.breaks
-        return Snapshot(self._corrections, self._values(), breaks, invalid, failure, saved, paths)
+        return Snapshot(
+            self._corrections, self._values(), self._breaks, invalid, failure, saved, paths
+        )
 
-    def _add(self, item: RobotOdometry | RobotClosure) -> None:
-        if isinstance(item, RobotClosure):
-            self._graph.add_closure(item.closure)
+    def _add(self, item: RobotOdometry | Closure) -> None:
+        if isinstance(item, Closure):
+            self._graph.add_closure(item)
             return
-        pose = matrices(checked_pose(np.array(item.pose)))
+        pose, covariance = matrices(checked_pose(np.array(item.pose))), None
         origin = self._origins.setdefault(item.robot, np.eye(4))
-        self._graph.add_odometry(item.stamp, to_poses(origin @ pose))
+        if item.covariance is not None:
+            turn = np.kron(np.eye(2), origin[:3, :3])
+            covariance = turn @ np.array(item.covariance).reshape(6, 6) @ turn.T
+        breaks = self._graph.chain.breaks
+        known = len(breaks)
+        self._graph.add_odometry(item.stamp, to_poses(origin @ pose), item.robot, covariance)
+        self._breaks += [(item.robot, reason) for reason in breaks[known:]]
 
     def _save(self, path: str, force: Force) -> int | str:
         if not len(self._graph.update(final=True)):
             return 'the graph is empty: there was no odometry'
+        if '' not in self._origins and not path.endswith('.g2o'):
+            return f'{path}: expected a name that ends in .g2o, the file of several robots'
         try:
             return save_graph(self._graph, path, force)
         except StavprError as error:
@@ -147,7 +158,9 @@ class GraphServer:
         return {
             'nodes': len(graph.chain),
             'sessions': graph.chain.sessions,
-            'breaks': '; '.join(graph.chain.breaks[-3:]),
+            'breaks': '; '.join(
+                f'{robot} {reason}'.strip() for robot, reason in self._breaks[-3:]
+            ),
             'breaks_by_closures': graph.splits,
             'accepted_closures': graph.accepted,
             'rejected_closures': graph.rejected,
@@ -158,11 +171,14 @@ class GraphServer:
 
     def _paths(self) -> Paths:
         graph, solved = self._graph, self._graph.solved
-        stamps, before, after = graph.chain.trajectory(solved)
+        trajectories = {}
+        for robot in self._origins:
+            stamps, before, after = graph.chain.trajectory(solved, robot)
+            trajectories[robot] = stamps, to_poses(before), to_poses(after)
         known = [e for e in graph.edges if max(e.query, e.place) < len(solved)]
         ends = np.array([(e.query, e.place) for e in known], int).reshape(-1, 2)
         taken, points = np.array([e.accepted for e in known], bool), solved[ends, :3, 3]
-        return Paths(stamps, to_poses(before), to_poses(after), points[taken], points[~taken])
+        return Paths(trajectories, points[taken], points[~taken])
 
 
 def run_server(connection: Connection, parent: int, *given: Any) -> None:
@@ -198,7 +214,7 @@ class GraphProcess:
         self._settings, self._on_snapshot, self._on_lost = settings, on_snapshot, on_lost
         self._wake = threading.Condition()  # of the inbox, and of the child
         self._turn = threading.Lock()  # of requests
-        self._inbox: deque[RobotOdometry | RobotClosure] = deque(maxlen=MAX_WAITING)
+        self._inbox: deque[RobotOdometry | Closure] = deque(maxlen=MAX_WAITING)
         self.dropped = 0  # input that waited for too long
         self._child: Any = None
         self._connection: Connection | None = None
@@ -208,12 +224,12 @@ class GraphProcess:
         self._thread = threading.Thread(target=self._run, name='graph', daemon=True)
         self._thread.start()
 
-    def add(self, item: RobotOdometry | RobotClosure) -> None:
+    def add(self, item: RobotOdometry | Closure) -> None:
         """Hand over odometry or a closure; the oldest input is dropped if too much waits."""
         with self._wake:
             self.dropped += len(self._inbox) == MAX_WAITING
             self._inbox.append(item)
-            if isinstance(item, RobotClosure):
+            if isinstance(item, Closure):
                 self._has_closures = True
                 self._wake.notify()
 

@@ -31,8 +31,9 @@ ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 PERIOD = 1.0  # seconds between two diagnostics
 MAX_PENDING = 1000  # closures that wait for keyframes
 REMEDIES = {
-    'without_relative_pose': 'the closures are of appearance alone: set camera_info and odom of '
-    'the recognition node',
+    'without_relative_pose': 'the closures are of appearance alone, refuted by PnP, or dropped at '
+    'load (relative_pose.source NONE, REFUTED, DROPPED; relative_pose.reason has the cause): set '
+    'camera_info and odom of the recognition node, for REFUTED raise min_probability',
     'invalid': 'the closures are invalid, as the log states',
     'waiting': 'no keyframes of the target: is it running, and are its topics remapped?',
     'no_keyframe': 'no keyframe near the stamps of the images: is it the same clock and odometry?',
