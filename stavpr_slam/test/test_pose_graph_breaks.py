@@ -9,7 +9,7 @@ import pytest
 from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam import simulated_odometry
 from stavpr_slam.pose_graph import PoseGraph
-from stavpr_slam.pose_graph.odometry import ChainSettings, KeyframeChain
+from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.refutation import Refutation
 from stavpr_slam.pose_graph.transforms import planar_poses
 from test_pose_graph import carried_drive, circle, closure, error, LAP, odometry_of, SECOND, solve

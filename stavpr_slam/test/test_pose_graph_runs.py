@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from stavpr_ros.mapping.transforms import inverse, to_poses
 from stavpr_slam.pose_graph import optimize, PoseGraph, runs
-from stavpr_slam.pose_graph.odometry import ChainSettings, KeyframeChain, OdometryNoise
+from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain, OdometryNoise
 from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
 from stavpr_slam.simulated_odometry import drifted
 from test_pose_graph import circle, closure, LAP, odometry_of, SECOND
