@@ -11,7 +11,8 @@ from stavpr_slam.pose_graph.cycles import Cycles, LIMIT
 from stavpr_slam.pose_graph.joint import NodeErrors, predicted, refuted, UNKNOWN
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.transforms import adjoints
-from test_pose_graph import circle, closure, error, LAP as IMAGES, odometry_of, SECOND
+from test_pose_graph import circle, closure, error, odometry_of, SECOND
+from test_pose_graph import LAP as IMAGES
 from test_pose_graph_cycles import drive, LAP, laps, measured, PLANE
 from test_pose_graph_runs import step_covariance
 
