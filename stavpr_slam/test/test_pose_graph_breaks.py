@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Breaks of the odometry that closures prove: where they are, and when they end."""
 
-
 import numpy as np
 from stavpr_slam.pose_graph import acceptance, PoseGraph
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
