@@ -54,7 +54,9 @@ def neighbors(
     :param accepted: clusters that agree if there is a break.
     :returns: None without clusters enough on both sides.
     """
-    own = [each for each in accepted if chain.session[each.members[0].query] == chain.session[node]]
+    own = [
+        each for each in accepted if chain.session[each.members[0].query] == chain.session[node]
+    ]
     own.sort(key=lambda each: each.members[0].at)
     sides = [each for each in own if each.members[0].query < node], [
         each for each in own if each.members[0].query >= node

@@ -54,7 +54,8 @@ def g2o_text(graph: PoseGraph) -> str:
     nodes = np.flatnonzero(chain.previous[:count] >= 0)
     before, T = chain.previous[nodes], chain.transforms
     spread, _ = path_errors(chain, nodes, before)
-    for node, start, covariance in zip(nodes, before, graph.scale**2 * spread, strict=True):
+    ends = nodes.tolist(), before.tolist()
+    for node, start, covariance in zip(*ends, graph.scale**2 * spread, strict=True):
         lines.append(_edge(start, node, inverse(T[start]) @ T[node], covariance))
     for edge in graph.used.values():
         lines.append(_edge(edge.place, edge.query, edge.transform, edge.covariance))

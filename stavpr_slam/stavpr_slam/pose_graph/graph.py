@@ -4,7 +4,6 @@
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from stavpr_ros.errors import InputError

@@ -170,7 +170,7 @@ def predicted(
     nodes: NodeErrors, edges: Sequence[ResolvedClosure], others: Sequence[ResolvedClosure]
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return how far edges are from what the odometry and others imply, and the odds that they are right.
+    Return how far edges are from what the odometry and others imply, and the odds of being right.
 
     Odds by Bayes' rule: the density of the misclosure by the prediction, and that of a wrong
     place, which is anywhere on the map; as many of the edges are right as there are others.

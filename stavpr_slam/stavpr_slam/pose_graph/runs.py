@@ -24,7 +24,8 @@ class Runs:
         variable ends its run, and has none where a session begins.
     :param motion: from ``before`` to each node, shape (N, 4, 4).
     :param share: distance from ``before`` to each node, of the whole run, shape (N,).
-    :param covariance: of ``motion`` at scale 1, in the axes of the node, rotation first, (N, 6, 6).
+    :param covariance: of ``motion`` at scale 1, in the axes of the node, rotation first,
+        (N, 6, 6).
     """
 
     variable: np.ndarray

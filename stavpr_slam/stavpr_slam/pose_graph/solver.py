@@ -109,8 +109,8 @@ class Solver:
         nodes = problem.initial
         for _ in range(STEPS):  # each one moves the points of linearization
             self._isam.update()
-            before, nodes = nodes, self._nodes(self._isam.calculateEstimate(), runs)
-            if np.abs(nodes[:, :3, 3] - before[:, :3, 3]).max() < MOVED:
+            last, nodes = nodes, self._nodes(self._isam.calculateEstimate(), runs)
+            if np.abs(nodes[:, :3, 3] - last[:, :3, 3]).max() < MOVED:
                 break
         return nodes
 
