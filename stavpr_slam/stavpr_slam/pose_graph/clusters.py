@@ -20,7 +20,7 @@ class ConsistencySettings:
 
     :param gap: meters that the query travels at most between two closures of a cluster.
     :param span: meters that the query travels at most in a cluster.
-    :param support: least closures of a cluster by which others are judged.
+    :param support: least closures of a cluster that others are compared with.
     :param join_support: least closures that join two sessions.
     :param break_support, break_distance: closures, and meters that the query travels, in each of
         two runs that contradict each other, which prove that the odometry has a break between.

@@ -34,7 +34,7 @@ class ChainSettings:
 
 
 @dataclass(eq=False)
-class Recording:
+class RecordedOdometry:
     """
     Odometry without a break, of one robot.
 
@@ -85,8 +85,8 @@ class KeyframeChain:
             ('bent', np.float64, (6, 3)),
         ])  # fmt: skip
         self._count = 0
-        self._recordings: list[Recording] = []
-        self._current: dict[str, Recording] = {}  # of each robot
+        self._recordings: list[RecordedOdometry] = []
+        self._current: dict[str, RecordedOdometry] = {}  # of each robot
         self.sessions = 0
         self._fixed: dict[tuple[str, int], int] = {}
         # first nodes after splits: the stamps, and the nodes before
@@ -126,7 +126,7 @@ class KeyframeChain:
             if current is not None:
                 self.breaks.append(cause)
             track = OdometryTrack(self._settings.distance, self._settings.angle)
-            current = Recording(robot, track, (stamp, pose), (stamp, pose), covariance)
+            current = RecordedOdometry(robot, track, (stamp, pose), (stamp, pose), covariance)
             self._current[robot] = current
             self._recordings.append(current)
             self.sessions += 1
@@ -147,7 +147,7 @@ class KeyframeChain:
             self._append(current, stamp, pose, node, covariance)
         return is_keyframe
 
-    def _break(self, current: Recording | None, stamp: int, pose: np.ndarray) -> str:
+    def _break(self, current: RecordedOdometry | None, stamp: int, pose: np.ndarray) -> str:
         """Return why a new session begins; empty = none does."""
         if current is None:
             return 'start'
@@ -162,7 +162,7 @@ class KeyframeChain:
         return ''
 
     def _append(
-        self, current: Recording, stamp: int, pose: np.ndarray, previous: int,
+        self, current: RecordedOdometry, stamp: int, pose: np.ndarray, previous: int,
         covariance: np.ndarray | None,
     ) -> None:  # fmt: skip
         transform = matrices(pose)
