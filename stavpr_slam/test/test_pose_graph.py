@@ -94,31 +94,6 @@ def test_optimize_with_wrong_closures_rejects_them(drive, run):
     assert error(found, truth) < 1.3 * error(clean, truth) + 0.1
 
 
-@pytest.mark.parametrize(
-    ('right', 'wrong', 'believed'),
-    [
-        (True, False, 'right'),
-        (True, None, 'wrong'),
-        (None, None, 'wrong'),
-        (False, False, 'wrong'),
-    ],
-    ids=['refuted by keypoints', 'not tried', 'never tried', 'images without keypoints'],
-)
-def test_optimize_longer_run_is_believed_unless_keypoints_refute_it(drive, right, wrong, believed):
-    """20 right closures, and then 30 wrong ones that agree with each other."""
-    truth, closures = drive
-    mixed = [replace(each, verified=right) for each in closures[:20]]
-    mixed += [
-        replace(closure(truth, LAP + k, k, k - 15), verified=wrong) for k in range(LAP - 30, LAP)
-    ]
-    _, graph = solve(truth, mixed)
-    claimed = [truth[edge.query, :2] - truth[edge.place, :2] for edge in graph.edges]
-    is_right = np.linalg.norm(claimed, axis=1) < 5
-    accepted = np.array([edge.accepted for edge in graph.edges])
-    assert accepted[is_right].mean() == pytest.approx(float(believed == 'right'), abs=0.2)
-    assert accepted[~is_right].mean() == pytest.approx(float(believed == 'wrong'), abs=0.2)
-
-
 def carried_drive():
     """
     Return a drive whose odometry misses 40 m before image 140, its odometry, and closures.
@@ -249,14 +224,6 @@ def test_largest_consistent_by_hand():
     assert light.tolist() == [True, False, True, True]
     heavy = largest_consistent(conflicts, np.array([3, 9, 3, 1]), everyone)
     assert heavy.tolist() == [False, True, False, True]
-
-
-def test_largest_consistent_where_most_opposed_is_in_the_largest_set_finds_it():
-    conflicts = np.zeros((5, 5), bool)
-    for a, b in ((0, 1), (0, 2), (0, 3), (2, 3), (3, 4)):
-        conflicts[a, b] = conflicts[b, a] = True
-    chosen = largest_consistent(conflicts, np.array([15, 9, 10, 19, 16]), np.ones(5, bool))
-    assert chosen.tolist() == [False, True, True, False, True]  # 35; without other starts 28
 
 
 def test_body_covariance_turned_by_90_degrees_swaps_axes():

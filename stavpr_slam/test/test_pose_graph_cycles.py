@@ -4,29 +4,21 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph.acceptance import SCALES
 from stavpr_slam.pose_graph.closures import ResolvedClosure
-from stavpr_slam.pose_graph.consistency import ConsistencySettings, grow
+from stavpr_slam.pose_graph.clusters import ConsistencySettings, grow
 from stavpr_slam.pose_graph.cycles import Cycles
-from stavpr_slam.pose_graph.odometry import ChainSettings, KeyframeChain, OdometryNoise
-from stavpr_slam.pose_graph.transforms import logarithms, planar_poses
+from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
+from stavpr_slam.pose_graph.path_errors import OdometryNoise
+from stavpr_slam.pose_graph.transforms import exponentials, logarithms, planar_poses
 
 NOISE = OdometryNoise(0.05, 0.003, 0.0001)
 COVARIANCE = np.diag([0.01, 0.01, 0.02, 0.3, 0.2, 0.1]) ** 2
 LAP = 200
 SPACE, PLANE = np.ones(6), np.array([0, 0, 1, 1, 1, 0])
 TENTH = 10**8  # ns between images
-
-
-def exponential(steps: np.ndarray) -> np.ndarray:
-    """Return small motions (n, 6), rotation first, as transforms (n, 4, 4)."""
-    result = np.tile(np.eye(4), (len(steps), 1, 1))
-    result[:, :3, :3] = Rotation.from_rotvec(steps[:, :3]).as_matrix()
-    result[:, :3, 3] = steps[:, 3:]
-    return result
 
 
 def laps(count: int) -> np.ndarray:
@@ -38,16 +30,17 @@ def laps(count: int) -> np.ndarray:
 
 
 def drive(
-    truth: np.ndarray, dice: np.random.Generator, noise: OdometryNoise, axes: np.ndarray = SPACE
-) -> KeyframeChain:
+    truth: np.ndarray, dice: np.random.Generator, scale: float = 1.0, axes: np.ndarray = SPACE,
+    noise: OdometryNoise = NOISE,
+) -> KeyframeChain:  # fmt: skip
     """Return an odometry with errors of all three kinds along some axes, rotation first."""
     steps = inverse(truth[:-1]) @ truth[1:]
     length = np.linalg.norm(steps[:, :3, 3], axis=1)[:, None]
     turned = noise.rotation * np.sqrt(length) * dice.normal(size=(len(steps), 3))
     turned += noise.bias * length * dice.normal(size=3)
     moved = noise.translation * np.sqrt(length) * dice.normal(size=(len(steps), 3))
-    steps = steps @ exponential(axes * np.concatenate([turned, moved], axis=1))
-    chain, pose = KeyframeChain(ChainSettings(0.1, 0.01)), truth[0]
+    steps = steps @ exponentials(scale * axes * np.concatenate([turned, moved], axis=1))
+    chain, pose = KeyframeChain(ChainSettings(0.1, 0.01), noise), truth[0]
     chain.add(TENTH, to_poses(pose))
     for i, step in enumerate(steps):
         pose = pose @ step
@@ -62,7 +55,7 @@ def measured(
 ) -> ResolvedClosure:  # fmt: skip
     """Measure the query in the place, and claim it of another one."""
     error = axes * dice.multivariate_normal(np.zeros(6), COVARIANCE)[None]
-    Z = inverse(truth[place]) @ truth[query] @ exponential(error)[0]
+    Z = inverse(truth[place]) @ truth[query] @ exponentials(error)[0]
     to = place if claimed is None else claimed
     return ResolvedClosure(query, to, Z, COVARIANCE, float(chain.travelled[query]), 0, 0, True)
 
@@ -72,9 +65,9 @@ def test_deviations_of_right_closures_are_chi_square():
     ends = [(220, 20), (300, 100), (380, 180), (230, 25)]
     found = []
     for _ in range(60):
-        chain = drive(truth, dice, NOISE)
+        chain = drive(truth, dice)
         cycles = Cycles(chain, [measured(truth, chain, *each, dice) for each in ends])
-        found.append([cycles.deviations(i, NOISE) for i in range(len(ends))])
+        found.append([cycles.deviations(i, 1.0) for i in range(len(ends))])
     squared = np.array(found)
     apart = ~np.eye(len(ends), dtype=bool)
     assert squared[:, ~apart] == pytest.approx(0, abs=1e-9)
@@ -83,28 +76,28 @@ def test_deviations_of_right_closures_are_chi_square():
     assert 0 <= above.min() < above.max() < 0.2
 
 
-def test_deviations_know_that_a_turn_moves_the_end_of_a_way_to_one_side():
+def test_deviations_ahead_are_larger_than_across():
     """Ahead, an error of 10 m is improbable where one of 10 m across is not."""
     straight = np.tile(np.eye(4), (LAP, 1, 1))
     straight[:, 0, 3] = np.arange(LAP)
-    chain = drive(straight, np.random.default_rng(0), OdometryNoise(0, 0, 0))
+    chain = drive(straight, np.random.default_rng(0), 0.0)
     squared = []
     for off in ([10.0, 0, 0], [0, 10.0, 0]):
         Z = inverse(straight[0]) @ straight[150]
         Z[:3, 3] += off
         far = ResolvedClosure(150, 0, Z, COVARIANCE, 150.0, 0, 0, True)
         first = ResolvedClosure(1, 0, straight[1], COVARIANCE, 1.0, 0, 0, True)
-        squared.append(Cycles(chain, [first, far]).deviations(0, NOISE)[1])
+        squared.append(Cycles(chain, [first, far]).deviations(0, 1.0)[1])
     assert squared[0] > 100 > 16 > squared[1]
 
 
 def test_logarithm_of_a_turn_about_a_point_is_exact():
     turn, point = np.array([0.1, -0.2, 1.9]), np.array([3.0, -7.0, 2.0])
-    motion = exponential(np.array([[*turn, 0, 0, 0]]))
+    motion = exponentials(np.array([[*turn, 0, 0, 0]]))
     motion[0, :3, 3] = point - motion[0, :3, :3] @ point
     expected = [*turn, *-np.cross(turn, point)]
     np.testing.assert_allclose(logarithms(motion)[0], expected, atol=1e-9)
-    small = exponential(np.array([[1e-7, 0, 0, 1.0, 2.0, 3.0]]))
+    small = exponentials(np.array([[1e-7, 0, 0, 1.0, 2.0, 3.0]]))
     np.testing.assert_allclose(logarithms(small)[0], [1e-7, 0, 0, 1, 2, 3], atol=1e-6)
 
 
@@ -112,22 +105,22 @@ def test_logarithm_of_a_turn_about_a_point_is_exact():
 @pytest.mark.parametrize(('every', 'most'), [(0, 2), (10, 4)], ids=['right', 'tenth_wrong'])
 def test_noise_scale_is_that_of_the_odometry(factor, every, most):
     truth, dice = laps(3 * LAP), np.random.default_rng(3)
-    chain, closures = drive(truth, dice, NOISE.scaled(factor), PLANE), []
+    chain, closures = drive(truth, dice, factor, PLANE), []
     for number, query in enumerate(range(LAP, 3 * LAP, 10)):
         claimed = (query + 60) % LAP if every and number % every == 0 else None
         closures.append(measured(truth, chain, query, query % LAP, dice, claimed, PLANE))
-    found = Cycles(chain, closures).noise_scale(NOISE, SCALES)
+    found = Cycles(chain, closures).noise_scale(SCALES)
     assert 0.5 * factor < found < most * factor
 
 
 def test_grow_does_not_mix_places_of_two_laps():
     """Over a lap, the odometry is so uncertain that wrong closures agree with right ones."""
     truth, dice = laps(3 * LAP), np.random.default_rng(0)
-    chain, clusters = drive(truth, dice, NOISE), []
-    noise, settings = NOISE.scaled(10), ConsistencySettings()
+    chain, clusters = drive(truth, dice), []
     for query in range(2 * LAP + 10, 2 * LAP + 18):
         place = query % LAP + (LAP if query % 2 else 0)
-        grow(clusters, measured(truth, chain, query, place, dice), chain, noise, settings)
+        edge = measured(truth, chain, query, place, dice)
+        grow(clusters, edge, chain, 10.0, ConsistencySettings())
     assert [len(each.members) for each in clusters] == [4, 4]
     for cluster in clusters:
         places = [each.place for each in cluster.members]

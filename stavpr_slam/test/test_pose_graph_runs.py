@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from stavpr_ros.mapping.transforms import inverse, to_poses
 from stavpr_slam.pose_graph import optimize, PoseGraph, runs
-from stavpr_slam.pose_graph.odometry import ChainSettings, KeyframeChain, OdometryNoise
+from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
+from stavpr_slam.pose_graph.path_errors import OdometryNoise, path_errors
 from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
 from stavpr_slam.simulated_odometry import drifted
 from test_pose_graph import circle, closure, LAP, odometry_of, SECOND
@@ -17,7 +18,7 @@ NOISE = OdometryNoise(0.05, 0.012)
 @pytest.fixture(scope='module')
 def chain():
     """Return a chain far from the origin of its odometry, in two sessions."""
-    chain = KeyframeChain(ChainSettings())
+    chain = KeyframeChain(ChainSettings(), NOISE)
     poses = planar_poses(circle(1)[:40])
     poses[:, :2] += 5e5
     for i, pose in enumerate(poses):
@@ -27,25 +28,40 @@ def chain():
 
 
 def test_runs_end_at_edges_sessions_and_after_the_longest(chain):
-    found = runs.Runs.of(chain, NOISE, {3, 17, 38})
+    found = runs.Runs.of(chain, {3, 17, 38})
     assert np.flatnonzero(found.variable).tolist() == [0, 3, 10, 17, 20, 25, 35, 38]
     assert found.before[[0, 2, 3, 12, 25, 26, 39]].tolist() == [-1, 0, 0, 10, -1, 25, 38]
     assert found.after[[1, 4, 24, 26, 39]].tolist() == [3, 10, -1, 35, -1]
 
 
-def test_covariance_of_a_run_is_that_of_its_steps(chain):
-    found = runs.Runs.of(chain, NOISE, set())
-    T, expected = chain.transforms, np.zeros((6, 6))
+def step_covariance(step: np.ndarray, noise: OdometryNoise) -> np.ndarray:
+    """Return that of errors in the middle of a step, in the axes of its end, rotation first."""
+    length = np.linalg.norm(step[:3, 3])
+    middle = np.eye(4)
+    middle[:3, 3] = -(step[:3, :3].T @ step[:3, 3]) / 2
+    own = np.diag(np.repeat([noise.rotation**2 * length, noise.translation**2 * length], 3))
+    change = adjoints(middle[None])[0]
+    covariance: np.ndarray = change @ own @ change.T
+    return covariance
+
+
+@pytest.mark.parametrize('side', [1, -1])
+def test_path_errors_are_sums_over_the_steps(chain, side):
+    ends = np.array([10, 20])[::side]
+    found, bent = path_errors(chain, ends[:1], ends[1:])
+    T, expected, turned = chain.transforms, np.zeros((6, 6)), np.zeros((6, 3))
     for k in range(11, 21):
-        length = chain.travelled[k] - chain.travelled[k - 1]
-        change = adjoints((inverse(T[k]) @ T[k - 1])[None])[0]
-        step = np.repeat([NOISE.rotation**2 * length, NOISE.translation**2 * length], 3)
-        expected = change @ expected @ change.T + np.diag(step)
-        assert found.covariance[k] == pytest.approx(expected, rel=1e-6, abs=1e-12)
+        change = adjoints((inverse(T[ends[0]]) @ T[k])[None])[0]
+        step = inverse(T[k - 1]) @ T[k]
+        expected += change @ step_covariance(step, NOISE) @ change.T
+        half = adjoints(_moved(-np.linalg.norm(step[:3, 3]) / 2, 0, 0)[None])[0]
+        turned += side * NOISE.bias * np.linalg.norm(step[:3, 3]) * (change @ half)[:, :3]
+    assert found[0] == pytest.approx(expected, rel=1e-5, abs=1e-9)
+    assert bent[0] == pytest.approx(turned, rel=0.02, abs=1e-3)
 
 
 def test_filled_run_continues_to_its_moved_end(chain):
-    found = runs.Runs.of(chain, NOISE, set())
+    found = runs.Runs.of(chain, set())
     values = chain.transforms.copy()
     values[20] = values[20] @ _moved(0.2, -0.1, 0.02)
     filled = found.filled(values)

@@ -4,9 +4,9 @@
 
 import numpy as np
 import pytest
-from stavpr_slam.pose_graph import ChainSettings, GraphSettings, PoseGraph
+from stavpr_slam.pose_graph import ChainSettings, GraphSettings, OdometryNoise, PoseGraph
 from stavpr_slam.pose_graph.files import save_graph
-from stavpr_slam.pose_graph.odometry import KeyframeChain
+from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.track import MOST
 from stavpr_slam.pose_graph.transforms import planar_poses
 from test_pose_graph import circle, closure, error, LAP, odometry_of, SECOND
@@ -18,7 +18,7 @@ def fine(poses: np.ndarray) -> np.ndarray:
     """
     Return planar poses (n, 3) with others in between, (RATE * (n - 1) + 1, 3).
 
-    Each way of 2 m begins with half of it, then the robot stands, then it drives the rest.
+    Each step of 2 m begins with half of it, then the robot stands, then it drives the rest.
     """
     share = np.clip(np.arange(RATE) / RATE * 4, 0, 2) / 4
     share = np.maximum(share, np.arange(RATE) / RATE * 4 / 2 - 1)
@@ -66,7 +66,7 @@ def test_saved_trajectory_has_the_odometry_between_keyframes(solved, tmp_path):
 
 @pytest.mark.parametrize(('jitter', 'most'), [(0.0, 5), (0.05, MOST + 2)])
 def test_add_odometry_of_high_rate_keeps_few_poses(jitter, most):
-    chain, dice = KeyframeChain(ChainSettings()), np.random.default_rng(0)
+    chain, dice = KeyframeChain(ChainSettings(), OdometryNoise()), np.random.default_rng(0)
     rows = np.column_stack([np.arange(20_000) / 200, *jitter * dice.normal(size=(2, 20_000)) / 5])
     for i, pose in enumerate(planar_poses(rows)):
         chain.add((i + 1) * SECOND // 200, pose)
@@ -75,7 +75,7 @@ def test_add_odometry_of_high_rate_keeps_few_poses(jitter, most):
 
 
 def test_trajectory_after_a_split_belongs_to_the_session_from_its_stamp():
-    chain = KeyframeChain(ChainSettings(distance=1.0))
+    chain = KeyframeChain(ChainSettings(), OdometryNoise())
     for i, pose in enumerate(planar_poses(np.arange(30)[:, None] / 4 * [1, 0, 0])):
         chain.add((i + 1) * SECOND, pose)
     chain.split(4, 15 * SECOND)  # its keyframe has stamp 17, the one before 13
