@@ -8,7 +8,7 @@ import pytest
 from stavpr_ros.mapping.transforms import inverse, to_poses
 from stavpr_slam.pose_graph import Closure, joint, optimize, PoseGraph
 from stavpr_slam.pose_graph.cycles import Cycles, LIMIT
-from stavpr_slam.pose_graph.joint import NodeErrors, predicted, refuted, UNKNOWN
+from stavpr_slam.pose_graph.joint import NodeErrors, predicted, refuted
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.transforms import adjoints
 from test_pose_graph import circle, closure, error, odometry_of, SECOND
@@ -130,7 +130,9 @@ def test_covariance_of_nodes_is_the_sum_over_their_steps():
     chain.split(40, int(chain.stamps[40]))
     solved = truth.copy()
     solved[40:, 0, 3] += 7.0
-    found = NodeErrors(chain, solved, 0.5, {0}).covariance(np.arange(60), np.arange(60))
+    nodes = NodeErrors(chain, solved, 0.5, {0})
+    assert nodes.loose[:, 0].tolist() == [0.0] * 40 + [1.0] * 20
+    found = nodes.covariance(np.arange(60), np.arange(60))
     X = solved.copy()
     X[:, :3, 3] -= X[:, :3, 3].mean(axis=0)
     steps, bent = np.zeros((60, 6, 6)), np.zeros((60, 6, 3))
@@ -150,7 +152,7 @@ def test_covariance_of_nodes_is_the_sum_over_their_steps():
         return spread + turned[0] @ turned[1].T
 
     for a, b, first in ((10, 30, 1), (30, 30, 1), (45, 59, 41), (20, 50, None)):
-        whole = expected(a, b, first) + (UNKNOWN if first == 41 else 0)
+        whole = expected(a, b, first)
         assert found[a, b] == pytest.approx(whole, rel=1e-3, abs=1e-6), (a, b)
         assert found[b, a] == pytest.approx(whole.T, rel=1e-3, abs=1e-6)
 
