@@ -42,6 +42,7 @@ class Acceptance:
         # breaks that ended: first nodes, and the weight of all closures then
         self._denied: list[tuple[int, int]] = []
         self.scale = 1.0
+        self._loop_scale = np.inf  # until there are clusters enough
         self.restart()
 
     def restart(self) -> None:
@@ -57,6 +58,16 @@ class Acceptance:
     def cautious_scale(self) -> float:
         """Return the factor by which closures are compared."""
         return min(1.0, self.scale * CAUTION)
+
+    @property
+    def solution_scale(self) -> float:
+        """Return the factor of the solution: the first loops say how far odometry is trusted."""
+        return float(min(self.scale, self._loop_scale))
+
+    @property
+    def is_precise(self) -> bool:
+        """Return whether even the least errors of the odometry explain the first loops."""
+        return bool(self._loop_scale == SCALES[0])
 
     @property
     def has_changed(self) -> bool:
@@ -160,9 +171,11 @@ class Acceptance:
         """
         weights = np.array([cluster.weight for cluster in self.clusters])
         candidates = np.flatnonzero(weights >= self._settings.support)
-        if not self._adapt or len(candidates) < max(LEAST_CLUSTERS, MORE * self._scaled_at):
+        if not self._adapt:
             return False
-        self._scaled_at = len(candidates)
+        if len(candidates) < max(LEAST_CLUSTERS, MORE * self._scaled_at):
+            return not self._scaled_at and self._estimate_from_loops()
+        self._scaled_at, self._loop_scale = len(candidates), np.inf
         self._refuted = set()  # those that refuted them may be rejected by now
         return self._estimate(candidates)
 
@@ -190,6 +203,13 @@ class Acceptance:
         self.scale = scale
         self.compare_all()
         return True
+
+    def _estimate_from_loops(self) -> bool:
+        edges = [each for cluster in self.accepted for each in cluster.independent]
+        if not edges:
+            return False
+        before, self._loop_scale = self._loop_scale, Cycles(self._chain, edges).loop_scale(SCALES)
+        return not SAME[0] < self._loop_scale / before < SAME[1]
 
     def refute(self, initial: np.ndarray, ties: Ties, final: bool) -> bool:
         """

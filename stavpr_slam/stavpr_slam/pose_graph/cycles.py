@@ -18,6 +18,7 @@ from stavpr_slam.pose_graph.transforms import adjoints, logarithms
 LIMIT = 16.0  # squared deviations: 99.9 % for motion in a plane, of three dimensions
 FEW = 0.537  # most probable squared scale of Student's t with 2 degrees for normal errors
 CLOSURE_FACTORS = (0.05, 0.2, 1.0)  # on the covariances of closures that are tried
+SIGNIFICANT = 1.92  # difference of logarithms of likelihoods: 95 %, one degree of freedom
 NEAR, FAR = 30.0, 400.0  # meters that the query travels between two closures of such a cycle
 
 
@@ -102,11 +103,34 @@ class Cycles:
             return float(scales[-1])
         off, measured, odometry = np.concatenate(rows, axis=2)
         likelihood = [
-            max(_likelihood(off, FEW * (factor * measured + scale**2 * odometry))
+            max(_likelihood(off, FEW * (factor * measured + scale**2 * odometry), 2)
                 for factor in CLOSURE_FACTORS)
             for scale in scales
         ]  # fmt: skip
         return float(scales[np.argmax(likelihood)])
+
+    def loop_scale(self, scales: np.ndarray) -> float:
+        """
+        Return the factor on the errors of the odometry that most probably left these loops open.
+
+        Few closures, and short loops, have no cycles that :meth:`noise_scale` could use. It is the
+        least factor unless the likelihood ratio excludes that one.
+
+        :param scales: rising.
+        """
+        session, T = self._chain.session, self._chain.transforms
+        same = session[self.query] == session[self.place]
+        if not same.any():
+            return float(scales[-1])
+        query, place = self.query[same], self.place[same]
+        error = logarithms(inverse(self.Z[same]) @ inverse(T[place]) @ T[query])
+        spread, bent = path_errors(self._chain, query, place)
+        off = np.array([np.linalg.norm(error[:, i : i + 3], axis=1) for i in (3, 0)])
+        measured = _planar(self.covariance[same])
+        odometry = _planar(spread + bent @ bent.swapaxes(1, 2))
+        likelihood = [_likelihood(off, measured + scale**2 * odometry, 4) for scale in scales]
+        best = int(np.argmax(likelihood))
+        return float(scales[best if likelihood[best] > likelihood[0] + SIGNIFICANT else 0])
 
 
 def _planar(covariances: np.ndarray) -> np.ndarray:
@@ -115,6 +139,7 @@ def _planar(covariances: np.ndarray) -> np.ndarray:
     return np.array([shift[:, 1:].sum(axis=1), turn[:, 2]])
 
 
-def _likelihood(off: np.ndarray, variances: np.ndarray) -> float:
-    """Return the logarithm of that of deviations by Student's t with 2 degrees, each (2, n)."""
-    return -float((1.5 * np.log1p(off**2 / (2 * variances)) + np.log(variances) / 2).sum())
+def _likelihood(off: np.ndarray, variances: np.ndarray, freedom: float) -> float:
+    """Return the logarithm of that of deviations by Student's t, each (2, n)."""
+    tails = (freedom + 1) / 2 * np.log1p(off**2 / (freedom * variances))
+    return -float((tails + np.log(variances) / 2).sum())

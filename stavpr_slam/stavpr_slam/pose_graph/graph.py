@@ -217,16 +217,23 @@ class PoseGraph:
         return ties, extended(self.chain, self.solved, ties)
 
     def _solve(self, ties: Ties, initial: np.ndarray, final: bool) -> None:
-        """Estimate all nodes by the accepted closures."""
+        """
+        Estimate all nodes by the accepted closures.
+
+        Where even the least errors of the odometry explain the first loops, the closures measure
+        them less precisely than the odometry, and would add their own errors.
+        """
         chain, accepted = self.chain, self._acceptance.accepted
-        allowed = ties.allow(*(chain.session[each] for each in ends(accepted)))
+        query, place = (chain.session[each] for each in ends(accepted))
+        allowed = ties.allow(query, place)
+        allowed &= (query != place) | (not self._acceptance.is_precise)
         edges = {
             each.number: each
             for cluster, counts in zip(accepted, allowed, strict=True) if counts
             for each in cluster.independent
         }  # fmt: skip
         moved = ties.moved_since(self._ties)
-        problem = Problem(chain, initial, edges, self._acceptance.scale, ties.links)
+        problem = Problem(chain, initial, edges, self._acceptance.solution_scale, ties.links)
         if final or moved:
             self.solved = self._solver.solve(problem)
             problem = replace(problem, initial=self.solved)
