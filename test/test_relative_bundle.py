@@ -13,7 +13,7 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.recognition.verification import mutual_matches
 from stavpr_ros.relative_pose.bundle import odometry_information, SHIFT, TURN
 from stavpr_ros.relative_pose.landmarks import triangulate
-from test_relative_pose import motions, points_ahead, pose, views_of
+from test_pnp import motions, points_ahead, pose, views_of
 
 
 @pytest.mark.parametrize('seed', range(4))

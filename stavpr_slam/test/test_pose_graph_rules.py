@@ -65,13 +65,16 @@ def test_carried_robot_without_pairwise_consistency_or_breaks(monkeypatch):
     assert (found > 0.3, graph.splits) == (True, 0)
 
 
+def _unknown(_, edges, __):
+    return np.full(len(edges), np.inf), np.zeros(len(edges))
+
+
 def test_closures_of_single_images_without_confirmation(monkeypatch):
     truth = circle()
     closures = [closure(truth, q, q - LAP) for q in (*range(100, 120), *range(130, 200, 10))]
     drive = truth, odometry_of(truth), closures
     found, graph = ratio(*drive)
-    nothing = lambda _, edges, __: (np.full(len(edges), np.inf), np.zeros(len(edges)))  # noqa: E731
-    monkeypatch.setattr(acceptance, 'predicted', nothing)
+    monkeypatch.setattr(acceptance, 'predicted', _unknown)
     less, without = ratio(*drive)
     assert (graph.rejected, without.rejected) == (5, 7)
     assert found < 0.6 * less
