@@ -63,9 +63,7 @@ class PoseGraph:
     def reset(self) -> None:
         """Forget everything."""
         self.chain = KeyframeChain(self.settings.keyframes, self.settings.noise)
-        self._acceptance = Acceptance(
-            self.chain, self.settings.consistency, self.settings.adapt
-        )
+        self._acceptance = Acceptance(self.chain, self.settings.consistency, self.settings.adapt)
         self._solver.restart()
         self._pending: list[Closure] = []
         self._known: list[Closure] = []  # those between nodes

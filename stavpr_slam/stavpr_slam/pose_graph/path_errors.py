@@ -82,9 +82,7 @@ def given_growth(
     return grown if values[-1] > 0 and values[0] > -NEGLIGIBLE * values[-1] else None
 
 
-def path_errors(
-    chain: Nodes, start: np.ndarray, end: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def path_errors(chain: Nodes, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the errors of the motion between nodes of one session, in the axes of the start.
 
