@@ -166,6 +166,7 @@ class GraphServer:
             'rejected_closures': graph.rejected,
             'waiting_closures': graph.pending,
             'closures_of_unknown_stamps': graph.counts['unknown stamp'],
+            'closures_without_solution': graph.counts['failed'],
             'odometry_error_factor': f'{graph.scale:.2f}',
         }
 
