@@ -212,6 +212,24 @@ def test_accuracy_of_pages_is_that_of_accuracy_table():
                 assert float(cell) == pytest.approx(value, abs=0.51 * 10**-digits), (page, row)
 
 
+def test_speed_in_readme_is_that_of_its_run():
+    run = json.loads((RESULTS / 'matching-amd-epyc-2-cores-512-bit.json').read_text())
+    frames = {
+        (row['n'], row['precision']): row
+        for row in run['rows']
+        if (row['stage'], row['mode'], row['d']) == ('frame', 'robust', 224)
+    }
+    readme = (ROOT / 'README.md').read_text()
+    for n in (2_000, 20_000, 100_000):
+        float32, int8 = frames[n, 'float32'], frames[n, 'int8']
+        (reading,) = (p['ratio'] for p in float32['peers'] if p['name'] == 'reading the map')
+        (line,) = re.findall(rf'^\| {n:,}, 224 .*', readme, re.M)
+        times = [float(text) for text in re.findall(r'([\d.]+) ms', line)]
+        expected = [1e3 * float32['median_s'], 1e3 * int8['median_s']]
+        assert times == pytest.approx(expected, abs=0.051)
+        assert float(line.split('|')[3]) == pytest.approx(1 / reading, rel=0.02)
+
+
 @pytest.mark.parametrize('page', [page for page in PAGES if page.stem != 'slam_measured'])
 def test_tables_of_accuracy_name_their_results(page):
     """A table with numbers of three digits below 1 is generated, marked or compared above."""
