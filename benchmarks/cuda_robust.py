@@ -6,7 +6,7 @@ Time of an image in mode robust, beside the time to move its bytes; for a machin
     python benchmarks/cuda_robust.py [--places N ...] [--precision ...] [--backend cpu]
     python benchmarks/cuda_robust.py --places --loop-closure 20000
 
-The bytes are those of ``bytes on a GPU`` in benchmarks/results/tables.json.
+The table of bytes is that of docs/performance.md, "On a GPU".
 """
 
 import argparse
