@@ -198,10 +198,9 @@ def test_accuracy_of_pages_is_that_of_accuracy_table():
         worst = min(f1(*speeds, of=of))
         expected['README.md', f'`{mode}`'] = [same[0], worst, *same[1:]]
         expected['docs/evaluation.md', name] = [*same[:2]]
-    others = json.loads((RESULTS / 'tables.json').read_text())['place recognition networks'][
-        'rows'
-    ]
-    expected['docs/evaluation.md', 'SeqSLAM'] = [others[0]['SeqSLAM'], others[4]['SeqSLAM']]
+    tables = json.loads((RESULTS / 'tables.json').read_text())
+    walk, *_, train = tables['place recognition networks']['rows'][:5]
+    expected['docs/evaluation.md', 'SeqSLAM'] = [walk['SeqSLAM'], train['SeqSLAM']]
     for (page, row), values in expected.items():
         text = (ROOT / page).read_text()
         (line,) = re.findall(rf'^\| {re.escape(row)} (\| *\d*\.\d.*)$', text, re.M)
