@@ -193,7 +193,7 @@ def _map(source: Any, making: FeatureExtractor) -> PlaceMap:
 
 
 def measure(folder: Path, quick: bool) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield key and numbers of every row; print what is left out."""
+    """Yield key and numbers of every row; report rows that are left out."""
     for feature in ('g',) if quick else FEATURES:
         try:
             making = extractors(feature, folder)

@@ -6,7 +6,7 @@ Map files: time to the first answer, and memory.
 Every start is a process of its own, after imports and a start on a tiny map, which loads compiled
 kernels. The times are those of ``open_map``, of the recognizer, and of its first match; *cold*:
 the file was dropped from the page cache before. The floor is the time to read the bytes that the
-matcher holds, or is made of, from the same file. ``PYTHONPATH=. python benchmarks/maps.py``.
+matcher keeps, or is made of, from the same file. ``PYTHONPATH=. python benchmarks/maps.py``.
 """
 
 import argparse
@@ -64,7 +64,7 @@ def write_files(folder: Path, places: int) -> None:
 
 
 def start(path: Path, precision: str, cache: str) -> dict[str, Any]:
-    """Return the times of a start in this process, s, and what it took, MB."""
+    """Return the times of a start in this process, s, and its memory, MB."""
     from memory import resident_bytes
     from stavpr_ros.mapping import descriptor_map, open_map
     from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings

@@ -125,7 +125,7 @@ def main(arguments: list[str] | None = None) -> int:
     document = about | {
         'peaks': asdict(peaks),
         'rows': [asdict(row) | {'ratio_to_lower_bound': row.ratio} for row in run.rows],
-        'memory': [asdict(held) | {'ratio': held.ratio, 'wanted': TARGET} for held in memory],
+        'memory': [asdict(one) | {'ratio': one.ratio, 'wanted': TARGET} for one in memory],
         'skipped': run.skipped,
     }
     write(options.output / name, document, report(about, run, memory))

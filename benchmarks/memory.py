@@ -114,8 +114,8 @@ def measure_memory(operation: str, mode: str, precision: str, n: int = 0, d: int
         done = subprocess.run(
             command, env=os.environ | variables, stdout=subprocess.PIPE, text=True, check=True
         )
-    held = n * d * STRIPS * ITEM_BYTES[precision]
-    return Memory(operation, mode, precision, n, d, held, int(done.stdout))
+    size = n * d * STRIPS * ITEM_BYTES[precision]
+    return Memory(operation, mode, precision, n, d, size, int(done.stdout))
 
 
 def _kind() -> 'Kind':
@@ -152,7 +152,7 @@ def resident_bytes() -> int:
 def run_pipeline(
     operation: str, mode: str, precision: str, n: int, d: int, folder: Path
 ) -> 'Pipeline':
-    """Return a pipeline that holds n places and has processed images."""
+    """Return a pipeline of n places that has processed images."""
     from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
 
     settings = PipelineSettings(
@@ -186,7 +186,7 @@ def main(arguments: list[str]) -> None:
     pipeline = run_pipeline(*run, int(n), int(d), Path(folder))
     after = resident_bytes()
     if pipeline.places is None or len(pipeline.places) != int(n):
-        raise SystemExit(f'memory: the pipeline holds {pipeline.places}: expected {n} places')
+        raise SystemExit(f'memory: the pipeline has {pipeline.places}: expected {n} places')
     print(after - before)
 
 

@@ -67,7 +67,7 @@ class Pair:
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """
-    What a drive of N images was matched with; every array has the shape (N,).
+    The matches of a drive of N images; every array has the shape (N,).
 
     :param accepted: matched.
     :param probabilities: declared for the matches, NaN = none.
@@ -331,7 +331,7 @@ def opened(
 
 
 def measure(folder: Path, chosen: Sequence[str], coarser: int) -> Results:
-    """Return all rows; print what is left out."""
+    """Return all rows; report features that are left out."""
     results: Results = {}
     for feature in chosen:
         try:

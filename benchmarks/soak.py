@@ -26,7 +26,7 @@ from results import commit, cpu_model, versions
 PLACES, WIDTH, HEIGHT = 2000, 640, 480
 STEP = 41  # pixels from one view to the next
 IMAGES = 30  # different ones
-SETTLED = 3.0  # seconds for the images on their way at the end
+SETTLED = 3.0  # seconds for the last images
 
 
 def texture_route(count: int) -> Iterator[np.ndarray]:

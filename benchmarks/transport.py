@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Losses and latency of camera images on their way through nodes in processes of their own.
+Losses and latency of camera images through nodes in processes of their own.
 
 Images of two sizes, raw and compressed, are published reliably and with best effort to one node
 and to two. Run it where the package is built and sourced: ``make shell``, then

@@ -97,8 +97,8 @@ def test_report_sums_stages_counts_losses_and_names_missed_targets():
     sequences = Row('lm_dtw', 'paper', 20_000, 0, 'float32', 0.002, 0, 9, 0.001, peers)
     run = Run('cpu', PEAKS, rows=[*parts, frame, sequences])
     run.skip('x', 1, 0, 'why')
-    held = memory.Memory('localization', 'robust', 'int8', 5, 8, 10**6, 3 * 10**6)
-    text = '\n'.join(report.report(results.environment(named_commit='abc'), run, [held]))
+    measured = memory.Memory('localization', 'robust', 'int8', 5, 8, 10**6, 3 * 10**6)
+    text = '\n'.join(report.report(results.environment(named_commit='abc'), run, [measured]))
     assert 'Commit abc' in text
     assert '| 7 ms | 10 ms | 1 ms | 5 ms | 2 |' in text  # five stages of 1 ms, one of 2 ms
     assert '## Beside peers (1 of 2 lost)' in text
@@ -228,6 +228,5 @@ def test_simulated_places_have_mean_and_neighbors_of_real_ones():
     of_real = 1 - (unit[:, 1:] * unit[:, :-1]).sum(dim=2).mean()
     assert 0.5 < float(change / of_real) < 2
     features, first = city.city(real, 500, seed=0)
-    held = features[first : first + 60].strips
-    torch.testing.assert_close(held, unit, atol=1e-3, rtol=0)
+    torch.testing.assert_close(features[first : first + 60].strips, unit, atol=1e-3, rtol=0)
     assert len(features) == 500

@@ -370,7 +370,7 @@ def plain_match(status, place=-1):
 
 
 def test_evaluate_records_with_invalid_image_keeps_others_aligned():
-    """Windows of 3; image 3 is in none: the window of image 4 holds images 1, 2 and 4."""
+    """Windows of 3; image 3 is in none: the window of image 4 has images 1, 2 and 4."""
     records = [plain_match('WARMING_UP'), plain_match('WARMING_UP'), plain_match('MATCH', 1)]
     records += [plain_match('INVALID_IMAGE'), plain_match('MATCH', 2), plain_match('MATCH', 4)]
     result = evaluate_records(records, 3, 0.5, np.arange(6), 0)

@@ -46,7 +46,7 @@ def run(monkeypatch, capsys):
 
 @pytest.fixture
 def numbers(run, tmp_path):
-    """Run the command with some options and return its JSON."""
+    """Run the command with options and return its JSON."""
 
     def call(*arguments):
         path = tmp_path / 'out.json'
@@ -235,7 +235,7 @@ def test_evaluate_with_loop_closure_matches_the_second_lap(tmp_path, numbers):
 
 @pytest.fixture
 def report(run, tmp_path):
-    """Run the command with some options; return its JSON, the rows of its matches, its text."""
+    """Run the command with options; return its JSON, the rows of its matches, its text."""
 
     def call(*arguments):
         folder = tmp_path / 'report'

@@ -176,7 +176,7 @@ def test_from_file_of_pickled_objects_raises(tmp_path):
     np.savez(tmp_path / 'objects.npz', truth=rows)
     (tmp_path / 'pickle.npy').write_bytes(pickle.dumps(MATRIX))
     for name in ('objects.npy', 'objects.npz', 'pickle.npy'):
-        with pytest.raises(SourceError, match=rf'{name} holds Python objects.*runs whatever'):
+        with pytest.raises(SourceError, match=rf'{name} contains Python objects.*runs whatever'):
             GroundTruth.from_file(tmp_path / name, 3, 5)
 
 

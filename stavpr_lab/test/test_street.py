@@ -52,7 +52,7 @@ def shift_of_patch(before, after, x, y, size=36, reach=14):
 
 
 def test_render_with_lateral_step_shows_parallax(world):
-    """Houses at the sides are some 20 m away, the vanishing point 60 m and more."""
+    """Houses at the sides are about 20 m away, the vanishing point 60 m and more."""
     near, far = [], []
     for along in np.arange(20.0, 320.0, 20.0):
         before = view(world, along, replace(STILL, lane=0.0), (320, 240))

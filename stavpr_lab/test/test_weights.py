@@ -136,7 +136,7 @@ def test_download_is_complete_and_checked(server, cache, content):
     [
         ({'status': 404}, 'HTTP Error 404'),
         ({'announced': 10**6}, 'of 1000000 bytes received'),
-        ({'body': b''}, 'it was changed or damaged on its way'),
+        ({'body': b''}, 'it was changed or damaged in transit'),
         ({'status': 302}, 'ftp://elsewhere/ is not http'),
     ],
 )
@@ -195,7 +195,7 @@ def test_model_is_found_by_its_hash(tmp_path, cache, content, monkeypatch):
     assert find_model(digest, '') == cache / 'any.name'
     (tmp_path / 'models' / 'mine').write_bytes(content)
     assert find_model(digest, '') == tmp_path / 'models' / 'mine'
-    assert find_model(digest, '/some/file') == Path('/some/file')  # its hash is checked later
+    assert find_model(digest, '/given/file') == Path('/given/file')  # its hash is checked later
     with pytest.raises(UnavailableError, match='given'):
         find_model(digest, str(tmp_path / 'given'))
 
@@ -237,10 +237,10 @@ def test_weights_of_other_hash_than_map_are_rejected(server, tmp_path, content):
 
 
 def read(tmp_path, content: bytes) -> dict[str, torch.Tensor]:
-    path = tmp_path / 'some.pth'
+    path = tmp_path / 'net.pth'
     path.write_bytes(content)
     with path.open('rb') as file:
-        return read_checkpoint(file, 'some.pth')
+        return read_checkpoint(file, 'net.pth')
 
 
 WEIGHT = torch.arange(6.0).reshape(2, 3)
@@ -271,7 +271,7 @@ def test_read_checkpoint_executes_nothing(tmp_path):
     old = OldPickle().file({'state_dict': Call(Global('posix', 'mkdir'), (str(mark),))})
     for hostile in (saved({'a.weight': Hostile(str(mark))}), pickle.dumps(Hostile(str(mark)))):
         with pytest.raises(
-            UnavailableError, match=r'some\.pth cannot be read as a file of weights'
+            UnavailableError, match=r'net\.pth cannot be read as a file of weights'
         ):
             read(tmp_path, hostile)
     with pytest.raises(UnavailableError, match=r'requires posix\.mkdir, .* not executed'):
@@ -294,7 +294,7 @@ def test_read_checkpoint_of_other_files_fails(tmp_path, cut, text):
     [({}, 'nothing'), ([1], 'a list'), ({'state_dict': 3}, "a int as 'state_dict'")],
 )
 def test_read_checkpoint_without_parameters_fails(tmp_path, content, kind):
-    with pytest.raises(UnavailableError, match=f'holds {kind}'):
+    with pytest.raises(UnavailableError, match=f'contains {kind}'):
         read(tmp_path, saved(content))
 
 
@@ -309,4 +309,4 @@ def test_read_checkpoint_with_damage_fails_or_reads(tmp_path, content):
             try:
                 read(tmp_path, bytes(damaged))
             except UnavailableError as error:
-                assert 'some.pth' in str(error)  # noqa: PT017
+                assert 'net.pth' in str(error)  # noqa: PT017

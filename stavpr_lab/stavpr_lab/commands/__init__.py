@@ -18,9 +18,7 @@ COMMANDS = {
     'experiments': Command(
         'stavpr_lab.commands.experiments', "reproduce the paper's tables on local data sets"
     ),
-    'monitor': Command(
-        'stavpr_lab.commands.monitor', 'show the node in a web browser', True
-    ),
+    'monitor': Command('stavpr_lab.commands.monitor', 'show the node in a web browser', True),
     'demo': Command(
         'stavpr_lab.commands.demo',
         'build, run and evaluate everything on a synthetic street',

@@ -68,7 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     add_slam('--draw', type=int, default=0, help='of the errors of the odometry (%(default)s)')
     add_slam(
         '--drift', type=float, default=DRIFT, metavar='F',
-        help='factor on the errors of the odometry; 0.06: some 2 m after three laps (%(default)s)',
+        help='factor on the errors of the odometry; 0.06: 2 m after three laps (%(default)s)',
     )  # fmt: skip
     add_slam(
         '--false-closures', type=float, default=0.0, metavar='P',
@@ -211,7 +211,7 @@ def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair
 
 
 def _limit(arguments: argparse.Namespace, threshold: float | None) -> dict[str, object]:
-    """Return the parameters of the node that decide what is a match."""
+    """Return the parameters of the node of the limit of a match."""
     if arguments.mode == 'robust':
         return {'mode': 'robust', 'min_probability': arguments.min_probability}
     return {'mode': 'paper', 'threshold': threshold}

@@ -53,7 +53,7 @@ another drive (they combine; applied in the order speed, stop, reverse, drop):
   --mirror                    every image mirrored left-right: no match is right
   --reverse                   the last image comes first
   --speed 3, 0.5, varying     images are left out or repeated; varying: 1/2 to 2
-  --stop 60:100               the query stands still at image 60 for 100 images more
+  --stop 60:100               the query stops at image 60 for 100 images more
   --drop 0.2                  each image is left out with probability 0.2
 
 examples:
@@ -132,7 +132,7 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
     add('--reverse', action='store_true', help='drive the query in reverse order')
     speed = 'images of the query per image, varying, or stop (30 images in the middle)'
     add('--speed', '--warp', metavar='X', help=speed)
-    stop = 'stand still at image IMAGE of the query for COUNT more; may be repeated'
+    stop = 'stop at image IMAGE of the query for COUNT images more; may be repeated'
     add('--stop', metavar='IMAGE:COUNT', help=stop, **pairs)
     drop = 'leave each image of the query out with this probability (%(default)g)'
     add('--drop', type=float, default=0.0, metavar='P', help=drop)

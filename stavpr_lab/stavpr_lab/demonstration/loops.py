@@ -69,14 +69,14 @@ class LoopResult:
             return line
         correct = np.count_nonzero(right)
         precision = f', precision {correct / C:.3f}' if C else ''
-        seen = self.ground_truth.has_match
+        revisited = self.ground_truth.has_match
         aligned = self.pairs[self.are_correct(self.pairs)]
         closed = len(np.unique(aligned[:, 0]))
-        recall = f', recall {closed / seen.sum():.3f}' if seen.any() else ''
+        recall = f', recall {closed / revisited.sum():.3f}' if revisited.any() else ''
         return (
             f'{line}\n'
             f'{correct} of {C} loop closures are correct{precision}\n'
-            f'{closed} of {np.count_nonzero(seen)} images of places passed before are in a '
+            f'{closed} of {np.count_nonzero(revisited)} images of places passed before are in a '
             f'correct pair{recall}'
         )
 

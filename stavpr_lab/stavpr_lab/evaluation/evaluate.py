@@ -77,7 +77,7 @@ class TraverseResults:
         theirs from the paths of the outermost windows.
     :param single: of each image alone.
     :param seconds: to match each image, features excluded, shape (N,).
-    :param windows: distances of some windows.
+    :param windows: distances of up to :data:`WINDOWS` windows.
     :param distances: of all images.
     :param accepted: of the windows' matches, those that the recognizer accepts, shape (N,), bool.
     :param probabilities: declared for them, shape (N,); NaN = not declared.
@@ -146,7 +146,7 @@ class Evaluation:
 
     @property
     def distances(self) -> dict[str, np.ndarray]:
-        """Return the distances of the windows' matches, by what they are."""
+        """Return the distances of the windows' matches, by group."""
         scores = self.results.sequence.scores
         groups = {'correct': scores[self.correct], 'wrong': scores[~self.correct]}
         if self.unknown is not None:
@@ -155,7 +155,7 @@ class Evaluation:
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """Return how far the declared probabilities hold; None without any."""
+        """Return the calibration of the declared probabilities; None without any."""
         return calibrate(self.results.probabilities, self.correct, self.ground_truth.has_match)
 
 
@@ -266,7 +266,7 @@ def evaluate_on_map(
 
     :param query: features of N images.
     :param ground_truth: of the same images.
-    :param settings: of the recognizer; only what it accepts depends on its threshold.
+    :param settings: of the recognizer; only the accepted matches depend on its threshold.
     :param unknown: features of a traverse through places that are not in the map.
     :param shown: images whose windows' distances are kept in any case.
     :param backend, precision: see :class:`stavpr_ros.recognition.PlaceRecognizer`.

@@ -78,13 +78,13 @@ class GroundTruth:
         Read accepted pairs; queries and places are counted from 0.
 
         * Text (.csv, .tsv, .txt): a line a pair, query and place, with or without a header. A
-          single column holds the place of query 0, 1, 2 and so on. A place of -1 = not in the map.
+          single column is the place of query 0, 1, 2 and so on. A place of -1 = not in the map.
         * Array (.npy, .npz with one array or one called ``truth``): shape (N, n), 0 or 1; else
           shape (M, 2), pairs; or shape (N,), the place of each query, -1 = none.
         * Black and white image, N high and n wide: white at row i, column j accepts place j for
           query i. For loop closures, where both are one traverse, see :meth:`loop_closures`.
 
-        :raises SourceError: the file cannot be read, or holds objects (pickles).
+        :raises SourceError: the file cannot be read, or contains objects (pickles).
         :raises InputError: it is that of other images: wrong size, or indices outside.
         """
         queries, places = read_pairs(Path(path), N, n)
@@ -200,7 +200,7 @@ class GroundTruth:
 
     def select(self, indices: np.ndarray) -> Self:
         """
-        Return the ground truth of some of the queries.
+        Return the ground truth of selected queries.
 
         :param indices: query of each row of the result, shape (K,), in any order, repeated or not.
         """
@@ -213,7 +213,7 @@ class GroundTruth:
 
     def on_places(self, places: np.ndarray) -> Self:
         """
-        Return the ground truth on a map that keeps only some of the places.
+        Return the ground truth on a map that keeps only the given places.
 
         :param places: those that are kept, ascending, shape (k,); they become 0 .. k - 1.
         """
@@ -227,7 +227,7 @@ class GroundTruth:
         """
         Return the ground truth of one traverse on its own past: the later image is the query.
 
-        Either triangle of a square matrix may hold the pairs, the lower one (row = query, as
+        Either triangle of a square matrix may contain the pairs, the lower one (row = query, as
         RTAB-Map writes it), the upper one or both.
 
         :param exclude: the latest images before the query that are not part of the map.

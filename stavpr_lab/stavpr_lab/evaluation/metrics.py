@@ -121,7 +121,7 @@ class ImageMatches:
 @dataclass(frozen=True)
 class Metrics:
     """
-    Metrics of the matches of some queries.
+    Metrics of the matches of queries.
 
     :param queries: number of queries.
     :param with_match: how many of them have a place in the map.

@@ -191,7 +191,7 @@ def drive(
     unseen: np.ndarray,
 ) -> None:
     """
-    Draw the matched and the true places of a query, image by image, and what was not matched.
+    Draw the matched and the true places of a query, and the images without a match.
 
     :param truth: correct (query, place), shape (M, 2).
     :param places: number of places n.
@@ -262,7 +262,7 @@ def page(path: Path, width: float, height: float) -> Iterator[Figure]:
 def titled_page(
     path: Path, width: float, height: float, title: str, text: str
 ) -> Iterator[SubFigure]:
-    """Yield the part of a page below its title and some lines of text, ``height`` inches high."""
+    """Yield the part of a page below its title and a text, ``height`` inches high."""
     head = 0.5 + 0.17 * len(text.splitlines())
     with page(path, width, head + height) as figure:
         parts: Any = figure.subfigures(2, 1, height_ratios=(head, height))

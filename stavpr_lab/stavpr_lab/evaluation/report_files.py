@@ -46,7 +46,7 @@ def write_folder(report: Report, folder: Path, force: bool = False) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SourceError(f'the report cannot be written into {folder}: {error}') from error
-    require_replaceable(page, HTML, force)  # the page stands for its report
+    require_replaceable(page, HTML, force)
     _write_matches(report, folder / 'answers.csv')
     _write_curves(report.evaluation, folder / 'curves.csv')
     boxes = _draw(report, folder)

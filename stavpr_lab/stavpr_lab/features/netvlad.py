@@ -174,7 +174,7 @@ def _require_fitting(found: NetVladParameters, name: str) -> None:
             f'{wrong}: its whitening takes {found.whitening[0].shape[1]} numbers, expected {K * D}'
         )
     if not all(bool(torch.isfinite(value).all()) for value in found.tensors()):
-        raise UnavailableError(f'{name} is damaged: it holds NaN or infinite numbers')
+        raise UnavailableError(f'{name} is damaged: it contains NaN or infinite numbers')
 
 
 def _from_matlab(file: BinaryIO, name: str) -> NetVladParameters:

@@ -102,7 +102,7 @@ def download(address: str, path: Path, sha256: str) -> None:
             if digest != sha256:
                 raise UnavailableError(
                     f'the file from {address} has sha256 {digest}, expected {sha256}: it was '
-                    f'changed or damaged on its way; try again, or {advice}'
+                    f'changed or damaged in transit; try again, or {advice}'
                 )
             write_output(_hash_file(path), f'{digest}  {path.name}\n', ANY, force=True)
     except (OSError, OutputError) as error:
@@ -170,12 +170,12 @@ def read_checkpoint(file: BinaryIO, name: str) -> dict[str, torch.Tensor]:
         content = content['state_dict']
     if not isinstance(content, Mapping) or not content:
         raise UnavailableError(
-            f'{name} holds {_kind(content)}: expected the parameters of a network by name'
+            f'{name} contains {_kind(content)}: expected the parameters of a network by name'
         )
     for key, value in content.items():
         if not isinstance(key, str) or not isinstance(value, torch.Tensor):
             raise UnavailableError(
-                f'{name} holds {_kind(value)} as {key!r}: expected parameters by name'
+                f'{name} contains {_kind(value)} as {key!r}: expected parameters by name'
             )
     return {key.removeprefix('module.'): value for key, value in content.items()}
 
@@ -230,7 +230,7 @@ def load_parameters(network: nn.Module, parameters: Mapping[str, torch.Tensor], 
         floats[key] = value.detach().float()
         # numpy: torch would start its threads for each of 800 parameters
         if not np.isfinite(floats[key].numpy()).all():
-            raise UnavailableError(f'{name} is damaged: {key} holds NaN or infinite numbers')
+            raise UnavailableError(f'{name} is damaged: {key} contains NaN or infinite numbers')
     counters = {key: torch.zeros((), dtype=torch.long) for key in state if key.endswith(COUNTER)}
     network.load_state_dict(floats | counters, assign=True)
 

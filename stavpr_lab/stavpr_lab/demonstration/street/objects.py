@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Things that stand or drive in the synthetic street: trees, lamps, signs, cars, vans; in numba.
+Objects in the synthetic street: trees, lamps, signs, cars, vans; in numba.
 
 They are drawn after walls and ground, from far to near, each sample compared with the depth so
 far. Cars are boxes that the rays enter from behind or from the side; all else is a flat card
