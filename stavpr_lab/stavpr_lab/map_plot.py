@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 import numpy as np
-from stavpr_lab.evaluation.plots import color_bar, page, QUIET, SCALE
+from stavpr_lab.evaluation.plots import page, QUIET, show_distances
 from stavpr_ros.mapping import PlaceMap, select_places
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.robust import evenly
@@ -81,10 +81,8 @@ def _draw_matrix(figure: Figure | SubFigure, axes: Axes, place_map: PlaceMap) ->
     part = select_places(place_map, places)
     recognizer = PlaceRecognizer(part, RecognizerSettings(0.5, mode='robust'))
     distances = recognizer.distances(part.features)
-    extent = (-0.5, n - 0.5, n - 0.5, -0.5)
-    away = distances[~np.eye(len(part), dtype=bool)]
-    low, high = np.quantile(away, [0.002, 0.995]) if away.size else (0.0, 1.0)
-    image = axes.imshow(distances, extent=extent, cmap=SCALE, vmin=low, vmax=max(high, low + 1e-6))
+    distances = np.where(np.eye(len(part), dtype=bool), np.nan, distances)  # without zeros
+    show_distances(figure, axes, distances, extent=(-0.5, n - 0.5, n - 0.5, -0.5))
     for _, session in _runs(place_map)[1:]:
         if len(session):
             axes.axhline(session[0] - 0.5, color='#ff5440', lw=1)
@@ -92,4 +90,3 @@ def _draw_matrix(figure: Figure | SubFigure, axes: Axes, place_map: PlaceMap) ->
     borders = '; red: borders of sessions' if len(place_map.sessions) > 1 else ''
     axes.set_title(f'distance of places to each other{borders}', fontsize=10.5, loc='left')
     axes.set(xlabel='place', ylabel='place')
-    color_bar(figure, image, axes)

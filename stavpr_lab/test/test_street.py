@@ -7,7 +7,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from stavpr_lab.demonstration.street import (
+from stavpr_lab.demonstration.street.laps import drive_laps, RingWorld
+from stavpr_lab.demonstration.street.objects import _from_camera
+from stavpr_lab.demonstration.street.rendering import _on_ground, center_line_ahead
+from stavpr_lab.demonstration.street.street import CELL
+from stavpr_lab.demonstration.street.traverses import (
     first_traverse,
     GOOD_LIGHT,
     nearest_places,
@@ -15,10 +19,6 @@ from stavpr_lab.demonstration.street import (
     Traverse,
     World,
 )
-from stavpr_lab.demonstration.street.laps import drive_laps, RingWorld
-from stavpr_lab.demonstration.street.objects import _from_camera
-from stavpr_lab.demonstration.street.rendering import _on_ground, center_line_ahead
-from stavpr_lab.demonstration.street.street import CELL
 
 SIZE = (96, 72)
 STILL = replace(GOOD_LIGHT, noise=0.0, shake=0.0)

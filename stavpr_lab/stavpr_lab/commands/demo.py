@@ -239,17 +239,17 @@ def _localization(arguments: argparse.Namespace, folder: Path) -> None:
     from stavpr_lab.demonstration.plots import draw_result
     from stavpr_lab.evaluation.records import evaluate_records
     from stavpr_ros.commands.feature_options import make_extractor
-    from stavpr_ros.mapping import save_map
+    from stavpr_ros.mapping import build_map, save_map
 
     pair = _traverse_pair(arguments, folder)
     length, map_path = arguments.sequence_length, folder / 'map.stavpr'
     _print(f'2. The map of the first traverse: {map_path}')
-    place_map = pair.reference.build_map(make_extractor(arguments), _skip)
+    place_map = build_map(pair.reference.open(_skip), make_extractor(arguments))
     save_map(place_map, map_path, force=True)
     threshold = _threshold(place_map, arguments)
 
     _print('3. The second traverse through the node, over ROS, with a replay and a recorder')
-    query = pair.query.build_map(place_map.extractor(), _skip)
+    query = build_map(pair.query.open(_skip), place_map.extractor())
     if pair.true_places is not None:
         _require_all(query, len(pair.true_places))
     parameters = {
@@ -282,6 +282,7 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
     from stavpr_lab.demonstration.live import run_live
     from stavpr_lab.demonstration.loops import draw_loops, read_result
     from stavpr_ros.commands.feature_options import make_extractor
+    from stavpr_ros.mapping import build_map
 
     exclude = arguments.exclude_places or EXCLUDE_PLACES
     length = arguments.sequence_length
@@ -293,7 +294,7 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
             f'window of {length}'
         )
     extractor = make_extractor(arguments)
-    place_map = recording.build_map(extractor, _skip)
+    place_map = build_map(recording.open(_skip), extractor)
     if traverse.ground_truth is not None:
         _require_all(place_map, traverse.N)
     features = folder / 'features.stavpr'

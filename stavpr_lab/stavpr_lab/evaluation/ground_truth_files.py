@@ -152,7 +152,7 @@ def _load(path: Path) -> np.ndarray:
             ) from error
         raise SourceError(f'ground truth {path} cannot be read: {error}') from error
     raise SourceError(
-        f'ground truth {path} has the arrays {", ".join(names)}: expected one, or one called {NAME}'
+        f'ground truth {path} has {", ".join(names)}: expected one array, or one called {NAME}'
     )
 
 

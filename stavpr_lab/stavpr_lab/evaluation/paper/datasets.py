@@ -15,6 +15,7 @@ from stavpr_ros.sources.folder import FolderSource, SUFFIXES
 SYNTH = 'synth_'  # before a name: the same with both traverses cropped
 CROP_MAP, CROP_QUERY = 0.3, 0.1  # right of every map image, left of every query image (synth-Nord)
 GROUND_TRUTHS = ('groundtruth', 'gt', 'truth', 'groundtruthnew')
+DEPTH = 4  # levels of folders, the root among them
 PARENTS = ('images', 'data', 'datasets', 'test')  # folders of folders
 # Parts of folder names besides the traverse: sizes, rates, kinds of files.
 NOISE = re.compile(r'\d+x\d+|\dfps|images|image|imgs|frames|gr[ae]yscale|jpg|png|test')
@@ -133,22 +134,11 @@ def _folders(path: Path) -> list[Path]:
         ) from error
 
 
-def _parents(paths: list[Path]) -> list[Path]:
-    return [child for path in paths for child in _folders(path) if _letters(child.name) in PARENTS]
-
-
 def _find(name: str, layout: Layout, root: Path) -> tuple[Path, Path, Path]:
-    """Return the folders of data set, map and query, those nearest to the root first."""
-    inside = _parents([root])
-    own = [
-        child
-        for path in (root, *inside)
-        for child in _folders(path)
-        if _is_called(child.name, layout)
-    ]
-    searched: list[Path] = []
-    for level in ([root], inside, own, _parents(own)):
-        searched += [path for path in level if path not in searched]
+    """Return the folders of data set, map and query, those nearest to the root."""
+    level, searched = [root], []
+    for _ in range(DEPTH):
+        searched += level
         hits = [(path, *found) for path in level if (found := _traverses(path, layout))]
         if len(hits) > 1:
             several = ', '.join(str(path) for path, *_ in hits)
@@ -157,6 +147,12 @@ def _find(name: str, layout: Layout, root: Path) -> tuple[Path, Path, Path]:
             )
         if hits:
             return hits[0]
+        level = [
+            child
+            for path in level
+            for child in _folders(path)
+            if _letters(child.name) in PARENTS or _is_called(child.name, layout)
+        ]
     present = (
         ', '.join(folder.name for path in searched for folder in _folders(path)) or 'no folder'
     )
