@@ -380,22 +380,6 @@ def test_evaluate_records_with_invalid_image_keeps_others_aligned():
     assert result.counts.false_negatives == 1
 
 
-@pytest.mark.parametrize(
-    'options',
-    [
-        ['--slam', 'world', '--map', 'a'],
-        ['--slam', 'world', '--false-closures', '1.5'],
-        ['--slam', 'world', '--drift', '-1'],
-        ['--slam', 'other'],
-    ],
-)
-def test_demo_with_invalid_slam_options_exits_with_usage(options, capsys):
-    with pytest.raises(SystemExit) as raised:
-        demo.main(options)
-    assert raised.value.code == 2
-    assert 'usage' in capsys.readouterr().err
-
-
 def test_demonstration_imports_no_package_of_the_extra_evaluation():
     code = (
         'import sys; sys.modules.update(dict.fromkeys(("sklearn", "jinja2")))\n'
