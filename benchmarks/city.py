@@ -21,7 +21,7 @@ from typing import Any
 
 from data import data_folder
 import numpy as np
-from results import commit, cpu_model, RESULTS, ROOT, table
+from results import commit, cpu_model, RESULTS, ROOT, table, write_json
 from scipy.signal import lfilter
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
@@ -180,7 +180,7 @@ def merged(path: Path, found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     before = json.loads(path.read_text(encoding='utf-8')) if path.exists() else []
     of_cases = {(one['case'], one['places']): one for one in (*before, *found)}
     if found:
-        path.write_text(json.dumps([*of_cases.values()], indent=1) + '\n', encoding='utf-8')
+        write_json(path, [*of_cases.values()])
     return list(of_cases.values())
 
 

@@ -21,10 +21,9 @@ import time
 from typing import Any
 
 import numpy as np
-from results import cpu_model, table
+from results import cpu_model, table, write_json
 import torch
 
-TESTS = Path(__file__).resolve().parents[1] / 'test'
 TINY = 300  # places
 CACHES = ('cold', 'warm')
 
@@ -163,8 +162,7 @@ def main() -> None:
     print('\n'.join(lines(rows)))
     if arguments.output:
         found = {'processor': cpu_model(), 'places': arguments.places, 'megabytes': sizes}
-        content = json.dumps(found | {'starts': rows}, indent=1)
-        arguments.output.write_text(content + '\n', encoding='utf-8')
+        write_json(arguments.output, found | {'starts': rows})
 
 
 if __name__ == '__main__':

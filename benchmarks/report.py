@@ -47,7 +47,7 @@ def value_of(row: Row, name: str) -> float | None:
         return row.extra['cells'] / row.median_s if 'cells' in row.extra else None
     if name in (BOUND, SECONDS):
         return row.ratio if name == BOUND else row.median_s
-    ratio = next((peer.ratio for peer in row.peers if peer.name == name), None)
+    ratio = next((peer['ratio'] for peer in row.peers if peer['name'] == name), None)
     return 1 / ratio if ratio and name not in AT_LEAST else ratio
 
 
@@ -116,10 +116,10 @@ def peer_section(rows: Sequence[Row]) -> list[str]:
     pairs = [(row, peer) for row in rows for peer in row.peers]
     lines = []
     for row, peer in pairs:
-        times = map(seconds_text, (row.median_s, peer.median_s, peer.spread_s))
-        note = peer.note + ('; a part of the work' if peer.partial else '')
-        lines.append([*_sizes(row), peer.name, *times, number_text(peer.ratio), note])
-    whole = [peer.ratio for _, peer in pairs if not peer.partial]
+        times = map(seconds_text, (row.median_s, peer['median_s'], peer['spread_s']))
+        note = peer['note'] + ('; a part of the work' if peer['partial'] else '')
+        lines.append([*_sizes(row), peer['name'], *times, number_text(peer['ratio']), note])
+    whole = [peer['ratio'] for _, peer in pairs if not peer['partial']]
     lost = f'{sum(ratio < 1 for ratio in whole)} of {len(whole)} lost'
     head = (*SIZES, 'peer', 'ours', 'peer', 'spread', 'peer / ours', '')
     return [f'## Beside peers ({lost})', '', *table(head, lines)]

@@ -10,13 +10,12 @@ benchmarks/results/.
 """
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 from data import data_folder
 import numpy as np
-from results import environment, RESULTS, ROOT, table
+from results import environment, RESULTS, ROOT, table, write_json
 from slam import ate, DRIFTS
 from slam_pairs import measured, recognize, with_edges
 from stavpr_lab.demonstration.street.laps import LapDrive, RingWorld
@@ -130,9 +129,7 @@ def main() -> None:
             cells = [f'{np.median(before):.2f}', f'{np.median(ratios):.3f}', f'{max(ratios):.3f}']
             lines.append([name, drift, f'{closures:.0f}', *cells])
     text = table(('images', 'drift', 'closures', 'ATE before, m', 'ratio', 'worst'), lines)
-    (RESULTS / 'slam_data.json').write_text(
-        json.dumps({'about': environment(), 'rows': rows}, indent=1)
-    )
+    write_json(RESULTS / 'slam_data.json', {'about': environment(), 'rows': rows})
     with page(ROOT / 'docs' / 'slam_data.png', 12.5, 9.0) as figure:
         for axes, (title, (drive, poses)) in zip(
             figure.subplots(2, 2).flat, drawn.items(), strict=True

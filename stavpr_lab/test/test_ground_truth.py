@@ -222,13 +222,6 @@ def test_from_poses_by_hand():
             assert GroundTruth.from_poses(poses, places, *limits).pairs.tolist() == pairs
 
 
-def test_from_poses_in_chunks_equals_all_at_once(monkeypatch):
-    monkeypatch.setattr('stavpr_lab.evaluation.ground_truth.CHUNK', 7)
-    poses = np.array([pose(float(i)) for i in range(5)])
-    expected = GroundTruth.identity(5, 5, 1).pairs
-    np.testing.assert_array_equal(GroundTruth.from_poses(poses, poses, 1).pairs, expected)
-
-
 def test_from_poses_never_accepts_places_with_unknown_pose():
     unknown = [np.nan] * 7
     places, queries = np.array([pose(0), unknown, pose(5)]), np.array([pose(0), pose(5), pose(9)])

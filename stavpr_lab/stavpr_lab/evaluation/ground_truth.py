@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from scipy.spatial import KDTree
 from stavpr_lab.evaluation.ground_truth_files import read_pairs
 from stavpr_ros.errors import InputError
 
-CHUNK = 1_000_000  # pairs of poses compared at a time
 LISTED = 10  # images that an error names
 
 
@@ -118,20 +118,17 @@ class GroundTruth:
             )
         if not meters >= 0 or (degrees is not None and not degrees >= 0):
             raise InputError(f'{meters} meters and {degrees} degrees: expected numbers >= 0')
-        pairs = []
-        step = max(1, CHUNK // len(place))
-        for first in range(0, len(query), step):
-            part = query[first : first + step]
-            near = np.linalg.norm(part[:, None, :3] - place[None, :, :3], axis=2) <= meters
-            found = np.argwhere(near)
-            if degrees is not None:
-                # a quaternion and its negative are the same rotation: the angle is 2 acos |<p, q>|
-                cosines = np.abs(np.sum(part[found[:, 0], 3:] * place[found[:, 1], 3:], axis=1))
-                angles = 2 * np.degrees(np.arccos(np.minimum(cosines, 1)))
-                found = found[angles <= degrees + 1e-5]  # acos is inexact near 1
-            pairs.append(found + np.array([first, 0]))
-        accepted = np.concatenate(pairs)
-        return cls.from_pairs(accepted[:, 0], accepted[:, 1], len(query), len(place))
+        known = np.flatnonzero(~np.isnan(place[:, 0]))
+        near = KDTree(place[known, :3]).query_ball_point(query[:, :3], meters)
+        queries = np.repeat(np.arange(len(query)), [len(found) for found in near])
+        places = known[np.concatenate(near).astype(np.int64)]
+        if degrees is not None:
+            # a quaternion and its negative are the same rotation: the angle is 2 acos |<p, q>|
+            cosines = np.abs(np.sum(query[queries, 3:] * place[places, 3:], axis=1))
+            angles = 2 * np.degrees(np.arccos(np.minimum(cosines, 1)))
+            similar = angles <= degrees + 1e-5  # acos is inexact near 1
+            queries, places = queries[similar], places[similar]
+        return cls.from_pairs(queries, places, len(query), len(place))
 
     @property
     def pairs(self) -> np.ndarray:
