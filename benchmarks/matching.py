@@ -104,7 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
     from graphs import draw
     from memory import CASES, measure_memory, TARGET
     from peaks import measure_peaks
-    from report import report, target_section
+    from report import report
     from results import environment, file_name, write_json, write_lines
     from run import Run
     from stavpr_ros.recognition.matcher import PRECISIONS
@@ -127,11 +127,13 @@ def main(arguments: list[str] | None = None) -> int:
         'skipped': run.skipped,
     }
     write_json(options.output / name, document)
-    write_lines((options.output / name).with_suffix('.md'), report(about, run, memory))
+    lines = report(about, run, memory)
+    write_lines((options.output / name).with_suffix('.md'), lines)
     if importlib.util.find_spec('matplotlib'):
         documented = options.output == RESULTS and not options.quick and options.device == 'cpu'
         draw(run.rows, GRAPH if documented else (options.output / name).with_suffix('.png'))
-    print('\n'.join(target_section(run.rows, options.device)))
+    first, last = lines.index('## Targets'), lines.index('## All stages')
+    print('\n'.join(lines[first:last]))
     print(f'took {time.perf_counter() - began:.0f} s\nwrote {options.output / name} and its .md')
     return 0
 

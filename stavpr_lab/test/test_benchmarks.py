@@ -168,7 +168,7 @@ def test_process_of_matches_is_measured_beside_process_without():
     run = Run('cpu', PEAKS)
     stages.process_stages(run, 2 * stages.DRIVEN, 'int8', 0)
     (row,) = run.rows
-    assert (row.stage, [peer.name for peer in row.peers]) == ('process', ['without matches'])
+    assert (row.stage, [peer['name'] for peer in row.peers]) == ('process', ['without matches'])
 
 
 # ------------------------------------------------ the city
