@@ -19,12 +19,7 @@ from peaks import reader
 from results import READING
 from run import Peer, Run
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
-from stavpr_ros.alignment.lm_dtw import (
-    best_match,
-    match_padded,
-    padded_width,
-    SequenceDistances,
-)
+from stavpr_ros.alignment.lm_dtw import best_match, match_padded, padded_width, SequenceDistances
 from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.features import FeatureExtractor, LocalFeatures

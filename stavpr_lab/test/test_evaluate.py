@@ -97,10 +97,7 @@ def test_evaluate_of_two_folders_writes_numbers_and_settings(folders, numbers):
 
 @pytest.mark.parametrize(
     ('options', 'spatial'),
-    [
-        (['--xi', 1], SpatialSettings(xi=1)),
-        (['--strategy', 'none'], SpatialSettings('none')),
-    ],
+    [(['--xi', 1], SpatialSettings(xi=1)), (['--strategy', 'none'], SpatialSettings('none'))],
 )
 def test_evaluate_numbers_are_those_of_the_recognizer(folders, numbers, options, spatial):
     """Every image through the recognizer, windows assigned to their middles, best F1."""

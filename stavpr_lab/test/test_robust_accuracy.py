@@ -79,10 +79,7 @@ def test_corridor_is_recognized(traverses, data_folder):
 
 @pytest.mark.parametrize(
     ('route', 'query'),
-    [
-        ('gardens_point/day_left', 'corridor/query'),
-        ('corridor/ref', 'gardens_point/day_right'),
-    ],
+    [('gardens_point/day_left', 'corridor/query'), ('corridor/ref', 'gardens_point/day_right')],
 )
 def test_other_route_is_not_matched(traverses, route, query):
     answers = recognize_all(robust(map_of(traverses(route))), traverses(query))[19:]

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 from scores import best_f1
 from stavpr_lab.evaluation.paper.datasets import open_dataset
-from stavpr_lab.evaluation.seqslam import (
-    match_differences,
-    preprocess,
-    seqslam,
-    SeqSlamSettings,
-)
+from stavpr_lab.evaluation.seqslam import match_differences, preprocess, seqslam, SeqSlamSettings
 
 SMALL = SeqSlamSettings(width=4, height=2, patch=2)
 

@@ -15,11 +15,7 @@ import numpy as np
 import pytest
 from stavpr_lab.features import PublishedSettings, weights
 from stavpr_lab.features.paper_networks import PublishedNetwork
-from stavpr_lab.features.weights import (
-    download,
-    PublishedFile,
-    read_checkpoint,
-)
+from stavpr_lab.features.weights import download, PublishedFile, read_checkpoint
 from stavpr_ros.errors import FeatureMismatchError, UnavailableError
 from stavpr_ros.features.model_files import cache_folder, find_model, read_model
 import torch

@@ -344,10 +344,7 @@ def _slam(arguments: argparse.Namespace, folder: Path) -> None:
         relay = [sys.executable, '-m', 'stavpr_slam.ros.false_closures']
         relay += ['--share', str(arguments.false_closures), '--seed', str(arguments.world)]
         others['false_closures'] = relay + ['--coherent'] * arguments.coherent
-    graph = {
-        'maps_folder': folder.absolute(),
-        'loop_closure_topics': [topic],
-    }
+    graph = {'maps_folder': folder.absolute(), 'loop_closure_topics': [topic]}
     others['pose_graph'] = [
         executable('pose_graph', 'stavpr_slam'), '--ros-args',
         *(word for name, value in graph.items() for word in ('-p', f'{name}:={value}')),

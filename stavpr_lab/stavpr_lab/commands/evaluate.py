@@ -8,13 +8,7 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
-from stavpr_ros.commands.jobs import (
-    add_job_options,
-    Job,
-    job_names,
-    other_arguments,
-    run_jobs,
-)
+from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import HTML, JSON, NPY, require_replaceable

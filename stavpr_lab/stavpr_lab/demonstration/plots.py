@@ -67,11 +67,7 @@ def choose_images(outcomes: list[Outcome]) -> list[int]:
 
 
 def _pair(
-    result: TraverseEvaluation,
-    image: int,
-    outcome: Outcome,
-    query: PlaceMap,
-    place_map: PlaceMap,
+    result: TraverseEvaluation, image: int, outcome: Outcome, query: PlaceMap, place_map: PlaceMap
 ) -> MatchPair:
     left = query.thumbnail(image)
     if left is None:

@@ -15,13 +15,7 @@ facing the camera.
 from math import floor, sqrt
 
 from numba import njit
-from stavpr_lab.demonstration.street.street import (
-    CAR,
-    CELL,
-    LAMP,
-    TREE,
-    VAN,
-)
+from stavpr_lab.demonstration.street.street import CAR, CELL, LAMP, TREE, VAN
 from stavpr_lab.demonstration.street.surfaces import hash01, noise
 
 _LAMPS, _FOLIAGE, _SUN, _AMBIENT = 5, 8, 0, 4  # of the array of light; see rendering.py

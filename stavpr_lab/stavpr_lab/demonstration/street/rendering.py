@@ -17,12 +17,7 @@ from math import atan, cos, exp, hypot, pi, sin
 from numba import njit
 import numpy as np
 from stavpr_lab.demonstration.street.objects import draw_things
-from stavpr_lab.demonstration.street.street import (
-    CELL,
-    SIDE_STREET,
-    Street,
-    VIEW,
-)
+from stavpr_lab.demonstration.street.street import CELL, SIDE_STREET, Street, VIEW
 from stavpr_lab.demonstration.street.surfaces import ground, hash01, noise, sky
 from stavpr_lab.demonstration.street.walls import roof_height, wall
 

@@ -9,12 +9,7 @@
 from math import floor, sin
 
 from numba import njit
-from stavpr_lab.demonstration.street.street import (
-    BRICK,
-    HALL,
-    OFFICE,
-    PARK,
-)
+from stavpr_lab.demonstration.street.street import BRICK, HALL, OFFICE, PARK
 from stavpr_lab.demonstration.street.surfaces import hash01, noise, part
 
 
