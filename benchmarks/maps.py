@@ -10,12 +10,11 @@ matcher keeps, or is made of, from the same file. ``PYTHONPATH=. python benchmar
 """
 
 import argparse
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-import json
+from multiprocessing import get_context
 import os
 from pathlib import Path
-import subprocess
-import sys
 import tempfile
 import time
 from typing import Any
@@ -109,11 +108,10 @@ def start(path: Path, precision: str, cache: str) -> dict[str, Any]:
 
 def measure(path: Path, case: Case, cache: str, runs: int) -> dict[str, Any]:
     """Return the run of the least time of several, each a process of its own."""
-    command = [sys.executable, __file__, '--start', str(path), case.precision, cache]
     found = []
     for _ in range(runs):
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-        found.append(json.loads(done.stdout))
+        with ProcessPoolExecutor(1, get_context('spawn')) as pool:
+            found.append(pool.submit(start, path, case.precision, cache).result())
     best: dict[str, Any] = min(found, key=lambda one: one['all'])
     return {'file': case.file, 'precision': case.precision, 'cache': cache, **best}
 
@@ -139,15 +137,10 @@ def main() -> None:
     parser.add_argument('--places', type=int, default=100_000)
     parser.add_argument('--runs', type=int, default=3, help='of each start (%(default)s)')
     parser.add_argument('--output', type=Path, help='JSON file')
-    parser.add_argument('--start', nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     from stavpr_ros.threads import wait_passively
 
     wait_passively()  # as the node does; the processes that are timed inherit it
-    if arguments.start:
-        path, precision, cache = arguments.start
-        print(json.dumps(start(Path(path), precision, cache)))
-        return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_files(folder, arguments.places)

@@ -20,9 +20,7 @@ if TYPE_CHECKING:
     from run import Run
 
 SIZES = (2_000, 20_000, 100_000, 1_000_000)
-CITY = (
-    200_000  # from so many places on, a CPU measures mode robust in int8 and the first stage alone
-)
+CITY = 200_000  # from here on, a CPU measures mode robust in int8 and the first stage alone
 QUICK_LIMIT = 20_000  # most places of --quick
 DIMENSIONS = (224, 512)  # of the gradient features, and of projected ones
 GRAPH = ROOT / 'docs' / 'performance.png'
