@@ -18,6 +18,7 @@ import numpy as np
 from results import environment, RESULTS, ROOT, table, write_json
 from slam import ate, DRIFTS
 from slam_pairs import measured, recognize, with_edges
+from stavpr_lab.demonstration.slam import trajectory_errors
 from stavpr_lab.demonstration.street.laps import LapDrive, RingWorld
 from stavpr_lab.demonstration.street.traverses import LENGTH
 from stavpr_lab.evaluation.ground_truth import GroundTruth
@@ -135,21 +136,15 @@ def main() -> None:
             figure.subplots(2, 2).flat, drawn.items(), strict=True
         ):
             axes.plot(*drive.truth[:, :2].T, color='black', lw=2.2, alpha=0.5, label='truth')
-            axes.plot(*_moved(drive.odometry, drive), color='#c44', lw=1.0, label='odometry')
-            axes.plot(*_moved(poses, drive), color='#07a', lw=1.0, label='optimized')
+            odometry, truth = planar_poses(drive.odometry), planar_poses(drive.truth)
+            shown = (odometry, '#c44', 'odometry'), (poses, '#07a', 'optimized')
+            for trajectory, color, label in shown:
+                moved = trajectory_errors(drive.stamps, trajectory, truth)[2]
+                axes.plot(*moved[:, :2].T, color=color, lw=1.0, label=label)
             axes.set_aspect('equal', adjustable='datalim')
             axes.set_title(title)
             axes.legend(loc='upper right')
     print('\n'.join(text))
-
-
-def _moved(poses: np.ndarray, drive: LapDrive) -> np.ndarray:
-    """Return positions, aligned with the truth, shape (2, N)."""
-    a, b = poses[:, :2], drive.truth[:, :2]
-    U, _, V = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
-    R = V.T @ np.diag([1, np.sign(np.linalg.det(V.T @ U.T))]) @ U.T
-    moved: np.ndarray = (R @ (a - a.mean(axis=0)).T).T + b.mean(axis=0)
-    return moved.T
 
 
 if __name__ == '__main__':
