@@ -81,7 +81,8 @@ def _draw_matrix(figure: Figure | SubFigure, axes: Axes, place_map: PlaceMap) ->
     part = select_places(place_map, places)
     recognizer = PlaceRecognizer(part, RecognizerSettings(0.5, mode='robust'))
     distances = recognizer.distances(part.features)
-    distances = np.where(np.eye(len(part), dtype=bool), np.nan, distances)  # without zeros
+    apart = ~np.eye(len(part), dtype=bool)  # a place itself is 0, which is left out of the scale
+    distances = np.where(apart, distances, distances.min(where=apart, initial=np.inf))
     show_distances(figure, axes, distances, extent=(-0.5, n - 0.5, n - 0.5, -0.5))
     for _, session in _runs(place_map)[1:]:
         if len(session):

@@ -5,7 +5,7 @@
 import numpy as np
 from places import map_of
 import pytest
-from stavpr_lab.evaluation.drive import DriveChanges, KINDS
+from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.evaluate import evaluate_on_map, recognize_all
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import accepted_counts
@@ -47,7 +47,7 @@ def test_gardens_point_at_every_speed_is_recognized(traverses):
     print(f'Gardens Point, robust, gradient: F1 {f1:.4f}, precision {precision:.4f}')
     assert f1 >= 0.99
     assert precision >= 0.95
-    for kind in KINDS:
+    for kind in ('2x', '0.5x', 'vary', 'stop'):
         indices = DriveChanges.named(kind, 200).images(200)
         f1, precision = evaluated(reference, query[indices], truth.select(indices))
         print(f'Gardens Point {kind}: F1 {f1:.4f}, precision {precision:.4f}')
