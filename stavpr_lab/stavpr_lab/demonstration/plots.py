@@ -38,31 +38,22 @@ def draw_result(
     demo_sheet(path, pairs, recognizer.distances(query.features), result, threshold, title)
 
 
-def outcomes_of(result: TraverseEvaluation) -> list[Outcome]:
-    """Return one outcome for each image."""
-    if result.true_places is None or result.correct is None:
-        return ['match' if accepted else 'no match' for accepted in result.accepted]
-    outcomes: list[Outcome] = []
-    for accepted, correct, place in zip(
-        result.accepted, result.correct, result.true_places, strict=True
-    ):
-        rejected: Outcome = 'unseen' if place < 0 else 'no match'
-        outcomes.append(('right' if correct else 'wrong') if accepted else rejected)
-    return outcomes
+def outcomes_of(result: TraverseEvaluation) -> np.ndarray:
+    """Return the :data:`stavpr_lab.evaluation.plots.Outcome` of each image, shape (N,), str."""
+    in_map = None if result.true_places is None else result.true_places >= 0
+    return plots.outcomes(result.accepted, result.correct, in_map)
 
 
-def choose_images(outcomes: list[Outcome]) -> list[int]:
+def choose_images(outcomes: np.ndarray) -> list[int]:
     """Choose one image of each outcome, and others of the most frequent, far from each other."""
-    chosen: list[int] = []
-    for outcome in dict.fromkeys(outcomes):
-        same = [i for i, other in enumerate(outcomes) if other == outcome]
-        chosen.append(same[len(same) // 2])
-    common = max(set(outcomes), key=outcomes.count)
-    candidates = np.array([i for i, other in enumerate(outcomes) if other == common])
-    while len(chosen) < min(SHOWN, len(outcomes)) and len(candidates):
+    kinds, counts = np.unique(outcomes, return_counts=True)
+    groups = [np.flatnonzero(outcomes == kind) for kind in kinds]
+    chosen = [int(same[len(same) // 2]) for same in groups]
+    common = groups[counts.argmax()]
+    while len(chosen) < min(SHOWN, len(outcomes)):
         others = np.array([0, len(outcomes), *chosen])
-        gaps = np.abs(candidates[:, None] - others).min(axis=1)
-        chosen.append(int(candidates[gaps.argmax()]))
+        gaps = np.abs(common[:, None] - others).min(axis=1)
+        chosen.append(int(common[gaps.argmax()]))
     return sorted(set(chosen))[:SHOWN]
 
 
@@ -124,7 +115,7 @@ def _draw_matrix(figure: SubFigure, distances: np.ndarray, result: TraverseEvalu
 
 def _draw_time(axes: Axes, result: TraverseEvaluation, threshold: float) -> None:
     """Draw the distance of each query's best match as a dot in the color of its outcome."""
-    distances, kinds = result.matches.distances, np.array(outcomes_of(result))
+    distances, kinds = result.matches.distances, outcomes_of(result)
     index = np.arange(len(distances))
     axes.plot(index, distances, color=plots.GRID, lw=1.0, zorder=1)
     for outcome, color in COLORS.items():

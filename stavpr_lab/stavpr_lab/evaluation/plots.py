@@ -76,6 +76,22 @@ class MatchPair:
     outcome: Outcome
 
 
+def outcomes(
+    accepted: np.ndarray, correct: np.ndarray | None, in_map: np.ndarray | None
+) -> np.ndarray:
+    """
+    Return the :data:`Outcome` of each image, shape (N,), str.
+
+    :param accepted: the image is matched, shape (N,), bool.
+    :param correct: the match is right, shape (N,), bool; None = unknown.
+    :param in_map: the map has its place, shape (N,), bool; None = unknown.
+    """
+    if correct is None or in_map is None:
+        return np.where(accepted, 'match', 'no match')
+    matched = np.where(correct, 'right', 'wrong')
+    return np.where(accepted, matched, np.where(in_map, 'no match', 'unseen'))
+
+
 def reduced_matrix(
     path: Path,
     distances: np.ndarray,

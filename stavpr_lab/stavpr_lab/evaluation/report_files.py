@@ -140,11 +140,7 @@ def _draw_distances(evaluation: Evaluation, path: Path) -> None:
 def _draw_drive(report: Report, path: Path) -> None:
     truth, places = report.evaluation.ground_truth, report.evaluation.results.sequence.best
     unseen = np.any([np.zeros(truth.N, bool), *report.drive.unseen()], axis=0)
-    outcomes = np.where(
-        report.accepted,
-        np.where(report.evaluation.correct, 'right', 'wrong'),
-        np.where(truth.has_match, 'no match', 'unseen'),
-    )
+    outcomes = plots.outcomes(report.accepted, report.evaluation.correct, truth.has_match)
     plots.drive(path, truth.pairs, truth.n, places, outcomes, unseen)
 
 
