@@ -55,61 +55,41 @@ def _parser() -> argparse.ArgumentParser:
     add('--output', default='demo_output', metavar='FOLDER', help='output folder (%(default)s)')
     add('--map', metavar='FOLDER|BAG', help='first traverse: the map is built from it')
     add('--query', metavar='FOLDER|BAG', help='second traverse: it is replayed')
-    add(
-        '--loop', nargs='?', const=SYNTHETIC, metavar='FOLDER|BAG|synthetic',
-        help=f'a traverse that passes places again ({SYNTHETIC})',
-    )  # fmt: skip
+    loop = f'a traverse that passes places again ({SYNTHETIC})'
+    add('--loop', nargs='?', const=SYNTHETIC, metavar='FOLDER|BAG|synthetic', help=loop)
     add('--slam', choices=('world',), help='three laps with a drifting odometry, and a pose graph')
-    slam = parser.add_argument_group('options of --slam')
-    add_slam = slam.add_argument
-    add_slam(
-        '--world', type=int, default=7, metavar='SEED', help='seed of the world (%(default)s)'
-    )
-    add_slam('--draw', type=int, default=0, help='of the errors of the odometry (%(default)s)')
-    add_slam(
-        '--drift', type=float, default=DRIFT, metavar='F',
-        help='factor on the errors of the odometry; 0.06: 2 m after three laps (%(default)s)',
-    )  # fmt: skip
-    add_slam(
-        '--false-closures', type=float, default=0.0, metavar='P',
-        help='share of loop closures that are made wrong (%(default)g)',
-    )  # fmt: skip
-    add_slam('--coherent', action='store_true', help='they are wrong in runs of 20 that agree')
-    add_slam(
-        '--carried', action='store_true',
-        help='the robot is carried over 60 images of lap 2, which the odometry misses',
-    )  # fmt: skip
-    add_slam(
-        '--sessions', type=int, default=1, choices=(1, 2),
-        help='2: lap 3 is on the next day, its odometry starts anew',
-    )  # fmt: skip
     add('--topic', help='image topic of the bags, if they have several')
-    add(
-        '--truth', metavar='identity|FILE',
-        help='identity: image i of the query shows place i of the map; with --loop a FILE: pairs '
-        'of images (.csv), or a square array (.npy) or black and white image of loop closures',
-    )  # fmt: skip
-    add('--tolerance', type=int, default=3, help='places that a correct match may be off '
-        '(%(default)s)')  # fmt: skip
-    add('--sequence-length', type=int, default=20, metavar='L', help='images in the window '
-        '(%(default)s)')  # fmt: skip
+    truth = (
+        'identity: image i of the query shows place i of the map; with --loop a FILE: pairs of '
+        'images (.csv), or a square array (.npy) or black and white image of loop closures'
+    )
+    add('--truth', metavar='identity|FILE', help=truth)
+    tolerance = 'places that a correct match may be off (%(default)s)'
+    add('--tolerance', type=int, default=3, help=tolerance)
+    length = 'images in the window (%(default)s)'
+    add('--sequence-length', type=int, default=20, metavar='L', help=length)
     add('--mode', default='robust', choices=('paper', 'robust'), help='of the node (%(default)s)')
-    add(
-        '--min-probability', type=float, default=BY_NAME['min_probability'].default, metavar='P',
-        help='of the node, mode robust: matches have a greater probability (%(default)g)',
-    )  # fmt: skip
-    add(
-        '--threshold', type=float, metavar='DISTANCE',
-        help='of the node, mode paper (estimated from the first traverse)',
-    )  # fmt: skip
-    add(
-        '--exclude-places', type=int, metavar='N',
-        help=f'with --loop: the latest N places are not compared ({EXCLUDE_PLACES})',
-    )  # fmt: skip
-    add(
-        '--geometric-check', choices=('none', 'orb', 'sift'),
-        help=f'with --loop: verification of matches by keypoints ({GEOMETRIC_CHECK})',
-    )  # fmt: skip
+    least = 'of the node, mode robust: matches have a greater probability (%(default)g)'
+    default = BY_NAME['min_probability'].default
+    add('--min-probability', type=float, default=default, metavar='P', help=least)
+    limit = 'of the node, mode paper (estimated from the first traverse)'
+    add('--threshold', type=float, metavar='DISTANCE', help=limit)
+    exclude = f'with --loop: the latest N places are not compared ({EXCLUDE_PLACES})'
+    add('--exclude-places', type=int, metavar='N', help=exclude)
+    check = f'with --loop: verification of matches by keypoints ({GEOMETRIC_CHECK})'
+    add('--geometric-check', choices=('none', 'orb', 'sift'), help=check)
+    add = parser.add_argument_group('options of --slam').add_argument
+    add('--world', type=int, default=7, metavar='SEED', help='seed of the world (%(default)s)')
+    add('--draw', type=int, default=0, help='of the errors of the odometry (%(default)s)')
+    drift = 'factor on the errors of the odometry; 0.06: 2 m after three laps (%(default)s)'
+    add('--drift', type=float, default=DRIFT, metavar='F', help=drift)
+    wrong = 'share of loop closures that are made wrong (%(default)g)'
+    add('--false-closures', type=float, default=0.0, metavar='P', help=wrong)
+    add('--coherent', action='store_true', help='they are wrong in runs of 20 that agree')
+    carried = 'the robot is carried over 60 images of lap 2, which the odometry misses'
+    add('--carried', action='store_true', help=carried)
+    sessions = '2: lap 3 is on the next day, its odometry starts anew'
+    add('--sessions', type=int, default=1, choices=(1, 2), help=sessions)
     add_feature_options(parser)
     return parser
 
