@@ -12,6 +12,7 @@ matcher keeps, or is made of, from the same file. ``PYTHONPATH=. python benchmar
 import argparse
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import product
 from multiprocessing import get_context
 import os
 from pathlib import Path
@@ -145,11 +146,8 @@ def main() -> None:
         folder = Path(name)
         write_files(folder, arguments.places)
         sizes = {path.name: path.stat().st_size / 1e6 for path in sorted(folder.iterdir())}
-        rows = [
-            measure(folder / case.file, case, cache, arguments.runs)
-            for case in CASES
-            for cache in CACHES
-        ]
+        pairs = product(CASES, CACHES)
+        rows = [measure(folder / case.file, case, cache, arguments.runs) for case, cache in pairs]
     print(f'{cpu_model()}, {torch.get_num_threads()} threads; {arguments.places:,} places')
     print(', '.join(f'{name}: {size:.0f} MB' for name, size in sizes.items()))
     print('\n'.join(lines(rows)))

@@ -10,6 +10,7 @@ benchmarks/results/.
 """
 
 import argparse
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -108,13 +109,7 @@ def main() -> None:
     }
     rows: list[dict[str, Any]] = []
     drawn: dict[str, tuple[LapDrive, np.ndarray]] = {}
-    cases = [
-        (name, drift, seed, draw)
-        for name in sets
-        for drift in DRIFTS
-        for seed in given.seeds
-        for draw in range(given.draws)
-    ]
+    cases = list(product(sets, DRIFTS, given.seeds, range(given.draws)))
     for name, drift, seed, draw in tqdm(cases, unit='drive'):
         (images, at, length), exclude = sets[name]
         drive = drive_of(at, length, seed, draw, DRIFTS[drift])

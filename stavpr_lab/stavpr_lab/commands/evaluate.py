@@ -76,32 +76,18 @@ def _parser() -> argparse.ArgumentParser:
     add('--query', nargs='+', metavar='FOLDER|BAG|MAP|ARRAY', help=query)
     add('--dataset', metavar='NAME=FOLDER', help='map, query and ground truth of a known data set')
     add('--topic', help='image topic of the bags, if they have several')
-    add(
-        '--unknown',
-        metavar='FOLDER|BAG|MAP|ARRAY',
-        help='a traverse of places that are not in the map, for the rate of false alarms',
-    )
+    unknown = 'a traverse of places that are not in the map, for the rate of false alarms'
+    add('--unknown', metavar='FOLDER|BAG|MAP|ARRAY', help=unknown)
     add('--loop-closure', action='store_true', help="the map is the query's own past: no --map")
-    add(
-        '--exclude-places',
-        type=int,
-        metavar='N',
-        help=f'the latest N images are not part of that map ({EXCLUDE_PLACES})',
-    )
+    exclude = f'the latest N images are not part of that map ({EXCLUDE_PLACES})'
+    add('--exclude-places', type=int, metavar='N', help=exclude)
     late = 'count closures that are published late, too: see the message LoopClosure'
     add('--late-closures', action='store_true', help=late)
-    odometry = (
-        'poses of the images of the query by odometry, as --query-poses: compared with paths'
-    )
+    odometry = 'poses of the query by odometry, as --query-poses: compared with paths'
     add('--odometry', metavar='CSV', help=odometry)
     for name, side in (('map', 'right'), ('query', 'left')):
-        add(
-            f'--crop-{name}',
-            type=float,
-            default=0.0,
-            metavar='X',
-            help=f'crop this share of the {side} of every image of the {name} (%(default)g)',
-        )
+        crop = f'crop this share of the {side} of every image of the {name} (%(default)g)'
+        add(f'--crop-{name}', type=float, default=0.0, metavar='X', help=crop)
     _add_drive_options(parser)
     _add_ground_truth_options(parser)
     _add_method_options(parser)

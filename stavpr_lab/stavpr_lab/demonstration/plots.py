@@ -127,10 +127,7 @@ def _draw_time(axes: Axes, result: TraverseEvaluation, threshold: float) -> None
     axes.axhline(threshold, color=plots.THRESHOLD, lw=1.3, ls=(0, (5, 3)), label=name, zorder=1.5)
     truth = np.zeros(len(index)) if result.true_places is None else result.true_places
     plots.shade_runs(axes, truth < 0, 'not in the map')
-    axes.set(
-        xlabel='query image',
-        ylabel='distance of the best match',
-        xlim=(-1, max(1, len(distances))),
-    )
+    axes.set(xlabel='query image', ylabel='distance of the best match')
+    axes.set_xlim(-1, max(1, len(distances)))
     axes.grid(axis='y', color=plots.GRID, lw=0.7)
     plots.legend_above(axes, 3)

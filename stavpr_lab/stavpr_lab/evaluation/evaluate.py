@@ -237,15 +237,9 @@ def recognize_traverse(
                 windows.append(_window_distances(image, i, length, rows, match.path))
     matched = image_matches(matches, length, late)
     ranked = np.stack([_ranked(*pair) for pair in zip(matched.places, candidates, strict=True)])
-    sequence = Ranking(ranked, matched.distances)
+    sequence, kept = Ranking(ranked, matched.distances), (tuple(windows), reduced.result())
     return TraverseResults(
-        sequence,
-        single,
-        seconds,
-        tuple(windows),
-        reduced.result(),
-        matched.accepted,
-        matched.probabilities,
+        sequence, single, seconds, *kept, matched.accepted, matched.probabilities
     )
 
 

@@ -91,14 +91,8 @@ class NetVlad:
         self._k_fastest = found.k_fastest
         kept = found.whitening if settings.whitening else None
         self._whitening = None if kept is None else [part.to(self._device) for part in kept]
-        self._batch = BatchMaker(
-            settings.size,
-            settings.resize,
-            self._device,
-            scale=found.scale,
-            mean=found.mean,
-            std=found.std,
-        )
+        standard: dict[str, Any] = {'scale': found.scale, 'mean': found.mean, 'std': found.std}
+        self._batch = BatchMaker(settings.size, settings.resize, self._device, **standard)
 
     def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
         """

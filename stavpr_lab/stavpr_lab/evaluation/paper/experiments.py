@@ -251,13 +251,8 @@ class DatasetExperiment:
         """Return the features of map and query."""
         key = (configuration.strips, configuration.projection)
         if key not in self._features:
-            extractor = FeatureExtractor(
-                self._kind,
-                self._backbone,
-                configuration.strips,
-                configuration.projection,
-                device=self._device,
-            )
+            kind = self._kind, self._backbone
+            extractor = FeatureExtractor(*kind, *key, device=self._device)
             self._features[key] = tuple(  # type: ignore[assignment]
                 build_map(source, extractor, thumbnails=False, progress=False)
                 for source in (self._dataset.map, self._dataset.query)
