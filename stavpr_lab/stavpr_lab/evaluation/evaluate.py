@@ -135,14 +135,9 @@ class Evaluation:
         """
         if self.unknown is None:
             return {}
-        both = {
-            'sequence': (self.unknown.sequence, self.sequence),
-            'single': (self.unknown.single, self.single),
-        }
-        return {
-            kind: float(np.mean(matches.scores < metrics.best.threshold))
-            for kind, (matches, metrics) in both.items()
-        }
+        sequence = self.unknown.sequence.scores < self.sequence.best.threshold
+        single = self.unknown.single.scores < self.single.best.threshold
+        return {'sequence': float(np.mean(sequence)), 'single': float(np.mean(single))}
 
     @property
     def distances(self) -> dict[str, np.ndarray]:
@@ -331,17 +326,13 @@ def evaluate_traverse(
         raise InputError(
             f'ground truth of {ground_truth.N} images for {count} images: expected a row each'
         )
-    centered = centered_images(count, length)
-    return Evaluation(
-        results,
-        ground_truth,
-        length,
-        sequence=evaluate_ranking(results.sequence, ground_truth),
-        sequence_without_ends=evaluate_ranking(results.sequence, ground_truth, centered),
-        single=evaluate_ranking(results.single, ground_truth),
-        single_without_ends=evaluate_ranking(results.single, ground_truth, centered),
-        unknown=unknown,
+    sequence, sequence_inner, single, single_inner = (
+        evaluate_ranking(ranking, ground_truth, images)
+        for ranking in (results.sequence, results.single)
+        for images in (slice(None), centered_images(count, length))
     )
+    metrics = sequence, sequence_inner, single, single_inner
+    return Evaluation(results, ground_truth, length, *metrics, unknown)
 
 
 def _ranked(place: int, candidates: np.ndarray) -> np.ndarray:

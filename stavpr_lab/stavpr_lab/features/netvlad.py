@@ -102,12 +102,8 @@ class NetVlad:
         :returns: shape (n, D), float32, of unit norm.
         """
         with torch.inference_mode():
-            return torch.cat(
-                [
-                    self._vectors(self._batch(images[first : first + PER_PASS]))
-                    for first in range(0, len(images), PER_PASS)
-                ]
-            )
+            parts = [images[i : i + PER_PASS] for i in range(0, len(images), PER_PASS)]
+            return torch.cat([self._vectors(self._batch(part)) for part in parts])
 
     def _vectors(self, batch: torch.Tensor) -> torch.Tensor:
         columns = normalize(self._conv5_3(batch).flatten(2), dim=1)  # (n, D, P)
