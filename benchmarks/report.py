@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
+import jinja2  # a requirement of torch
 from memory import Memory, TARGET
 from results import heading, number_text, READING, Row, seconds_text
 from run import Run
