@@ -10,7 +10,6 @@ the table of docs/performance.md: the lowest of best F1, precision and recall ov
 import argparse
 from collections.abc import Iterator
 from dataclasses import replace
-import json
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from accuracy import Case, extractors, long_cases, numbers, short_cases
 from city import written_between
 from data import data_folder
 import numpy as np
-from results import RESULTS, ROOT, table
+from results import RESULTS, ROOT, table, write_json
 from stavpr_lab.evaluation.evaluate import evaluate_on_map
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import descriptor_map, PlaceMap
@@ -93,7 +92,7 @@ def rows(case: Case, kind: str, extractor: FeatureExtractor) -> Iterator[dict[st
         evaluation = evaluate_on_map(
             place_map, images, case.truth(len(query), n), settings, precision=precision
         )
-        found = numbers(evaluation, THRESHOLD)
+        found = numbers(evaluation, 'robust')
         yield {
             'kind': kind,
             'dimension': places.dimension,
@@ -143,7 +142,7 @@ def main() -> None:
             new = [*rows(case, kind, extractor)]
             print(case.name, lines(new)[2], flush=True)
             found += new
-    arguments.output.write_text(json.dumps(found, indent=1) + '\n', encoding='utf-8')
+    write_json(arguments.output, found)
     if arguments.output == RESULTS / 'projection.json':
         written_between(PAGE, BEGIN, END, lines(found))
 

@@ -61,7 +61,7 @@ def run_live(
     at_end: Callable[[Records, dict[str, str]], None] = lambda closures, environment: None,
 ) -> tuple[Records, Records]:
     """
-    Replay a query losslessly into a node and return what was recorded.
+    Replay a query losslessly into a node and return its records.
 
     :param node_parameters: of the node, name to value.
     :param query: the bag or folder of images to replay.

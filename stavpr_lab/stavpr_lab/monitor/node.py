@@ -47,7 +47,7 @@ LEVELS = ('ok', 'warn', 'error', 'stale')
 
 class History:
     """
-    What the page shows, each part with the number of its last change; any thread may use it.
+    The data of the page, each part with the number of its last change; any thread may use it.
 
     :param sample_seconds: least time between two samples.
     """
@@ -98,7 +98,7 @@ class History:
         self.set('image', self._version + 1)
 
     def since(self, version: int, timeout: float) -> tuple[int, dict[str, Any]]:
-        """Return the newest version and what has changed since one; wait until there is any."""
+        """Return the newest version and all changes since one; wait until there are any."""
         with self._changed:
             self._changed.wait_for(lambda: self._version > version or self.closed, timeout)
             changes: dict[str, Any] = {

@@ -155,7 +155,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def _send_events(self) -> None:
-        """Send what has changed until the browser or the server closes."""
+        """Send changes until the browser or the server closes."""
         self.close_connection = True
         self.send_response(HTTPStatus.OK)
         self.send_header('Content-Type', 'text/event-stream')
