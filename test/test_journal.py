@@ -3,6 +3,7 @@
 """The journal: every recorded place is on disk, whatever ends the recording."""
 
 from dataclasses import replace
+import json
 import os
 import shlex
 import subprocess
@@ -15,7 +16,8 @@ from pipelines import process, save, settings_of
 import pytest
 from stavpr_ros.errors import JournalError, OutputTakenError
 from stavpr_ros.mapping import journal_writer, load_map, save_map
-from stavpr_ros.mapping.journal import Base, JournalPlace, JournalReader, journals, recover
+from stavpr_ros.mapping.journal import Base, frame, JournalPlace, JournalReader
+from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.pipeline.saving import recover_maps
@@ -34,7 +36,7 @@ def start(target):
     """Make a pipeline that records with a journal; close the journals at the end."""
     started = []
 
-    def start(operation='mapping', loaded=None, **settings):
+    def start(operation='mapping', loaded=None, target=target, **settings):
         def open_journal(base, template):
             return JournalWriter.create(target, base, template, print)
 
@@ -51,6 +53,17 @@ def start(target):
 def killed(pipeline):
     """Leave the journal as a killed process does: it is written, and no longer locked."""
     pipeline.close_journals(delete_route=False)
+
+
+def journal_of(target):
+    return target.with_name(f'{target.name}.journal')
+
+
+def wait_until(condition):
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
 
 
 def stamps(path):
@@ -74,12 +87,8 @@ def assert_equal(path, place_map):
 
 def places_of(place_map):
     for i in range(len(place_map)):
-        features = place_map.features[i : i + 1]
-        arrays = features.strips[:, 0].numpy(), features.weights[:, 0].numpy()
-        yield JournalPlace(
-            i, int(place_map.stamps[i]), place_map.ids[i], place_map.pose(i), *arrays,
-            place_map.thumbnails[i],
-        )  # fmt: skip
+        features, thumbnail = place_map.features[i : i + 1], place_map.thumbnails[i]
+        yield JournalPlace(i, place_map.place(i), features, thumbnail)
 
 
 @pytest.fixture
@@ -102,26 +111,168 @@ def test_recover_returns_every_part_of_every_place(written, small_map, target):
     assert os.listdir(target.parent) == ['route.stavpr']
 
 
-@pytest.mark.parametrize('change', ['cut off', 'damaged'])
-def test_journal_changed_anywhere_keeps_all_places_before(written, small_map, change):
-    content = written.read_bytes()
-    with JournalReader(written) as reader:
-        ends = [reader.size, *(reader.size for _ in reader.places())]
-    assert ends[-1] == len(content)
+def test_fault_at_every_write_loses_no_synced_place(small_map, target, tmp_path, monkeypatch):
+    """Copies of the journal without a write, with half of it, and with zeros in its stead."""
+    monkeypatch.setattr(journal_writer, 'SYNC_PERIOD', 0.01)
+    journal, places = journal_of(target), list(places_of(small_map))[:20]
+    appended = synced = forgotten = 0
+    writes, pwrite, fsync = [], os.pwrite, os.fsync
+
+    def is_journal(file):
+        return journal.exists() and os.path.samestat(os.fstat(file), journal.stat())
+
+    def logged_pwrite(file, content, offset):
+        written = bytes(content) if is_journal(file) else b''  # else of the file that replaces it
+        writes.append((journal.read_bytes(), offset, written, forgotten, synced))
+        return pwrite(file, content, offset)
+
+    def logged_fsync(file):
+        nonlocal synced
+        count = appended
+        fsync(file)
+        synced = count if is_journal(file) else synced
+
+    monkeypatch.setattr(os, 'pwrite', logged_pwrite)
+    monkeypatch.setattr(os, 'fsync', logged_fsync)
+    writer = JournalWriter.create(target, Base(), small_map, print)
+    for appended, place in enumerate(places, 1):
+        writer.append(place)
+        if appended % 4 == 0:
+            wait_until(lambda count=appended: synced == count)
+        if appended == 10:
+            forgotten, inode = 8, journal.stat().st_ino
+            writer.forget(forgotten, Base())
+            wait_until(lambda inode=inode: journal.stat().st_ino != inode)
+    writer.close()
+    monkeypatch.undo()
+    copy = tmp_path / 'copy.stavpr'
+    for before, offset, written, first, count in writes:
+        cut, n = before[:offset] if written else before, len(written)
+        for content in (cut, cut + written[: n // 2], cut + bytes(n), cut + bytes(8)):
+            journal_of(copy).write_bytes(content)
+            try:
+                found = stamps(recover(journal_of(copy)).path)
+            except JournalError:
+                found = []
+            assert set(small_map.stamps[first:count].tolist()) <= set(found)
+            for path in tmp_path.glob('copy*'):
+                path.unlink()
+    assert len(writes) >= 23
+
+
+def ends_of(journal):
+    with JournalReader(journal) as reader:
+        return [reader.end, *(reader.end for _ in reader.places())]
+
+
+def test_damage_costs_one_place_and_the_journal_is_kept(written, small_map, target):
+    content, ends = written.read_bytes(), ends_of(written)
     rng = np.random.default_rng(0)
-    for at in [*ends[:-1], *rng.integers(ends[0], len(content), 150)]:
-        rest = bytes([content[at] ^ rng.integers(1, 256)]) + content[at + 1 :]
-        written.write_bytes(content[:at] + rest * (change == 'damaged'))
-        with JournalReader(written) as reader:
-            found = [place.stamp for place in reader.places()]
-        assert found == small_map.stamps[: np.searchsorted(ends, at, 'right') - 1].tolist()
+    for place in range(0, 60, 3):
+        begin, end = ends[place : place + 2]
+        at = rng.integers(begin, end)
+        flipped = bytes([content[at] ^ 1 << rng.integers(8)])
+        for damaged in (
+            bytes(end - begin),
+            b'',
+            content[begin:at] + flipped + content[at + 1 : end],
+        ):
+            written.write_bytes(content[:begin] + damaged + content[end:])
+            with JournalReader(written) as reader:
+                found = [each.number for each in reader.places()]
+                assert found == [i for i in range(60) if i != place]
+                assert bool(reader.problem) is bool(damaged)
+    result = recover(written)
+    assert (result.places, len(load_map(target))) == (59, 59)
+    kept = target.with_name(f'{written.name}.damaged')
+    assert f'{kept} is kept' in result.problems[0]
+    assert kept.exists()
+    assert journals(target) == []
+
+
+def altered(place, **changes):
+    """Return the record of a place with other values."""
+    values = {name: changes[name] for name in changes if name in JournalPlace._fields}
+    known = {name: changes[name] for name in changes if name in ('stamp', 'identifier', 'pose')}
+    features = {name: changes[name] for name in changes if name in ('strips', 'weights')}
+    values['place'] = replace(place.place, **known)
+    features = {name: getattr(place.features, name) * factor for name, factor in features.items()}
+    values['features'] = replace(place.features, **features)
+    return frame(place._replace(**values).encode())
+
+
+@pytest.mark.parametrize(
+    'records',
+    [
+        lambda places: bytes(8),
+        lambda places: frame(b''),
+        lambda places: frame(b'short'),
+        lambda places: frame(places[3].encode()[:-2000]),
+        lambda places: frame(places[3].encode())[:-1],
+        lambda places: frame(places[3].encode().replace(b'place 3', b'place \xff')),
+        lambda places: altered(places[3], strips=1e30),
+        lambda places: altered(places[3], strips=np.nan),
+        lambda places: altered(places[3], weights=-1),
+        lambda places: altered(places[3], pose=np.ones(7)),
+        lambda places: altered(places[3], stamp=2**62),
+        lambda places: altered(places[3], thumbnail=b'no image'),
+        lambda places: altered(places[2]),  # again
+        lambda places: altered(places[1]),  # in another order
+    ],
+)
+def test_invalid_record_is_skipped_and_the_journal_is_kept(small_map, target, records):
+    writer = JournalWriter.create(target, Base(), small_map, print)
+    places = list(places_of(small_map))[:6]
+    for place in places[:3]:
+        writer.append(place)
+    writer.close()
+    behind = b''.join(frame(place.encode()) for place in places[4:])
+    with writer.path.open('ab') as file:
+        file.write(records(places) + behind)
+    log = Mock()
+    assert recover_maps(target, log) == str(target)
+    assert stamps(target) == seconds(1, 2, 3, 5, 6)
+    assert log.method_calls[1][0] == 'error'
+    assert set(os.listdir(target.parent)) == {'route.stavpr', 'route.stavpr.journal.damaged'}
+    assert recover_maps(target, log) == ''  # the next start
+
+
+@pytest.mark.parametrize(
+    'change',
+    [{'path': 7}, {'path': []}, {'places': '9'}, {'version': 3}, {'source': None}, None],
+)
+def test_journal_with_an_invalid_header_stops_no_start(written, target, change):
+    content, about = written.read_bytes(), json.loads(frame_content(written))
+    changed = b'[' * 5000 if change is None else json.dumps(about | change).encode()
+    written.write_bytes(frame(changed) + content[len(frame(frame_content(written))) :])
+    content, log = written.read_bytes(), Mock()
+    assert recover_maps(target, log) == ''
+    assert 'is no journal, or its header is damaged' in log.method_calls[0].args[0]
+    assert written.read_bytes() == content
+
+
+def frame_content(journal):
+    """Return the content of the first record."""
+    content = journal.read_bytes()
+    return content[16 : 16 + int.from_bytes(content[4:8], 'little')]
+
+
+def test_journal_of_zeros_and_holes_is_read_in_a_second(written):
+    with written.open('ab') as file:
+        file.write(bytes(10**6))
+        file.truncate(2**33)
+    begin = time.monotonic()
+    with JournalReader(written) as reader:
+        assert len(list(reader.places())) == 60
+        assert reader.problem
+    assert time.monotonic() - begin < 10
 
 
 @pytest.mark.parametrize('content', [b'', b'\xff' * 100, b'\x10\0\0\0\0\0\0\0{}'])
 def test_recover_file_that_is_no_journal_fails_and_keeps_it(content, tmp_path):
     path = tmp_path / 'x.stavpr.journal'
     path.write_bytes(content)
-    with pytest.raises(JournalError, match='is no journal, or was cut off before its first place'):
+    with pytest.raises(JournalError, match='is no journal, or its header is damaged'):
         recover(path)
     assert path.read_bytes() == content
 
@@ -131,7 +282,7 @@ def test_recover_what_is_no_file_or_in_use_fails(small_map, target, tmp_path):
     writer = JournalWriter.create(target, Base(), small_map, print)
     for path, text in (
         (tmp_path / 'missing', 'cannot be read'),
-        (tmp_path / 'fifo', 'no regular file'),
+        (tmp_path / 'fifo', 'expected a regular file'),
         (writer.path, 'written by a running program'),
     ):
         with pytest.raises(JournalError, match=text):
@@ -262,10 +413,8 @@ def test_journal_of_a_route_follows_evictions(start, route, target, monkeypatch)
     process(pipeline, [route[i % 60] for i in range(130)])
     held = pipeline.snapshot().places
     (path,) = journals(target)
-    end = time.monotonic() + 20
-    while os.path.getsize(path) > 600_000:  # of 9,000 a place; rewritten by the thread that syncs
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    # of 9,000 a place; rewritten by the thread that syncs
+    wait_until(lambda: os.path.getsize(path) <= 600_000)
     killed(pipeline)
     result = recover(path)
     found = load_map(result.path)
@@ -299,11 +448,29 @@ def test_discarded_places_stay_in_their_journal(start, small_map, route, target,
 
 # ---------------------------------------------------------------------------------------- the disk
 
+
+@pytest.mark.parametrize('removed', ['the folder', 'the journal'])
+def test_removed_journal_is_reported_and_written_anew(start, route, tmp_path, capsys, removed):
+    target = tmp_path / 'maps' / 'route.stavpr'
+    target.parent.mkdir()
+    pipeline = start(target=target)
+    process(pipeline, route[:6])
+    journal_of(target).unlink()
+    if removed == 'the folder':
+        target.parent.rmdir()
+    wait_until(journal_of(target).exists)
+    wait_until(lambda: 'was removed: its places are written anew' in capsys.readouterr().out)
+    process(pipeline, route[6:9], first=6)
+    killed(pipeline)
+    assert recover(journals(target)[0]).recorded == 9
+    assert stamps(target) == seconds(*range(1, 10))
+
+
 FULL = """
 import resource, signal, sys
 from pipelines import process, settings_of
 from fixtures import route_images
-from stavpr_ros.mapping.journal import recover
+from stavpr_ros.mapping.journal_map import recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.pipeline import Pipeline
 
@@ -320,7 +487,7 @@ process(pipeline, images[:1])
 if case != 'tmpfs':
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
 process(pipeline, images[1:50], first=1)
-assert writers[0]._problem
+assert writers[0].failed
 if case == 'room':
     resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
 process(pipeline, images[50:], first=50)

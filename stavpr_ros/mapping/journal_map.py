@@ -1,91 +1,187 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A map of the places in a journal that does not fit into memory: its features stay on disk."""
+"""Maps made of journals: after an interrupted recording, and of what build_map has read."""
 
-from collections.abc import Sequence
-import mmap
-import os
+from dataclasses import dataclass
+import io
 from pathlib import Path
+import re
 import tempfile
-from typing import overload
 
 import numpy as np
-from stavpr_ros.errors import JournalError
-from stavpr_ros.mapping.journal import JournalReader
+from stavpr_ros.errors import JournalError, OutputTakenError, StavprError
+from stavpr_ros.mapping.growing_map import GrowingMap
+from stavpr_ros.mapping.journal import Base, JournalReader, SUFFIX
+from stavpr_ros.mapping.map_container import MapFile, Part
+from stavpr_ros.mapping.map_file import load_map, open_map, save_map
 from stavpr_ros.mapping.place_map import PlaceMap
-from stavpr_ros.mapping.stored_features import MappedFeatures
+from stavpr_ros.mapping.stored_features import StoredFeatures, StoredThumbnails
+from stavpr_ros.output_file import explained, FileVersion, numbered, write_at
 import torch
 
-PLACES_AT_ONCE = 8192  # whose pages count as memory of this process
+DAMAGED = '.damaged'  # suffix of journals that were not read to their end
 
 
-class _Thumbnails(Sequence[bytes]):
-    """Thumbnails that are read from the journal on every use."""
-
-    def __init__(self, path: Path, ends: list[int], sizes: list[int]) -> None:
-        self._file, self._ends, self._sizes = path.open('rb'), ends, sizes
-
-    def __len__(self) -> int:
-        return len(self._ends)
-
-    @overload
-    def __getitem__(self, index: int) -> bytes: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[bytes]: ...
-
-    def __getitem__(self, index: int | slice) -> bytes | list[bytes]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        size = self._sizes[index]
-        return os.pread(self._file.fileno(), size, self._ends[index] - size)
-
-
-def journal_map(path: Path) -> PlaceMap:
+def journal_map(reader: JournalReader, folder: Path) -> PlaceMap:
     """
     Return the places of a journal as a map.
 
-    The features are in a temporary file beside the journal that has no name, the thumbnails stay
-    in the journal: both only take memory while they are used.
+    Features and thumbnails are in a temporary file without a name.
 
-    :raises JournalError: no journal, or one without places.
+    :param folder: of that file.
+    :raises JournalError: there are no places.
+    :raises OSError: there is no room.
     """
-    with JournalReader(path) as reader:
-        n = sum(1 for _ in reader.places())
+    template = reader.template
+    n = sum(1 for _ in reader.places())
     if not n:
-        raise JournalError(f'{path} has no places: delete it')
-    with JournalReader(path) as reader:
-        template = reader.template
-        W, d = template.settings.strips, template.dimension
-        D = 0 if template.features.vectors is None else template.features.vectors.shape[1]
-        with tempfile.TemporaryFile(dir=path.parent) as file:
-            file.truncate(4 * n * (W * d + D))
-            pages = mmap.mmap(file.fileno(), 0)
-        strips = np.frombuffer(pages, np.float32, W * n * d).reshape(W, n, d)
-        vectors = np.frombuffer(pages, np.float32, n * D, strips.nbytes).reshape(n, D)
-        weights = np.empty((W, n), np.float32)
-        stamps, poses = np.empty(n, np.int64), np.full((n, 7), np.nan)
-        ids, ends, sizes = [], [], []
-        for i, place in enumerate(reader.places()):
-            if i % PLACES_AT_ONCE == 0:
-                pages.madvise(mmap.MADV_DONTNEED)  # they stay in the file
-            strips[:, i], weights[:, i], stamps[i] = place.strips, place.weights, place.stamp
-            vectors[i] = place.vector
-            if place.pose is not None:
-                poses[i] = place.pose
-            ids.append(place.identifier)
-            ends.append(reader.size)
-            sizes.append(len(place.thumbnail))
-    features = MappedFeatures(
-        torch.from_numpy(strips), torch.from_numpy(weights), template.settings,
-        template.features.cells, torch.from_numpy(vectors) if D else None,
-    )  # fmt: skip
-    object.__setattr__(features, 'pages', pages)
+        raise JournalError(f'{reader.path} has no places: {reader.problem or "delete it"}')
+    W, d = template.settings.strips, template.dimension
+    vectors = template.features.vectors
+    parts = {'strips': Part('F32', (W, n, d))}
+    end = parts['strips'].size
+    if vectors is not None:
+        parts['vectors/vectors'] = Part('F32', (n, vectors.shape[1]), end)
+        end += parts['vectors/vectors'].size
+    first = end
+    raw = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115
+    assert isinstance(raw, io.FileIO)
+    weights, poses = np.empty((W, n), np.float32), np.full((n, 7), np.nan)
+    stamps, ends, ids = np.empty(n, np.int64), np.empty(n, np.int64), []
+    for i, (_, place, features, thumbnail) in enumerate(reader.places()):
+        for j in range(W):
+            write_at(raw.fileno(), features.strips[j].numpy().data, 4 * d * (j * n + i))
+        if features.vectors is not None:
+            at = parts['vectors/vectors'].start + i * features.vectors.nbytes
+            write_at(raw.fileno(), features.vectors.numpy().data, at)
+        write_at(raw.fileno(), thumbnail, end)
+        end += len(thumbnail)
+        weights[:, i], stamps[i], ends[i] = features.weights[:, 0], place.stamp, end - first
+        ids.append(place.identifier)
+        if place.pose is not None:
+            poses[i] = place.pose
+    parts['thumbnails'] = Part('U8', (end - first,), first)
+    file = MapFile(raw, reader.path)
+    file.parts = parts
+    cells = template.features.cells
     return PlaceMap(
-        features=features,
+        features=StoredFeatures(file, torch.from_numpy(weights), template.settings, cells),
         projection=template.projection,
         stamps=stamps,
         ids=tuple(ids),
         poses=None if np.isnan(poses).all() else poses,
         camera=template.camera,
-        thumbnails=_Thumbnails(path, ends, sizes) if any(sizes) else (),
+        thumbnails=StoredThumbnails(file, ends) if end > first else (),
     )
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """
+    A map made of a journal.
+
+    :param path: the map's file.
+    :param places: all of its places; ``recorded`` of them are from the journal.
+    :param problems: sentences on missing places, and on the damaged journal that is kept.
+    """
+
+    path: str
+    places: int
+    recorded: int
+    problems: tuple[str, ...] = ()
+
+
+def journals(target: str | Path) -> list[Path]:
+    """Return the journals of a map and of its numbered names, oldest first."""
+    target = Path(target)
+    name = re.compile(rf'{re.escape(target.stem)}(-\d+)*{re.escape(target.suffix + SUFFIX)}')
+    try:
+        found = [path for path in target.parent.iterdir() if name.fullmatch(path.name)]
+        return sorted(found, key=lambda path: path.stat().st_mtime)
+    except OSError:
+        return []
+
+
+def recover(journal: str | Path, output: str | Path | None = None) -> Recovered:
+    """
+    Make a map of the places in a journal and of the map that they continue; delete the journal.
+
+    A journal that was not read to its end is kept, under a name with the suffix ``DAMAGED``.
+
+    :param output: file of the map, which must not exist; None = the journal's name without its
+        suffix. That may be the map that is continued, which is replaced then; beside another map,
+        a numbered name is taken.
+    :raises JournalError: no journal, one without places, or one that is being written.
+    :raises OutputError: the map cannot be written; the journal stays.
+    """
+    journal, problems = Path(journal), []
+    target = Path(output or journal.with_name(journal.name.removesuffix(SUFFIX)))
+    with explained(target), JournalReader(journal) as reader:
+        place_map = journal_map(reader, target.parent)
+        base, problem = _base_map(reader.base)
+        if base is not None:
+            place_map = _continued(base, place_map, reader.base.places)
+        if output is None:
+            target = _save_beside(place_map, target)
+        else:
+            save_map(place_map, target)
+        if problem:
+            problems.append(f'{target} lacks the map that the recording continued: {problem}')
+        if reader.problem:
+            names = numbered(journal.with_name(journal.name + DAMAGED))
+            kept = journal.rename(next(path for path in names if not path.exists()))
+            problems.append(f'{target} may lack places: {reader.problem}; {kept} is kept')
+        else:
+            journal.unlink()
+    places = len(place_map)
+    return Recovered(str(target), places, places - len(base or ()), tuple(problems))
+
+
+def _base_map(base: Base) -> tuple[PlaceMap | None, str]:
+    """Return the map that a journal continues, or None and why it is missing."""
+    if not base.places:
+        return None, ''
+    try:
+        place_map = load_map(base.path)
+    except StavprError as error:
+        return None, str(error)
+    if Base.of(base.path, place_map.stamps[: base.places]) != base:
+        return None, f'{base.path} is another map than the one that was continued'
+    return place_map, ''
+
+
+def _continued(base: PlaceMap, recorded: PlaceMap, count: int) -> PlaceMap:
+    """Return a map with the recorded places behind it; ``count`` were there when it was opened."""
+    growing, n = GrowingMap.from_map(base, 2**31), len(recorded)
+    # a map that was saved just before the end has the first places of its journal already
+    saved = base.stamps[count : count + n]
+    known = int(np.cumprod(saved == recorded.stamps[: len(saved)]).sum())
+    thumbnails = recorded.thumbnails or [b''] * n
+    for i in range(known, n):
+        place = recorded.place(i)
+        growing.add(
+            recorded.features[i : i + 1], place.stamp, place.identifier, place.pose, thumbnails[i]
+        )
+    return growing.snapshot()
+
+
+def _save_beside(place_map: PlaceMap, target: Path) -> Path:
+    """Save a map under a name that is free, or that is of an earlier state of it."""
+    for path in numbered(target):
+        version = FileVersion.of(path)
+        try:
+            force = version if version and _begins(path, place_map) else False
+            save_map(place_map, path, force=force)
+            return path
+        except OutputTakenError:
+            continue
+    raise AssertionError
+
+
+def _begins(path: Path, place_map: PlaceMap) -> bool:
+    """Return whether a file is a map of the first places of this one."""
+    try:
+        stamps = open_map(path).stamps
+    except StavprError:
+        return False
+    return np.array_equal(stamps, place_map.stamps[: len(stamps)])

@@ -71,7 +71,7 @@ class SaveState:
             self._forgotten = self.recorded
         if self.journal is not None:
             thumbnail = places.thumbnails[-1]
-            self.journal.append(JournalPlace.of(self.recorded, newest, features, thumbnail))
+            self.journal.append(JournalPlace(self.recorded, newest, features, thumbnail))
             self._forget(places.first)  # of a route, which counts as recorded does
         self.recorded += 1
 
