@@ -187,13 +187,11 @@ class JournalReader:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._size = os.fstat(self._file.fileno()).st_size
             self._read_header()
-        except BlockingIOError as error:
+        except BaseException as error:
             self.close()
-            raise JournalError(
-                f'{path} is being written by a running program: end it first'
-            ) from error
-        except BaseException:
-            self.close()
+            if isinstance(error, BlockingIOError):
+                text = f'{path} is being written by a running program: end it first'
+                raise JournalError(text) from error
             raise
 
     def __enter__(self) -> 'JournalReader':
@@ -207,11 +205,7 @@ class JournalReader:
         self._file.close()
 
     def places(self) -> Iterator[JournalPlace]:
-        """
-        Yield the places in the order in which they were recorded; skip what is damaged.
-
-        :raises JournalError: the disk reports an error.
-        """
+        """Yield the places in the order in which they were recorded; skip what is damaged."""
         last = -1
         for content in self._records(self._begin):
             try:
@@ -219,7 +213,8 @@ class JournalReader:
                 if place.number <= last:
                     raise ValueError(f'number {place.number} follows {last}')
             except (ValueError, StavprError) as error:
-                self._note(f'the place up to byte {self.end} is invalid: {error}')
+                problem = f'the place up to byte {self.end} is invalid: {error}'
+                self.problem = self.problem or problem
                 continue
             last = place.number
             yield place
@@ -259,28 +254,24 @@ class JournalReader:
                 self.end = at = start + length
                 yield content
             else:
-                self._note(f'no whole record at byte {at}')
+                self.problem = self.problem or f'no whole record at byte {at}'
                 wasted += len(content)
                 at = self._find(at + 1 if wasted <= self._size else start + len(content))
 
     def _find(self, at: int) -> int:
         """Return the position of the next ``MAGIC``, or the end of the file."""
-        with suppress(OSError):  # of lseek: a hole ends with the file
+        file = self._file.fileno()
+        with suppress(OSError):  # a hole up to the end, or an error of the disk
             while at < self._size:
-                at = os.lseek(self._file.fileno(), at, os.SEEK_DATA)
-                piece = self._read(at, PIECE)
+                at = os.lseek(file, at, os.SEEK_DATA)
+                piece = os.pread(file, PIECE, at)
                 if (found := piece.find(MAGIC)) >= 0:
                     return at + found
                 at += max(1, len(piece) - len(MAGIC) + 1)
         return self._size
 
     def _read(self, at: int, count: int) -> bytes:
-        try:
+        """Return the bytes from a position on, fewer at the end or where the disk has an error."""
+        with suppress(OSError):
             return os.pread(self._file.fileno(), max(0, min(count, self._size - at)), at)
-        except OSError as error:
-            raise JournalError(
-                f'{self.path} cannot be read at byte {at} ({error.strerror}): copy it elsewhere'
-            ) from error
-
-    def _note(self, problem: str) -> None:
-        self.problem = self.problem or problem
+        return b''

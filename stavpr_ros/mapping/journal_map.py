@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps made of journals: after an interrupted recording, and of what build_map has read."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 import io
 from pathlib import Path
@@ -169,12 +170,10 @@ def _save_beside(place_map: PlaceMap, target: Path) -> Path:
     """Save a map under a name that is free, or that is of an earlier state of it."""
     for path in numbered(target):
         version = FileVersion.of(path)
-        try:
-            force = version if version and _begins(path, place_map) else False
+        force = version if version and _begins(path, place_map) else False
+        with suppress(OutputTakenError):
             save_map(place_map, path, force=force)
             return path
-        except OutputTakenError:
-            continue
     raise AssertionError
 
 

@@ -52,7 +52,7 @@ class JournalWriter:
         self.path, self._file, self._ends = path, file, list(ends)
         self._base, self._begin, self._log = base, begin, log
         self._waiting: list[bytes] = []
-        self._forgotten = 0  # of the places in the file and of those that wait
+        self._first = self._needed = 0  # numbers of the first place, and of the first one needed
         self._dirty = self.failed = self._rebased = self._closing = self._deleting = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name='journal', daemon=True)
@@ -118,19 +118,22 @@ class JournalWriter:
         """Add a place: it is in the file when this returns, and synced a second later."""
         content = frame(place.encode())
         with self._changed:
+            if len(self._ends) == 1 and not self._waiting:
+                self._first = place.number
             full = self.failed and sum(map(len, self._waiting)) > WAITING
             self._waiting.append(b'' if full else content)  # the error is logged
             if not self.failed:
                 self._write_waiting()
 
-    def forget(self, count: int, base: Base | None = None) -> None:
+    def forget(self, until: int, base: Base | None = None) -> None:
         """
         Drop the first places, which were evicted or are in a map file.
 
+        :param until: number of the first one that is needed; numbers count places.
         :param base: the map that the others continue now; None = as before.
         """
         with self._changed:
-            self._forgotten += count
+            self._needed = max(until, self._needed)
             if base is not None:
                 self._base, self._rebased = base, True
                 self._changed.notify()
@@ -186,7 +189,8 @@ class JournalWriter:
     def _rewrite_if_needed(self) -> None:
         """Make a new file if the base changed, most places are forgotten, or it was removed."""
         with self._changed:
-            count = min(self._forgotten, len(self._ends) - 1)  # others may still wait
+            # others that are forgotten may still wait
+            count = min(max(0, self._needed - self._first), len(self._ends) - 1)
             begin, end = self._ends[count], self._ends[-1]
             base, rebased, removed = self._base, self._rebased, self._is_removed()
         if not (rebased or removed) and begin - self._ends[0] <= max(SLACK, end // 2):
@@ -208,7 +212,7 @@ class JournalWriter:
                 os.close(self._file)
                 self._file, self._dirty = file, True
                 self._ends = [end - begin + len(head) for end in self._ends[count:]]
-                self._forgotten -= count
+                self._first += count
                 self._rebased = self._base != base
         except BaseException:
             path.unlink(missing_ok=True)
