@@ -82,7 +82,7 @@ class JournalPlace(NamedTuple):
         pose = np.nan if self.place.pose is None else self.place.pose
         arrays = self.features.strips, self.features.weights, self.features.vectors
         strips, weights, vector = (0 if each is None else each.cpu().squeeze(1) for each in arrays)
-        row = np.zeros((), _row(*_sizes(self.features)))
+        row = np.zeros((), _row(*sizes_of(self.features)))
         sizes = len(identifier), len(self.thumbnail)
         values = self.number, stamp, *sizes, pose, weights, strips, vector
         for name, value in zip(row.dtype.names or (), values, strict=True):
@@ -98,7 +98,7 @@ class JournalPlace(NamedTuple):
         :raises ValueError: not of this format, or values that no map file has.
         :raises StavprError: likewise.
         """
-        row = np.frombuffer(content, _row(*_sizes(template.features)), 1)[0]
+        row = np.frombuffer(content, _row(*sizes_of(template.features)), 1)[0]
         rest = content[row.nbytes :]
         identifier, thumbnail = rest[: row['of_id']].decode(), rest[row['of_id'] :]
         if len(thumbnail) != row['of_thumbnail']:
@@ -106,7 +106,7 @@ class JournalPlace(NamedTuple):
         require_jpegs(np.frombuffer(thumbnail, np.uint8), np.array([len(thumbnail)]))
         require_weights(row['weights'])
         strips, weights, vector = (
-            torch.tensor(row[name]) for name in ('strips', 'weights', 'vector')
+            torch.from_numpy(row[name].copy()) for name in ('strips', 'weights', 'vector')
         )
         require_normalized(strips, 'strips', 0)
         require_normalized(vector[None], 'vectors', 0)
@@ -122,7 +122,7 @@ class JournalPlace(NamedTuple):
         return cls(int(row['number']), places.place(0), features, thumbnail)
 
 
-def _sizes(features: LocalFeatures) -> tuple[int, int, int]:
+def sizes_of(features: LocalFeatures) -> tuple[int, int, int]:
     """Return the sizes W, d and D of the features of a place; D = 0 without a vector."""
     vectors = features.vectors
     return features.settings.strips, features.dimension, 0 if vectors is None else vectors.shape[1]
@@ -245,11 +245,11 @@ class JournalReader:
         """Yield the contents of whole records; time and memory are bounded for any file."""
         wasted = 0  # bytes of damaged records: only as many as the file has are searched again
         while at < self._size:
-            head = self._read(at, _HEAD.size + 4)
+            head = self.read(at, _HEAD.size + 4)
             start, length, checksum = at + len(head), 0, 0
             if head.startswith(MAGIC) and head[-4:] == _checksum(head[:-4]):
                 _, length, checksum = _HEAD.unpack_from(head)
-            content = self._read(start, length) if length <= LONGEST else b''
+            content = self.read(start, length) if length <= LONGEST else b''
             if content and zlib.crc32(content) == checksum:
                 self.end = at = start + length
                 yield content
@@ -270,7 +270,7 @@ class JournalReader:
                 at += max(1, len(piece) - len(MAGIC) + 1)
         return self._size
 
-    def _read(self, at: int, count: int) -> bytes:
+    def read(self, at: int, count: int) -> bytes:
         """Return the bytes from a position on, fewer at the end or where the disk has an error."""
         with suppress(OSError):
             return os.pread(self._file.fileno(), max(0, min(count, self._size - at)), at)

@@ -12,7 +12,7 @@ import tempfile
 import numpy as np
 from stavpr_ros.errors import JournalError, OutputTakenError, StavprError
 from stavpr_ros.mapping.growing_map import GrowingMap
-from stavpr_ros.mapping.journal import Base, JournalReader, SUFFIX
+from stavpr_ros.mapping.journal import Base, JournalReader, sizes_of, SUFFIX
 from stavpr_ros.mapping.map_container import MapFile, Part
 from stavpr_ros.mapping.map_file import load_map, open_map, save_map
 from stavpr_ros.mapping.place_map import PlaceMap
@@ -34,45 +34,45 @@ def journal_map(reader: JournalReader, folder: Path) -> PlaceMap:
     :raises OSError: there is no room.
     """
     template = reader.template
-    n = sum(1 for _ in reader.places())
-    if not n:
+    W, d, D = sizes_of(template.features)
+    places, weights, records, ends = [], [], [], [0]
+    for _, place, features, thumbnail in reader.places():
+        places.append(place)
+        weights.append(features.weights)
+        size = 4 * (W * d + D) + len(place.identifier.encode()) + len(thumbnail)
+        records.append((reader.end - size, size))  # strips, vector, identifier, thumbnail
+        ends.append(ends[-1] + len(thumbnail))
+    if not places:
         raise JournalError(f'{reader.path} has no places: {reader.problem or "delete it"}')
-    W, d = template.settings.strips, template.dimension
-    vectors = template.features.vectors
-    parts = {'strips': Part('F32', (W, n, d))}
-    end = parts['strips'].size
-    if vectors is not None:
-        parts['vectors/vectors'] = Part('F32', (n, vectors.shape[1]), end)
-        end += parts['vectors/vectors'].size
-    first = end
+    n = len(places)
+    strips, vectors = Part('F32', (W, n, d)), Part('F32', (n, D), 4 * W * n * d)
+    parts = {'strips': strips} | ({'vectors/vectors': vectors} if D else {})
+    first = strips.size + vectors.size
+    parts['thumbnails'] = Part('U8', (ends[-1],), first)
     raw = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115
     assert isinstance(raw, io.FileIO)
-    weights, poses = np.empty((W, n), np.float32), np.full((n, 7), np.nan)
-    stamps, ends, ids = np.empty(n, np.int64), np.empty(n, np.int64), []
-    for i, (_, place, features, thumbnail) in enumerate(reader.places()):
+    for i, (start, size) in enumerate(records):
+        content = reader.read(start, size)
+        if len(content) < size:
+            raise JournalError(f'{reader.path} is shorter than before, or its disk has an error')
         for j in range(W):
-            write_at(raw.fileno(), features.strips[j].numpy().data, 4 * d * (j * n + i))
-        if features.vectors is not None:
-            at = parts['vectors/vectors'].start + i * features.vectors.nbytes
-            write_at(raw.fileno(), features.vectors.numpy().data, at)
-        write_at(raw.fileno(), thumbnail, end)
-        end += len(thumbnail)
-        weights[:, i], stamps[i], ends[i] = features.weights[:, 0], place.stamp, end - first
-        ids.append(place.identifier)
-        if place.pose is not None:
-            poses[i] = place.pose
-    parts['thumbnails'] = Part('U8', (end - first,), first)
+            strip = content[4 * j * d : 4 * (j + 1) * d]
+            write_at(raw.fileno(), strip, 4 * (j * n + i) * d)
+        vector = content[4 * W * d : 4 * (W * d + D)]
+        write_at(raw.fileno(), vector, vectors.start + 4 * i * D)
+        write_at(raw.fileno(), content[size - (ends[i + 1] - ends[i]) :], first + ends[i])
     file = MapFile(raw, reader.path)
     file.parts = parts
+    poses = np.array([np.full(7, np.nan) if one.pose is None else one.pose for one in places])
     cells = template.features.cells
     return PlaceMap(
-        features=StoredFeatures(file, torch.from_numpy(weights), template.settings, cells),
+        features=StoredFeatures(file, torch.cat(weights, dim=1), template.settings, cells),
         projection=template.projection,
-        stamps=stamps,
-        ids=tuple(ids),
+        stamps=np.array([place.stamp for place in places], np.int64),
+        ids=tuple(place.identifier for place in places),
         poses=None if np.isnan(poses).all() else poses,
         camera=template.camera,
-        thumbnails=StoredThumbnails(file, ends) if end > first else (),
+        thumbnails=StoredThumbnails(file, np.array(ends[1:])) if ends[-1] else (),
     )
 
 
