@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The journal: every recorded place is on disk, whatever ends the recording."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 import json
 import os
 import shlex
@@ -190,19 +190,17 @@ def test_damage_costs_one_place_and_the_journal_is_kept(written, small_map, targ
     assert journals(target) == []
 
 
-def altered(place, **changes):
-    """Return the record of a place with other values."""
-    values = {name: changes[name] for name in changes if name in JournalPlace._fields}
-    known = {name: changes[name] for name in changes if name in ('stamp', 'identifier', 'pose')}
-    features = {name: changes[name] for name in changes if name in ('strips', 'weights')}
-    values['place'] = replace(place.place, **known)
-    features = {name: getattr(place.features, name) * factor for name, factor in features.items()}
-    values['features'] = replace(place.features, **features)
-    return frame(place._replace(**values).encode())
+def with_features(place, **factors):
+    factors = {name: getattr(place.features, name) * factors[name] for name in factors}
+    return place._replace(features=replace(place.features, **factors))
+
+
+def with_place(place, **changes):
+    return place._replace(place=replace(place.place, **changes))
 
 
 @pytest.mark.parametrize(
-    'records',
+    'record',
     [
         lambda places: bytes(8),
         lambda places: frame(b''),
@@ -210,26 +208,27 @@ def altered(place, **changes):
         lambda places: frame(places[3].encode()[:-2000]),
         lambda places: frame(places[3].encode())[:-1],
         lambda places: frame(places[3].encode().replace(b'place 3', b'place \xff')),
-        lambda places: altered(places[3], strips=1e30),
-        lambda places: altered(places[3], strips=np.nan),
-        lambda places: altered(places[3], weights=-1),
-        lambda places: altered(places[3], pose=np.ones(7)),
-        lambda places: altered(places[3], stamp=2**62),
-        lambda places: altered(places[3], thumbnail=b'no image'),
-        lambda places: altered(places[2]),  # again
-        lambda places: altered(places[1]),  # in another order
+        lambda places: with_features(places[3], strips=1e30),
+        lambda places: with_features(places[3], strips=np.nan),
+        lambda places: with_features(places[3], weights=-1),
+        lambda places: with_place(places[3], pose=np.ones(7)),
+        lambda places: with_place(places[3], stamp=2**62),
+        lambda places: places[3]._replace(thumbnail=b'no image'),
+        lambda places: places[2],  # again
+        lambda places: places[1],  # in another order
     ],
 )
-def test_invalid_record_is_skipped_and_the_journal_is_kept(small_map, target, records):
+def test_invalid_record_is_skipped_and_the_journal_is_kept(small_map, target, record):
+    places, log = list(places_of(small_map))[:6], Mock()
     writer = JournalWriter.create(target, Base(), small_map, print)
-    places = list(places_of(small_map))[:6]
     for place in places[:3]:
         writer.append(place)
     writer.close()
-    behind = b''.join(frame(place.encode()) for place in places[4:])
+    found = record(places)
+    records = [found if isinstance(found, bytes) else frame(found.encode())]
+    records += [frame(place.encode()) for place in places[4:]]
     with writer.path.open('ab') as file:
-        file.write(records(places) + behind)
-    log = Mock()
+        file.writelines(records)
     assert recover_maps(target, log) == str(target)
     assert stamps(target) == seconds(1, 2, 3, 5, 6)
     assert log.method_calls[1][0] == 'error'
@@ -237,44 +236,47 @@ def test_invalid_record_is_skipped_and_the_journal_is_kept(small_map, target, re
     assert recover_maps(target, log) == ''  # the next start
 
 
-@pytest.mark.parametrize(
-    'change',
-    [{'path': 7}, {'path': []}, {'places': '9'}, {'version': 3}, {'source': None}, None],
-)
-def test_journal_with_an_invalid_header_stops_no_start(written, target, change):
-    content, about = written.read_bytes(), json.loads(frame_content(written))
-    changed = b'[' * 5000 if change is None else json.dumps(about | change).encode()
-    written.write_bytes(frame(changed) + content[len(frame(frame_content(written))) :])
-    content, log = written.read_bytes(), Mock()
-    assert recover_maps(target, log) == ''
-    assert 'is no journal, or its header is damaged' in log.method_calls[0].args[0]
-    assert written.read_bytes() == content
-
-
-def frame_content(journal):
-    """Return the content of the first record."""
-    content = journal.read_bytes()
-    return content[16 : 16 + int.from_bytes(content[4:8], 'little')]
-
-
-def test_journal_of_zeros_and_holes_is_read_in_a_second(written):
+def test_journal_that_ends_with_zeros_and_a_hole_is_read_at_once(written):
     with written.open('ab') as file:
         file.write(bytes(10**6))
-        file.truncate(2**33)
-    begin = time.monotonic()
+        file.truncate(2**40)
     with JournalReader(written) as reader:
         assert len(list(reader.places())) == 60
-        assert reader.problem
-    assert time.monotonic() - begin < 10
+        assert 'no whole record' in reader.problem
 
 
-@pytest.mark.parametrize('content', [b'', b'\xff' * 100, b'\x10\0\0\0\0\0\0\0{}'])
-def test_recover_file_that_is_no_journal_fails_and_keeps_it(content, tmp_path):
-    path = tmp_path / 'x.stavpr.journal'
+def header_with(**changes):
+    about = {'format': 'stavpr-journal', 'version': 2, 'source': ''} | asdict(Base()) | changes
+    return frame(json.dumps(about).encode())
+
+
+@pytest.mark.parametrize(
+    ('content', 'text'),
+    [
+        (b'', 'no JSON'),
+        (b'\xff' * 100, 'no JSON'),
+        (frame(b'[' * 5000), 'nested too deeply'),
+        (header_with(path=7), 'another format'),
+        (header_with(path=[]), 'another format'),
+        (header_with(places='9'), 'another format'),
+        (header_with(version=1), 'another format'),
+        (header_with(), 'damaged or truncated'),  # and no map
+    ],
+)
+def test_file_with_an_invalid_header_stops_no_start_and_is_kept(content, text, target):
+    path, log = journal_of(target), Mock()
     path.write_bytes(content)
-    with pytest.raises(JournalError, match='is no journal, or its header is damaged'):
+    with pytest.raises(JournalError, match=f'is no journal, or its header is damaged.*{text}'):
         recover(path)
+    assert recover_maps(target, log) == ''
     assert path.read_bytes() == content
+
+
+def test_create_on_a_full_disk_leaves_no_journal(small_map, target, monkeypatch):
+    monkeypatch.setattr(os, 'pwrite', Mock(side_effect=OSError('the disk is full')))
+    with pytest.raises(JournalError, match='the disk is full'):
+        JournalWriter.create(target, Base(), small_map, print)
+    assert not journal_of(target).exists()
 
 
 def test_recover_what_is_no_file_or_in_use_fails(small_map, target, tmp_path):

@@ -16,7 +16,7 @@ from stavpr_ros.errors import JournalError, OutputError
 from stavpr_ros.mapping.journal import Base, frame, header, JournalPlace, JournalReader, SUFFIX
 from stavpr_ros.mapping.map_file import save_map
 from stavpr_ros.mapping.place_map import PlaceMap
-from stavpr_ros.output_file import create_temporary, numbered, sync_folder, write_at
+from stavpr_ros.output_file import create_temporary, explained, numbered, sync_folder, write_at
 
 SYNC_PERIOD = 1.0  # seconds between syncs, and between attempts after an error
 WAITING = 2**28  # most bytes that wait for room on the disk
@@ -80,10 +80,7 @@ class JournalWriter:
             with tempfile.TemporaryDirectory() as folder:
                 save_map(template, Path(folder, 'map'))
                 begin = partial(header, template=Path(folder, 'map').read_bytes(), source=source)
-            path, file = _create(Path(target))
-            write_at(file, begin(base), 0)
-            os.fsync(file)
-            sync_folder(path.parent)
+            path, file = _create(Path(target), begin(base))
         except (OSError, OutputError) as error:
             raise JournalError(
                 f'no journal can be written beside {target} ({error}): make room, or set another '
@@ -100,6 +97,7 @@ class JournalWriter:
 
         :param reader: of the journal; it is closed.
         :returns: the writer, and the number of that place, -1 = none.
+        :raises OutputError: it cannot be written.
         """
         ends, last = [reader.end], -1
         for place in reader.places():
@@ -107,10 +105,11 @@ class JournalWriter:
                 break
             ends.append(reader.end)
             last = place.number
-        file = os.open(reader.path, os.O_RDWR | os.O_CLOEXEC)
-        reader.close()
-        fcntl.flock(file, fcntl.LOCK_EX)
-        os.ftruncate(file, ends[-1])
+        with explained(reader.path):
+            file = os.open(reader.path, os.O_RDWR | os.O_CLOEXEC)
+            reader.close()
+            fcntl.flock(file, fcntl.LOCK_EX)
+            os.ftruncate(file, ends[-1])
         begin = partial(header, template=reader.template_content, source=reader.source)
         return cls(reader.path, file, ends, reader.base, begin, log), last
 
@@ -197,7 +196,7 @@ class JournalWriter:
             return
         head = self._begin(base)
         target = self.path.with_name(self.path.name.removesuffix(SUFFIX))
-        path, file = _create(target) if removed else create_temporary(self.path)
+        path, file = _create(target, head) if removed else create_temporary(self.path)
         try:
             write_at(file, head, 0)
             self._copy(file, begin, end, len(head))
@@ -237,13 +236,21 @@ class JournalWriter:
         self.failed = True
 
 
-def _create(target: Path) -> tuple[Path, int]:
-    """Create and lock the journal of a file, or of the first numbered name that has none."""
+def _create(target: Path, head: bytes) -> tuple[Path, int]:
+    """Begin and lock the journal of a file, or of the first numbered name that has none."""
     target.parent.mkdir(parents=True, exist_ok=True)
     for path in numbered(target):
         journal = path.with_name(path.name + SUFFIX)
         with suppress(FileExistsError):
             file = os.open(journal, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-            fcntl.flock(file, fcntl.LOCK_EX)
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX)
+                write_at(file, head, 0)
+                os.fsync(file)
+                sync_folder(journal.parent)
+            except OSError:
+                journal.unlink()
+                os.close(file)
+                raise
             return journal, file
     raise AssertionError
