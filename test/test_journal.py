@@ -19,6 +19,7 @@ from stavpr_ros.mapping import journal_writer, load_map, save_map
 from stavpr_ros.mapping.journal import Base, frame, JournalPlace, JournalReader
 from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
+from stavpr_ros.mapping.place_map import Place
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.pipeline.saving import recover_maps
 import torch
@@ -157,7 +158,7 @@ def test_fault_at_every_write_loses_no_synced_place(small_map, target, tmp_path,
             assert set(small_map.stamps[first:count].tolist()) <= set(found)
             for path in tmp_path.glob('copy*'):
                 path.unlink()
-    assert len(writes) >= 23
+    assert len(writes) >= 23  # header, places, and the rewritten ones
 
 
 def ends_of(journal):
@@ -165,74 +166,47 @@ def ends_of(journal):
         return [reader.end, *(reader.end for _ in reader.places())]
 
 
-def test_damage_costs_one_place_and_the_journal_is_kept(written, small_map, target):
-    content, ends = written.read_bytes(), ends_of(written)
-    rng = np.random.default_rng(0)
-    for place in range(0, 60, 3):
-        begin, end = ends[place : place + 2]
-        at = rng.integers(begin, end)
-        flipped = bytes([content[at] ^ 1 << rng.integers(8)])
-        for damaged in (
-            bytes(end - begin),
-            b'',
-            content[begin:at] + flipped + content[at + 1 : end],
-        ):
-            written.write_bytes(content[:begin] + damaged + content[end:])
-            with JournalReader(written) as reader:
-                found = [each.number for each in reader.places()]
-                assert found == [i for i in range(60) if i != place]
-                assert bool(reader.problem) is bool(damaged)
-    result = recover(written)
-    assert (result.places, len(load_map(target))) == (59, 59)
-    kept = target.with_name(f'{written.name}.damaged')
-    assert f'{kept} is kept' in result.problems[0]
-    assert kept.exists()
-    assert journals(target) == []
+def flipped(record, at):
+    return record[:at] + bytes([record[at] ^ 4]) + record[at + 1 :]
 
 
-def with_features(place, **factors):
+def scaled(place, **factors):
     factors = {name: getattr(place.features, name) * factors[name] for name in factors}
     return place._replace(features=replace(place.features, **factors))
 
 
-def with_place(place, **changes):
-    return place._replace(place=replace(place.place, **changes))
-
-
 @pytest.mark.parametrize(
-    'record',
+    'damage',
     [
-        lambda places: bytes(8),
-        lambda places: frame(b''),
-        lambda places: frame(b'short'),
-        lambda places: frame(places[3].encode()[:-2000]),
-        lambda places: frame(places[3].encode())[:-1],
-        lambda places: frame(places[3].encode().replace(b'place 3', b'place \xff')),
-        lambda places: with_features(places[3], strips=1e30),
-        lambda places: with_features(places[3], strips=np.nan),
-        lambda places: with_features(places[3], weights=-1),
-        lambda places: with_place(places[3], pose=np.ones(7)),
-        lambda places: with_place(places[3], stamp=2**62),
-        lambda places: places[3]._replace(thumbnail=b'no image'),
-        lambda places: places[2],  # again
-        lambda places: places[1],  # in another order
+        lambda record, place: bytes(8),
+        lambda record, place: bytes(len(record)),
+        lambda record, place: record[:-1],
+        *(lambda record, place, at=at: flipped(record, at) for at in (0, 5, 9, 13, 20, 1500)),
+        lambda record, place: frame(b''),
+        lambda record, place: frame(b'short'),
+        lambda record, place: frame(place.encode()[:-2000]),
+        lambda record, place: frame(place.encode().replace(b'place 30', b'place \xff0')),
+        lambda record, place: scaled(place, strips=1e30),
+        lambda record, place: scaled(place, strips=np.nan),
+        lambda record, place: scaled(place, weights=-1),
+        lambda record, place: place._replace(place=Place(pose=np.ones(7))),
+        lambda record, place: place._replace(place=Place(stamp=2**62)),
+        lambda record, place: place._replace(thumbnail=b'no image'),
+        lambda record, place: place._replace(number=29),  # again
+        lambda record, place: place._replace(number=28),  # in another order
     ],
 )
-def test_invalid_record_is_skipped_and_the_journal_is_kept(small_map, target, record):
-    places, log = list(places_of(small_map))[:6], Mock()
-    writer = JournalWriter.create(target, Base(), small_map, print)
-    for place in places[:3]:
-        writer.append(place)
-    writer.close()
-    found = record(places)
-    records = [found if isinstance(found, bytes) else frame(found.encode())]
-    records += [frame(place.encode()) for place in places[4:]]
-    with writer.path.open('ab') as file:
-        file.writelines(records)
+def test_damage_costs_one_place_and_the_journal_is_kept(written, small_map, target, damage):
+    content, ends, log = written.read_bytes(), ends_of(written), Mock()
+    record = damage(content[ends[30] : ends[31]], list(places_of(small_map))[30])
+    record = record if isinstance(record, bytes) else frame(record.encode())
+    written.write_bytes(content[: ends[30]] + record + content[ends[31] :])
     assert recover_maps(target, log) == str(target)
-    assert stamps(target) == seconds(1, 2, 3, 5, 6)
+    assert stamps(target) == seconds(*range(1, 31), *range(32, 61))
+    kept = target.with_name(f'{written.name}.damaged')
     assert log.method_calls[1][0] == 'error'
-    assert set(os.listdir(target.parent)) == {'route.stavpr', 'route.stavpr.journal.damaged'}
+    assert f'{kept} is kept' in log.method_calls[1].args[0]
+    assert set(os.listdir(target.parent)) == {target.name, kept.name}
     assert recover_maps(target, log) == ''  # the next start
 
 

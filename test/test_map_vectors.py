@@ -13,7 +13,7 @@ from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import OnnxSettings
 from stavpr_ros.mapping import load_map, open_map, PlaceMap, save_map
 from stavpr_ros.mapping.growing_map import GrowingMap
-from stavpr_ros.mapping.journal import Base, JournalPlace, JournalReader
+from stavpr_ros.mapping.journal import Base, JournalPlace
 from stavpr_ros.mapping.journal_map import journal_map, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.merging import merge_maps, select_places
@@ -140,9 +140,7 @@ def test_journal_returns_vectors(place_map, tmp_path):
     for i in range(len(place_map)):
         writer.append(JournalPlace(i, place_map.place(i), place_map.features[i : i + 1], b''))
     writer.close()
-    with JournalReader(writer.path) as reader:
-        found = journal_map(reader, tmp_path).features
-    assert torch.equal(found.vectors, place_map.features.vectors)
+    assert torch.equal(journal_map(writer.path).features.vectors, place_map.features.vectors)
     assert recover(writer.path).recorded == 50
     found = load_map(target).features
     assert torch.equal(found.vectors, place_map.features.vectors)

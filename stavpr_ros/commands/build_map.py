@@ -18,8 +18,8 @@ from stavpr_ros.commands.jobs import (
     run_jobs,
 )
 from stavpr_ros.commands.program import make_parser, run_program
-from stavpr_ros.errors import ImageError, JournalError, SettingsError, SourceError
-from stavpr_ros.output_file import explained, MAP, require_replaceable
+from stavpr_ros.errors import ImageError, SettingsError, SourceError
+from stavpr_ros.output_file import MAP, require_replaceable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -193,7 +193,6 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     from stavpr_ros.commands.feature_options import make_extractor, principal_dimension
     from stavpr_ros.mapping import KeyframeSettings
     from stavpr_ros.mapping.builder import build_journal
-    from stavpr_ros.mapping.journal import JournalReader
     from stavpr_ros.mapping.journal_map import journal_map
     from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
     from stavpr_ros.mapping.reduction import with_principal_components
@@ -226,10 +225,7 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
         keyframes=keyframes,
         thumbnail_width=width,
     )
-    with explained(arguments.output), JournalReader(journal) as reader:
-        place_map = journal_map(reader, journal.parent)
-        if reader.problem:
-            raise JournalError(f'{journal} is damaged ({reader.problem}): run the same again')
+    place_map = journal_map(journal)
     if learned:
         place_map = with_principal_components(place_map, principal_dimension(projection))
     if arguments.odometry and not place_map.has_poses:

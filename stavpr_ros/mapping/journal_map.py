@@ -23,15 +23,27 @@ import torch
 DAMAGED = '.damaged'  # suffix of journals that were not read to their end
 
 
-def journal_map(reader: JournalReader, folder: Path) -> PlaceMap:
+def journal_map(path: Path) -> PlaceMap:
     """
-    Return the places of a journal as a map.
+    Return the places of a journal as a map, whose features and thumbnails take no memory.
 
-    Features and thumbnails are in a temporary file without a name.
+    They are in a temporary file without a name, in the same folder.
 
-    :param folder: of that file.
-    :raises JournalError: there are no places.
-    :raises OSError: there is no room.
+    :raises JournalError: no journal, one without places, or a damaged one.
+    :raises OutputError: there is no room.
+    """
+    with explained(path), JournalReader(path) as reader:
+        place_map = _recorded(reader, path.parent)
+    if reader.problem:
+        raise JournalError(f'{path} is damaged: {reader.problem}')
+    return place_map
+
+
+def _recorded(reader: JournalReader, folder: Path) -> PlaceMap:
+    """
+    Return the places of a journal, with a temporary file in a folder.
+
+    :raises JournalError: there are none.
     """
     template = reader.template
     W, d, D = sizes_of(template.features)
@@ -118,7 +130,7 @@ def recover(journal: str | Path, output: str | Path | None = None) -> Recovered:
     journal, problems = Path(journal), []
     target = Path(output or journal.with_name(journal.name.removesuffix(SUFFIX)))
     with explained(target), JournalReader(journal) as reader:
-        place_map = journal_map(reader, target.parent)
+        place_map = _recorded(reader, target.parent)
         base, problem = _base_map(reader.base)
         if base is not None:
             place_map = _continued(base, place_map, reader.base.places)
