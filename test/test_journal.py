@@ -24,7 +24,7 @@ from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.pipeline.saving import recover_maps
 import torch
 
-SETTINGS = settings_of()
+PARTS_OF_RECORD = (0, 5, 9, 13, 20, 1500)  # a byte of each, and of the features
 
 
 @pytest.fixture
@@ -161,15 +161,6 @@ def test_fault_at_every_write_loses_no_synced_place(small_map, target, tmp_path,
     assert len(writes) >= 23  # header, places, and the rewritten ones
 
 
-def ends_of(journal):
-    with JournalReader(journal) as reader:
-        return [reader.end, *(reader.end for _ in reader.places())]
-
-
-def flipped(record, at):
-    return record[:at] + bytes([record[at] ^ 4]) + record[at + 1 :]
-
-
 def scaled(place, **factors):
     factors = {name: getattr(place.features, name) * factors[name] for name in factors}
     return place._replace(features=replace(place.features, **factors))
@@ -181,7 +172,10 @@ def scaled(place, **factors):
         lambda record, place: bytes(8),
         lambda record, place: bytes(len(record)),
         lambda record, place: record[:-1],
-        *(lambda record, place, at=at: flipped(record, at) for at in (0, 5, 9, 13, 20, 1500)),
+        *(
+            lambda record, _, at=at: record[:at] + b'U' + record[at + 1 :]
+            for at in PARTS_OF_RECORD
+        ),
         lambda record, place: frame(b''),
         lambda record, place: frame(b'short'),
         lambda record, place: frame(place.encode()[:-2000]),
@@ -197,7 +191,9 @@ def scaled(place, **factors):
     ],
 )
 def test_damage_costs_one_place_and_the_journal_is_kept(written, small_map, target, damage):
-    content, ends, log = written.read_bytes(), ends_of(written), Mock()
+    content, log = written.read_bytes(), Mock()
+    with JournalReader(written) as reader:
+        ends = [reader.end, *(reader.end for _ in reader.places())]
     record = damage(content[ends[30] : ends[31]], list(places_of(small_map))[30])
     record = record if isinstance(record, bytes) else frame(record.encode())
     written.write_bytes(content[: ends[30]] + record + content[ends[31] :])
@@ -231,7 +227,6 @@ def header_with(**changes):
         (b'\xff' * 100, 'no JSON'),
         (frame(b'[' * 5000), 'nested too deeply'),
         (header_with(path=7), 'another format'),
-        (header_with(path=[]), 'another format'),
         (header_with(places='9'), 'another format'),
         (header_with(version=1), 'another format'),
         (header_with(), 'damaged or truncated'),  # and no map
