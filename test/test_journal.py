@@ -24,7 +24,7 @@ from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.pipeline.saving import recover_maps
 import torch
 
-PARTS_OF_RECORD = (0, 5, 9, 13, 20, 1500)  # a byte of each, and of the features
+BYTES = (0, 5, 9, 13, 20, 1500)  # of each part of a record
 
 
 @pytest.fixture
@@ -172,10 +172,7 @@ def scaled(place, **factors):
         lambda record, place: bytes(8),
         lambda record, place: bytes(len(record)),
         lambda record, place: record[:-1],
-        *(
-            lambda record, _, at=at: record[:at] + b'U' + record[at + 1 :]
-            for at in PARTS_OF_RECORD
-        ),
+        *(lambda record, _, at=at: record[:at] + b'U' + record[at + 1 :] for at in BYTES),
         lambda record, place: frame(b''),
         lambda record, place: frame(b'short'),
         lambda record, place: frame(place.encode()[:-2000]),

@@ -227,9 +227,9 @@ class JournalReader:
         try:
             match read_json(about, 'its first record'):
                 case {
-                    'format': 'stavpr-journal', 'version': 2, 'source': str(source),
+                    'format': found, 'version': version, 'source': str(source),
                     'path': str(path), 'places': int(places), 'checksum': int(checksum),
-                }:  # fmt: skip
+                } if (found, version) == (FORMAT, VERSION):  # fmt: skip
                     self.source, self.base = source, Base(path, places, checksum)
                 case _:
                     raise ValueError('another format or version')
