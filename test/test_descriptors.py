@@ -93,7 +93,7 @@ def test_read_descriptors_executes_nothing(tmp_path, name, words):
         (np.zeros((5, 0)), r'\(5, 0\)'),
         (np.zeros((5, 2), complex), 'complex128'),
         (np.zeros((1, 1025, 1)), 'W = 1025'),
-        (np.where(np.arange(40)[:, None] == 7, np.nan, np.ones((40, 2))), 'row 7 holds NaN'),
+        (np.where(np.arange(40)[:, None] == 7, np.nan, np.ones((40, 2))), 'row 7 has NaN'),
     ],
 )
 def test_read_descriptors_of_other_arrays_is_rejected(tmp_path, array, words):

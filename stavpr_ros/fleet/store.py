@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The protocol of a map's home, what all homes hold beside the places, and the home in memory.
+The protocol of stores, the index that a robot downloads, and the store in memory.
 
 The vector of a place is made of its centered and whitened strips: the means of three groups of
 neighboring strips, joined, unit norm.
@@ -26,7 +26,7 @@ MOST_PLACES = 2**31 - 1
 @dataclass(frozen=True, eq=False)
 class MapIndex:
     """
-    What a robot holds of a map before it asks for any place.
+    The part of a map that a robot downloads before any place.
 
     :param places: number n of places.
     :param firsts: first place of every run of places of one session, ascending, int64; the first
@@ -99,7 +99,7 @@ class PlaceStore(Protocol):
 
     def fetch(self, places: np.ndarray) -> tuple[PlaceMap, np.ndarray]:
         """
-        Return some places as a map, and of each itself or the place that shows the same, int64.
+        Return places as a map, and of each itself or the place that shows the same, int64.
 
         :param places: ascending, int64.
         :raises FleetError: as for :meth:`nearest`.
@@ -130,8 +130,8 @@ def map_vectors(place_map: PlaceMap, index: MapIndex) -> np.ndarray:
     """Return the vectors of all places, (n, D), float32; features are read block by block."""
     centering = index.centering()
     vectors = np.empty((len(place_map), index.dimension), np.float32)
-    for places, some in blocks(place_map.features):
-        vectors[places] = place_vectors(centering.places(some).strips)
+    for places, block in blocks(place_map.features):
+        vectors[places] = place_vectors(centering.places(block).strips)
     return vectors
 
 

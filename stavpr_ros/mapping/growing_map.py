@@ -217,7 +217,7 @@ class GrowingMap:
         )
 
     def _with_session(self) -> tuple[tuple[Session, ...], np.ndarray | None]:
-        """Return the sessions of a continued map that has some, and one of the places added."""
+        """Return the sessions of a continued map, and one of the places added."""
         index = self._session_index
         if index is None or len(index) == self._count:
             return self.sessions, index

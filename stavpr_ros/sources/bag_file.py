@@ -48,7 +48,7 @@ class OpenBag:
         self, connections: list[Connection], start: float = 0.0, duration: float = math.inf
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """
-        Yield the messages of some connections, with their times of recording, ns, in order.
+        Yield the messages of connections, with their times of recording, ns, in order.
 
         :param start: seconds after the start of the bag.
         :param duration: seconds from there on.

@@ -54,7 +54,7 @@ class FolderSource:
         if not files:
             expected = ' '.join(sorted(SUFFIXES))
             raise SourceError(
-                f'{self.path} holds no images: expected files ending in {expected}, not in '
+                f'{self.path} has no images: expected files ending in {expected}, not in '
                 'sub-folders'
             )
         self.files: list[Path] = sorted(files, key=lambda file: natural_key(file.name))
