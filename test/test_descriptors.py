@@ -32,9 +32,6 @@ def unit(array):
     return array / np.maximum(np.linalg.norm(array, axis=-1, keepdims=True), 1e-12)
 
 
-# ------------------------------------------------ files
-
-
 def save(folder, kind, array):
     """Write an array as one kind of file; return the path to give."""
     path = folder / f'a.{kind.split(":")[0]}'
@@ -224,6 +221,3 @@ def test_descriptors_of_another_source_or_dimension_are_rejected(tmp_path, vecto
         require_comparable(other, one.settings, D)
     with pytest.raises(SourceError, match='24 dimensions, those of the map have 25'):
         require_comparable(one, one.settings, 25)
-
-
-# ------------------------------------------------ commands

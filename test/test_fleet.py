@@ -88,9 +88,6 @@ def drive(recognizer, query):
     return [recognizer.update(query[i : i + 1], i + 1) for i in range(len(query))]
 
 
-# Homes
-
-
 @pytest.mark.parametrize('home', HOMES)
 def test_fetch_returns_places_of_every_home(home, tmp_path, server):
     place_map = replace(example_map(), same_as=np.arange(24, dtype=np.int32))
@@ -147,9 +144,6 @@ def test_votes_follow_the_speed():
         votes.add(image, np.array([*wrong, 1000 + 2 * image, -1]))
     assert abs(votes.best(1)[0] - 1018) <= 8
     assert Votes(5, (1.0,)).best(3).tolist() == []
-
-
-# Recognition
 
 
 @pytest.mark.parametrize('home', ['memory', 'faiss'])
@@ -240,9 +234,6 @@ def test_recognizer_rejects_mode_paper_and_vertical(city):
         FleetRecognizer(made, replace(SETTINGS, spatial=spatial))
 
 
-# Bad homes
-
-
 def test_open_of_missing_or_interrupted_upload_names_remedy(tmp_path, server):
     with pytest.raises(FleetError, match='upload'):
         open_city_map(f'qdrant:{tmp_path}')
@@ -279,9 +270,6 @@ def test_fetch_of_damaged_payload_is_error(change, tmp_path):
     points.payloads = lambda ids: {i: payload | change for i, payload in whole(ids).items()}
     with pytest.raises(FleetError, match=r'damaged|finite'):
         city.store.fetch(np.arange(3))
-
-
-# Command and node
 
 
 def test_map_upload_command_and_pipeline_localize(route, small_map, tmp_path, capsys, server):

@@ -159,8 +159,6 @@ def test_vertical_alignment_in_int8_is_rejected():
         )
 
 
-# ------------------------------------------------ instructions
-
 PROCESSORS = (
     ('avx512vnni', 'x86_64', 'icelake-server', 'vpdpbusd'),
     ('avxvnni', 'x86_64', 'alderlake', 'vpdpbusd'),
@@ -240,9 +238,6 @@ def test_every_instruction_of_this_processor_returns_same_bits():
         found[name] = value
     assert len(found) == len(sets)
     assert len(set(found.values())) == 1
-
-
-# ------------------------------------------------ real images
 
 
 @pytest.mark.long

@@ -48,9 +48,6 @@ def assert_same(a: PlaceMap, b: PlaceMap) -> None:
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
-# ------------------------------------------------------------------------------------- the format
-
-
 @pytest.mark.parametrize('read', [load_map, open_map])
 def test_saved_map_is_read_as_it_was(example, saved, read):
     found = read(saved)
@@ -156,9 +153,6 @@ def test_unknown_section_is_ignored_unless_it_is_required(saved, example, requir
             load_map(saved)
     else:
         assert_same(load_map(saved), example)
-
-
-# ------------------------------------------------------------------------------------- the file
 
 
 def test_what_could_not_be_read_again_is_not_saved(example, tmp_path):
@@ -272,9 +266,6 @@ def test_damage_of_a_large_part_is_named_to_four_megabytes(example, tmp_path):
         load_map(tmp_path / 'map')
     first, last = map(int, re.search(r'bytes (\d+) to (\d+)', str(caught.value)).groups())
     assert first <= 5 * 2**20 < last == first + 2**22
-
-
-# ----------------------------------------------------------------------------- hand-made files
 
 
 def _setting(name, value):
@@ -418,9 +409,6 @@ def test_header_that_disagrees_is_rejected(saved, change, text):
     saved.write_bytes(_header(saved.read_bytes(), change))
     with pytest.raises(MapFileError, match=text):
         load_map(saved)
-
-
-# ------------------------------------------------------------------------------------------ fuzz
 
 
 def test_damaged_file_is_rejected_or_harmless(originals, example, tmp_path):

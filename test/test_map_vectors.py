@@ -155,9 +155,6 @@ def test_maps_made_of_maps_keep_vectors(place_map):
     assert torch.equal(select_places(both, np.array([1, 60])).features.vectors, vectors[[1, 10]])
 
 
-# ------------------------------------------------ first stage
-
-
 def noisy(features, share):
     """Return the same images with other vectors."""
     drawn = unit(len(features), D, seed=9)

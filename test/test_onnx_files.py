@@ -189,9 +189,6 @@ def test_build_map_with_a_network_anywhere_suggests_a_threshold(
     assert 'suggested threshold for mode paper' in output
 
 
-# ------------------------------------------------ networks of torch, as the documentation has it
-
-
 class Network(nn.Module):
     """Patches of 32 pixels; returns a vector, the class token, and the map of the patches."""
 
@@ -234,8 +231,6 @@ def test_network_of_torch_is_exported_as_documented(tmp_path, monkeypatch, half)
         tolerance = 2e-2 if half else 1e-5
         torch.testing.assert_close(found, expected, atol=tolerance, rtol=tolerance)
 
-
-# ------------------------------------------------ devices
 
 CUDA, TENSORRT, CPU = (f'{name}ExecutionProvider' for name in ('CUDA', 'Tensorrt', 'CPU'))
 

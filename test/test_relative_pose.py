@@ -28,9 +28,6 @@ MOUNTED = replace(CAMERA, mount=(0.4, -0.2, 1.1, *FORWARD[3:]))
 DISTORTED = replace(CAMERA, model='plumb_bob', distortion=(-0.2, 0.05, 0.001, -0.001, 0.0))
 
 
-# ------------------------------------------------ from images to edges
-
-
 def projected(points, distortion):
     """Return the pixels of points in the camera, (m, 3), by OpenCV, (m, 2)."""
     zero = np.zeros(3)
@@ -184,9 +181,6 @@ def test_edge_without_what_pnp_needs_names_it(changes, cameras, source, words):
     assert words in edge.reason
 
 
-# ------------------------------------------------ alignment by odometry
-
-
 def plain_pair(query_poses, middle, distances, poses=None):
     poses = np.array([pose(i * SPACING) for i in range(PLACES)]) if poses is None else poses
     return MatchedPair(object(), PLACE, None, query_poses, middle, distances, 0, poses, {})
@@ -240,9 +234,6 @@ def test_independent_edges_are_apart(method):
         found.append(estimator.estimate(pair, None, None).independent)
     assert np.flatnonzero(found).tolist() == list(range(0, 30, APART[Source.ALIGNED]))
     assert not EdgeEstimator('none').estimate(pair, None, None).independent
-
-
-# ------------------------------------------------ cameras
 
 
 def test_rays_of_a_thumbnail_are_those_of_the_image():

@@ -20,8 +20,6 @@ from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.sources.frame import Frame
 import torch
 
-# ------------------------------------------------ outputs
-
 
 def test_as_maps_of_tokens_by_hand():
     """A class token, a register, then patches row by row: patch 2 is below patch 0."""
@@ -60,9 +58,6 @@ def test_one_of_several_outputs_by_number_and_key():
         one_of([a, b], '2', 'net')
 
 
-# ------------------------------------------------ pooled strips
-
-
 @pytest.mark.parametrize('pooling', ['mean', 'gem'])
 def test_cut_strips_pooled_equals_plain_loops(pooling):
     """A map of 5 rows and 8 columns in three strips: columns 1-2, 3-4, 5-6."""
@@ -77,9 +72,6 @@ def test_cut_strips_pooled_equals_plain_loops(pooling):
                 if pooling == 'gem':
                     expected = (sum(max(v, 1e-6) ** 3 for v in cells) / 10) ** (1 / 3)
                 assert float(strips[w, n, c]) == pytest.approx(expected, abs=1e-6)
-
-
-# ------------------------------------------------ extraction
 
 
 @pytest.fixture(scope='module')
@@ -187,9 +179,6 @@ def test_map_of_vectors_localizes_in_the_pipeline(network, route, tmp_path):
     assert last.place_index == 37
 
 
-# ------------------------------------------------ matching
-
-
 def vectors(n, d, seed=0):
     """Return unit-norm vectors along a random curve; the first is zero."""
     steps = np.random.default_rng(seed).standard_normal((n, d))
@@ -251,9 +240,6 @@ def test_loop_of_vectors_is_closed():
             found.append((i, match.place_index))
     assert len(found) > 20
     assert all(abs(place - (i - 60 - 5)) <= 2 for i, place in found)
-
-
-# ------------------------------------------------ a vector beside strips
 
 
 def test_extractor_of_vector_and_strips_equals_both_alone(network, route):
