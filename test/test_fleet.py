@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps of a fleet: their homes, recognition in neighborhoods, and homes that fail."""
+"""Maps of a fleet: their stores, recognition in neighborhoods, and stores that fail."""
 
 from dataclasses import replace
 import threading
@@ -19,6 +19,7 @@ from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.fleet import CityMap, FleetRecognizer, MemoryStore, open_city_map, upload
 from stavpr_ros.fleet.neighborhoods import Votes
+from stavpr_ros.fleet.qdrant_store import EdgePoints
 from stavpr_ros.fleet.store import MapIndex, place_vectors, sample_places
 from stavpr_ros.mapping import descriptor_map, open_map, save_map, Session
 from stavpr_ros.pipeline import Pipeline, read_map
@@ -30,7 +31,7 @@ for package in ('faiss', 'qdrant_client', 'qdrant_edge'):
 from qdrant_server import QdrantServer  # noqa: E402
 
 CITY, SETTINGS = 6000, RecognizerSettings(0.5, mode='robust')
-HOMES = ('memory', 'faiss', 'qdrant', 'server')
+STORES = ('memory', 'faiss', 'qdrant', 'server')
 FIRST, DRIVEN = 2500, 60
 SOURCE = FeatureSettings('descriptors', settings_class('descriptors')(), 3)
 
@@ -73,12 +74,12 @@ def server():
     server.close()
 
 
-def home_of(place_map, home, tmp_path, server):
-    """Upload a map to a home and open it there."""
-    if home == 'memory':
+def city_in(place_map, store, tmp_path, server):
+    """Upload a map to a store and open it there."""
+    if store == 'memory':
         return CityMap.of(MemoryStore(place_map))
-    address = f'{home}:{tmp_path / home}'
-    if home == 'server':
+    address = f'{store}:{tmp_path / store}'
+    if store == 'server':
         address = server.address(tmp_path.name.replace('/', '_'))
     upload(place_map, address)
     return open_city_map(address)
@@ -88,14 +89,14 @@ def drive(recognizer, query):
     return [recognizer.update(query[i : i + 1], i + 1) for i in range(len(query))]
 
 
-@pytest.mark.parametrize('home', HOMES)
-def test_fetch_returns_places_of_every_home(home, tmp_path, server):
+@pytest.mark.parametrize('store', STORES)
+def test_fetch_returns_places_of_every_store(store, tmp_path, server):
     place_map = replace(example_map(), same_as=np.arange(24, dtype=np.int32))
     place_map.same_as[20] = 5
-    if home == 'faiss':
+    if store == 'faiss':
         save_map(place_map, tmp_path / 'same')
         place_map = open_map(tmp_path / 'same')
-    city = home_of(place_map, home, tmp_path, server)
+    city = city_in(place_map, store, tmp_path, server)
     places = np.array([2, 3, 4, 20])
     fetched, same_as = city.store.fetch(places)
     torch.testing.assert_close(
@@ -146,10 +147,10 @@ def test_votes_follow_the_speed():
     assert Votes(5, (1.0,)).best(3).tolist() == []
 
 
-@pytest.mark.parametrize('home', ['memory', 'faiss'])
-def test_recognizer_in_neighborhoods_matches_as_exact_one(home, city, query, tmp_path):
+@pytest.mark.parametrize('store', ['memory', 'faiss'])
+def test_recognizer_in_neighborhoods_matches_as_exact_one(store, city, query, tmp_path):
     exact = drive(PlaceRecognizer(city, SETTINGS), query)
-    recognizer = FleetRecognizer(home_of(city, home, tmp_path, None), SETTINGS, timeout=60)
+    recognizer = FleetRecognizer(city_in(city, store, tmp_path, None), SETTINGS, timeout=60)
     found = drive(recognizer, query)
     assert [m.status for m in found[:19]] == [Status.WARMING_UP] * 19
     accepted = [i for i, match in enumerate(exact) if match.accepted]
@@ -175,7 +176,7 @@ def test_recognizer_off_the_map_matches_nothing(city):
 
 
 class Faulty(MemoryStore):
-    """A home that can be cut off, or made slow."""
+    """A store that can be cut off, or made slow."""
 
     cut = False
 
@@ -215,7 +216,7 @@ def test_recognizer_cut_off_from_the_start_publishes_why(city, query):
     assert 'cut off' in matches[-1].reason
 
 
-def test_recognizer_does_not_wait_for_a_slow_home(city, query):
+def test_recognizer_does_not_wait_for_a_slow_store(city, query):
     store = Faulty(city)
     recognizer = FleetRecognizer(CityMap.of(store), SETTINGS, timeout=60)
     drive(recognizer, query[:30])
@@ -263,11 +264,12 @@ def test_upload_replaces_only_with_force(tmp_path, server):
 @pytest.mark.parametrize(
     'change', [{'strips': 'AAAA'}, {'pose': [1]}, {'weights': []}, {'stamp': 'x'}, {'id': 'a\0b'}]
 )
-def test_fetch_of_damaged_payload_is_error(change, tmp_path):
-    city = home_of(example_map(), 'qdrant', tmp_path, None)
-    points = city.store._points
-    whole = points.payloads
-    points.payloads = lambda ids: {i: payload | change for i, payload in whole(ids).items()}
+def test_fetch_of_damaged_payload_is_error(change, tmp_path, monkeypatch):
+    city = city_in(example_map(), 'qdrant', tmp_path, None)
+    whole = EdgePoints.payloads
+    monkeypatch.setattr(
+        EdgePoints, 'payloads', lambda *of: {i: row | change for i, row in whole(*of).items()}
+    )
     with pytest.raises(FleetError, match=r'damaged|finite'):
         city.store.fetch(np.arange(3))
 

@@ -201,7 +201,7 @@ class FleetRecognizer(SequenceRecognizer):
         self._unasked.append((self._count, place_vectors(strips[:, None])))
         if self._motion is not None:
             self._motion.way.append(position)
-        if self._look_around():
+        if self._update_neighborhoods():
             self._rebuild()
         elif self._layout is not None:
             self._push(image)
@@ -231,7 +231,7 @@ class FleetRecognizer(SequenceRecognizer):
 
     # neighborhoods
 
-    def _look_around(self) -> bool:
+    def _update_neighborhoods(self) -> bool:
         """Look neighborhoods up if it is time; return whether other places are loaded."""
         if self._pending is None:
             if self._layout is not None and len(self._unasked) < EVERY:

@@ -82,7 +82,7 @@ class MapIndex:
 
 
 class PlaceStore(Protocol):
-    """A home of a map. Its calls may come from another thread, one at a time."""
+    """A store of a map. Its calls may come from another thread, one at a time."""
 
     @property
     def index(self) -> MapIndex:
@@ -94,7 +94,7 @@ class PlaceStore(Protocol):
 
         :param vectors: of images, (Q, D), float32, unit norm.
         :returns: shape (Q, count), int64; -1 behind the last.
-        :raises FleetError: the home cannot be reached, or its data is damaged.
+        :raises FleetError: the store cannot be reached, or its data is damaged.
         """
 
     def fetch(self, places: np.ndarray) -> tuple[PlaceMap, np.ndarray]:
@@ -136,7 +136,7 @@ def map_vectors(place_map: PlaceMap, index: MapIndex) -> np.ndarray:
 
 
 class LocalStore:
-    """A map on this machine; the base of homes that differ in the search for vectors."""
+    """A map on this machine; the base of stores that differ in the search for vectors."""
 
     def __init__(self, place_map: PlaceMap) -> None:
         self._map = place_map
