@@ -236,8 +236,7 @@ class GrowingMap:
         if self.full:
             raise InputError(
                 f'the map is full, it has {self.limit} places: raise its limit, evict the oldest '
-                'places or '
-                'save it and start another'
+                'places or save it and start another'
             )
         added = _rows_of(features)
         if self.dimension not in (0, d := features.dimension):

@@ -182,8 +182,7 @@ def decode_image(
     if flat.size < needed:
         raise ImageError(
             f'{flat.size} bytes of data for {width}x{height} {encoding} with step {step}: '
-            f'expected {needed} '
-            'or more; the image is cut off',
+            f'expected {needed} or more; the image is cut off',
             kind='cut off',
         )
     if width * height > files.MAX_PIXELS:  # last: a wrong header fails the checks above
@@ -294,16 +293,13 @@ def _check_header(height: int, width: int, encoding: str, step: int, row: int) -
     if height % rows or width % columns:
         raise ImageError(
             f'{encoding} image of {width}x{height} pixels: expected a width that is a multiple of '
-            f'{columns} '
-            f'and a height that is a multiple of {rows}, since so many pixels share a color; '
-            'check the '
-            'camera driver',
+            f'{columns} and a height that is a multiple of {rows}, since so many pixels share a '
+            'color; check the camera driver',
             kind='size',
         )
     if step < row:
         raise ImageError(
             f'step of {step} bytes is too small for a row of {width} {encoding} pixels: expected '
-            f'{row} or '
-            'more; check the camera driver',
+            f'{row} or more; check the camera driver',
             kind='step',
         )

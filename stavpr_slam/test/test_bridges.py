@@ -28,6 +28,7 @@ from stavpr_slam.ros.bridges.bridge import Bridge, interfaces
 from stavpr_slam.ros.bridges.external_keyframes import ExternalKeyframes, keyframe_edge
 from stavpr_slam.ros.graph_messages import pose_array
 from test_pose_graph import LAP
+from test_pose_graph_node import Peer
 
 COVARIANCE = np.diag([0.2, 0.1, 0.3, 0.01, 0.02, 0.03]) ** 2
 
@@ -111,8 +112,9 @@ def test_status_of_bridge_that_sends_nothing_is_warning_with_remedy(counts, leve
     assert text in sentence
 
 
-def test_pose_bridges_publish_pose_on_map(tmp_path, peer):
+def test_pose_bridges_publish_pose_on_map(tmp_path):
     """The prior of RTAB-Map for each independent closure, robot_localization once."""
+    peer = Peer()
     node, counts, wait_until = peer.node, peer.diagnostics, peer.wait_until
     priors: list[PoseWithCovarianceStamped] = []
     poses: list[PoseWithCovarianceStamped] = []
@@ -156,6 +158,7 @@ def test_pose_bridges_publish_pose_on_map(tmp_path, peer):
     finally:
         for process in processes:
             process.end()
+        peer.close()
 
 
 @pytest.fixture(scope='module')
