@@ -29,6 +29,6 @@ def no_nan(array: np.ndarray, name: str) -> np.ndarray:
     bad = np.count_nonzero(~(array > -np.inf))
     if bad:
         raise InputError(
-            f'{name} holds {bad} NaN or -inf among {array.size} values: check the features'
+            f'{name} has {bad} NaN or -inf among {array.size} values: check the features'
         )
     return array

@@ -23,7 +23,7 @@ def choose_device(requested: str) -> str:
     available = torch.cuda.is_available()
     if requested == 'cuda' and not available:
         raise UnavailableError(
-            "device 'cuda': torch sees no CUDA device here; take 'cpu' or 'auto'"
+            "device 'cuda': torch finds no CUDA device here; take 'cpu' or 'auto'"
         )
     return ('cuda' if available else 'cpu') if requested == 'auto' else requested
 
@@ -50,7 +50,7 @@ def why_no_cuda() -> str:
     import torch
 
     if not torch.cuda.is_available():
-        return 'torch sees no CUDA device here'
+        return 'torch finds no CUDA device here'
     if importlib.util.find_spec('numba_cuda') is None:
         return (
             'the package numba-cuda is not installed: pip install numba-cuda[cu13], '

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The one way to write a file: all of it or nothing, and never over somebody else's."""
+"""Write a file completely or not at all, and never over one of another program."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress

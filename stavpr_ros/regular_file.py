@@ -23,7 +23,7 @@ def open_regular(path: str | Path) -> io.FileIO:
 
     :raises OSError: it does not exist, cannot be read, or is a pipe, a device, a folder.
     """
-    require_regular(path)  # before it is opened: opening alone has an effect on some devices
+    require_regular(path)  # before it is opened: opening alone can have an effect on devices
     file = io.FileIO(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), 'rb')
     try:
         _require_regular(os.fstat(file.fileno()).st_mode)  # it may have been replaced

@@ -26,7 +26,7 @@ def limit_threads(count: int) -> None:
     """
     Limit torch, numba and OpenCV to so many threads.
 
-    OpenCV's limit holds for the process, the others' for the calling thread.
+    OpenCV's limit is that of the process, the others' for the calling thread.
 
     :param count: 0 = as many as they take of themselves.
     """

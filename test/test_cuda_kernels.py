@@ -94,9 +94,6 @@ def test_compiled_kernels_spill_no_registers():
         assert (report['stack_bytes'] > 0) == long, name
 
 
-# ------------------------------------------------ image distances
-
-
 def image_distances(runtime, products, strategy, sigma=1.0, xi=None, block=4):
     """Run a spatial kernel on products (queries, W, W, places)."""
     from stavpr_ros.alignment.cuda import dtw
@@ -171,9 +168,6 @@ def test_image_distances_of_any_strides_equal_oracle(runtime):
     arguments = runtime.array(view), np.float32(1), 0, 0, runtime.array(out)
     runtime.launch(dtw.spatial_dtw(5, 5), (2, 2), 4, *arguments)
     np.testing.assert_array_equal(out.cpu().numpy(), expected_images(products, 'adaptive'))
-
-
-# ------------------------------------------------ LM-DTW and the choice
 
 
 def run_sequences(runtime, D, k, apart, block=8, columns=None, first=0, launches=1):

@@ -32,9 +32,6 @@ def unit(array):
     return array / np.maximum(np.linalg.norm(array, axis=-1, keepdims=True), 1e-12)
 
 
-# ------------------------------------------------ files
-
-
 def save(folder, kind, array):
     """Write an array as one kind of file; return the path to give."""
     path = folder / f'a.{kind.split(":")[0]}'
@@ -93,7 +90,7 @@ def test_read_descriptors_executes_nothing(tmp_path, name, words):
         (np.zeros((5, 0)), r'\(5, 0\)'),
         (np.zeros((5, 2), complex), 'complex128'),
         (np.zeros((1, 1025, 1)), 'W = 1025'),
-        (np.where(np.arange(40)[:, None] == 7, np.nan, np.ones((40, 2))), 'row 7 holds NaN'),
+        (np.where(np.arange(40)[:, None] == 7, np.nan, np.ones((40, 2))), 'row 7 has NaN'),
     ],
 )
 def test_read_descriptors_of_other_arrays_is_rejected(tmp_path, array, words):
@@ -224,6 +221,3 @@ def test_descriptors_of_another_source_or_dimension_are_rejected(tmp_path, vecto
         require_comparable(other, one.settings, D)
     with pytest.raises(SourceError, match='24 dimensions, those of the map have 25'):
         require_comparable(one, one.settings, 25)
-
-
-# ------------------------------------------------ commands

@@ -12,20 +12,15 @@ from hypothesis import strategies as st
 from llvmlite import binding, ir
 import numpy as np
 import oracle
-from places import recognize_all
 import pytest
 from stavpr_ros.alignment import image_distances, SpatialSettings
 from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
+from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.mapping import build_map, extract_features
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.int8_features import rounded
 from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.recognition.robust import THRESHOLD
-from stavpr_ros.sources import open_source
 import torch
 
 TILE = int8.TILE
@@ -159,8 +154,6 @@ def test_vertical_alignment_in_int8_is_rejected():
         )
 
 
-# ------------------------------------------------ instructions
-
 PROCESSORS = (
     ('avx512vnni', 'x86_64', 'icelake-server', 'vpdpbusd'),
     ('avxvnni', 'x86_64', 'alderlake', 'vpdpbusd'),
@@ -240,31 +233,3 @@ def test_every_instruction_of_this_processor_returns_same_bits():
         found[name] = value
     assert len(found) == len(sets)
     assert len(set(found.values())) == 1
-
-
-# ------------------------------------------------ real images
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ('places', 'query'),
-    [('gardens_point/day_left', 'gardens_point/day_right'), ('corridor/ref', 'corridor/query')],
-)
-def test_int8_changes_no_verdict_on_real_images(data_folder, places, query):
-    extractor = FeatureExtractor('gradient')
-    place_map = build_map(open_source(data_folder / places), extractor, progress=False)
-    images = extract_features(open_source(data_folder / query), extractor, progress=False)
-    found = {
-        precision: recognize_all(
-            PlaceRecognizer(
-                place_map, RecognizerSettings(THRESHOLD, mode='robust'), precision=precision
-            ),
-            images,
-        )
-        for precision in ('float32', 'int8')
-    }
-    pairs = list(zip(*found.values(), strict=True))
-    assert [one.status for one, _ in pairs] == [other.status for _, other in pairs]
-    accepted = [(one, other) for one, other in pairs if one.accepted]
-    assert len(accepted) > 80
-    assert max(abs(one.place_index - other.place_index) for one, other in accepted) <= 2

@@ -150,9 +150,6 @@ def test_selector_equals_plain_loop(steps, rules):
     assert kept == expected
 
 
-# ------------------------------------------------------------------------------------------ views
-
-
 def test_image_change_by_hand():
     ramp = np.tile(np.arange(32, dtype=np.float32), (24, 1))
     flat = np.full((24, 32), 80, np.float32)

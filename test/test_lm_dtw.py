@@ -37,9 +37,6 @@ def check_every_start(D, length, beta):
     return matches
 
 
-# ------------------------------------------------ by hand
-
-
 @pytest.mark.parametrize('dtype', DTYPES)
 def test_match_sequence_by_hand(dtype):
     # l = 2, k = 4. Start 0: S row 1 = 4 6 7 12, row 2 by column:
@@ -81,9 +78,6 @@ def test_places_searched_round_up_but_not_rounding_errors(length, beta, k):
     assert SequenceSettings(length=length, beta=beta).k == k
 
 
-# ------------------------------------------------ the best match
-
-
 def matches_of(q, m):
     return SequenceDistances(distances=np.array(q, float), lengths=np.array(m, np.int32))
 
@@ -112,9 +106,6 @@ def test_best_match_of_banned_starts_is_none():
 def test_aligned_index_is_floor_of_middle():
     path = np.array([(0, 3), (0, 4), (0, 5), (0, 6), (1, 7), (2, 7)], np.int32)
     assert [aligned_index(path, i) for i in range(3)] == [4, 7, 7]
-
-
-# ------------------------------------------------ the kernel against the oracle, exactly
 
 
 @settings(max_examples=100)

@@ -155,9 +155,6 @@ def test_maps_made_of_maps_keep_vectors(place_map):
     assert torch.equal(select_places(both, np.array([1, 60])).features.vectors, vectors[[1, 10]])
 
 
-# ------------------------------------------------ first stage
-
-
 def noisy(features, share):
     """Return the same images with other vectors."""
     drawn = unit(len(features), D, seed=9)
@@ -177,26 +174,26 @@ def recognizer(features, **changes):
 
 
 def test_first_stage_takes_candidates_by_vector_not_by_strips(few):
-    """The strips of the image are of no place, its vector is that of place 2000."""
-    features = features_of(3000)
-    image = replace(features_of(1, seed=5), vectors=features.vectors[2000:2001])
+    """The strips of the image are of no place, its vector is that of place 816."""
+    features = features_of(1200)
+    image = replace(features_of(1, seed=5), vectors=features.vectors[816:817])
     matcher = CpuMatcher(features, SpatialSettings())
     strips, weights = image.strips[:, 0], image.weights[:, 0]
     expected = matcher.distances(strips, weights).numpy()
-    whole = LocalFeatures(features.vectors[None], torch.ones(1, 3000), SETTINGS)
+    whole = LocalFeatures(features.vectors[None], torch.ones(1, 1200), SETTINGS)
 
     def exact_in_chunk(held, *vector):
         stage = FirstStage(matcher, held, lambda: np.empty(0, np.int64))
         found = stage.distances(strips, weights, *vector).numpy()
-        return np.isclose(found, expected, atol=1e-6)[1984:2016].all()
+        return np.isclose(found, expected, atol=1e-6)[800:832].all()
 
     assert exact_in_chunk(whole, image.vectors)
     assert not exact_in_chunk(features)
 
 
 def test_recognizer_with_vectors_matches_as_exact_one(few):
-    features = features_of(3000)
-    query = noisy(features[2000:2040], 0.5)
+    features = features_of(1200)
+    query = noisy(features[800:840], 0.5)
     exact = PlaceRecognizer(map_of(features), RecognizerSettings(0.5, mode='robust'))
     coarse = recognizer(features)
     assert 'a first stage of vectors' in coarse.stages
@@ -204,7 +201,7 @@ def test_recognizer_with_vectors_matches_as_exact_one(few):
         a, b = exact.update(query[i : i + 1]), coarse.update(query[i : i + 1])
         assert (a.status, a.place_index) == (b.status, b.place_index)
     assert b.accepted
-    assert abs(b.sequence.middle - 2029) <= 1
+    assert abs(b.sequence.middle - 829) <= 1
     coarse.reset()
     again = [coarse.update(query[i : i + 1]).probability for i in range(len(query))]
     assert again[-1] == b.probability, "the vectors' running mean is reset as well"

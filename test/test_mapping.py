@@ -29,9 +29,6 @@ def test_place_map_with_partial_pose_is_rejected(small_map, value):
         dataclasses.replace(small_map, poses=poses)
 
 
-# --------------------------------------------------------------------------- keyframes
-
-
 def traverse(images, seconds=1):
     """Frames of a traverse, one in so many seconds."""
     return [Frame(image, (i + 1) * seconds * SECOND, f'{i}') for i, image in enumerate(images)]

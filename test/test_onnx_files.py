@@ -175,21 +175,14 @@ def test_weights_in_another_file_are_rejected_with_the_remedy(saved, tmp_path):
         extractor(path)
 
 
-def test_build_map_with_a_network_anywhere_suggests_a_threshold(
-    saved, tmp_path, monkeypatch, capsys
-):
-    """The file is in no folder of models; its place is an option of the command."""
-    folder = write_images(tmp_path / 'drive', np.tile(IMAGES, (20, 1, 1, 1)))
+def test_build_map_takes_the_path_of_a_network_as_option(saved, tmp_path, monkeypatch, capsys):
+    folder = write_images(tmp_path / 'drive', IMAGES)
     run = runner(build_map, monkeypatch, capsys)
-    code, output, errors = run(
+    code, _, errors = run(
         *('--input', folder, '--output', tmp_path / 'map.stavpr', '--features', 'onnx'),
         *('--onnx-model', saved(), '--onnx-layer', 'y', '--onnx-size', 64),
     )
     assert code == 0, errors
-    assert 'suggested threshold for mode paper' in output
-
-
-# ------------------------------------------------ networks of torch, as the documentation has it
 
 
 class Network(nn.Module):
@@ -234,8 +227,6 @@ def test_network_of_torch_is_exported_as_documented(tmp_path, monkeypatch, half)
         tolerance = 2e-2 if half else 1e-5
         torch.testing.assert_close(found, expected, atol=tolerance, rtol=tolerance)
 
-
-# ------------------------------------------------ devices
 
 CUDA, TENSORRT, CPU = (f'{name}ExecutionProvider' for name in ('CUDA', 'Tensorrt', 'CPU'))
 

@@ -94,9 +94,6 @@ def imports_of(package: str) -> set[str]:
     return imported(PACKAGES[package] / package) - {package}
 
 
-# Dependencies
-
-
 @each_package
 def test_every_imported_distribution_is_required(package, monkeypatch):
     arguments = setup_arguments(package, monkeypatch)
@@ -137,9 +134,6 @@ def test_dependencies_between_packages_are_declared():
     assert 'stavpr_ros' in found['stavpr_slam'] & found['stavpr_lab']
 
 
-# Versions and licenses
-
-
 def test_versions_agree(monkeypatch):
     folders = [*PACKAGES.values(), ROOT / 'stavpr_msgs']
     versions = [manifest(folder).findtext('version') for folder in folders]
@@ -155,9 +149,6 @@ def test_license_file_is_there(folder):
     assert element.text == 'Apache-2.0'
     assert 'Apache License' in (ROOT / folder / element.get('file')).read_text(encoding='utf-8')
     assert (ROOT / folder / 'CHANGELOG.rst').is_file()
-
-
-# What is installed
 
 
 @pytest.fixture(scope='module')
@@ -264,9 +255,6 @@ def test_wheel_has_all_python_packages_and_entry_points(sources, installed, tmp_
         table = (PACKAGES[package] / 'setup.cfg').read_text(encoding='utf-8')
         for line in re.findall(r'^    (\w+ = .*)$', table, re.MULTILINE):
             assert line in entries
-
-
-# The command `stavpr`
 
 
 def test_stavpr_lists_every_command(capsys):

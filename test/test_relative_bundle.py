@@ -51,7 +51,7 @@ def test_odometry_information_of_two_steps_is_that_of_their_composition():
     around = np.array(motions([pose(-1), pose(2, 0.5, 0.3), pose(4, 2, 0.8)], pose(0)))
     covariance = np.linalg.inv(odometry_information(around, 1)).reshape(3, 6, 3, 6)
     rng, samples = np.random.default_rng(0), []
-    for _ in range(20_000):
+    for _ in range(5000):
         last = own = np.eye(4)
         row = []
         for motion in around[1:]:
@@ -67,7 +67,7 @@ def test_odometry_information_of_two_steps_is_that_of_their_composition():
     expected = covariance[1:, :, 1:].reshape(12, 12)
     scale = np.sqrt(np.diag(expected))
     off = (np.cov(np.array(samples).T) - expected) / np.outer(scale, scale)
-    assert np.abs(off).max() < 0.05
+    assert np.abs(off).max() < 0.08
     assert not covariance[0, :, 1:].any()  # the other side of the place has other steps
 
 

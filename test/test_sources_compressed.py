@@ -162,7 +162,7 @@ def test_compressed_message_format_is_taken_from_bytes(transport):
 )
 def test_compressed_message_of_depth_is_rejected(transport):
     png = encoded('.png', np.zeros((4, 4), np.uint8))  # an image, so that only the name is wrong
-    with pytest.raises(ImageError, match='holds depth or measurements, not an image') as caught:
+    with pytest.raises(ImageError, match='is depth or measurements, not an image') as caught:
         decode_compressed_message(compressed(transport, png))
     assert repr(transport) in str(caught.value)
     assert caught.value.kind == 'depth'

@@ -62,7 +62,7 @@ def test_folder_with_damaged_file_fails_or_skips(tmp_path):
 
 
 def test_open_source_of_no_source_fails(tmp_path):
-    with pytest.raises(SourceError, match='holds no images: expected files ending in'):
+    with pytest.raises(SourceError, match='has no images: expected files ending in'):
         open_source(tmp_path)
     with pytest.raises(SourceError, match='does not exist'):
         open_source(tmp_path / 'missing')

@@ -39,9 +39,6 @@ def random_distances(seed, shape, dtype, levels, banned=0.0):
     return d.astype(dtype)
 
 
-# ------------------------------------------------ by hand
-
-
 @pytest.mark.parametrize('dtype', DTYPES)
 def test_distance_of_published_figure_by_hand(dtype):
     d = oracle.GOLDEN.astype(dtype)
@@ -104,9 +101,6 @@ def test_adaptive_weight_of_even_number_of_strips_by_hand(row, places_away):
     assert one(d, ADAPTIVE) == pytest.approx((a * row[1] - 2 * a) / (1 + 3 * a))
 
 
-# ------------------------------------------------ the band
-
-
 def test_band_allows_29_of_49_cells():
     allowed = set()
     restricted = SpatialSettings(strategy='vanilla', xi=3)
@@ -120,9 +114,6 @@ def test_band_allows_29_of_49_cells():
     assert len(allowed) == 29
 
 
-# ------------------------------------------------ sliding window
-
-
 def test_sliding_window_by_hand():
     d = np.full((5, 5), 9.0)
     # p = 1, q = 2: (1 + 2 + 3 + 4) / 4; every other start has 9s only
@@ -133,9 +124,6 @@ def test_sliding_window_by_hand():
     d = np.zeros((4, 4))
     d[np.diag_indices(4)] = [1, 2, 3, 6]  # one start only, so the zeros do not count
     assert one(d, WINDOW) == 3
-
-
-# ------------------------------------------------ the kernels against the oracle, exactly
 
 
 def check(d, strategy, sigma=1.0, xi=None):

@@ -29,9 +29,6 @@ def unit(strips):
     return directions.numpy(), weights.numpy()
 
 
-# ------------------------------------------------ cutting
-
-
 def test_cut_strips_drops_surplus_columns_by_hand():
     # 8 columns, 3 strips of 2: r = 2, one lost on each side: (1 2) (3 4) (5 6)
     row = torch.arange(8.0).reshape(1, 1, 1, 8)
@@ -74,18 +71,12 @@ def test_cut_strips_of_other_shape_is_rejected(shape, W, text):
         cut_strips(torch.zeros(shape), W)
 
 
-# ------------------------------------------------ norms
-
-
 def test_normalize_by_hand():
     # one image, strips (3 4), (0 0), (0 12): norms 5, 0, 12, together 13
     directions, weights = unit(np.array([[[3.0, 4]], [[0, 0]], [[0, 12]]], np.float32))
     np.testing.assert_allclose(directions[:, 0], [[0.6, 0.8], [0, 0], [0, 1]], atol=1e-7)
     np.testing.assert_allclose(weights[:, 0], [5 / 13, 0, 12 / 13], atol=1e-7)
     assert directions.dtype == weights.dtype == np.float32
-
-
-# ------------------------------------------------ distances
 
 
 @settings(max_examples=25)

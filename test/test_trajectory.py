@@ -155,9 +155,6 @@ def test_trajectory_turns_evenly_on_shorter_arc(first, angle, part, flip, axis):
     assert rotation(start, end) == pytest.approx(abs(angle), abs=1e-6)
 
 
-# ------------------------------------------------------------------------------------------ bags
-
-
 @pytest.mark.parametrize('ros1', [False, True])
 def test_read_odometry_returns_sorted_poses(tmp_path, ros1):
     # the third came late, the last has no stamp of its own

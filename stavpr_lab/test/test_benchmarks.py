@@ -67,7 +67,7 @@ def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
 def test_command_on_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, 'is_available', lambda: False)
     assert matching.main(['--device', 'cuda', '--output', str(tmp_path)]) == 2
-    assert 'torch sees no CUDA device here' in capsys.readouterr().err
+    assert 'torch finds no CUDA device here' in capsys.readouterr().err
 
 
 # ------------------------------------------------ peers on an equal footing

@@ -108,7 +108,7 @@ def test_open_dataset_not_found_names_the_searched_folders(tmp_path):
     with pytest.raises(SourceError, match='cannot be listed'):
         open_dataset('nordland', tmp_path / 'missing')
     (tmp_path / 'Nordland' / 'winter').mkdir()
-    with pytest.raises(SourceError, match='holds no images'):
+    with pytest.raises(SourceError, match='has no images'):
         open_dataset('nordland', tmp_path)
     with pytest.raises(SettingsError, match='take one of nordland, gardens_point'):
         open_dataset('alderley', tmp_path)

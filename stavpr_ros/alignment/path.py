@@ -13,7 +13,7 @@ def trace_sequence(window: np.ndarray, start: int, k: int) -> np.ndarray:
     Trace the path of one start in a checked window: to the first end with the smallest S / C.
 
     :param window: image distances D, shape (l, n).
-    :param k: map images a start sees.
+    :param k: map images a start searches.
     :returns: the cells from the first to the last, shape (m, 2), int32: (query index, map index),
         both 0-based, the map index counted from the map's start.
     """

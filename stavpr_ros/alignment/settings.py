@@ -21,7 +21,7 @@ class SpatialSettings:
     :param xi: restricted alignment: strips i and j with ``|i - j| >= xi`` are never aligned;
         1 <= xi <= W, None = no restriction.
     :param vertical: the distance of two strips is that of their cells, aligned from top to bottom
-        in the same way (the paper's remark on drones), instead of their cosine distance;
+        by the same alignment (the paper's remark on drones), instead of their cosine distance;
         ``adaptive``, ``vanilla``.
     """
 
@@ -64,7 +64,7 @@ class SequenceSettings:
     How a window of query images is matched with the map (LM-DTW).
 
     :param length: images in the window, l >= 2.
-    :param beta: map images considered per query image, > 1: each start sees k = ceil(beta l).
+    :param beta: map images considered per query image, > 1: each start searches k = ceil(beta l).
     """
 
     length: int = 20
@@ -78,5 +78,5 @@ class SequenceSettings:
 
     @property
     def k(self) -> int:
-        """Map images seen by one start: ceil(beta l), which is 55 for 1.1 * 50 as well."""
+        """Map images searched by one start: ceil(beta l), which is 55 for 1.1 * 50 as well."""
         return math.ceil(self.beta * self.length - 1e-9)

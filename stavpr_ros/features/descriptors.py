@@ -67,7 +67,7 @@ def read_descriptors(path: str, source: str = '') -> LocalFeatures:
     except Exception as error:  # damaged files raise errors of any type
         reason = str(error)
         if 'allow_pickle' in reason or 'Python objects' in reason:
-            reason = 'it holds Python objects, or is of another format; save an array of numbers'
+            reason = 'it has Python objects, or is of another format; save an array of numbers'
         raise SourceError(f'descriptors {file} cannot be read: {reason}') from error
     if array.dtype.kind not in 'fiu' or array.ndim not in (2, 3) or 0 in array.shape:
         raise SourceError(
@@ -79,9 +79,9 @@ def read_descriptors(path: str, source: str = '') -> LocalFeatures:
         raise SourceError(f'descriptors {path}: W = {W} strips, at most {MOST_STRIPS}')
     strips, weights = torch.empty((W, n, array.shape[-1])), torch.empty((W, n))
     for low in range(0, n, AT_ONCE):  # it may be in its file
-        some = slice(low, low + AT_ONCE)
-        rows = _float32(array[some].reshape(-1, W, array.shape[-1]), path, low)
-        strips[:, some], weights[:, some] = normalize(torch.from_numpy(rows).transpose(0, 1))
+        part = slice(low, low + AT_ONCE)
+        rows = _float32(array[part].reshape(-1, W, array.shape[-1]), path, low)
+        strips[:, part], weights[:, part] = normalize(torch.from_numpy(rows).transpose(0, 1))
     settings = FeatureSettings('descriptors', DescriptorSettings(source=source), W)
     return LocalFeatures(strips, weights, settings)
 
@@ -97,7 +97,7 @@ def _float32(rows: np.ndarray, path: str, first: int) -> np.ndarray:
     finite = np.isfinite(rows).all(axis=(1, 2))
     if not finite.all():
         row = first + int(np.flatnonzero(~finite)[0])
-        raise SourceError(f'descriptors {path}: row {row} holds NaN or infinite numbers')
+        raise SourceError(f'descriptors {path}: row {row} has NaN or infinite numbers')
     _, exponents = np.frexp(abs(rows).max(axis=(1, 2), keepdims=True))
     return np.ldexp(rows, -exponents).astype(np.float32)
 
@@ -189,9 +189,9 @@ def _chosen(file: Path, name: str, shapes: dict[str, tuple[int, ...]]) -> str:
     if not name and len(able if len(shapes) > 1 else shapes) == 1:
         return (able or list(shapes))[0]
     if name not in shapes:
-        some = ', '.join(list(shapes)[:20]) or 'none'
+        listed = ', '.join(list(shapes)[:20]) or 'none'
         raise SourceError(
-            f'descriptors {file}: {name or "which array"}? Its arrays of numbers are {some}: '
+            f'descriptors {file}: {name or "which array"}? Its arrays of numbers are {listed}: '
             f'give {file}:NAME'
         )
     return name
@@ -224,7 +224,7 @@ def _from_csv(file: Path, name: str) -> np.ndarray:
     )
     header = _is_header(names[labels:], width - labels)
     if header and not second:
-        raise SourceError(f'descriptors {file} holds names, but no numbers')
+        raise SourceError(f'descriptors {file} has names, but no numbers')
 
     def numbers(line: str) -> str:
         line = line.strip().replace(point, '.')

@@ -200,8 +200,7 @@ class FeatureExtractor:
         if extractor.settings != settings:
             raise FeatureMismatchError(
                 f'this extractor has the settings {extractor.settings.to_json()}, the map '
-                'requires '
-                f'{settings.to_json()}'
+                f'requires {settings.to_json()}'
             )
         return extractor
 

@@ -93,7 +93,7 @@ class Gradient:
 
 
 def _on_threads(work: Callable[[int], None], count: int) -> None:
-    """Call work(0) .. work(count - 1), which rarely holds the GIL, on as many threads as torch."""
+    """Call work(0) .. work(count - 1), which release the GIL, on as many threads as torch."""
     threads = min(torch.get_num_threads(), count // PER_THREAD)
     if threads < 2:
         for i in range(count):

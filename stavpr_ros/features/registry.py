@@ -53,7 +53,7 @@ def _check_resize(method: str, size: int) -> None:
 class GradientSettings:
     """Settings of the oriented-gradient features."""
 
-    # of maps that do not hold these settings, since they were made before there were any
+    # of maps without these settings, which were added later
     BEFORE: ClassVar[dict[str, Any]] = {'logarithm': False}
 
     size: int = setting(224, help='images are resized to size x size pixels first')

@@ -4,7 +4,7 @@
 A map in Qdrant: on a server that many robots query, or in a folder, embedded (Qdrant Edge).
 
 A point is a place: its id the index of the place, its payload stamp, identifier, pose, session and
-the strips as float16. One more point, ``INDEX_POINT``, holds what is known of the map as a whole.
+the strips as float16. One more point, ``INDEX_POINT``, has the index of the map.
 It is written last: without it, an upload was interrupted.
 """
 
@@ -205,14 +205,14 @@ class QdrantStore:
     """
     A map whose places are points; see :class:`stavpr_ros.fleet.store.PlaceStore`.
 
-    :raises FleetError: unreachable, or it holds no complete map.
+    :raises FleetError: unreachable, or no complete map.
     """
 
     def __init__(self, points: Points) -> None:
         self._points = points
         payload = points.payloads([INDEX_POINT]).get(INDEX_POINT)
         if payload is None:
-            raise FleetError('it holds no map, or one whose upload was interrupted: upload again')
+            raise FleetError('no map, or one whose upload was interrupted: upload again')
         with _foreign():
             self.index = _read_index(payload)
 
@@ -246,9 +246,9 @@ def upload_to_qdrant(place_map: PlaceMap, points: Points, force: bool = False) -
     centering = index.centering()
     for low in range(0, index.places, AT_ONCE):
         places = np.arange(low, min(low + AT_ONCE, index.places))
-        some = select_places(place_map, places)
-        vectors = place_vectors(centering.places(some.features).strips)
-        payloads = _written_places(place_map, some, places)
+        selected = select_places(place_map, places)
+        vectors = place_vectors(centering.places(selected.features).strips)
+        payloads = _written_places(place_map, selected, places)
         points.upsert(list(zip(places.tolist(), vectors.tolist(), payloads, strict=True)))
     points.upsert([(INDEX_POINT, [0.0] * index.dimension, _written_index(index))])
 
@@ -284,20 +284,20 @@ def _read_index(payload: dict[str, Any]) -> MapIndex:
 
 
 def _written_places(
-    place_map: PlaceMap, some: PlaceMap, places: np.ndarray
+    place_map: PlaceMap, selected: PlaceMap, places: np.ndarray
 ) -> Iterator[dict[str, Any]]:
-    strips = some.features.strips.half().numpy()
+    strips = selected.features.strips.half().numpy()
     for i, place in enumerate(places.tolist()):
         pose, session = place_map.pose(place), place_map.session(place)
         yield {
             'index': place,
             'session': '' if session is None else session.id,
-            'stamp': int(some.stamps[i]),
-            'id': some.ids[i],
+            'stamp': int(selected.stamps[i]),
+            'id': selected.ids[i],
             'pose': None if pose is None else pose.tolist(),
             'same_as': place if place_map.same_as is None else int(place_map.same_as[place]),
             'strips': base64.b64encode(strips[:, i].tobytes()).decode(),
-            'weights': some.features.weights[:, i].tolist(),
+            'weights': selected.features.weights[:, i].tolist(),
         }
 
 

@@ -5,15 +5,15 @@ Recognition on a city's map: exact, over the neighborhoods where the camera may 
 
 Every few images, the vectors of the latest ones are looked up, and the neighborhoods that they
 agree on are fetched, in chunks of neighboring places that are kept while there is room. Mode
-robust runs over the chunks held as over a map of so many sessions, with three differences:
+robust runs over the loaded chunks as over a map of so many sessions, with three differences:
 
 * The mean, the whitening and the z-normalization come from a sample of the whole map.
 * The filter's probabilities of starting on and entering the map are multiplied by the share m / n
-  of the places held, so that each place has the probability that it has in the whole map: the
-  places held are those most alike of n.
+  of the loaded places, so that each place has the probability that it has in the whole map: the
+  loaded places are the most similar of n.
 * When chunks are replaced, the filter runs over the latest images again, over the new places.
 
-While the map cannot be reached, the chunks held are used.
+While the map cannot be reached, the loaded chunks are used.
 """
 
 from collections import deque
@@ -41,7 +41,7 @@ from stavpr_ros.threads import call_on_thread
 import torch
 
 CHUNK = 32  # places that are fetched together
-CHUNKS = 128  # held: 4096 places
+CHUNKS = 128  # loaded: 4096 places
 NEIGHBORHOODS = 16  # that are looked at
 BEHIND, AHEAD = 16, 48  # places of a neighborhood before and after its middle
 EVERY = 5  # images between lookups
@@ -54,7 +54,7 @@ TIMEOUT = 0.25  # seconds that an image waits for a lookup
 
 class CityLayout(SessionLayout):
     """
-    Columns for some places of a city, with a gap between runs of neighboring ones.
+    Columns for places of a city, with a gap between runs of neighboring ones.
 
     :param places: ascending, (m,).
     :param firsts: position of the first place of each run.
@@ -65,17 +65,17 @@ class CityLayout(SessionLayout):
         self, places: np.ndarray, firsts: np.ndarray, same_as: np.ndarray, nms_radius: int
     ) -> None:
         super().__init__(firsts, same_as, nms_radius)
-        self.held = places
+        self.loaded = places
         self._places = places[self._places]
 
     def positions(self, places: np.ndarray | int) -> np.ndarray:
-        """See :meth:`SessionLayout.positions`; of places that are held."""
-        return super().positions(np.searchsorted(self.held, places))
+        """See :meth:`SessionLayout.positions`; of loaded places."""
+        return super().positions(np.searchsorted(self.loaded, places))
 
     def session_of(self, place: int) -> tuple[int, int]:
-        """Return the first place held of a run of neighboring ones, and the one behind it."""
-        first, end = super().session_of(int(np.searchsorted(self.held, place)))
-        return int(self.held[first]), int(self.held[end - 1]) + 1
+        """Return the first loaded place of a run of neighboring ones, and the one behind it."""
+        first, end = super().session_of(int(np.searchsorted(self.loaded, place)))
+        return int(self.loaded[first]), int(self.loaded[end - 1]) + 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class _Image:
     :param strips, weights: centered features, (W, d) and (W,).
     :param change: from the one before.
     :param mean, deviation: of its distances to the sample.
-    :param z: normalized distances to the places in the chunks held, by slot.
+    :param z: normalized distances to the places in the loaded chunks, by slot.
     """
 
     strips: torch.Tensor
@@ -99,7 +99,7 @@ class _Image:
 
 
 class _Lookup(NamedTuple):
-    """Chunks that are wanted, and the places fetched of those that were not held."""
+    """Chunks that are wanted, and the places fetched of those that were not loaded."""
 
     wanted: list[int]
     places: np.ndarray
@@ -114,7 +114,7 @@ class FleetRecognizer(SequenceRecognizer):
     :param city: the map.
     :param settings: mode robust with all its options.
     :param timeout: seconds that an image waits for the lookup of neighborhoods; it goes on with
-        those held, and they are used when they have arrived.
+        those loaded, and they are used when they have arrived.
     :raises SettingsError: other settings than those of mode robust, or vertical alignment.
 
     ``problem`` is why the last lookup failed, '' = it did not.
@@ -139,15 +139,15 @@ class FleetRecognizer(SequenceRecognizer):
         # the sample, then the chunks: the matcher shares the memory
         self._strips = torch.zeros(W, self._sampled + CHUNKS * CHUNK, d)
         self._weights = torch.zeros(W, self._strips.shape[1])
-        seen = PlaceChanges(self._sampled, APART)
-        centered = self._centering.places(sample, seen.add)
+        changes = PlaceChanges(self._sampled, APART)
+        centered = self._centering.places(sample, changes.add)
         self._strips[:, : self._sampled] = centered.strips
         self._weights[:, : self._sampled] = centered.weights
         self._matcher = CpuMatcher(
             LocalFeatures(self._strips, self._weights, city.settings), settings.spatial
         )
         self._learned = ImageChange(self._sampled, FilterSettings())
-        self._learned.learn(seen.changes, _firsts(places, index.runs(places)))
+        self._learned.learn(changes.changes, _firsts(places, index.runs(places)))
         self._chunks = np.full(CHUNKS, -1)  # in each slot
         self._wanted = np.zeros(CHUNKS, np.int64)  # number of the image that wanted it last
         self._places = np.full(CHUNKS * CHUNK, -1)
@@ -168,7 +168,7 @@ class FleetRecognizer(SequenceRecognizer):
         return min(len(self._images), self._settings.sequence.length)
 
     def reset(self) -> None:
-        """Drop the images of the query; the chunks held stay."""
+        """Drop the images of the query; the loaded chunks stay."""
         self._centering.reset()
         self._images: deque[_Image] = deque(maxlen=HISTORY)
         self._unasked: deque[tuple[int, np.ndarray]] = deque(maxlen=self._settings.sequence.length)
@@ -201,7 +201,7 @@ class FleetRecognizer(SequenceRecognizer):
         self._unasked.append((self._count, place_vectors(strips[:, None])))
         if self._motion is not None:
             self._motion.way.append(position)
-        if self._look_around():
+        if self._update_neighborhoods():
             self._rebuild()
         elif self._layout is not None:
             self._push(image)
@@ -214,34 +214,34 @@ class FleetRecognizer(SequenceRecognizer):
         return Match(status, reason, self._settings.threshold)
 
     def newest_row(self) -> np.ndarray:
-        """See :meth:`SequenceRecognizer.newest_row`; +inf for places that are not held."""
+        """See :meth:`SequenceRecognizer.newest_row`; +inf for places that are not loaded."""
         row = np.full(len(self._city), np.inf, np.float32)
         if self._images:
             row[self._places[self._order]] = self._images[-1].z[self._order]
         return row
 
     def window_columns(self, places: np.ndarray) -> np.ndarray:
-        """See :meth:`SequenceRecognizer.window_columns`; +inf for places that are not held."""
-        held = self._places[self._order]
-        here = np.isin(places, held)
-        rows = super().window_columns(held.searchsorted(places[here]))
+        """See :meth:`SequenceRecognizer.window_columns`; +inf for places that are not loaded."""
+        loaded = self._places[self._order]
+        here = np.isin(places, loaded)
+        rows = super().window_columns(loaded.searchsorted(places[here]))
         columns = np.full((len(rows), len(places)), np.inf, np.float32)
         columns[:, here] = rows
         return columns
 
     # neighborhoods
 
-    def _look_around(self) -> bool:
-        """Look neighborhoods up if it is time; return whether other places are held."""
+    def _update_neighborhoods(self) -> bool:
+        """Look neighborhoods up if it is time; return whether other places are loaded."""
         if self._pending is None:
             if self._layout is not None and len(self._unasked) < EVERY:
                 return False
             asked = list(self._unasked)
             self._unasked.clear()
-            held, likely = set(self._chunks.tolist()), self._likely()
+            loaded, likely = set(self._chunks.tolist()), self._likely()
             votes = self._votes  # of this query, if it is reset meanwhile
             self._pending = call_on_thread(
-                lambda: self._look_up(asked, votes, held, likely), 'neighborhoods'
+                lambda: self._look_up(asked, votes, loaded, likely), 'neighborhoods'
             )
             wait([self._pending], 0 if self.problem else self._timeout)
         if not self._pending.done():
@@ -250,7 +250,7 @@ class FleetRecognizer(SequenceRecognizer):
         try:
             lookup = pending.result()
         except StavprError as error:
-            self.problem = f'the neighborhoods held are used: {error}'
+            self.problem = f'the loaded neighborhoods are used: {error}'
             return False
         self.problem = ''
         return self._take(lookup)
@@ -259,7 +259,7 @@ class FleetRecognizer(SequenceRecognizer):
         self,
         asked: list[tuple[int, np.ndarray]],
         votes: Votes,
-        held: set[int],
+        loaded: set[int],
         likely: np.ndarray,
     ) -> _Lookup:
         """Return the neighborhoods of images; on a thread of its own, without this object's."""
@@ -273,7 +273,7 @@ class FleetRecognizer(SequenceRecognizer):
             low, high = max(place - BEHIND, 0) // CHUNK, (place + AHEAD) // CHUNK
             wanted |= dict.fromkeys(range(low, min(high, last) + 1))
         chosen = list(wanted)[:CHUNKS]
-        chunks = sorted(set(chosen) - held)
+        chunks = sorted(set(chosen) - loaded)
         if not chunks:
             return _Lookup(chosen, np.empty(0, np.int64), None, np.empty(0, np.int64))
         places = (np.array(chunks)[:, None] * CHUNK + np.arange(CHUNK)).ravel()
@@ -321,7 +321,7 @@ class FleetRecognizer(SequenceRecognizer):
         return True
 
     def _rebuild(self) -> None:
-        """Run the filter over the latest images again, over the places held."""
+        """Run the filter over the latest images again, over the loaded places."""
         filled = np.flatnonzero(self._places >= 0)
         self._order = filled[np.argsort(self._places[filled])]
         places = self._places[self._order]

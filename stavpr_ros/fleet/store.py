@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The protocol of a map's home, what all homes hold beside the places, and the home in memory.
+The protocol of stores, the index that a robot downloads, and the store in memory.
 
 The vector of a place is made of its centered and whitened strips: the means of three groups of
 neighboring strips, joined, unit norm.
@@ -26,7 +26,7 @@ MOST_PLACES = 2**31 - 1
 @dataclass(frozen=True, eq=False)
 class MapIndex:
     """
-    What a robot holds of a map before it asks for any place.
+    The part of a map that a robot downloads before any place.
 
     :param places: number n of places.
     :param firsts: first place of every run of places of one session, ascending, int64; the first
@@ -82,7 +82,7 @@ class MapIndex:
 
 
 class PlaceStore(Protocol):
-    """A home of a map. Its calls may come from another thread, one at a time."""
+    """A store of a map. Its calls may come from another thread, one at a time."""
 
     @property
     def index(self) -> MapIndex:
@@ -94,12 +94,12 @@ class PlaceStore(Protocol):
 
         :param vectors: of images, (Q, D), float32, unit norm.
         :returns: shape (Q, count), int64; -1 behind the last.
-        :raises FleetError: the home cannot be reached, or its data is damaged.
+        :raises FleetError: the store cannot be reached, or its data is damaged.
         """
 
     def fetch(self, places: np.ndarray) -> tuple[PlaceMap, np.ndarray]:
         """
-        Return some places as a map, and of each itself or the place that shows the same, int64.
+        Return places as a map, and of each itself or the place that shows the same, int64.
 
         :param places: ascending, int64.
         :raises FleetError: as for :meth:`nearest`.
@@ -130,13 +130,13 @@ def map_vectors(place_map: PlaceMap, index: MapIndex) -> np.ndarray:
     """Return the vectors of all places, (n, D), float32; features are read block by block."""
     centering = index.centering()
     vectors = np.empty((len(place_map), index.dimension), np.float32)
-    for places, some in blocks(place_map.features):
-        vectors[places] = place_vectors(centering.places(some).strips)
+    for places, block in blocks(place_map.features):
+        vectors[places] = place_vectors(centering.places(block).strips)
     return vectors
 
 
 class LocalStore:
-    """A map on this machine; the base of homes that differ in the search for vectors."""
+    """A map on this machine; the base of stores that differ in the search for vectors."""
 
     def __init__(self, place_map: PlaceMap) -> None:
         self._map = place_map

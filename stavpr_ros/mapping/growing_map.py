@@ -217,7 +217,7 @@ class GrowingMap:
         )
 
     def _with_session(self) -> tuple[tuple[Session, ...], np.ndarray | None]:
-        """Return the sessions of a continued map that has some, and one of the places added."""
+        """Return the sessions of a continued map, and one of the places added."""
         index = self._session_index
         if index is None or len(index) == self._count:
             return self.sessions, index
@@ -236,8 +236,7 @@ class GrowingMap:
         if self.full:
             raise InputError(
                 f'the map is full, it has {self.limit} places: raise its limit, evict the oldest '
-                'places or '
-                'save it and start another'
+                'places or save it and start another'
             )
         added = _rows_of(features)
         if self.dimension not in (0, d := features.dimension):

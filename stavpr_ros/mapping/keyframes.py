@@ -9,9 +9,8 @@ from math import isfinite
 import cv2
 import numpy as np
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation
+from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation, SECOND
 
-SECOND = 1_000_000_000
 OUT_OF_ORDER = SECOND // 10  # images later than this after a newer one: the clock jumped back
 SIZE = (32, 24)  # width and height of the images compared: averages noise out, but not motion
 BLUR = 0.5  # pixels of the small image

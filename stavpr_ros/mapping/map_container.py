@@ -92,7 +92,7 @@ class MapFile:
             view, start = view[count:], start + count
 
     def bytes_at(self, start: int, count: int) -> bytes:
-        """Read some bytes; they must be within the file, checked before memory is taken."""
+        """Read bytes; they must be within the file, checked before memory is taken."""
         if start < 0 or count < 0 or start + count > self.size:
             raise self.damaged(
                 f'has {self.size} bytes, {count} from byte {start} on are missing: it is truncated'
@@ -169,7 +169,7 @@ def errors_of(path: Path) -> Iterator[None]:
     """
     Turn every error in the block into one that names the map file and a remedy.
 
-    :raises MapFileError: nothing else leaves the block, whatever the file holds.
+    :raises MapFileError: the only error of any content.
     """
     try:
         yield

@@ -178,7 +178,7 @@ def _ends(ends: np.ndarray, size: int, name: str) -> list[int]:
 
 
 def _thumbnails(file: MapFile, ends: np.ndarray | None) -> Sequence[bytes]:
-    """Check the headers of all thumbnails, some megabytes at a time."""
+    """Check the headers of all thumbnails, in blocks of megabytes."""
     if ends is None:
         return ()
     part = file.parts['thumbnails']

@@ -42,7 +42,7 @@ def save_map(
     :param storage: of the features, ``float32`` or ``float16``; '' = that of the file where they
         are, float32 in memory.
     :param force: replace an existing map, see :func:`stavpr_ros.output_file.atomic_output`.
-    :param statistics: what recognition has learned from the features as they will be stored, see
+    :param statistics: learned by recognition from the features as they will be stored, see
         :func:`stavpr_ros.recognition.held_map.statistics_of_map`; None = write none.
     :returns: the id of the map, 16 hexadecimal digits of the hash of its content.
     :raises OutputError: the file is there already, or cannot be written.
@@ -118,9 +118,9 @@ def _parts(place_map: PlaceMap, storage: str) -> dict[str, Part]:
         add_texts('ids', 'id_ends', [identifier.encode() for identifier in place_map.ids])
     if len(place_map.thumbnails):
         for first in range(0, n, THUMBNAILS_AT_ONCE):
-            some = place_map.thumbnails[first : first + THUMBNAILS_AT_ONCE]
-            ends = np.cumsum([len(content) for content in some])
-            require_jpegs(np.frombuffer(b''.join(some), np.uint8), ends, first)
+            part = place_map.thumbnails[first : first + THUMBNAILS_AT_ONCE]
+            ends = np.cumsum([len(content) for content in part])
+            require_jpegs(np.frombuffer(b''.join(part), np.uint8), ends, first)
         add_texts('thumbnails', 'thumbnail_ends', place_map.thumbnails)
     if (vectors := features.vectors) is not None:
         parts['vectors/vectors'] = _part('vectors/vectors', vectors.cpu().numpy(), dtype)

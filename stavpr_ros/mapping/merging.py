@@ -77,7 +77,7 @@ def select_session(place_map: PlaceMap, session_id: str, keep: bool = True) -> P
 
 def select_places(place_map: PlaceMap, places: np.ndarray) -> PlaceMap:
     """
-    Return a map of some places.
+    Return a map of selected places.
 
     A place that is the same as one left out is the same as itself only.
 

@@ -201,8 +201,7 @@ def _require_whole_rows(poses: np.ndarray) -> None:
     if len(bad):
         raise InputError(
             f'the pose of place {bad[0]} (and {len(bad) - 1} others) is {poses[bad[0]].tolist()}: '
-            'expected 7 '
-            'finite numbers, or 7 times NaN where it is unknown'
+            'expected 7 finite numbers, or 7 times NaN where it is unknown'
         )
     bad = np.flatnonzero(abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) > 0.01)
     if len(bad):

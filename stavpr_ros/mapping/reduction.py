@@ -20,7 +20,7 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
     Project a map's features to the directions in which they vary most around their mean.
 
     The directions are the same for all strips, and learned from all places. They stay as they are
-    when the map grows: images are projected by the matrix that the map holds.
+    when the map grows: images are projected by the matrix of the map.
 
     :param dimension: at least 1, below that of the features, and so small that the map has
         ``STRIPS_A_DIRECTION`` strips for each.

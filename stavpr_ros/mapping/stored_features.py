@@ -46,13 +46,13 @@ class StoredFeatures(LocalFeatures):
     """
     Features of a map that stay in its file, without a copy in memory.
 
-    Every access to ``strips`` or ``vectors`` reads them all, ``features[places]`` some of them.
+    Every access to ``strips`` or ``vectors`` reads them all, ``features[places]`` a part.
     The file stays open, so that it may be replaced or deleted. Thread-safe.
 
     :param weights: see :class:`LocalFeatures`; in memory.
 
     ``statistics`` is what recognition has learned from them, None = unknown;
-    ``has_stale_statistics`` whether the file has some of other features.
+    ``has_stale_statistics`` whether those in the file are of other features.
     """
 
     statistics: MapStatistics | None = None
@@ -123,14 +123,14 @@ class StoredFeatures(LocalFeatures):
         return self.statistics is not None and CODES in self.file.parts
 
     def codes(self, j: int, first: int, count: int) -> np.ndarray:
-        """Return the codes of one strip of some places, shape (count, d), int8."""
+        """Return the codes of one strip of places, shape (count, d), int8."""
         _, n, d = self._part.shape
         codes: np.ndarray = np.empty((count, d), np.int8)
         self.file.fill(codes, self.file.parts[CODES].start + (j * n + first) * d)
         return codes
 
     def _read(self, places: np.ndarray) -> torch.Tensor:
-        """Return the features of some places, shape (W, len(places), d), float32."""
+        """Return the features of places, shape (W, len(places), d), float32."""
         W, n, d = self._part.shape
         out = torch.empty((W, len(places), d))
         for j in range(W):
@@ -138,7 +138,7 @@ class StoredFeatures(LocalFeatures):
         return out
 
     def _read_vectors(self, places: np.ndarray) -> torch.Tensor | None:
-        """Return the vectors of some places, shape (len(places), D), float32."""
+        """Return the vectors of places, shape (len(places), D), float32."""
         if self._vectors is None:
             return None
         out = torch.empty((len(places), self._vectors.shape[1]))
@@ -148,7 +148,7 @@ class StoredFeatures(LocalFeatures):
     def _fill(
         self, out: torch.Tensor, part: Part, first: int, places: np.ndarray, name: str
     ) -> None:
-        """Read the rows of some places of a part; ``first`` is the row of place 0."""
+        """Read the rows of places of a part; ``first`` is the row of place 0."""
         dtype = np.dtype(DTYPES[part.dtype])
         runs = np.split(np.arange(len(places)), np.flatnonzero(np.diff(places) != 1) + 1)
         starts = [(run, at) for run in runs for at in range(0, len(run), PLACES_AT_ONCE)]

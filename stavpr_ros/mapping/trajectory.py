@@ -142,8 +142,8 @@ class Trajectory:
             stamps, poses = self._stamps, self._poses
             after = bisect_left(stamps, stamp)
             if after == len(stamps):
-                held = bool(stamps) and stamp - stamps[-1] <= self._timeout
-                return poses[-1].copy() if held else None
+                recent = bool(stamps) and stamp - stamps[-1] <= self._timeout
+                return poses[-1].copy() if recent else None
             a, b = max(after - 1, 0), after
             start, end, first, last = stamps[a], stamps[b], poses[a], poses[b]
         if stamp == end:

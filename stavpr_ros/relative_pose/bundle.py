@@ -23,16 +23,16 @@ LEAST_SHARE = 1 / 500  # least inverse depth, 1/m: everything beyond is at infin
 @dataclass(frozen=True, eq=False)
 class Observations:
     """
-    Keypoints of the place, seen from its neighbors: m pairs.
+    Keypoints of the place, observed from its neighbors: m pairs.
 
     :param keypoint: its number, shape (m,); neighbor: number of the neighbor.
-    :param ray: of the keypoint in the place, shape (m, 3); seen: in the neighbor, (m, 2).
+    :param ray: of the keypoint in the place, shape (m, 3); observed: in the neighbor, (m, 2).
     """
 
     keypoint: np.ndarray
     neighbor: np.ndarray
     ray: np.ndarray
-    seen: np.ndarray
+    observed: np.ndarray
 
     def _turned(self, motions: np.ndarray) -> np.ndarray:
         return np.einsum('mij,mj->mi', motions[self.neighbor, :3, :3], self.ray)
@@ -47,9 +47,9 @@ class Observations:
         variance with the noise of the place as well, which all neighbors have in common.
         """
         base, slope = self._turned(motions), motions[self.neighbor, :3, 3]
-        # (base + rho slope)_xy = seen (base + rho slope)_z
-        a = slope[:, :2] - self.seen * slope[:, 2:]
-        b = self.seen * base[:, 2:] - base[:, :2]
+        # (base + rho slope)_xy = observed (base + rho slope)_z
+        a = slope[:, :2] - self.observed * slope[:, 2:]
+        b = self.observed * base[:, 2:] - base[:, :2]
         depth = np.maximum(base[:, 2] + rho[self.keypoint] * slope[:, 2], 0.05)
         weight, k = use / depth**2, len(rho)
         information = np.bincount(self.keypoint, weight * (a * a).sum(axis=1), k)
@@ -65,10 +65,11 @@ class Observations:
             self._turned(motions) + rho[self.keypoint, None] * motions[self.neighbor, :3, 3]
         )
         ahead = direction[:, 2] > 1e-6
-        return direction[:, :2] / np.where(ahead, direction[:, 2], 1)[:, None] - self.seen, ahead
+        depth = np.where(ahead, direction[:, 2], 1)[:, None]
+        return direction[:, :2] / depth - self.observed, ahead
 
     def chosen(self, use: np.ndarray) -> 'Observations':
-        """Return some of the observations, (m,) bool."""
+        """Return a part of the observations, (m,) bool."""
         return Observations(*(each[use] for each in vars(self).values()))
 
     def refined(
@@ -87,7 +88,7 @@ class Observations:
         slope = motions[self.neighbor, :3, 3]
         x, y, z = (turned + rho[self.keypoint, None] * slope).T
         z = np.maximum(z, 1e-6)
-        off = focal * (np.stack([x / z, y / z], axis=1) - self.seen)
+        off = focal * (np.stack([x / z, y / z], axis=1) - self.observed)
         zero = np.zeros_like(z)
         projection = np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]])
         projection = focal * projection.transpose(2, 0, 1)
@@ -105,10 +106,10 @@ class Observations:
         mixed = shared.transpose(0, 2, 1).reshape(6 * count, keypoints)
         normal, right = information.copy(), information @ _moved(motions, prior)
         for number in range(count):
-            seen, part = self.neighbor == number, slice(6 * number, 6 * number + 6)
-            rows, weights = by_motion[seen].reshape(-1, 6), np.repeat(weight[seen], 2)
+            mine, part = self.neighbor == number, slice(6 * number, 6 * number + 6)
+            rows, weights = by_motion[mine].reshape(-1, 6), np.repeat(weight[mine], 2)
             normal[part, part] += rows.T @ (weights[:, None] * rows)
-            right[part] += rows.T @ (weights * off[seen].ravel())
+            right[part] += rows.T @ (weights * off[mine].ravel())
         step = -np.linalg.solve(normal - (mixed / own) @ mixed.T, right - mixed @ (pull / own))
         deeper = rho - (pull + mixed.T @ step) / own
         result = motions.copy()

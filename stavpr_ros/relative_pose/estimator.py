@@ -23,7 +23,7 @@ from stavpr_ros.relative_pose.pnp import LEAST_INLIERS, PnpPose, solve_pnp
 from stavpr_ros.relative_pose.verification import verified_edge, Verifier
 
 METHODS = ('auto', 'none', 'aligned', 'pnp')
-VIEWS, LANDMARKS = 64, 32  # places kept: some 300 kB and 100 kB each
+VIEWS, LANDMARKS = 64, 32  # places kept: about 300 kB and 100 kB each
 LEAST_BASELINE = 0.05  # meters between the place and a neighbor
 # Places between independent edges: their errors have views, or odometry, in common.
 APART = {Source.PNP: 5, Source.ALIGNED: 10}

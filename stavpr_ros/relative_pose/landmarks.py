@@ -91,18 +91,18 @@ def triangulate(
         the optical frame of the place to that of the view, meters.
     :param before: the number of those before the place.
     """
-    seen = _observed(place, neighbors)
+    observed = _observed(place, neighbors)
     prior = motions = np.array([motion for _, motion in neighbors])
     trust = odometry_information(prior, before)
-    use = np.ones(len(seen.keypoint), bool)
+    use = np.ones(len(observed.keypoint), bool)
     rho = np.full(len(place.rays), LEAST_SHARE)
     for limit in PIXELS:
         for _ in range(2):
-            rho, information, variance = seen.depths(motions, rho, use)
-            off, ahead = seen.residuals(motions, rho)
+            rho, information, variance = observed.depths(motions, rho, use)
+            off, ahead = observed.residuals(motions, rho)
             use = ahead & (np.linalg.norm(off, axis=1) * place.focal < limit)
         if limit != PIXELS[-1]:
-            used = seen.chosen(use)
+            used = observed.chosen(use)
             for _ in range(STEPS):
                 motions, rho = used.refined(motions, rho, prior, trust, place.focal)
     good = information * MOST_SHIFT**2 > 1
@@ -118,5 +118,5 @@ def _observed(place: View, neighbors: Sequence[tuple[View, np.ndarray]]) -> Obse
     keypoint = np.concatenate([mine for mine, _ in pairs]).astype(np.intp)
     neighbor = np.repeat(np.arange(len(pairs)), [len(mine) for mine, _ in pairs])
     rays = np.column_stack([place.rays, np.ones(len(place.rays))])
-    seen = [view.rays[theirs] for (_, theirs), (view, _) in zip(pairs, neighbors, strict=True)]
-    return Observations(keypoint, neighbor, rays[keypoint], np.concatenate(seen))
+    observed = [view.rays[rows] for (_, rows), (view, _) in zip(pairs, neighbors, strict=True)]
+    return Observations(keypoint, neighbor, rays[keypoint], np.concatenate(observed))

@@ -11,12 +11,11 @@ import numpy as np
 from stavpr_ros.errors import ImageError, SourceError
 from stavpr_ros.sources.bag_file import message_type, open_bag, OpenBag, reading
 from stavpr_ros.sources.encodings import decode_message
-from stavpr_ros.sources.frame import Frame, ImageRecord
+from stavpr_ros.sources.frame import Frame, ImageRecord, SECOND
 
 RAW = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 ODOMETRY = 'nav_msgs/msg/Odometry'
-SECOND = 1_000_000_000
 LATE = SECOND // 2  # messages may be out of order by so much; more is a clock that jumped back
 LEAST_MESSAGE = 16  # bytes of a message in a bag, with its entry in the index
 Item = TypeVar('Item')
@@ -118,8 +117,7 @@ class BagSource:
             if (start, duration) == (0, math.inf) and index + 1 < self._count:
                 raise SourceError(
                     f'{self.path} ends early: {index + 1} of the {self._count} messages of '
-                    f'{self.topic} '
-                    'that it states are present; try `ros2 bag reindex`'
+                    f'{self.topic} that it states are present; try `ros2 bag reindex`'
                 )
 
     def _message(self, bag: OpenBag, raw: bytes) -> Any:

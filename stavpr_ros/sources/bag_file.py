@@ -18,9 +18,9 @@ from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import SourceError, StavprError
 from stavpr_ros.regular_file import require_regular
+from stavpr_ros.sources.frame import SECOND
 
 METADATA = 'metadata.yaml'
-SECOND = 1_000_000_000
 STORAGE_SUFFIXES = frozenset({'.db3', '.mcap'})
 LOG_SUFFIXES = ('-wal', '-journal')
 """Files of SQLite beside a database with writes that are not in the database yet."""
@@ -48,7 +48,7 @@ class OpenBag:
         self, connections: list[Connection], start: float = 0.0, duration: float = math.inf
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """
-        Yield the messages of some connections, with their times of recording, ns, in order.
+        Yield the messages of connections, with their times of recording, ns, in order.
 
         :param start: seconds after the start of the bag.
         :param duration: seconds from there on.
@@ -115,8 +115,8 @@ def reading(path: Path) -> Iterator[None]:
     except Exception as error:
         raise SourceError(
             f'{path} is damaged, cut off or no bag: expected a ROS 2 bag (folder, .db3, .mcap) or '
-            'a ROS 1 '
-            f'.bag ({type(error).__name__}: {error}); try `ros2 bag reindex` or `rosbag reindex`'
+            f'a ROS 1 .bag ({type(error).__name__}: {error}); try `ros2 bag reindex` or `rosbag '
+            'reindex`'
         ) from error
 
 
@@ -149,8 +149,7 @@ def _only_storage_file(folder: Path) -> Path:
         names = ', '.join(file.name for file in files) or 'none'
         raise SourceError(
             f'{folder} has no {METADATA}: expected exactly one .db3 or .mcap file then, found '
-            f'{names}; '
-            'run `ros2 bag reindex`, or name one of the files'
+            f'{names}; run `ros2 bag reindex`, or name one of the files'
         )
     return files[0]
 

@@ -36,7 +36,7 @@ def read_messages(
     path: Path, topics: Collection[str], start: float = 0.0, duration: float = math.inf
 ) -> Iterator[MessageRecord]:
     """
-    Yield the messages of some topics, in the order of recording.
+    Yield the messages of topics, in the order of recording.
 
     Messages of ROS 1 are converted; of those, the common interfaces are known.
 

@@ -10,8 +10,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.output_file import atomic_folder
-from stavpr_ros.sources.bag import RAW, SECOND
-from stavpr_ros.sources.frame import ImageRecord, MessageRecord
+from stavpr_ros.sources.bag import RAW
+from stavpr_ros.sources.frame import ImageRecord, MessageRecord, SECOND
 
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
 VERSION: int = 9
@@ -44,11 +44,7 @@ def write_bag(
     count = 0
     with (
         atomic_folder(path) as folder,
-        Writer(
-            folder,
-            version=VERSION,  # type: ignore[arg-type]
-            storage_plugin=plugin,
-        ) as writer,
+        Writer(folder, version=VERSION, storage_plugin=plugin) as writer,  # type: ignore[arg-type]
     ):
         connection = writer.add_connection(topic, RAW, typestore=typestore)
         connections = {

@@ -65,7 +65,7 @@ def demosaic(code: int, mosaic: np.ndarray) -> np.ndarray:
 
     :param code: of OpenCV with four letters: the top-left 2x2 pixels, as ROS names a mosaic.
     :param mosaic: uint8, shape (height, width) or (height, width, 1); rows may be apart.
-    :raises ImageError: fewer than 2 rows or columns: some color is missing.
+    :raises ImageError: fewer than 2 rows or columns: a color is missing.
     """
     height, width = mosaic.shape[:2]
     if min(height, width) < 2:
@@ -182,8 +182,7 @@ def decode_image(
     if flat.size < needed:
         raise ImageError(
             f'{flat.size} bytes of data for {width}x{height} {encoding} with step {step}: '
-            f'expected {needed} '
-            'or more; the image is cut off',
+            f'expected {needed} or more; the image is cut off',
             kind='cut off',
         )
     if width * height > files.MAX_PIXELS:  # last: a wrong header fails the checks above
@@ -240,7 +239,7 @@ def decode_compressed_message(message: Any, least: tuple[int, int] | None = None
     original = message.format.partition(';')[0].strip()
     if 'compresseddepth' in message.format.lower() or _MEASUREMENTS.fullmatch(original):
         raise ImageError(
-            f'compressed format {message.format!r} holds depth or measurements, not an image: '
+            f'compressed format {message.format!r} is depth or measurements, not an image: '
             "choose the camera's color or gray topic",
             kind='depth',
         )
@@ -254,7 +253,7 @@ def _demosaic_of(transport: str) -> Callable[[np.ndarray], np.ndarray] | None:
     """
     Find the Bayer mosaic in a format such as ``bayer_rggb8; png compressed``.
 
-    After ``compressed`` stands the encoding before compression: nothing or the same mosaic if it
+    After ``compressed`` follows the encoding before compression: nothing or the same mosaic if it
     was not converted, ``mono8`` or ``bgr8`` if it is no mosaic any more.
     """
     original, _, rest = transport.partition(';')
@@ -272,7 +271,7 @@ def _layout(encoding: str) -> Encoding:
     known = ', '.join(ENCODINGS)
     if _MEASUREMENTS.fullmatch(encoding):
         raise ImageError(
-            f'encoding {encoding!r} holds depth or measurements, not an image: expected one of '
+            f'encoding {encoding!r} is depth or measurements, not an image: expected one of '
             f'{known}; '
             "choose the camera's color or gray topic",
             kind='depth',
@@ -294,16 +293,13 @@ def _check_header(height: int, width: int, encoding: str, step: int, row: int) -
     if height % rows or width % columns:
         raise ImageError(
             f'{encoding} image of {width}x{height} pixels: expected a width that is a multiple of '
-            f'{columns} '
-            f'and a height that is a multiple of {rows}, since so many pixels share a color; '
-            'check the '
-            'camera driver',
+            f'{columns} and a height that is a multiple of {rows}, since so many pixels share a '
+            'color; check the camera driver',
             kind='size',
         )
     if step < row:
         raise ImageError(
             f'step of {step} bytes is too small for a row of {width} {encoding} pixels: expected '
-            f'{row} or '
-            'more; check the camera driver',
+            f'{row} or more; check the camera driver',
             kind='step',
         )

@@ -11,10 +11,9 @@ import re
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, SourceError
 from stavpr_ros.sources.files import decode_file
-from stavpr_ros.sources.frame import Frame, ImageRecord
+from stavpr_ros.sources.frame import Frame, ImageRecord, SECOND
 
 SUFFIXES = frozenset({'.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'})
-SECOND = 1_000_000_000
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
@@ -54,7 +53,7 @@ class FolderSource:
         if not files:
             expected = ' '.join(sorted(SUFFIXES))
             raise SourceError(
-                f'{self.path} holds no images: expected files ending in {expected}, not in '
+                f'{self.path} has no images: expected files ending in {expected}, not in '
                 'sub-folders'
             )
         self.files: list[Path] = sorted(files, key=lambda file: natural_key(file.name))

@@ -7,6 +7,8 @@ from typing import Any, Self
 
 import numpy as np
 
+SECOND = 1_000_000_000  # ns
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:

@@ -23,6 +23,7 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.ros.output import pose_message, time_message
 from stavpr_slam.ros.graph_messages import pose_array
 from test_pose_graph import circle, LAP, planar_poses, SECOND
+from test_pose_graph_node import odometry_message
 
 EDGES = 10
 AHEAD = 3  # images that the place is ahead of the query
@@ -204,7 +205,7 @@ class Target(Node):
 
         def publish(number: int, stamp: int, pose) -> None:
             message = KeyframeOdom(id=number)
-            message.odom = odometry_message(stamp, pose)
+            message.odom = odometry_message(stamp, to_poses(pose))
             for publisher in publishers:
                 other.publish(message.odom)
                 publisher.publish(message)
@@ -220,13 +221,6 @@ class Target(Node):
                 'deviations': deviations,
             }
         )  # fmt: skip
-
-
-def odometry_message(stamp: int, pose: np.ndarray) -> Odometry:
-    message = Odometry(child_frame_id='base_link')
-    message.header.stamp, message.header.frame_id = time_message(stamp), 'odom'
-    message.pose.pose = pose_message(to_poses(pose))
-    return message
 
 
 def main(target: str, on_map: bool) -> None:
@@ -252,7 +246,7 @@ def main(target: str, on_map: bool) -> None:
     for message in closures(drive, on_map):
         node.closures.publish(message)
     for image in range(2 * LAP - 1):
-        node.odometry.publish(odometry_message(stamp_of(image), drive.at(image)))
+        node.odometry.publish(odometry_message(stamp_of(image), to_poses(drive.at(image))))
         if image % KEYFRAME == 0:  # known before the odometry after it
             publish(image // KEYFRAME + 1, stamp_of(image + 0.3), drive.at(image + 0.3))
         executor.spin_once(timeout_sec=0.01)

@@ -8,22 +8,17 @@ import os
 from pathlib import Path
 import subprocess
 import sys
-import time
 from types import SimpleNamespace
 
 from bridge_target import AHEAD, closures, DEVIATIONS, Drive, EDGES, KEYFRAME, stamp_of
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from interface_packages import build_interfaces
 import numpy as np
-from processes import DOMAIN, environment, executable, Process, SECOND, TIMEOUT
+from processes import environment, executable, Process, SECOND, TIMEOUT
 import pytest
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from scipy.spatial.transform import Rotation
-from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.ros.output import nanoseconds
@@ -33,6 +28,7 @@ from stavpr_slam.ros.bridges.bridge import Bridge, interfaces
 from stavpr_slam.ros.bridges.external_keyframes import ExternalKeyframes, keyframe_edge
 from stavpr_slam.ros.graph_messages import pose_array
 from test_pose_graph import LAP
+from test_pose_graph_node import Peer
 
 COVARIANCE = np.diag([0.2, 0.1, 0.3, 0.01, 0.02, 0.03]) ** 2
 
@@ -118,37 +114,20 @@ def test_status_of_bridge_that_sends_nothing_is_warning_with_remedy(counts, leve
 
 def test_pose_bridges_publish_pose_on_map(tmp_path):
     """The prior of RTAB-Map for each independent closure, robot_localization once."""
-    context = Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    node = rclpy.create_node('peer', context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
+    peer = Peer()
+    node, counts, wait_until = peer.node, peer.diagnostics, peer.wait_until
     priors: list[PoseWithCovarianceStamped] = []
     poses: list[PoseWithCovarianceStamped] = []
-    counts: dict[str, dict[str, str]] = {}
-
-    def on_diagnostics(message: DiagnosticArray) -> None:
-        for status in message.status:
-            counts[status.name] = {each.key: each.value for each in status.values}
-
-    def wait_until(done) -> None:
-        end = time.monotonic() + TIMEOUT
-        while not done():
-            assert time.monotonic() < end, (len(priors), len(poses), counts)
-            executor.spin_once(timeout_sec=0.1)
-
     qos = QoSProfile(depth=100)
     kind = PoseWithCovarianceStamped
     subscriptions = [
         node.create_subscription(kind, 'global_pose', priors.append, qos),
         node.create_subscription(kind, 'robot_localization_bridge/pose', poses.append, qos),
     ]
-    node.create_subscription(DiagnosticArray, '/diagnostics', on_diagnostics, 10)
-    publisher = node.create_publisher(LoopClosure, 'stavpr/loop_closure', qos)
     targets = ('rtabmap_global_pose', 'robot_localization')
     processes = [Process(tmp_path / name, 'bridge', name) for name in targets]
     try:
-        wait_until(lambda: publisher.get_subscription_count() == 2)
+        wait_until(lambda: peer.closures.get_subscription_count() == 2)
         wait_until(lambda: all(node.count_publishers(each.topic_name) for each in subscriptions))
         wait_until(lambda: len(counts) == 2)  # they have discovered each other's topics
         sent = closures(Drive(), on_map=True)
@@ -156,7 +135,7 @@ def test_pose_bridges_publish_pose_on_map(tmp_path):
         sent[-1].relative_pose.pose.covariance[0] = np.nan
         sent[-2].relative_pose.query_stamp.sec += 100
         for message in [*sent, *closures(Drive(), on_map=False)[:3]]:
-            publisher.publish(message)
+            peer.closures.publish(message)
         wait_until(
             lambda: all(int(each.get('closures', 0)) == len(sent) + 3 for each in counts.values())
         )
@@ -179,9 +158,7 @@ def test_pose_bridges_publish_pose_on_map(tmp_path):
     finally:
         for process in processes:
             process.end()
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown(context=context)
+        peer.close()
 
 
 @pytest.fixture(scope='module')

@@ -64,7 +64,7 @@ def test_deviations_of_right_closures_are_chi_square():
     truth, dice = laps(2 * LAP), np.random.default_rng(0)
     ends = [(220, 20), (300, 100), (380, 180), (230, 25)]
     found = []
-    for _ in range(60):
+    for _ in range(30):
         chain = drive(truth, dice)
         cycles = Cycles(chain, [measured(truth, chain, *each, dice) for each in ends])
         found.append([cycles.deviations(i, 1.0) for i in range(len(ends))])

@@ -157,9 +157,6 @@ def test_few_wrong_closures_join_no_session():
     assert error(found, truth) > 20
 
 
-# breaks
-
-
 def wrong_at_the_end(count: int, laps: int = 2, size: float = 1.0):
     """Return laps, the last closures of which are of one wrong place."""
     truth = circle(laps) * [size, size, 1]

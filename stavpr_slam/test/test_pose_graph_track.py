@@ -67,11 +67,11 @@ def test_saved_trajectory_has_the_odometry_between_keyframes(solved, tmp_path):
 @pytest.mark.parametrize(('jitter', 'most'), [(0.0, 5), (0.05, MOST + 2)])
 def test_add_odometry_of_high_rate_keeps_few_poses(jitter, most):
     chain, dice = KeyframeChain(ChainSettings(), OdometryNoise()), np.random.default_rng(0)
-    rows = np.column_stack([np.arange(20_000) / 200, *jitter * dice.normal(size=(2, 20_000)) / 5])
+    rows = np.column_stack([np.arange(4000) / 200, *jitter * dice.normal(size=(2, 4000)) / 5])
     for i, pose in enumerate(planar_poses(rows)):
         chain.add((i + 1) * SECOND // 200, pose)
     stamps, _, _ = chain.trajectory(chain.transforms)
-    assert 90 < len(chain) < len(stamps) < most * len(chain)
+    assert 18 < len(chain) < len(stamps) < most * len(chain)
 
 
 def test_trajectory_after_a_split_belongs_to_the_session_from_its_stamp():

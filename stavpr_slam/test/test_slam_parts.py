@@ -10,119 +10,67 @@ import numpy as np
 from processes import DOMAIN, SECOND
 import pytest
 import rclpy
-from rclpy.context import Context
 from sensor_msgs.msg import CameraInfo
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure, RelativePose
 from stavpr_ros.errors import StavprError
 from stavpr_ros.ros.camera import CameraInput
-from stavpr_ros.ros.output import pose_message, time_message
+from stavpr_ros.ros.output import time_message
 from stavpr_slam.pose_graph import PoseGraph
-from stavpr_slam.pose_graph.false_places import NEAR, RUN
+from stavpr_slam.pose_graph.false_places import FalsePlaces, NEAR, RUN
 from stavpr_slam.ros.false_closures import FalseClosures
 from stavpr_slam.ros.graph_client import fetch_graph
 from stavpr_slam.ros.graph_messages import closure_of
-from test_pose_graph import circle, closure, error, LAP, odometry_of
+from test_pose_graph import circle, odometry_of
 
 
 @pytest.fixture
 def context():
-    own = Context()
-    rclpy.init(context=own, domain_id=DOMAIN)
-    yield own
-    rclpy.try_shutdown(context=own)
+    rclpy.init(domain_id=DOMAIN)
+    yield rclpy.get_default_context()
+    rclpy.try_shutdown()
 
 
-def relayed(context, monkeypatch, share, coherent, count=200):
-    """Return how far the places of relayed closures are from the right ones."""
-    create = FalseClosures.__init__
-    monkeypatch.setattr('rclpy.node.Node.__init__', _in(context))
-    node = FalseClosures.__new__(FalseClosures)
-    create(node, share, coherent, 1)
-    sent = []
-    node._publisher = SimpleNamespace(publish=sent.append)
-    for place in range(count):
-        stamps = time_message((place + 300) * SECOND), time_message((place + 1) * SECOND)
-        message = LoopClosure(query_index=place + 300, place_index=place)
-        message.query_stamp, message.place_stamp = stamps
-        message.relative_pose.place_stamp = stamps[1]
-        message.pairs = [
-            AlignedPlaces(
-                query_index=place + 300, query_stamp=stamps[0], place_index=place,
-                place_stamp=stamps[1],
-            )
-        ]  # fmt: skip
-        node._on_closure(message)
-        assert sent[-1].relative_pose.place_stamp == sent[-1].place_stamp
-    node.destroy_node()
-    return np.array([message.place_index - i for i, message in enumerate(sent)])
+def offsets(share: float, coherent: bool) -> np.ndarray:
+    """Return how far the chosen places of 200 closures are from their own."""
+    false = FalsePlaces(share, coherent, 1)
+    return np.array([false.place(i, range(2 * i + 1)) - i for i in range(200)])
 
 
-def _in(context):
-    original = rclpy.node.Node.__init__
-
-    def initialize(self, name, **options):
-        original(self, name, context=context, **options)
-
-    return initialize
-
-
-def test_false_closures_of_share_zero_are_relayed_unchanged(context, monkeypatch):
-    assert not relayed(context, monkeypatch, 0.0, False).any()
-
-
-def test_false_closures_at_random_are_a_share_and_far(context, monkeypatch):
-    off = relayed(context, monkeypatch, 0.3, False)
+def test_false_places_at_random_are_a_share_and_far():
+    off = offsets(0.3, False)
     assert 0.15 < (off != 0).mean() < 0.45
     assert np.abs(off[off != 0]).min() > NEAR - 1
+    assert not offsets(0.0, False).any()
 
 
-def test_false_closures_coherent_are_runs(context, monkeypatch):
-    off = relayed(context, monkeypatch, 0.5, True)
+def test_false_places_coherent_are_runs():
+    off = offsets(0.5, True)
     assert (off != 0).any()
     changes = np.flatnonzero(np.diff(off != 0)) + 1
     assert not (changes % RUN).any()
 
 
+def test_false_closure_is_relayed_with_the_stamps_of_its_place(context, monkeypatch):
+    sent = []
+    monkeypatch.setattr(
+        rclpy.publisher.Publisher, 'publish', lambda _, message: sent.append(message)
+    )
+    monkeypatch.setattr(FalsePlaces, 'place', lambda *_: 7)
+    node = FalseClosures(1.0, False, 1)
+    (subscription,) = node.subscriptions
+    message = LoopClosure(query_index=300, place_index=0)
+    message.relative_pose.place_stamp = time_message(SECOND)
+    message.pairs = [AlignedPlaces(place_index=7, place_stamp=time_message(8 * SECOND))]
+    subscription.callback(message)
+    node.destroy_node()
+    relative = sent[-1].relative_pose
+    assert sent[-1].place_index == relative.place_index == 7
+    assert sent[-1].place_stamp == relative.place_stamp == time_message(8 * SECOND)
+
+
 def test_fetch_graph_without_node_names_what_is_missing():
     with pytest.raises(StavprError, match=r'pose_graph: 3 closures not in 0\.3 s'):
         fetch_graph([], 3, DOMAIN, timeout=0.3)
-
-
-def test_pose_graph_started_late_counts_closures_of_earlier_places():
-    """The node was restarted on lap 2: only closures of lap 3 with lap 2 have two known stamps."""
-    truth = circle(3)
-    odometry, graph = odometry_of(truth), PoseGraph()
-    for i in range(LAP, 3 * LAP):
-        graph.add_odometry((i + 1) * SECOND, odometry[i])
-        graph.add_closure(closure(truth, i, i - LAP))
-    found = graph.update()[:, :2, 3]
-    assert graph.counts['unknown stamp'] == LAP
-    assert graph.accepted > 0.9 * LAP
-    assert error(np.pad(found, ((0, 0), (0, 5))), truth[LAP:]) < 1
-
-
-def test_pose_graph_accepts_closures_before_and_after_recognition_restarts():
-    """The recognition node was restarted on lap 2: it numbers places anew, stamps go on."""
-    truth = circle(3)
-    odometry, graph, restart = odometry_of(truth), PoseGraph(), LAP + 40
-    for i in range(3 * LAP):
-        graph.add_odometry((i + 1) * SECOND, odometry[i])
-        first = 0 if i < restart else restart
-        if i - LAP < first:
-            continue  # the place of this image is not on the route
-        made = closure(truth, i, i - LAP, independent=True)
-        message = LoopClosure(query_index=i - first, place_index=i - LAP - first)
-        message.has_relative_pose = True
-        edge = message.relative_pose
-        edge.source, edge.is_independent = RelativePose.PNP, True
-        edge.query_stamp = time_message(made.query_stamp)
-        edge.place_stamp = time_message(made.place_stamp)
-        edge.pose.pose, edge.pose.covariance = pose_message(made.pose), made.covariance.ravel()
-        graph.add_closure(closure_of(message, False))
-    found = graph.update()[:, :2, 3]
-    assert graph.accepted > 0.9 * (40 + 60)
-    assert {edge.query for edge in graph.edges if edge.accepted} & set(range(LAP, restart))
-    assert error(np.pad(found, ((0, 0), (0, 5))), truth) < error(odometry, truth) / 2
 
 
 @pytest.mark.parametrize(

@@ -157,7 +157,7 @@ def image_distances(features, queries, weights, xi, out):
 @parallel_kernel
 def image_distances_at(features, queries, weights, xi, n, firsts, out):
     """
-    Image distances of one image to some map images, as :func:`image_distances`.
+    Image distances of one image to a part of the map images, as :func:`image_distances`.
 
     :param n: map images.
     :param firsts: first map image of each chunk, multiples of LANES below n, (m,).

@@ -3,7 +3,7 @@
 """
 The recursion of both alignments, row by row, on all lanes at once.
 
-Between rows the *edge* holds S and C of the row above: flat, slot x + 1 is column x, slot 0 the
+Between rows the *edge* has S and C of the row above: flat, slot x + 1 is column x, slot 0 the
 corner (-1, -1), whose S = C = 0 makes the first cell an ordinary diagonal step of weight 1.
 Infinite S mark what may not be used. The diagonal is taken only when strictly smallest; vertical
 wins a tie over horizontal. No ``fastmath``: the answers are the oracle's bit for bit.
@@ -71,7 +71,7 @@ def sweep_row(d, at, stride, first, last, edge, weight):
 
 @kernel
 def sweep_four_rows(d, at, pitch, columns, edge):
-    """Advance the edge, held in registers, by four rows, ``pitch`` apart, with a = 1."""
+    """Advance the edge, in registers, by four rows, ``pitch`` apart, with a = 1."""
     one = splat(edge.dtype.type(1))
     S0 = S1 = S2 = S3 = splat(edge.dtype.type(np.inf))
     C0 = C1 = C2 = C3 = one

@@ -7,7 +7,7 @@ A strip x of the map is rounded to whole numbers at a scale of its own, ``rint(s
 s = min(N / |x|, 127 / max |x_t|), one of the query with 63 instead of 127; N = 181 - sqrt(d) / 2.
 The distance of two strips is 1 less the cosine of their whole numbers. These are never longer than
 181, so that by Cauchy-Schwarz every product of two strips fits 16 bits, 181^2 < 2^15, and sums may
-wrap on the way. Two products of an unsigned map value and a query value, 2 * 255 * 63, fit as
+wrap in between. Two products of an unsigned map value and a query value, 2 * 255 * 63, fit as
 well: nothing saturates. Sums of whole numbers have no order: every processor returns the same.
 
 In memory, LANES places lie side by side, four dimensions of each: the lanes of one vector. It is
@@ -139,7 +139,7 @@ def _multiply_add(typing: Any, total: Any, places: Any, query: Any) -> Any:
 
 @intrinsic
 def _total(typing: Any, total: Any, query_sum: Any) -> Any:
-    """Return the whole numbers that the sums stand for, as float32, exactly."""
+    """Return the whole numbers of the sums, as float32, exactly."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         whole = write_total(builder, INSTRUCTION, *arguments)
@@ -257,7 +257,7 @@ class Int8Strips:
         Copy strips that were rounded before.
 
         :param first: their first place, a multiple of LANES.
-        :param codes: strip j of some places, shape (m, d), int8, as of :meth:`rounded`.
+        :param codes: strip j of places, shape (m, d), int8, as of :meth:`rounded`.
         :raises ValueError: a strip is longer than rounding makes it: sums could overflow.
         """
         longest = _copy_places(codes, j, first, self.values, self.reciprocals)
@@ -268,7 +268,7 @@ class Int8Strips:
             )
 
     def __getitem__(self, index: tuple[slice, slice | np.ndarray]) -> torch.Tensor:
-        """Return strips of some places, [:, places], float32, of unit norm again."""
+        """Return strips of places, [:, places], float32, of unit norm again."""
         places = np.arange(self.shape[1])[index[1]]
         rounded = self.values[:, places // LANES, :, places % LANES]  # (m, W, quads, QUAD)
         strips = rounded.reshape(len(places), len(self), -1)[:, :, : self.shape[2]]

@@ -42,7 +42,7 @@ def lm_dtw(D, k, distances, lengths):
 
     :param D: image distances, shape (l, N + k - 1), C-contiguous, with N = n rounded up to whole
         vectors of LANES; whatever lies past the map's end is +inf.
-    :param k: map images a start sees.
+    :param k: map images a start searches.
     :param distances: shape (N,), written; +inf where no path is finite.
     :param lengths: shape (N,) int32, written; 0 there.
     """

@@ -4,7 +4,7 @@
 Vectors of LANES numbers as a type that numba compiles.
 
 Both recursions run over *lanes*: neighboring map images (or starts) side by side in one SIMD
-register. Left to the compiler, such loops are vectorized at some sizes and not at others, an order
+register. Left to the compiler, such loops are vectorized depending on the size, an order
 of magnitude apart; written with vectors they are what they say, on every processor. In a kernel
 ``+ - * / <`` work on vectors as on numbers; ``<`` gives a mask for :func:`select`. IEEE
 arithmetic, nothing is reordered.
@@ -22,7 +22,7 @@ from numba.extending import intrinsic, models, overload, register_model
 
 
 def _lanes() -> int:
-    """As many 32-bit numbers as one register of this processor holds."""
+    """As many 32-bit numbers as one register of this processor has."""
     features = nb.config.CPU_FEATURES or binding.get_host_cpu_features().flatten()
     return 16 if '+avx512f' in features else 8 if '+avx2' in features else 4
 

@@ -3,13 +3,13 @@
 """
 LM-DTW with one thread for each start, and the choice of the best start, in one launch (section 4).
 
-A thread sweeps the k columns that its start sees, each from the window's first row to its last,
+A thread sweeps the k columns of its start, each from the window's first row to its last,
 with S and C of the column before in registers: l is a constant of the compiled kernel and the loop
 over the rows is unrolled. All starts of a block share the window's columns through shared memory,
 read once, and neighboring threads read neighboring words. A cell has the three sums of the CPU
 twin, compared in another order: first the diagonal against the horizontal one, neither of which
 waits for the cell above, then the better of them against the vertical one. Only one addition and
-one comparison are left on the way down a column.
+one comparison are left down a column.
 
 Windows of more than ``REGISTER_ROWS`` rows do not fit into the registers: there S and C are arrays
 in local memory, and the window is read through the caches. The same kernel, slower.
@@ -33,7 +33,7 @@ NONE = np.int32(2**31 - 1)  # no start, behind every other
 
 
 def row_pitch(n: int, k: int, block: int) -> int:
-    """Words from row to row of the window: whole blocks of starts, and what the last one sees."""
+    """Words from row to row of the window: blocks of starts, and the columns of the last."""
     return -(-(-(-n // block) * block + k - 1) // 32) * 32
 
 
@@ -219,10 +219,10 @@ def lm_dtw(l: int, k: int, block: int, columns: int | None = None) -> Any:
     every launch leaves 0. - ``places``: shape (4,), int32, written: the nearest start and its m,
     the second best's start and its m; start -1 for none. - ``answer``: shape (2 + l k,), float32,
     written: the distances of both (+inf for none), and the l x k cells of the window that the
-    nearest start sees.
+    nearest start searches.
 
     :param l: rows of the window.
-    :param k: columns that one start sees.
+    :param k: columns that one start searches.
     :param block: threads of one block, a power of 2.
     :param columns: columns staged at once, 0 for none; None for :func:`staged_columns`.
     """

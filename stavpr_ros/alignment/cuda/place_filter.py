@@ -137,7 +137,7 @@ def move(K: int, V: int) -> Any:
 @functools.cache
 def trace(K: int, V: int) -> Any:
     """
-    Compile the way back of the states of some places, one thread a state.
+    Compile the backtracking of the states of places, one thread a state.
 
     - ``tops``: places, (m,), int64.
     - ``states``: (K V, room).
@@ -145,19 +145,19 @@ def trace(K: int, V: int) -> Any:
     - ``steps``: ring of their steps, (L, V), int32.
     - ``newest``: slot of the newest.
     - ``probabilities``: (m K V,), written: the states.
-    - ``ways``: (L + 1, m K V), int32, written: 16 times the place of each image, newest first,
-      plus the speed; -1 before the way came onto the map.
+    - ``paths``: (L + 1, m K V), int32, written: 16 times the place of each image, newest first,
+      plus the speed; -1 before the path entered the map.
     """
     halves = (V + 1) // 2
 
-    def trace_states(tops, states, origins, steps, newest, probabilities, ways):
+    def trace_states(tops, states, origins, steps, newest, probabilities, paths):
         i = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
-        if i >= ways.shape[1]:
+        if i >= paths.shape[1]:
             return
         y, row = tops[i // (K * V)], i % (K * V)
         k, v, length = row // V, row % V, origins.shape[0]
         probabilities[i] = states[row, y]
-        ways[0, i] = 16 * y + v
+        paths[0, i] = 16 * y + v
         on = True
         for image in range(length):
             slot = (newest - image + length) % length
@@ -166,7 +166,7 @@ def trace(K: int, V: int) -> Any:
                 origin = (origins[slot, k * halves + v // 2, y] >> (v % 2 * 4)) & 15
             if origin == BORN:
                 on = False
-                ways[image + 1, i] = -1
+                paths[image + 1, i] = -1
                 continue
             step = origin // 3
             r = steps[slot, v]
@@ -180,6 +180,6 @@ def trace(K: int, V: int) -> Any:
                 v -= 1
             elif origin % 3 == 2:
                 v += 1
-            ways[image + 1, i] = 16 * y + v
+            paths[image + 1, i] = 16 * y + v
 
     return kernel(trace_states)

@@ -21,7 +21,7 @@ class Selection:
     :param distance: its q_m.
     :param second_best_start, second_best_length, second_best_distance: the same of the second
         best; -1 for none.
-    :param cells: what the nearest start sees of the window, shape (l, k), float32, +inf past the
+    :param cells: the cells of the nearest start, shape (l, k), float32, +inf past the
         map's end; valid until the next fetch.
     """
 
@@ -39,7 +39,7 @@ class SelectionBuffer:
     The buffer on the device, its twin on the host, and views of both.
 
     :param runtime: what kernels run on.
-    :param l, k: rows of the window, columns that one start sees.
+    :param l, k: rows of the window, columns that one start searches.
     """
 
     def __init__(self, runtime: Runtime, l: int, k: int) -> None:

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The pose graph in a process of its own, since GTSAM holds the interpreter lock while it solves.
+The pose graph in a process of its own, since GTSAM keeps the interpreter lock while it solves.
 
 Nothing here imports ROS. The parent sends the arguments of :meth:`GraphServer.serve`, and the
 child returns a :class:`Snapshot`.
