@@ -53,7 +53,7 @@ def line(
 def route_times(places: int, precision: str, device: str, images: int) -> np.ndarray:
     """Return the milliseconds of the last images of a route of so many places."""
     features = make_features(places, DIMENSIONS, W, 'cpu', 0)
-    settings = RecognizerSettings(0.5, mode='robust')
+    settings = RecognizerSettings(mode='robust')
     closer = LoopCloser(settings, 50, features.settings, backend=device, precision=precision)
     times = []
     for i in range(places):
@@ -80,7 +80,7 @@ def main() -> None:
     for places in arguments.places:
         place_map = descriptor_map(make_features(places, DIMENSIONS, W, 'cpu', 0))
         for precision in arguments.precision:
-            settings = RecognizerSettings(0.5, mode='robust')
+            settings = RecognizerSettings(mode='robust')
             recognizer = PlaceRecognizer(place_map, settings, device, precision)
             times = frame_times(recognizer, arguments.images)
             del recognizer

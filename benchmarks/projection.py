@@ -25,7 +25,7 @@ from stavpr_ros.mapping import descriptor_map, PlaceMap
 from stavpr_ros.mapping.builder import extract_features
 from stavpr_ros.mapping.reduction import STRIPS_A_DIRECTION, with_principal_components
 from stavpr_ros.recognition import RecognizerSettings
-from stavpr_ros.recognition.robust import THRESHOLD
+from stavpr_ros.recognition.robust import MIN_PROBABILITY
 import torch
 
 PAGE = ROOT / 'docs' / 'performance.md'
@@ -83,7 +83,7 @@ def rows(case: Case, kind: str, extractor: FeatureExtractor) -> Iterator[dict[st
     )
     n = len(places)
     whole = descriptor_map(places)
-    settings = RecognizerSettings(THRESHOLD, mode='robust')
+    settings = RecognizerSettings(mode='robust')
     for name, (projection, dimension, precision) in COLUMNS.items():
         limit = len(places.weights) * n // STRIPS_A_DIRECTION
         if dimension >= places.dimension or (projection == 'pca' and dimension > limit):
@@ -92,7 +92,7 @@ def rows(case: Case, kind: str, extractor: FeatureExtractor) -> Iterator[dict[st
         evaluation = evaluate_on_map(
             place_map, images, case.truth(len(query), n), settings, precision=precision
         )
-        found = numbers(evaluation, THRESHOLD)
+        found = numbers(evaluation, 1 - MIN_PROBABILITY)
         yield {
             'kind': kind,
             'dimension': places.dimension,

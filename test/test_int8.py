@@ -24,7 +24,6 @@ from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.int8_features import rounded
 from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.recognition.robust import THRESHOLD
 from stavpr_ros.sources import open_source
 import torch
 
@@ -256,9 +255,7 @@ def test_int8_changes_no_verdict_on_real_images(data_folder, places, query):
     images = extract_features(open_source(data_folder / query), extractor, progress=False)
     found = {
         precision: recognize_all(
-            PlaceRecognizer(
-                place_map, RecognizerSettings(THRESHOLD, mode='robust'), precision=precision
-            ),
+            PlaceRecognizer(place_map, RecognizerSettings(mode='robust'), precision=precision),
             images,
         )
         for precision in ('float32', 'int8')

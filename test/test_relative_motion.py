@@ -49,7 +49,7 @@ def driven_map(features, positions, **parts):
 
 def settings_of(**changes):
     return RecognizerSettings(
-        0.5, sequence=SequenceSettings(LENGTH), nms_radius=5, mode='robust', **changes
+        sequence=SequenceSettings(LENGTH), nms_radius=5, mode='robust', **changes
     )
 
 
@@ -190,7 +190,7 @@ def test_loop_closure_compares_the_way_with_its_route():
         closer = LoopCloser(settings_of(), 20, first.settings, limit=150)
         ways = track(-90, 60), track(turn, 60)
         matches = drive(closer, both, np.concatenate(ways))
-        assert len(closer._positions) == len(closer)
+        assert len(closer._track) == len(closer)
         results.append(np.array([match.accepted for match in matches[N:]]))
     same, other = results
     assert same[LENGTH:].all()

@@ -239,7 +239,7 @@ def test_loop_of_vectors_is_closed():
     again = features.strips + noise
     route = torch.cat([features.strips, again / again.norm(dim=2, keepdim=True)], dim=1)
     closer = LoopCloser(
-        RecognizerSettings(0.5, sequence=SequenceSettings(10), mode='robust'),
+        RecognizerSettings(sequence=SequenceSettings(10), mode='robust'),
         exclude=30,
         feature_settings=features.settings,
     )

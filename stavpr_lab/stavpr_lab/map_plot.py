@@ -79,9 +79,7 @@ def _draw_matrix(figure: Figure | SubFigure, axes: Axes, place_map: PlaceMap) ->
     """Draw the distances of places to each other, as mode robust compares images."""
     n, places = len(place_map), evenly(len(place_map), COMPARED)
     some = select_places(place_map, places)
-    distances = PlaceRecognizer(some, RecognizerSettings(0.5, mode='robust')).distances(
-        some.features
-    )
+    distances = PlaceRecognizer(some, RecognizerSettings(mode='robust')).distances(some.features)
     extent = (-0.5, n - 0.5, n - 0.5, -0.5)
     away = distances[~np.eye(len(some), dtype=bool)]
     low, high = np.quantile(away, [0.002, 0.995]) if away.size else (0.0, 1.0)

@@ -14,7 +14,7 @@ from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import extract_features
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
-from stavpr_ros.recognition.robust import THRESHOLD
+from stavpr_ros.recognition.robust import MIN_PROBABILITY
 from stavpr_ros.sources import open_source
 import torch
 
@@ -22,7 +22,7 @@ WARPS = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')
 
 
 def robust(place_map) -> PlaceRecognizer:
-    return PlaceRecognizer(place_map, RecognizerSettings(THRESHOLD, mode='robust'))
+    return PlaceRecognizer(place_map, RecognizerSettings(mode='robust'))
 
 
 @pytest.fixture(scope='module')
@@ -45,7 +45,7 @@ def evaluated(reference, query, truth):
     answers = image_matches(recognize_all(robust(map_of(reference)), query), 20)
     correct = truth.accepts(answers.places)
     return best_f1(answers.distances, correct).f1, counts_at(
-        THRESHOLD, answers.distances, correct
+        1 - MIN_PROBABILITY, answers.distances, correct
     ).precision
 
 
@@ -98,11 +98,11 @@ def test_hallway_loop_is_closed(traverses, data_folder):
     )
     truth = truth.loop_closures(19)
     assert truth.has_match.sum() == 44
-    closer = LoopCloser(RecognizerSettings(THRESHOLD, mode='robust'), 20, features.settings)
+    closer = LoopCloser(RecognizerSettings(mode='robust'), 20, features.settings)
     answers = [closer.update(features[i : i + 1]) for i in range(84)]
     answered = image_matches(answers, 20)
     score = counts_at(
-        THRESHOLD, answered.distances, truth.accepts(answered.places), truth.has_match
+        1 - MIN_PROBABILITY, answered.distances, truth.accepts(answered.places), truth.has_match
     )
     print(f'hallway: precision {score.precision:.3f}, recall {score.recall:.3f}')
     assert score.precision >= 0.95

@@ -20,8 +20,8 @@ from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.alignment.cpu.int8 import Int8Strips, TILE
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+from stavpr_ros.recognition.filter_paths import BLOCK
 from stavpr_ros.recognition.int8_features import Int8Features
-from stavpr_ros.recognition.place_filter import BLOCK
 from stavpr_ros.recognition.robust import evenly, MIN_DEVIATION, unit_norm
 import torch
 

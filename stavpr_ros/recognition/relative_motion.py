@@ -28,50 +28,53 @@ Positions = Sequence[np.ndarray] | np.ndarray
 
 class RelativeMotion:
     """
-    Compares the way of a query with the paths of its matches.
+    Compares the trajectory of a query by odometry with the paths of its matches.
 
-    What disagreed once lasts: while matches continue each other, the way since the first of them
-    is compared, at most ``LONGEST`` windows, beside that of the window alone.
+    A disagreement stays in the test for ``LONGEST`` windows: while matches continue each other,
+    the trajectory since the first of them is compared beside that of the window.
 
     :param length: images in a window, l.
     :param error: see :func:`agreement`.
+    :param positions: x and y of the places that are not evicted, meters; NaN = unknown. Empty =
+        nothing is compared.
 
-    ``way`` takes x and y of each image by odometry, (2,), meters; NaN = unknown.
+    ``trajectory`` contains x and y of each image by odometry, (2,), meters; NaN = unknown.
     """
 
-    def __init__(self, length: int, error: float) -> None:
-        self._length, self._error = length, error
-        self.way: deque[np.ndarray] = deque(maxlen=LONGEST * length)
+    def __init__(self, length: int, error: float, positions: Positions) -> None:
+        self._length, self._error, self._positions = length, error, positions
+        self.trajectory: deque[np.ndarray] = deque(maxlen=LONGEST * length)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the query."""
-        self.way.clear()
+        """Drop the images of the query."""
+        self.trajectory.clear()
         self._followed, self._last = 0, 0  # matches that continued each other; place of the last
 
-    def compared(
-        self, match: Match, positions: Positions, first: int, session: tuple[int, int]
-    ) -> Match:
+    def weighed(self, match: Match, first: int, session: tuple[int, int]) -> Match:
         """
-        Return a match of mode robust, less probable if odometry disagrees with its path.
+        Return a match, less probable if odometry disagrees with its path.
 
-        :param positions: x and y of the places held, meters; NaN = unknown.
-        :param first: the first of them.
+        :param first: first place that is not evicted.
         :param session: first place of the match's session, and the first one behind it.
         """
-        assert match.sequence is not None
+        end = first + len(self._positions)
+        if end == first or match.sequence is None or np.isnan(self.trajectory[-1][0]):
+            return match
         place, newest = match.sequence.middle, int(match.path[-1, 1])
         follows = match.accepted and 0 <= place - self._last <= FARTHEST
         self._followed = self._followed + 1 if follows else 0
         self._last = place
-        reach = FARTHEST * len(self.way) + 1  # places to either side that the way may lead along
-        low, high = max(session[0], place - reach), min(session[1], place + reach)
-        track = np.array(positions[low - first : high - first])
-        way, after = np.array(self.way), self._length - 1 - (self._length - 1) // 2
-        agreed = 1.0
-        for count in {self._length, min(len(way), self._length + self._followed)}:
+        reach = FARTHEST * len(self.trajectory) + 1  # places to either side of the trajectory
+        low = max(first, session[0], place - reach)
+        high = min(end, session[1], place + reach)
+        track = np.array(self._positions[low - first : high - first])
+        trajectory = np.array(self.trajectory)
+        after, agreed = self._length - 1 - (self._length - 1) // 2, 1.0
+        for count in {self._length, min(len(trajectory), self._length + self._followed)}:
+            part = trajectory[-count:]
             found = agreement(
-                track, (place - low, newest - low), way[-count:], count - 1 - after, self._error
+                track, (place - low, newest - low), part, count - 1 - after, self._error
             )
             agreed = agreed if np.isnan(found) else min(agreed, found)
         return less_probable(match, agreed)
@@ -79,7 +82,7 @@ class RelativeMotion:
 
 def less_probable(match: Match, agreed: float) -> Match:
     """
-    Return a match whose way agrees so far with its path.
+    Return a match whose trajectory agrees with its path to a degree from 0 to 1.
 
     Agreement is no evidence: other places have a track of that shape as well.
     """

@@ -27,7 +27,6 @@ import torch
 
 MODES = ('paper', 'robust')
 MIN_PROBABILITY = 0.5  # above which mode robust matches a window
-THRESHOLD = 1 - MIN_PROBABILITY  # of the distance, 1 less the probability
 PRIOR = 20  # images that the map's mean counts for in the query's, and at most a standstill
 RANK = 64  # directions that whitening shrinks, at most
 SAMPLE = 256  # places that whitening is learned from

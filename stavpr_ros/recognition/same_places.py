@@ -42,7 +42,9 @@ def with_same_places(place_map: PlaceMap, progress: bool = False) -> PlaceMap:
 
 def _recognized(reference: PlaceMap, place_map: PlaceMap, images: np.ndarray) -> np.ndarray:
     """Return the place of a reference that each of some images shows, -1 = none, (m,)."""
-    recognizer = PlaceRecognizer(reference, RecognizerSettings(1 - SURE, mode='robust'))
+    recognizer = PlaceRecognizer(
+        reference, RecognizerSettings(mode='robust', min_probability=SURE)
+    )
     found, near = (np.full(len(images), -1) for _ in range(2))
     for i, image in enumerate(images.tolist()):
         match = recognizer.update(place_map.features[image : image + 1])

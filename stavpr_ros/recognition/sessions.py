@@ -9,21 +9,85 @@ whose distances are +inf. Where a place of one session shows what one of an earl
 up, and neither is the second best of the other.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
+import sys
 
 import numpy as np
-from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition.match import ranked_candidates
-from stavpr_ros.recognition.place_filter import Belief
+from stavpr_ros.recognition.filter_paths import Belief
+from stavpr_ros.recognition.match import Candidate, ranked_candidates, Sequences, WindowMatch
 from stavpr_ros.recognition.robust import FilterSettings
 import torch
 
-Sequences = tuple[np.ndarray, np.ndarray]
+
+class Layout:
+    """
+    Places of one session, or of a route: each is the column of its number.
+
+    :attr:`runs` are the places of each session, ``firsts`` their first ones, ``gaps`` the columns
+    between them.
+    """
+
+    firsts: np.ndarray = np.zeros(1, np.int64)
+    runs: Sequence[slice] = (slice(None),)
+    gaps: np.ndarray = np.empty(0, np.int64)
+
+    def width(self, places: int) -> int:
+        """Return the number of columns of so many places."""
+        return places
+
+    def spread(self, row: torch.Tensor) -> torch.Tensor:
+        """Return distances to places (n,) as those to columns, +inf in gaps."""
+        return row
+
+    def gathered(self, values: np.ndarray) -> np.ndarray:
+        """Return the values of the columns that are places, (n,)."""
+        return values
+
+    def columns_of(self, places: np.ndarray) -> np.ndarray:
+        """Return the columns of places."""
+        return places
+
+    def positions_of(self, columns: np.ndarray) -> np.ndarray:
+        """Return the numbers of columns among the places; in a gap, of the place before it."""
+        return columns
+
+    def positions_from(self, columns: np.ndarray) -> np.ndarray:
+        """Return the numbers of columns among the places; in a gap, of the place after it."""
+        return columns
+
+    def first_column(self, column: int) -> int:
+        """Return the first column of a column's session."""
+        return 0
+
+    def session_of(self, place: int) -> tuple[int, int]:
+        """Return the first place of a place's session, and the first one behind it."""
+        return 0, sys.maxsize
+
+    def shared(self, belief: Belief, n: int, close: int) -> tuple[np.ndarray, np.ndarray, int]:
+        """
+        Let places of one position share their probability.
+
+        :param n: columns that are known.
+        :param close: columns to either side that count for a column, too.
+        :returns: columns whose probability is not 0, ascending, and their probabilities; among
+            them the most probable one: of the session that is most probable at the most probable
+            position.
+        """
+        columns, probabilities = belief.probabilities(n)
+        return columns, probabilities, int(np.argmax(probabilities))
+
+    def positions(self, places: np.ndarray | int) -> np.ndarray:
+        """Return positions: those at most nms_radius apart are neighbors in one session."""
+        return np.asarray(places)
+
+    def in_places(self, found: WindowMatch) -> WindowMatch:
+        """Return a match whose columns have become places, with its second best."""
+        return found
 
 
-class SessionLayout:
+class SessionLayout(Layout):
     """
     Places of several sessions in columns with gaps between them.
 
@@ -42,32 +106,49 @@ class SessionLayout:
         self.runs = [slice(*pair) for pair in zip(firsts, [*firsts[1:], n], strict=True)]
         run = np.repeat(np.arange(len(firsts)), np.diff(firsts, append=n))
         self.columns = np.arange(n) + run * self._gap
-        self.width = n + (len(firsts) - 1) * self._gap
-        self._places = np.repeat(np.arange(n), np.diff(self.columns, append=self.width))
+        self._width = n + (len(firsts) - 1) * self._gap
+        self._positions = np.repeat(np.arange(n), np.diff(self.columns, append=self._width))
+        self._places = self._positions  # of each column, as matches name them
         self._same_as = same_as
-        self._shared = np.arange(self.width)  # column where the position's probability is summed
+        self._shared = np.arange(self._width)  # column where the position's probability is summed
         self._shared[self.columns] = self.columns[same_as]
-        is_gap = np.ones(self.width, bool)
+        is_gap = np.ones(self._width, bool)
         is_gap[self.columns] = False
         self.gaps = np.flatnonzero(is_gap)
 
+    def width(self, places: int) -> int:
+        """See :meth:`Layout.width`."""
+        return self._width
+
     def spread(self, row: torch.Tensor) -> torch.Tensor:
-        """Return distances to places (n,) as those to columns, (width,)."""
-        out = torch.full((self.width,), torch.inf, dtype=row.dtype, device=row.device)
+        """See :meth:`Layout.spread`."""
+        out = torch.full((self._width,), torch.inf, dtype=row.dtype, device=row.device)
         out[torch.from_numpy(self.columns).to(row.device)] = row
         return out
 
+    def gathered(self, values: np.ndarray) -> np.ndarray:
+        """See :meth:`Layout.gathered`."""
+        return values[self.columns]
+
+    def columns_of(self, places: np.ndarray) -> np.ndarray:
+        """See :meth:`Layout.columns_of`."""
+        return self.columns[places]
+
     def positions_of(self, columns: np.ndarray) -> np.ndarray:
-        """Return the positions of columns among those of places; in a gap, the one before."""
-        return self.columns.searchsorted(columns, 'right') - 1
+        """See :meth:`Layout.positions_of`."""
+        return self._positions[columns]
+
+    def positions_from(self, columns: np.ndarray) -> np.ndarray:
+        """See :meth:`Layout.positions_from`."""
+        return self.columns.searchsorted(columns)
 
     def first_column(self, column: int) -> int:
-        """Return the first column of a column's session."""
+        """See :meth:`Layout.first_column`."""
         firsts = self.columns[self.firsts]
         return int(firsts[np.searchsorted(firsts, column, 'right') - 1])
 
     def session_of(self, place: int) -> tuple[int, int]:
-        """Return the first place of a place's session, and the first one behind it."""
+        """See :meth:`Layout.session_of`."""
         run = self.runs[int(np.searchsorted(self.firsts, place, 'right')) - 1]
         return int(run.start), int(run.stop)
 
@@ -79,23 +160,16 @@ class SessionLayout:
         :param close: columns to either side that count for a position, too.
         :returns: probability of each column's position, (width,).
         """
-        of_position = np.bincount(self._shared, weights, self.width)
+        of_position = np.bincount(self._shared, weights, self._width)
         sums = np.concatenate([np.zeros(close + 1), np.cumsum(of_position)])
         sums = np.concatenate([sums, np.full(close, sums[-1])])
         return np.minimum(sums[2 * close + 1 :] - sums[: -2 * close - 1], 1)[self._shared]
 
-    def shared(self, belief: Belief, close: int) -> tuple[np.ndarray, np.ndarray, int]:
-        """
-        Let places of one position share their probability.
-
-        :param close: places to either side that count for a place, too.
-        :returns: columns whose probability is not 0, ascending, and their probabilities; among
-            them the most probable one: of the session that is most probable at the most probable
-            position.
-        """
-        weights, own = np.zeros(self.width), np.zeros(self.width)
+    def shared(self, belief: Belief, n: int, close: int) -> tuple[np.ndarray, np.ndarray, int]:
+        """See :meth:`Layout.shared`."""
+        weights, own = np.zeros(self._width), np.zeros(self._width)
         weights[belief.places] = belief.weights
-        near, probabilities_near = belief.probabilities(self.width)
+        near, probabilities_near = belief.probabilities(self._width)
         own[near] = probabilities_near
         probabilities = self.summed(weights, close)
         best = int(np.argmax(probabilities))
@@ -106,42 +180,44 @@ class SessionLayout:
         return columns, probabilities[columns], int(np.searchsorted(columns, column))
 
     def positions(self, places: np.ndarray | int) -> np.ndarray:
-        """Return positions: those at most nms_radius apart are neighbors in one session."""
+        """See :meth:`Layout.positions`."""
         return self.columns[self._same_as[places]]
 
-    def in_places(
-        self, nearest: SequenceMatch, path: np.ndarray, in_columns: Callable[[], Sequences]
-    ) -> tuple[SequenceMatch, np.ndarray, Callable[[], Sequences]]:
-        """Return the fields of a match whose columns have become places, with its second best."""
+    def in_places(self, found: WindowMatch) -> WindowMatch:
+        """See :meth:`Layout.in_places`."""
 
         def sequences() -> Sequences:
-            costs, columns = in_columns()
-            return costs, self._places[columns]
+            return in_columns._replace(places=self._places[in_columns.places])
 
-        path = path.copy()
-        path[:, 1] = self._places[path[:, 1]]
-        nearest = replace(
-            nearest,
-            first=int(self._places[nearest.first]),
-            last=int(self._places[nearest.last]),
-            middle=int(self._places[nearest.middle]),
+        if found.nearest is None:
+            return found
+        in_columns = found.sequences()
+        first, last, middle = (
+            int(self._places[column])
+            for column in (found.nearest.first, found.nearest.last, found.nearest.middle)
         )
-        second = ranked_candidates(nearest, sequences(), 2, self._radius, self.positions)[1:]
+        best = Candidate(middle, found.nearest.distance)
+        second = ranked_candidates(best, sequences(), 2, self._radius, self.positions)[1:]
         nearest = replace(
-            nearest,
+            found.nearest,
+            first=first,
+            last=last,
+            middle=middle,
             second_best_index=second[0].place if second else -1,
             second_best_distance=second[0].distance if second else float('nan'),
         )
-        return nearest, path, sequences
+        path = found.path.copy()
+        path[:, 1] = self._places[path[:, 1]]
+        return replace(found, nearest=nearest, path=path, sequences=sequences)
 
 
-def layout_of(place_map: PlaceMap, nms_radius: int) -> SessionLayout | None:
-    """Return the layout of a map of several sessions, None of one session."""
+def layout_of(place_map: PlaceMap, nms_radius: int) -> Layout:
+    """Return the layout of a map."""
     if place_map.session_index is None or not len(place_map):
-        return None
+        return Layout()
     firsts = np.flatnonzero(np.diff(place_map.session_index, prepend=-1))
     if len(firsts) == 1:
-        return None
+        return Layout()
     same_as = place_map.same_as
     if same_as is None:
         same_as = np.arange(len(place_map))

@@ -1,0 +1,282 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Where the camera was: states of the place filter followed back over the latest images.
+
+For each image, an origin of every state is kept. Two of them share a byte, that of an even speed
+in the lower half and that of the next speed in the upper one:
+
+    origin = 3 * step + speed    step 0: as far as the speed, 1: one place more, 2: one less
+                                 speed 0: the same, 1: one lower, 2: one higher
+    ENTERED                      the state was off the map
+
+    ring of the latest images    (lag, blocks, K, (V + 1) // 2, BLOCK), uint8
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from stavpr_ros.alignment.cpu.simd import prefetch
+from stavpr_ros.compilation import kernel
+import torch
+
+BLOCK = 128  # places whose states are neighbors in memory; a multiple of all LANES
+ENTERED = 9  # origin of a state that came from off the map
+ALL_ENTERED = ENTERED | ENTERED << 4  # two origins
+TOP = 64  # places whose states are followed back
+NEGLIGIBLE = 1e-3  # of the most probable state: states below are not followed back
+CLOSE = 2  # places: the probability of a place is that of its neighbors within CLOSE, too
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """
+    Where the camera was some images ago.
+
+    :param places: places that paths of probable states lead to, ascending, (m,).
+    :param weights: probability of each of them alone, (m,).
+    :param states: of each, the most probable state now and the speed then, (m, 4), int: level,
+        speed, place, speed then.
+    """
+
+    places: np.ndarray
+    weights: np.ndarray
+    states: np.ndarray
+
+    def probabilities(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return the places of n whose probability, with that of close ones, is not 0.
+
+        :returns: places, ascending, (m,), and their probabilities.
+        """
+        most = len(self.places) * (2 * CLOSE + 1)
+        near, sums = np.empty(most, np.int64), np.empty(most)
+        count = _sum_close(self.places, self.weights, n, near, sums)
+        return near[:count], sums[:count]
+
+
+class StateFilter(Protocol):
+    """
+    A place filter over n places, on the CPU or on a CUDA device.
+
+    ``count`` is the number of images since the reset.
+    """
+
+    count: int
+
+    def reset(self) -> None:
+        """Forget where the camera was."""
+
+    def grow(self, places: int) -> None:
+        """Make room for more places."""
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+
+    def z_normalized(self, row: torch.Tensor, around: int, counted: np.ndarray) -> torch.Tensor:
+        """See :func:`stavpr_ros.recognition.robust.z_normalized`; on the filter's device."""
+
+    def update(
+        self,
+        z: torch.Tensor,
+        weight: float,
+        speed_weights: np.ndarray,
+        speed_likelihoods: np.ndarray | float = 1.0,
+    ) -> None:
+        """
+        Advance by an image.
+
+        :param z: z-normalized distances to the first m places, (m,), float32, on the filter's
+            device; +inf excludes a place.
+        :param weight: alpha; 0 = the image is no evidence.
+        :param speed_weights: relative probability of each speed, (V,).
+        :param speed_likelihoods: of each speed relative to that off the map, (V,).
+        """
+
+    def places_of_states(self) -> np.ndarray:
+        """Return the probability of each place, (room,), float32."""
+
+    def belief(self, n: int, images_ago: int) -> Belief:
+        """
+        Return where the camera was some images ago, by the images since then, too.
+
+        :param n: places.
+        :param images_ago: at most the lag and ``count - 1``.
+        """
+
+    def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
+        """
+        Return the most probable place outside ``excluded`` now, and its probability, 0 if none.
+
+        :param excluded: places, ascending.
+        """
+
+    def path(self, state: np.ndarray, images: int) -> np.ndarray:
+        """
+        Return the places of the most probable path to a state, newest first, (images + 1,).
+
+        :param state: level, speed, place.
+        """
+
+
+def belief_of(states: np.ndarray, probabilities: np.ndarray) -> Belief:
+    """
+    Return the belief that states give.
+
+    :param states: (m, 5): place then, level, speed and place now, speed then.
+    :param probabilities: of each state, (m,), float64.
+    """
+    order = np.argsort(states[:, 0], kind='stable')
+    best, weights = np.empty(len(order), np.int64), np.zeros(len(order))
+    count = _merge(states, probabilities, order, best, weights)
+    found = states[best[:count]]
+    return Belief(found[:, 0], weights[:count], found[:, 1:])
+
+
+# ------------------------------------------------ kernels
+
+
+@kernel
+def _before(k, v, y, origins, steps):
+    """Return speed and place of a state one image before, -1 as place where it was off the map."""
+    origin = (origins[y // BLOCK, k, v // 2, y % BLOCK] >> (v % 2 * 4)) & 15
+    if origin == ENTERED:
+        return v, -1
+    r, step, change = steps[v], origin // 3, origin % 3
+    places = r if step == 0 else r + 1 if step == 1 else max(r - 1, 0)
+    return v - (change == 1) + (change == 2), y - places
+
+
+@kernel
+def trace_back(k, v, y, origins, steps, newest, count, places):
+    """
+    Write the most probable path to a state, newest place first.
+
+    :param origins: ring of the last images' origins, (m, blocks, K, (V + 1) // 2, BLOCK), uint8.
+    :param steps: ring of their steps, (m, V).
+    :param newest: slot of the newest image.
+    :param count: images to go back, at most m.
+    :param places: (count + 1,), written: the place at each image, -1 before the path entered the
+        map.
+    """
+    places[0] = y
+    for i in range(count):
+        slot = (newest - i) % len(origins)
+        v, y = _before(k, v, y, origins[slot], steps[slot])
+        places[i + 1] = y
+        if y < 0:
+            places[i + 1 :] = -1
+            return
+
+
+@kernel
+def backtrack_states(a, least, tops, origins, steps, newest, count, states, probabilities):
+    """
+    Follow states back to where they were some images ago.
+
+    :param a: states, (blocks, K, V, BLOCK).
+    :param least: states below it are excluded.
+    :param tops: places whose states count, (m,).
+    :param count: images to go back; other parameters: see :func:`trace_back`.
+    :param states: (m K V, 5), written: place then, state now (k, v, y), speed then.
+    :param probabilities: (m K V,), written: of these states.
+    :returns: number of states that were on the map then.
+    """
+    found = 0
+    for y in tops:
+        for k in range(a.shape[1]):
+            for v in range(a.shape[2]):
+                p = a[y // BLOCK, k, v, y % BLOCK]
+                if p >= least:
+                    states[found, 0], states[found, 1], states[found, 2] = y, k, v
+                    states[found, 3], states[found, 4] = y, v
+                    probabilities[found] = p
+                    found += 1
+    _, blocks, _, halves, _ = origins.shape
+    flat = origins.reshape(-1)
+    for i in range(count):  # all together: each waits for its memory
+        slot, left = (newest - i) % len(origins), 0
+        earlier = (newest - i - 1) % len(origins) * blocks
+        for at in range(found):
+            speed, place = _before(
+                states[at, 1], states[at, 4], states[at, 0], origins[slot], steps[slot]
+            )
+            if place >= 0:
+                states[left], probabilities[left] = states[at], probabilities[at]
+                states[left, 0], states[left, 4] = place, speed
+                row = ((earlier + place // BLOCK) * a.shape[1] + states[at, 1]) * halves
+                prefetch(flat, (row + speed // 2) * BLOCK + place % BLOCK)
+                left += 1
+        found = left
+    return found
+
+
+@kernel
+def find_largest(by_place, blocks, n, places):
+    """Write the places of blocks, below n, with the largest sums, the largest first."""
+    values, last = np.full(len(places), -1, np.float32), len(places) - 1
+    for block in blocks:
+        for y in range(block * BLOCK, min((block + 1) * BLOCK, n)):
+            if by_place[y] <= values[last]:
+                continue
+            at = last
+            while at > 0 and values[at - 1] < by_place[y]:
+                values[at], places[at] = values[at - 1], places[at - 1]
+                at -= 1
+            values[at], places[at] = by_place[y], y
+
+
+@kernel
+def _merge(states, probabilities, order, best, weights):
+    """
+    Add up the probabilities of states that were at one place.
+
+    :param states: see :func:`belief_of`; order: of their places, ascending.
+    :param best, weights: of each place, its most probable state and its sum, written.
+    :returns: number of places.
+    """
+    found = -1
+    for i in order:
+        if found < 0 or states[i, 0] != states[best[found], 0]:
+            found += 1
+            best[found] = i
+        elif probabilities[i] > probabilities[best[found]]:
+            best[found] = i
+        weights[found] += probabilities[i]
+    return found + 1
+
+
+@kernel
+def _sum_close(places, weights, n, near, sums):
+    """Write the places below n within ``CLOSE`` of any place, and their sums, at most 1."""
+    found = low = end = 0
+    for place in places:
+        for y in range(max(place - CLOSE, end), min(place + CLOSE + 1, n)):
+            while places[low] < y - CLOSE:
+                low += 1
+            total, i = 0.0, low
+            while i < len(places) and places[i] <= y + CLOSE:
+                total += weights[i]
+                i += 1
+            near[found], sums[found] = y, min(total, 1.0)
+            found, end = found + 1, y + 1
+    return found
+
+
+@kernel
+def find_most_probable(by_place, maxima, excluded):
+    """Return the most probable place outside ``excluded``, ascending, and its sum, 0 if none."""
+    best, at, i = np.float32(-1), 0, 0
+    for block in range(len(maxima)):
+        while i < len(excluded) and excluded[i] < block * BLOCK:
+            i += 1
+        if maxima[block] <= best:
+            continue
+        for y in range(block * BLOCK, (block + 1) * BLOCK):
+            while i < len(excluded) and excluded[i] < y:
+                i += 1
+            value = np.float32(0) if i < len(excluded) and excluded[i] == y else by_place[y]
+            if value > best:
+                best, at = value, y
+    return at, best
