@@ -174,7 +174,7 @@ def _move(
 
 @kernel
 def _lost(row, step, spread):
-    """Return what a row, whose last place is the map's last, loses over the end of the map."""
+    """Return the loss of a row, which ends with the map, over the end of the map."""
     end = len(row)
     slow = step - 1 if step > 0 else 0
     total = (F(1) - F(2) * spread) * row[end - step :].sum()
@@ -210,13 +210,13 @@ def advance(
     :param z, weight, mu: z-normalized distances (n,), alpha, and mean of right places by level.
     :param levels, speeds: see :func:`_mix`.
     :param steps: places that each speed moves on, (V,).
-    :param spread: probability of one place more, and of one less, but never back.
+    :param spread: probability of one place more, and of one less, never back.
     :param stay_on: probability of staying on the map.
     :param entering: probability of each state of a level to come from off the map, (K,).
     :param halos: (parts, K, V, reach), scratch; zeros in the first. Reach is of whole vectors.
     :param origins: of this image, (blocks, K, (V + 1) // 2, BLOCK), uint8, written.
-    :param totals: (blocks, K, 3), written: sums before moving, of what moved over the map's end,
-        and with the image.
+    :param totals: (blocks, K, 3), written: sums before the motion, of the states that moved over
+        the end of the map, and with the image.
     :param by_place: sum of the states of each place, (n or more,), and maxima: the largest of each
         block, (blocks,); written.
     """

@@ -32,7 +32,7 @@ CLOSE = 2  # places: the probability of a place is that of its neighbors within 
 @dataclass(frozen=True, eq=False)
 class Belief:
     """
-    Where the camera was some images ago.
+    Where the camera was a number of images ago.
 
     :param places: places that paths of probable states lead to, ascending, (m,).
     :param weights: probability of each of them alone, (m,).
@@ -99,7 +99,7 @@ class StateFilter(Protocol):
 
     def belief(self, n: int, images_ago: int) -> Belief:
         """
-        Return where the camera was some images ago, by the images since then, too.
+        Return where the camera was a number of images ago, by the images since then, too.
 
         :param n: places.
         :param images_ago: at most the lag and ``count - 1``.
@@ -173,7 +173,7 @@ def trace_back(k, v, y, origins, steps, newest, count, places):
 @kernel
 def backtrack_states(a, least, tops, origins, steps, newest, count, states, probabilities):
     """
-    Follow states back to where they were some images ago.
+    Follow states back over a number of images.
 
     :param a: states, (blocks, K, V, BLOCK).
     :param least: states below it are excluded.

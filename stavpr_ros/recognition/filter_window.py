@@ -164,10 +164,10 @@ class FilterWindow(QueryWindow):
         self._images.append(_Image(change, weight, self.filter.count - 1))
 
     def _of_moving(self, z: torch.Tensor) -> torch.Tensor:
-        """Return z of a moving camera: places where the map's camera stood are not near it."""
-        columns = self.layout.columns_of(np.flatnonzero(self.change.stood()))
-        stood = torch.from_numpy(columns[columns < len(z)]).to(z.device)
-        return z.index_put((stood,), z[stood].clamp(min=0)) if len(stood) else z
+        """Return z of a moving camera: places where the map's camera was at rest are not near."""
+        columns = self.layout.columns_of(self.change.at_rest())
+        far = torch.from_numpy(columns[columns < len(z)]).to(z.device)
+        return z.index_put((far,), z[far].clamp(min=0)) if len(far) else z
 
     def _match(self, nms_radius: int) -> WindowMatch:
         return self._match_image(self._middle, nms_radius)

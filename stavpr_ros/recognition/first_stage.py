@@ -10,7 +10,7 @@ beside their strips, it is that of the vectors instead. It is computed for all p
 distances are computed in chunks of places: those with the smallest coarse distances, those that
 the place filter finds probable after the images so far, and a fixed sample. Mean and deviation of
 the sample scale the coarse distances to exact ones, so that z-normalization, the filter and the
-second best see one row with an entry for every place.
+second best have one row with an entry for every place.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ class FirstStage:
     A matcher that compares images with few places exactly, see the module.
 
     :param matcher: compares with the places exactly, strategy ``adaptive`` or ``vanilla``.
-    :param features: of the places: as the matcher holds them; or their vectors, as one strip.
+    :param features: of the places: those of the matcher; or their vectors, as one strip.
     :param probable: returns the first places of the blocks of ``BLOCK`` places that the filter
         finds probable.
     """

@@ -60,8 +60,8 @@ class LoopCloser(SequenceRecognizer):
     :param settings: strategies ``adaptive`` and ``vanilla``.
     :param exclude: the latest images that are not part of the map, at least 1.
     :param feature_settings: how the features are made.
-    :param limit: most places held; None for all. It must leave room for more than the excluded
-        images.
+    :param limit: most places that are kept; None for all. It must leave room for more than the
+        excluded images.
     :param exclude_seconds: places younger than so many seconds are not part of the map either.
     :param backend: see :func:`choose_loop_backend`. On ``cuda`` the route's features lie on the
         device; without the place filter, sequences are matched on the CPU.
@@ -109,16 +109,16 @@ class LoopCloser(SequenceRecognizer):
         self._places = 0  # the newest image may be matched with so many of the oldest places
 
     def __len__(self) -> int:
-        """Return the number of places that are held; ``first + len`` images have come."""
+        """Return the number of places that are not evicted; ``first + len`` images have come."""
         return self._route.count
 
     @property
     def first(self) -> int:
-        """Return the oldest place that is held: the number of evicted places."""
+        """Return the oldest place that is not evicted: the number of evicted ones."""
         return self._window.buffer.first
 
     def features(self) -> LocalFeatures:
-        """Return the features of the places held, strips (W, n, d), as they came."""
+        """Return the features of the places, strips (W, n, d), as they came."""
         return self._route.original()
 
     def reset(self) -> None:
@@ -151,7 +151,7 @@ class LoopCloser(SequenceRecognizer):
 
     def _late(self, match: Match) -> Match | None:
         """
-        Return the match of the oldest image, if it had none as the middle one, but is certain now.
+        Return the match of the oldest image, if it had none as the middle one and is certain now.
 
         It is a backward pass over the window. Windows without a match have no late one either.
         """

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import enum
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
@@ -200,35 +200,34 @@ class Match:
         nearest = found.nearest
         if nearest is None:
             return replace(self, status=Status.NO_MATCH, reason='the map is empty')
-        return replace(
-            self,
+        return self._decided(
+            nearest.distance,
+            found.probability,
             sequence=nearest,
             path=found.path,
-            distance=nearest.distance,
-            probability=found.probability,
             path_ratios=found.path_ratios(position),
-        ).decided()
+        )
 
     def with_probability(self, probability: float) -> 'Match':
         """Return the match of mode robust with another probability, accepted or not by it."""
-        return replace(self, probability=probability, distance=1 - probability).decided()
+        return self._decided(1 - probability, probability)
 
-    def decided(self) -> 'Match':
+    def _decided(self, distance: float, probability: float, **fields: Any) -> 'Match':
         """Return the match, accepted by its probability or, in mode paper, by its distance."""
-        if math.isnan(self.probability):
-            accepted = self.distance < self.threshold
+        if math.isnan(probability):
+            accepted = distance < self.threshold
             reason = (
-                f'nearest distance {self.distance:.4f} is not below the threshold '
-                f'{self.threshold:.4f}'
+                f'nearest distance {distance:.4f} is not below the threshold {self.threshold:.4f}'
             )
         else:
-            accepted = self.probability > self.min_probability
+            accepted = probability > self.min_probability
             reason = (
-                f'the probability of the best place, {self.probability:.3f}, is not above '
+                f'the probability of the best place, {probability:.3f}, is not above '
                 f'{self.min_probability:.3f}'
             )
         status = Status.MATCH if accepted else Status.NO_MATCH
-        return replace(self, status=status, reason='' if accepted else reason)
+        fields |= {'status': status, 'reason': '' if accepted else reason}
+        return replace(self, distance=distance, probability=probability, **fields)
 
     def with_candidates(self, ranked: Sequence[Candidate]) -> 'Match':
         """Return the match with its ranked places; the first is the match itself."""

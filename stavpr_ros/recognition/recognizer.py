@@ -143,7 +143,8 @@ class SequenceRecognizer(ABC):
 
         :returns: shape (n,), float32; lower is nearer.
         """
-        return self._window.newest_row()
+        window = self._window
+        return window.layout.gathered(window.buffer.newest().cpu().numpy())
 
     def window_columns(self, places: np.ndarray) -> np.ndarray:
         """
@@ -154,7 +155,9 @@ class SequenceRecognizer(ABC):
         :param places: shape (k,), int64.
         :returns: shape (m, k), float32, oldest image first, +inf for places not compared.
         """
-        return self._window.columns(places)
+        buffer = self._window.buffer
+        columns = self._window.layout.columns_of(places - buffer.first)
+        return buffer.at(columns[None])[buffer.length - len(buffer) :]
 
     def _require_one_image(self, features: LocalFeatures, where: str) -> None:
         features.require_same_settings(self._feature_settings, where)
@@ -322,7 +325,7 @@ class PlaceRecognizer(SequenceRecognizer):
         return self._matcher.distance_matrix(features.strips, features.weights).cpu().numpy()
 
     def _require_dimension(self, features: LocalFeatures) -> None:
-        """Reject what a map states wrongly about its network; the kernels trust it."""
+        """Reject features of another network than the map's; the kernels trust their shape."""
         if features.dimension != self._dimension:
             raise FeatureMismatchError(
                 f'strips of {features.dimension} dimensions, the map has {self._dimension}: it '

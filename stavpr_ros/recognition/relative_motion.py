@@ -1,11 +1,11 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Relative motion: whether the way of the query, by odometry, fits its path on the map.
+Relative motion: whether the trajectory of the query, by odometry, fits its path on the map.
 
-Look-alike corridors are distinguished by where they turn. Only positions are compared, in the
-plane of x and y (z is up), relative to each other: the frames of odometry and map may differ, and
-so may the bodies whose poses they are.
+Look-alike corridors are distinguished by their turns. Only positions are compared, in the plane of
+x and y (z is up), relative to each other: the frames of odometry and map may differ, and so may
+the bodies whose poses they are.
 """
 
 from collections import deque
@@ -17,10 +17,10 @@ from scipy.special import chdtrc
 from stavpr_ros.recognition.match import Match
 
 ALONG = 0.5  # deviation of a matched place along the track, places
-TURNS = 2  # degrees of freedom of the shape of the way; its length has one
-UNUSUAL = 0.05  # of right paths, so many disagree more: from there on, probabilities are lowered
+TURNS = 2  # degrees of freedom of the shape of the trajectory; its length has one
+UNUSUAL = 0.05  # share of right paths that disagree more, below which probabilities are lowered
 LEAST_IMAGES = 3
-LONGEST = 5  # windows that the way is compared over
+LONGEST = 5  # windows of the trajectory that are compared
 FARTHEST = 5  # places from image to image
 LEAST_DOUBT = 1e-9  # no probability is 1
 Positions = Sequence[np.ndarray] | np.ndarray
@@ -96,15 +96,15 @@ def less_probable(match: Match, agreed: float) -> Match:
 
 
 def agreement(
-    track: np.ndarray, places: tuple[int, int], way: np.ndarray, middle: int, error: float
+    track: np.ndarray, places: tuple[int, int], trajectory: np.ndarray, middle: int, error: float
 ) -> float:
     """
-    Return how often the way of a query on its right path would fit the map less than this one.
+    Return the share of queries on the right path whose trajectory would fit the map less.
 
-    From the middle image of the window on, the way by odometry is laid along the track. Two things
-    are compared: its shape, less one rotation and shift, and its length from the middle image to
-    the newest with that of the path. With the deviations sigma_i = hypot(``ALONG`` spacings,
-    ``error`` s_i) of an image s_i meters from the middle one, the sum
+    The trajectory by odometry is laid along the track, from the middle image of the window on. Two
+    properties are compared: its shape, less one rotation and shift, and its length from the middle
+    image to the newest with that of the path. With the deviations sigma_i = hypot(``ALONG``
+    spacings, ``error`` s_i) of an image s_i meters from the middle one, the sum
 
         chi^2 = 2 mean_i (|r_i| / sigma_i)^2 + (length - length of path)^2 / sigma^2
 
@@ -113,18 +113,18 @@ def agreement(
 
     :param track: positions of successive places, meters, (k, 2); NaN = unknown.
     :param places: rows of the track matched with the middle image and with the newest.
-    :param way: positions of successive images by odometry, meters, (m, 2); NaN = unknown.
-    :param middle: row of the middle image in ``way``.
+    :param trajectory: positions of successive images by odometry, meters, (m, 2); NaN = unknown.
+    :param middle: row of the middle image in ``trajectory``.
     :param error: of a distance by odometry, as a share of it.
     :returns: 0 to 1; NaN where too little is known.
     """
     at, lengths = _lengths(track)
-    images, driven = _lengths(way)
+    images, driven = _lengths(trajectory)
     ends = [np.flatnonzero(at == place) for place in places]
     own = np.flatnonzero(images == middle)
-    if not (own.size and images[-1] == len(way) - 1 and all(end.size for end in ends)):
+    if not (own.size and images[-1] == len(trajectory) - 1 and all(end.size for end in ends)):
         return float('nan')
-    if not lengths[-1] > 0:  # the map's camera stood
+    if not lengths[-1] > 0:  # the map's camera was at rest
         return float('nan')
     start, end = (float(lengths[found[0]]) for found in ends)
     driven = driven - driven[own[0]]
@@ -135,7 +135,7 @@ def agreement(
     if np.count_nonzero(inside) < LEAST_IMAGES:
         return float('nan')
     images, driven = images[inside], driven[inside]
-    mine = way[images] @ (1, 1j)
+    mine = trajectory[images] @ (1, 1j)
     theirs = np.interp(start + driven, lengths, track[at] @ (1, 1j))
     mine, theirs = mine - mine.mean(), theirs - theirs.mean()
     turn = np.vdot(mine, theirs)

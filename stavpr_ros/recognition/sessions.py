@@ -1,12 +1,11 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Maps of several sessions in matching: no sequence runs from one session into another.
+Places in the columns of a window's rows: no sequence continues from one session into another.
 
-The searches see a row of columns instead of places: between two sessions lies a gap of columns
-whose distances are +inf. Where a place of one session shows what one of an earlier session shows
-(:attr:`stavpr_ros.mapping.PlaceMap.same_as`), the two are one position: their probabilities add
-up, and neither is the second best of the other.
+Between two sessions lies a gap of columns whose distances are +inf. A place of one session and the
+place of an earlier session with the same view (:attr:`stavpr_ros.mapping.PlaceMap.same_as`) are
+one position: their probabilities add up, and neither is the second best of the other.
 """
 
 from collections.abc import Sequence

@@ -114,9 +114,10 @@ class SequenceBuffer:
 
     def at(self, columns: np.ndarray) -> np.ndarray:
         """Return entries of the window, oldest row first, by their columns, (l, m) each."""
-        rows = (self.oldest + np.arange(self.length)) % self.length
-        found = self.memory[torch.from_numpy(rows[:, None]), torch.from_numpy(columns)]
-        return found.cpu().numpy()
+        rows = (self.oldest + np.arange(self.length)[:, None]) % self.length
+        if not self.memory.is_cuda:  # torch takes longer to index a few entries
+            return self.memory.numpy()[rows, columns]
+        return self.memory[torch.from_numpy(rows), torch.from_numpy(columns)].cpu().numpy()
 
     def clear(self) -> None:
         """Empty the window."""
@@ -212,20 +213,6 @@ class QueryWindow(ABC):
             and in mode paper.
         """
         return WindowMatch()
-
-    def newest_row(self) -> np.ndarray:
-        """Return the distances of the newest image to the places, (n,), as they are matched."""
-        return self.layout.gathered(self.buffer.newest().cpu().numpy())
-
-    def columns(self, places: np.ndarray) -> np.ndarray:
-        """
-        Return the distances of the images in the window to certain places.
-
-        :param places: shape (k,), int64.
-        :returns: shape (m, k), float32, oldest image first, +inf for places not compared.
-        """
-        columns = self.layout.columns_of(places - self.buffer.first)
-        return self.buffer.at(columns[None])[self.buffer.length - len(self.buffer) :]
 
     def reset(self) -> None:
         """Drop all images."""
