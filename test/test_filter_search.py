@@ -12,9 +12,9 @@ import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.blocks import PlaceChanges
+from stavpr_ros.recognition.filter_paths import smooth
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.map_change import APART
-from stavpr_ros.recognition.path_refinement import smooth
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')

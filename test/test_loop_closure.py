@@ -19,7 +19,7 @@ from stavpr_ros.errors import (
 )
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, route_features, Status
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher, CpuRouteMatcher
-from stavpr_ros.recognition.filter_paths import CLOSE
+from stavpr_ros.recognition.filter_paths import BAND, CLOSE
 from stavpr_ros.recognition.loop_closer import (
     AROUND,
     choose_loop_backend,
@@ -27,7 +27,6 @@ from stavpr_ros.recognition.loop_closer import (
     LEAST_PLACES,
     LoopCloser,
 )
-from stavpr_ros.recognition.path_refinement import BAND
 from stavpr_ros.recognition.robust import (
     PAPER,
     ROBUST,

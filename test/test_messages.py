@@ -368,7 +368,7 @@ def test_draw_match_has_the_text_and_the_thumbnail_of_the_place(monkeypatch, ext
     for match, has_place, words, place in (
         (accepted(image=query, inliers=20), False, 'distance 0.250 (threshold 0.300), 20', 35),
         (rejected(image=query), True, 'distance 0.250 (threshold 0.300)', 32),
-        (rejected(image=query, relative=True, probability=0.934), True, 'p 0.93', 32),
+        (rejected(image=query, probability=0.934), True, 'p 0.93', 32),
     ):
         thumbnail, (text, is_match, label) = overlay.draw_match(match, route)
         assert (thumbnail is not None, label) == (has_place, f'map place {place}')

@@ -24,7 +24,8 @@ from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.place_filter import PlaceFilter
 from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.same_places import with_same_places
-from stavpr_ros.recognition.sessions import Layout, layout_of
+from stavpr_ros.recognition.sessions import layout_of
+from stavpr_ros.recognition.window import ColumnLayout
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -91,7 +92,7 @@ class PlaceMapOf:
 
 def test_map_of_one_session_has_no_gaps(town):
     one = merge_maps(town[:1], ['a'])
-    assert type(layout_of(town[0], 20)) is type(layout_of(one, 20)) is Layout
+    assert type(layout_of(town[0], 20)) is type(layout_of(one, 20)) is ColumnLayout
     query = features_of(route(0), 1.0, 9)[10:50]
     for found, expected in zip(recognize(one, query), recognize(town[0], query), strict=True):
         assert repr(found) == repr(expected)

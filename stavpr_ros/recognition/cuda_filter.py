@@ -51,7 +51,7 @@ def z_normalized_on_device(
 
 class CudaPlaceFilter:
     """
-    See :class:`stavpr_ros.recognition.filter_paths.StateFilter`, on torch's current CUDA device.
+    See :class:`stavpr_ros.recognition.filter_window.StateFilter`, on torch's current CUDA device.
 
     Probabilities differ from those of the CPU in the last digits: sums are formed in another
     order. Only the first of :meth:`belief`, :meth:`most_probable` and :meth:`path` after an image

@@ -11,15 +11,18 @@ in the lower half and that of the next speed in the upper one:
     ENTERED                      the state was off the map
 
     ring of the latest images    (lag, blocks, K, (V + 1) // 2, BLOCK), uint8
+
+The path of a state is then refined (:func:`offset_probabilities`): the speeds of the filter are
+few, and before the middle of the window the path is a straight line. The offset of each image's
+place from it is a hidden Markov model: it changes little from image to image, and the evidence is
+the filter's, at the path's level. The forward-backward algorithm gives its probabilities.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from stavpr_ros.alignment.cpu.simd import prefetch
 from stavpr_ros.compilation import kernel
-import torch
 
 BLOCK = 128  # places whose states are neighbors in memory; a multiple of all LANES
 ENTERED = 9  # origin of a state that came from off the map
@@ -27,6 +30,10 @@ ALL_ENTERED = ENTERED | ENTERED << 4  # two origins
 TOP = 64  # places whose states are followed back
 NEGLIGIBLE = 1e-3  # of the most probable state: states below are not followed back
 CLOSE = 2  # places: the probability of a place is that of its neighbors within CLOSE, too
+BAND = 5  # places to either side of the filter's path
+START_DEVIATION = 3.0  # places, of the path at the oldest image of the window
+STEPS = np.array([0.03, 0.12, 0.7, 0.12, 0.03])  # probability of 2 places less than the path, ...
+OFFSETS = np.arange(-BAND, BAND + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,70 +63,6 @@ class Belief:
         return near[:count], sums[:count]
 
 
-class StateFilter(Protocol):
-    """
-    A place filter over n places, on the CPU or on a CUDA device.
-
-    ``count`` is the number of images since the reset.
-    """
-
-    count: int
-
-    def reset(self) -> None:
-        """Forget where the camera was."""
-
-    def grow(self, places: int) -> None:
-        """Make room for more places."""
-
-    def evict(self, count: int) -> None:
-        """Drop the oldest places; the others move up."""
-
-    def z_normalized(self, row: torch.Tensor, around: int, counted: np.ndarray) -> torch.Tensor:
-        """See :func:`stavpr_ros.recognition.robust.z_normalized`; on the filter's device."""
-
-    def update(
-        self,
-        z: torch.Tensor,
-        weight: float,
-        speed_weights: np.ndarray,
-        speed_likelihoods: np.ndarray | float = 1.0,
-    ) -> None:
-        """
-        Advance by an image.
-
-        :param z: z-normalized distances to the first m places, (m,), float32, on the filter's
-            device; +inf excludes a place.
-        :param weight: alpha; 0 = the image is no evidence.
-        :param speed_weights: relative probability of each speed, (V,).
-        :param speed_likelihoods: of each speed relative to that off the map, (V,).
-        """
-
-    def places_of_states(self) -> np.ndarray:
-        """Return the probability of each place, (room,), float32."""
-
-    def belief(self, n: int, images_ago: int) -> Belief:
-        """
-        Return where the camera was a number of images ago, by the images since then, too.
-
-        :param n: places.
-        :param images_ago: at most the lag and ``count - 1``.
-        """
-
-    def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
-        """
-        Return the most probable place outside ``excluded`` now, and its probability, 0 if none.
-
-        :param excluded: places, ascending.
-        """
-
-    def path(self, state: np.ndarray, images: int) -> np.ndarray:
-        """
-        Return the places of the most probable path to a state, newest first, (images + 1,).
-
-        :param state: level, speed, place.
-        """
-
-
 def belief_of(states: np.ndarray, probabilities: np.ndarray) -> Belief:
     """
     Return the belief that states give.
@@ -132,6 +75,27 @@ def belief_of(states: np.ndarray, probabilities: np.ndarray) -> Belief:
     count = _merge(states, probabilities, order, best, weights)
     found = states[best[:count]]
     return Belief(found[:, 0], weights[:count], found[:, 1:])
+
+
+def offset_probabilities(
+    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int
+) -> np.ndarray:
+    """
+    Return the probability of each offset from a path, by all images of the window.
+
+    :param z: z-normalized distances of each image to the places near the path, (l, S).
+    :param path: place of each image, (l,).
+    :param exponents: of their likelihoods: alpha times the mean of right places, (l,).
+    :param images: the filter's number of each, (l,): equal ones are of a camera at rest.
+    :param n: places.
+    :returns: shape (l, S); each row sums to 1.
+    """
+    likelihoods, moves = np.empty(z.shape), np.empty((len(path), len(STEPS)))
+    _window_likelihoods(z, path, exponents, images, n, likelihoods, moves)
+    masses = np.empty(z.shape)
+    masses[0] = np.exp(-0.5 * (OFFSETS / START_DEVIATION) ** 2)
+    smooth(likelihoods, moves, masses)
+    return masses
 
 
 # ------------------------------------------------ kernels
@@ -280,3 +244,57 @@ def find_most_probable(by_place, maxima, excluded):
             if value > best:
                 best, at = value, y
     return at, best
+
+
+@kernel
+def _window_likelihoods(
+    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int,
+    likelihoods: np.ndarray, moves: np.ndarray,
+) -> None:  # fmt: skip
+    """Write the input of :func:`smooth`; parameters: see :func:`offset_probabilities`."""
+    for i in range(len(path)):
+        for s in range(z.shape[1]):
+            inside = 0 <= path[i] + s - BAND < n and np.isfinite(z[i, s])
+            likelihoods[i, s] = np.exp(exponents[i] * z[i, s]) if inside else 0
+        step = path[i] - path[i - 1] if i else 0
+        moves[i] = np.where(np.arange(step - 2, step + 3) >= 0, STEPS, 0)
+        if i and images[i] == images[i - 1]:
+            moves[i] = 0, 0, 1, 0, 0
+
+
+@kernel
+def smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> None:
+    """
+    Write the probability of each offset at each image, by the forward-backward algorithm.
+
+    Images that no offset explains give no evidence.
+
+    :param likelihoods: of each image at each offset, (l, S).
+    :param moves: probability that the offset becomes 2 less, ..., 2 more before an image, (l, 5).
+    :param masses: (l, S), written; its first row contains the probabilities before all images.
+    """
+    l, S = likelihoods.shape
+    for i in range(l):
+        for s in range(S):
+            if i:
+                masses[i, s] = 0
+                for d in range(max(-2, s - S + 1), min(2, s) + 1):
+                    masses[i, s] += masses[i - 1, s - d] * moves[i, d + 2]
+            masses[i, s] *= likelihoods[i, s]
+        total = masses[i].sum()
+        if total > 0:
+            masses[i] /= total
+        else:
+            masses[i] = 1 / S
+    later, weighed = np.ones(S), np.empty(S)
+    for i in range(l - 2, -1, -1):
+        weighed[:] = later * likelihoods[i + 1]
+        for s in range(S):
+            later[s] = 0
+            for d in range(max(-2, -s), min(2, S - 1 - s) + 1):
+                later[s] += moves[i + 1, d + 2] * weighed[s + d]
+        total = later.sum()
+        later[:] = later / total if total > 0 else np.ones(S)
+        combined = masses[i] * later
+        if combined.sum() > 0:
+            masses[i] = combined / combined.sum()

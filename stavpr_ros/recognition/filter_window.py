@@ -6,25 +6,31 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.settings import SequenceSettings
-from stavpr_ros.recognition.filter_paths import CLOSE, NEGLIGIBLE, StateFilter
+from stavpr_ros.recognition.filter_paths import (
+    BAND,
+    Belief,
+    CLOSE,
+    NEGLIGIBLE,
+    offset_probabilities,
+    OFFSETS,
+)
 from stavpr_ros.recognition.map_change import ImageChange
-from stavpr_ros.recognition.match import Sequences, WindowMatch
-from stavpr_ros.recognition.path_refinement import BAND, offset_probabilities, OFFSETS
+from stavpr_ros.recognition.match import WindowMatch, WindowSequences
 from stavpr_ros.recognition.place_filter import PlaceFilter
 from stavpr_ros.recognition.robust import FilterSettings
-from stavpr_ros.recognition.sessions import Layout
-from stavpr_ros.recognition.window import QueryWindow, SequenceBuffer
+from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
 import torch
 
 AT_REST = 0.05  # relative probability of a camera at rest, below which it moves
 
 
 @dataclass
-class _Image:
+class WindowImage:
     """
     An image of the window.
 
@@ -38,6 +44,70 @@ class _Image:
     weight: float
     number: int
     is_matched: bool = False
+
+
+class StateFilter(Protocol):
+    """
+    A place filter over n places, on the CPU or on a CUDA device.
+
+    ``count`` is the number of images since the reset.
+    """
+
+    count: int
+
+    def reset(self) -> None:
+        """Forget where the camera was."""
+
+    def grow(self, places: int) -> None:
+        """Make room for more places."""
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+
+    def z_normalized(self, row: torch.Tensor, around: int, counted: np.ndarray) -> torch.Tensor:
+        """See :func:`stavpr_ros.recognition.robust.z_normalized`; on the filter's device."""
+
+    def update(
+        self,
+        z: torch.Tensor,
+        weight: float,
+        speed_weights: np.ndarray,
+        speed_likelihoods: np.ndarray | float = 1.0,
+    ) -> None:
+        """
+        Advance by an image.
+
+        :param z: z-normalized distances to the first m places, (m,), float32, on the filter's
+            device; +inf excludes a place.
+        :param weight: alpha; 0 = the image is no evidence.
+        :param speed_weights: relative probability of each speed, (V,).
+        :param speed_likelihoods: of each speed relative to that off the map, (V,).
+        """
+
+    def places_of_states(self) -> np.ndarray:
+        """Return the probability of each place, (room,), float32."""
+
+    def belief(self, n: int, images_ago: int) -> Belief:
+        """
+        Return where the camera was a number of images ago, by the images since then, too.
+
+        :param n: places.
+        :param images_ago: at most the lag and ``count - 1``.
+        """
+
+    def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
+        """
+        Return the most probable place outside ``excluded`` now, and its probability, 0 if none.
+
+        :param excluded: places, ascending.
+        """
+
+    def path(self, state: np.ndarray, images: int) -> np.ndarray:
+        """
+        Return the places of the most probable path to a state, newest first, (images + 1,).
+
+        :param state: level, speed, place.
+        """
 
 
 class FilterWindow(QueryWindow):
@@ -63,13 +133,13 @@ class FilterWindow(QueryWindow):
         sequence: SequenceSettings,
         places: int,
         settings: FilterSettings | None = None,
-        layout: Layout | None = None,
+        layout: ColumnLayout | None = None,
         normalizes: bool = False,
         around: int = 0,
         to_oldest: bool = False,
         on_device: bool = False,
     ) -> None:
-        layout, settings = layout or Layout(), settings or FilterSettings()
+        layout, settings = layout or ColumnLayout(), settings or FilterSettings()
         length, width = sequence.length, layout.width(places)
         device = torch.device('cpu')
         filter_class: Callable[..., StateFilter] = PlaceFilter
@@ -84,7 +154,7 @@ class FilterWindow(QueryWindow):
         self.filter = filter_class(width, lag, settings, layout.gaps)
         self.change = ImageChange(places, settings)
         self._speeds, self._levels = settings.speeds, settings.levels
-        self._images: deque[_Image] = deque(maxlen=length)
+        self._images: deque[WindowImage] = deque(maxlen=length)
 
     @property
     def changes(self) -> tuple[float, ...]:
@@ -161,7 +231,7 @@ class FilterWindow(QueryWindow):
             by_place = self.layout.gathered(self.filter.places_of_states()[: len(z)])
             if self.change.is_dark_stretch(by_place):
                 self.filter.update(z, 0.0, ones, ones)
-        self._images.append(_Image(change, weight, self.filter.count - 1))
+        self._images.append(WindowImage(change, weight, self.filter.count - 1))
 
     def _of_moving(self, z: torch.Tensor) -> torch.Tensor:
         """Return z of a moving camera: places where the map's camera was at rest are not near."""
@@ -261,12 +331,12 @@ class FilterWindow(QueryWindow):
 
     def _sequences(
         self, n: int, first: int, places: np.ndarray, probabilities: np.ndarray
-    ) -> Sequences:
+    ) -> WindowSequences:
         """Return all places; improbable ones have a share of their probability now."""
         every = self.filter.places_of_states()[:n] * np.float64(NEGLIGIBLE)
         every[places] = probabilities
         costs = np.where(every > 0, 1 - every, np.inf)
-        return Sequences(costs, np.arange(first, first + n), every)
+        return WindowSequences(costs, np.arange(first, first + n), every)
 
     def _off_map(self, n: int, first: int) -> WindowMatch:
         """Return the place that is most probable now, with the probability 0."""

@@ -13,9 +13,8 @@ from stavpr_ros.alignment.lm_dtw import (
 )
 from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings
-from stavpr_ros.recognition.match import Sequences, WindowMatch
-from stavpr_ros.recognition.sessions import Layout
-from stavpr_ros.recognition.window import QueryWindow, SequenceBuffer
+from stavpr_ros.recognition.match import WindowMatch, WindowSequences
+from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
 import torch
 
 
@@ -33,11 +32,11 @@ class LmDtwWindow(QueryWindow):
         self,
         sequence: SequenceSettings,
         places: int,
-        layout: Layout | None = None,
+        layout: ColumnLayout | None = None,
         normalizes: bool = False,
         around: int = 0,
     ) -> None:
-        layout = layout or Layout()
+        layout = layout or ColumnLayout()
         buffer = SequenceBuffer(sequence.length, layout.width(places), sequence.k)
         super().__init__(buffer, layout, normalizes, around)
 
@@ -61,7 +60,7 @@ class LmDtwWindow(QueryWindow):
             second_best_index=second_best + first if second_best >= 0 else -1,
         )
         return WindowMatch(
-            nearest, path, lambda: Sequences(matches.distances, matches.middles + first)
+            nearest, path, lambda: WindowSequences(matches.distances, matches.middles + first)
         )
 
 
@@ -76,12 +75,12 @@ class CudaLmDtwWindow(QueryWindow):
     """
 
     def __init__(
-        self, sequence: SequenceSettings, places: int, layout: Layout | None = None
+        self, sequence: SequenceSettings, places: int, layout: ColumnLayout | None = None
     ) -> None:
         from stavpr_ros.alignment.cuda import lm_dtw, selection
         from stavpr_ros.alignment.cuda.compilation import runtime
 
-        layout = layout or Layout()
+        layout = layout or ColumnLayout()
         n, l, k = layout.width(places), sequence.length, sequence.k
         self._runtime = runtime()
         device, block = self._runtime.torch_device, lm_dtw.BLOCK
@@ -136,10 +135,10 @@ class CudaLmDtwWindow(QueryWindow):
         )
         return WindowMatch(nearest, path, self._sequences)
 
-    def _sequences(self) -> Sequences:
+    def _sequences(self) -> WindowSequences:
         """Copy distances and lengths of all starts to the host."""
         n = self.buffer.places
         found = SequenceDistances(
             self._distances[:n].cpu().numpy(), self._lengths[:n].cpu().numpy()
         )
-        return Sequences(found.distances, found.middles)
+        return WindowSequences(found.distances, found.middles)

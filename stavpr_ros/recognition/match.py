@@ -50,7 +50,7 @@ class Candidate:
     probability: float = math.nan
 
 
-class Sequences(NamedTuple):
+class WindowSequences(NamedTuple):
     """
     All sequences that a window was compared with.
 
@@ -79,7 +79,7 @@ class WindowMatch:
 
     nearest: SequenceMatch | None = None
     path: np.ndarray = field(default_factory=lambda: NO_PATH)
-    sequences: Callable[[], Sequences] = Sequences
+    sequences: Callable[[], WindowSequences] = WindowSequences
     probability: float = math.nan
     shares: np.ndarray = field(default_factory=lambda: NO_SHARES)
 
@@ -158,11 +158,6 @@ class Match:
     def place_index(self) -> int:
         """Return the matched place, the middle of the matched sequence; -1 unless matched."""
         return self.sequence.middle if self.sequence and self.accepted else -1
-
-    @property
-    def nearest_place(self) -> int:
-        """Return the middle of the nearest sequence, accepted or not; -1 without one."""
-        return self.sequence.middle if self.sequence else -1
 
     @property
     def position(self) -> int:
@@ -245,7 +240,7 @@ class Match:
 
 def ranked_candidates(
     nearest: Candidate | None,
-    sequences: Sequences,
+    sequences: WindowSequences,
     count: int,
     nms_radius: int,
     positions: Callable[[np.ndarray | int], np.ndarray] = np.asarray,
@@ -279,7 +274,7 @@ def ranked_candidates(
     return found
 
 
-def distinct_places(sequences: Sequences, count: int) -> tuple[np.ndarray, np.ndarray]:
+def distinct_places(sequences: WindowSequences, count: int) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the nearest distinct places, nearest first (the lowest index on a tie).
 

@@ -61,7 +61,7 @@ NO_PLACE = np.float32(-np.inf)  # z of a gap between sessions, where likelihoods
 
 class PlaceFilter:
     """
-    See :class:`stavpr_ros.recognition.filter_paths.StateFilter`, and the module; on the CPU.
+    See :class:`stavpr_ros.recognition.filter_window.StateFilter`, and the module; on the CPU.
 
     A state takes 4 bytes, and half a byte for each image of the lag: 247 bytes a place with the
     default speeds and levels and a lag of 10.

@@ -68,6 +68,7 @@ class SequenceRecognizer(ABC):
         positions: Positions = (),
     ) -> None:
         self._settings, self._feature_settings = settings, feature_settings
+        self.set_limits(settings.threshold, settings.min_probability)
         self._window = window
         if not settings.compares_odometry:
             positions = ()
@@ -108,9 +109,11 @@ class SequenceRecognizer(ABC):
         :param threshold, min_probability: see :class:`RecognizerSettings`.
         :raises SettingsError: out of range.
         """
-        self._settings = replace(
+        self._settings = settings = replace(
             self._settings, threshold=threshold, min_probability=min_probability
         )
+        threshold = settings.applied_threshold
+        self._limits = math.nan if threshold is None else threshold, settings.min_probability
 
     def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -172,12 +175,12 @@ class SequenceRecognizer(ABC):
         :param position: of the newest image by odometry, (2,); NaN = unknown.
         """
         settings, buffer = self._settings, self._window.buffer
-        threshold = settings.applied_threshold
+        threshold, min_probability = self._limits
         match = Match(
             Status.WARMING_UP,
             f'{len(buffer)} of {buffer.length} images in the window',
-            math.nan if threshold is None else threshold,
-            min_probability=settings.min_probability,
+            threshold,
+            min_probability=min_probability,
             window_stamps=buffer.stamps,
             window_changes=self._window.changes,
         )
@@ -185,8 +188,10 @@ class SequenceRecognizer(ABC):
         if buffer.full:
             self._found = self._window.match(settings.nms_radius)
             match = match.of_window(self._found, match.position)
-            session = self._window.layout.session_of(match.nearest_place)
-            match = self._motion.weighed(match, buffer.first, session)
+            is_known = len(self._motion.positions) and np.isfinite(position[0])
+            if is_known and match.sequence is not None:
+                session = self._window.layout.session_of(match.sequence.middle)
+                match = self._motion.weighed(match, buffer.first, session)
         self._newest = match
         return match
 

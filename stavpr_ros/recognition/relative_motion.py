@@ -42,7 +42,7 @@ class RelativeMotion:
     """
 
     def __init__(self, length: int, error: float, positions: Positions) -> None:
-        self._length, self._error, self._positions = length, error, positions
+        self._length, self._error, self.positions = length, error, positions
         self.trajectory: deque[np.ndarray] = deque(maxlen=LONGEST * length)
         self.reset()
 
@@ -53,22 +53,22 @@ class RelativeMotion:
 
     def weighed(self, match: Match, first: int, session: tuple[int, int]) -> Match:
         """
-        Return a match, less probable if odometry disagrees with its path.
+        Return a match with a sequence, less probable if odometry disagrees with its path.
+
+        The last position of the trajectory, that of the match's newest image, is known.
 
         :param first: first place that is not evicted.
         :param session: first place of the match's session, and the first one behind it.
         """
-        end = first + len(self._positions)
-        if end == first or match.sequence is None or np.isnan(self.trajectory[-1][0]):
-            return match
+        assert match.sequence is not None
         place, newest = match.sequence.middle, int(match.path[-1, 1])
         follows = match.accepted and 0 <= place - self._last <= FARTHEST
         self._followed = self._followed + 1 if follows else 0
         self._last = place
         reach = FARTHEST * len(self.trajectory) + 1  # places to either side of the trajectory
         low = max(first, session[0], place - reach)
-        high = min(end, session[1], place + reach)
-        track = np.array(self._positions[low - first : high - first])
+        high = min(first + len(self.positions), session[1], place + reach)
+        track = np.array(self.positions[low - first : high - first])
         trajectory = np.array(self.trajectory)
         after, agreed = self._length - 1 - (self._length - 1) // 2, 1.0
         for count in {self._length, min(len(trajectory), self._length + self._followed)}:

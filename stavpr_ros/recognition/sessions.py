@@ -8,85 +8,18 @@ place of an earlier session with the same view (:attr:`stavpr_ros.mapping.PlaceM
 one position: their probabilities add up, and neither is the second best of the other.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
-import sys
 
 import numpy as np
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.filter_paths import Belief
-from stavpr_ros.recognition.match import Candidate, ranked_candidates, Sequences, WindowMatch
+from stavpr_ros.recognition.match import Candidate, ranked_candidates, WindowMatch, WindowSequences
 from stavpr_ros.recognition.robust import FilterSettings
+from stavpr_ros.recognition.window import ColumnLayout
 import torch
 
 
-class Layout:
-    """
-    Places of one session, or of a route: each is the column of its number.
-
-    :attr:`runs` are the places of each session, ``firsts`` their first ones, ``gaps`` the columns
-    between them.
-    """
-
-    firsts: np.ndarray = np.zeros(1, np.int64)
-    runs: Sequence[slice] = (slice(None),)
-    gaps: np.ndarray = np.empty(0, np.int64)
-
-    def width(self, places: int) -> int:
-        """Return the number of columns of so many places."""
-        return places
-
-    def spread(self, row: torch.Tensor) -> torch.Tensor:
-        """Return distances to places (n,) as those to columns, +inf in gaps."""
-        return row
-
-    def gathered(self, values: np.ndarray) -> np.ndarray:
-        """Return the values of the columns that are places, (n,)."""
-        return values
-
-    def columns_of(self, places: np.ndarray) -> np.ndarray:
-        """Return the columns of places."""
-        return places
-
-    def positions_of(self, columns: np.ndarray) -> np.ndarray:
-        """Return the numbers of columns among the places; in a gap, of the place before it."""
-        return columns
-
-    def positions_from(self, columns: np.ndarray) -> np.ndarray:
-        """Return the numbers of columns among the places; in a gap, of the place after it."""
-        return columns
-
-    def first_column(self, column: int) -> int:
-        """Return the first column of a column's session."""
-        return 0
-
-    def session_of(self, place: int) -> tuple[int, int]:
-        """Return the first place of a place's session, and the first one behind it."""
-        return 0, sys.maxsize
-
-    def shared(self, belief: Belief, n: int, close: int) -> tuple[np.ndarray, np.ndarray, int]:
-        """
-        Let places of one position share their probability.
-
-        :param n: columns that are known.
-        :param close: columns to either side that count for a column, too.
-        :returns: columns whose probability is not 0, ascending, and their probabilities; among
-            them the most probable one: of the session that is most probable at the most probable
-            position.
-        """
-        columns, probabilities = belief.probabilities(n)
-        return columns, probabilities, int(np.argmax(probabilities))
-
-    def positions(self, places: np.ndarray | int) -> np.ndarray:
-        """Return positions: those at most nms_radius apart are neighbors in one session."""
-        return np.asarray(places)
-
-    def in_places(self, found: WindowMatch) -> WindowMatch:
-        """Return a match whose columns have become places, with its second best."""
-        return found
-
-
-class SessionLayout(Layout):
+class SessionLayout(ColumnLayout):
     """
     Places of several sessions in columns with gaps between them.
 
@@ -116,38 +49,38 @@ class SessionLayout(Layout):
         self.gaps = np.flatnonzero(is_gap)
 
     def width(self, places: int) -> int:
-        """See :meth:`Layout.width`."""
+        """See :meth:`ColumnLayout.width`."""
         return self._width
 
     def spread(self, row: torch.Tensor) -> torch.Tensor:
-        """See :meth:`Layout.spread`."""
+        """See :meth:`ColumnLayout.spread`."""
         out = torch.full((self._width,), torch.inf, dtype=row.dtype, device=row.device)
         out[torch.from_numpy(self.columns).to(row.device)] = row
         return out
 
     def gathered(self, values: np.ndarray) -> np.ndarray:
-        """See :meth:`Layout.gathered`."""
+        """See :meth:`ColumnLayout.gathered`."""
         return values[self.columns]
 
     def columns_of(self, places: np.ndarray) -> np.ndarray:
-        """See :meth:`Layout.columns_of`."""
+        """See :meth:`ColumnLayout.columns_of`."""
         return self.columns[places]
 
     def positions_of(self, columns: np.ndarray) -> np.ndarray:
-        """See :meth:`Layout.positions_of`."""
+        """See :meth:`ColumnLayout.positions_of`."""
         return self._positions[columns]
 
     def positions_from(self, columns: np.ndarray) -> np.ndarray:
-        """See :meth:`Layout.positions_from`."""
+        """See :meth:`ColumnLayout.positions_from`."""
         return self.columns.searchsorted(columns)
 
     def first_column(self, column: int) -> int:
-        """See :meth:`Layout.first_column`."""
+        """See :meth:`ColumnLayout.first_column`."""
         firsts = self.columns[self.firsts]
         return int(firsts[np.searchsorted(firsts, column, 'right') - 1])
 
     def session_of(self, place: int) -> tuple[int, int]:
-        """See :meth:`Layout.session_of`."""
+        """See :meth:`ColumnLayout.session_of`."""
         run = self.runs[int(np.searchsorted(self.firsts, place, 'right')) - 1]
         return int(run.start), int(run.stop)
 
@@ -165,7 +98,7 @@ class SessionLayout(Layout):
         return np.minimum(sums[2 * close + 1 :] - sums[: -2 * close - 1], 1)[self._shared]
 
     def shared(self, belief: Belief, n: int, close: int) -> tuple[np.ndarray, np.ndarray, int]:
-        """See :meth:`Layout.shared`."""
+        """See :meth:`ColumnLayout.shared`."""
         weights, own = np.zeros(self._width), np.zeros(self._width)
         weights[belief.places] = belief.weights
         near, probabilities_near = belief.probabilities(self._width)
@@ -179,13 +112,13 @@ class SessionLayout(Layout):
         return columns, probabilities[columns], int(np.searchsorted(columns, column))
 
     def positions(self, places: np.ndarray | int) -> np.ndarray:
-        """See :meth:`Layout.positions`."""
+        """See :meth:`ColumnLayout.positions`."""
         return self.columns[self._same_as[places]]
 
     def in_places(self, found: WindowMatch) -> WindowMatch:
-        """See :meth:`Layout.in_places`."""
+        """See :meth:`ColumnLayout.in_places`."""
 
-        def sequences() -> Sequences:
+        def sequences() -> WindowSequences:
             return in_columns._replace(places=self._places[in_columns.places])
 
         if found.nearest is None:
@@ -210,13 +143,13 @@ class SessionLayout(Layout):
         return replace(found, nearest=nearest, path=path, sequences=sequences)
 
 
-def layout_of(place_map: PlaceMap, nms_radius: int) -> Layout:
+def layout_of(place_map: PlaceMap, nms_radius: int) -> ColumnLayout:
     """Return the layout of a map."""
     if place_map.session_index is None or not len(place_map):
-        return Layout()
+        return ColumnLayout()
     firsts = np.flatnonzero(np.diff(place_map.session_index, prepend=-1))
     if len(firsts) == 1:
-        return Layout()
+        return ColumnLayout()
     same_as = place_map.same_as
     if same_as is None:
         same_as = np.arange(len(place_map))

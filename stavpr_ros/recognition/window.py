@@ -10,15 +10,82 @@ A recognizer has one window, which is all that is reset between two queries besi
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+import sys
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import padded_width
 from stavpr_ros.checks import no_nan
+from stavpr_ros.recognition.filter_paths import Belief
 from stavpr_ros.recognition.match import WindowMatch
 from stavpr_ros.recognition.robust import z_normalized
-from stavpr_ros.recognition.sessions import Layout
 import torch
+
+
+class ColumnLayout:
+    """
+    Places of one session, or of a route: each is the column of its number.
+
+    :attr:`runs` are the places of each session, ``firsts`` their first ones, ``gaps`` the columns
+    between them.
+    """
+
+    firsts: np.ndarray = np.zeros(1, np.int64)
+    runs: Sequence[slice] = (slice(None),)
+    gaps: np.ndarray = np.empty(0, np.int64)
+
+    def width(self, places: int) -> int:
+        """Return the number of columns of so many places."""
+        return places
+
+    def spread(self, row: torch.Tensor) -> torch.Tensor:
+        """Return distances to places (n,) as those to columns, +inf in gaps."""
+        return row
+
+    def gathered(self, values: np.ndarray) -> np.ndarray:
+        """Return the values of the columns that are places, (n,)."""
+        return values
+
+    def columns_of(self, places: np.ndarray) -> np.ndarray:
+        """Return the columns of places."""
+        return places
+
+    def positions_of(self, columns: np.ndarray) -> np.ndarray:
+        """Return the numbers of columns among the places; in a gap, of the place before it."""
+        return columns
+
+    def positions_from(self, columns: np.ndarray) -> np.ndarray:
+        """Return the numbers of columns among the places; in a gap, of the place after it."""
+        return columns
+
+    def first_column(self, column: int) -> int:
+        """Return the first column of a column's session."""
+        return 0
+
+    def session_of(self, place: int) -> tuple[int, int]:
+        """Return the first place of a place's session, and the first one behind it."""
+        return 0, sys.maxsize
+
+    def shared(self, belief: Belief, n: int, close: int) -> tuple[np.ndarray, np.ndarray, int]:
+        """
+        Let places of one position share their probability.
+
+        :param n: columns that are known.
+        :param close: columns to either side that count for a column, too.
+        :returns: columns whose probability is not 0, ascending, and their probabilities; among
+            them the most probable one: of the session that is most probable at the most probable
+            position.
+        """
+        columns, probabilities = belief.probabilities(n)
+        return columns, probabilities, int(np.argmax(probabilities))
+
+    def positions(self, places: np.ndarray | int) -> np.ndarray:
+        """Return positions: those at most nms_radius apart are neighbors in one session."""
+        return np.asarray(places)
+
+    def in_places(self, found: WindowMatch) -> WindowMatch:
+        """Return a match whose columns have become places, with its second best."""
+        return found
 
 
 class SequenceBuffer:
@@ -151,7 +218,11 @@ class QueryWindow(ABC):
     """
 
     def __init__(
-        self, buffer: SequenceBuffer, layout: Layout, normalizes: bool = False, around: int = 0
+        self,
+        buffer: SequenceBuffer,
+        layout: ColumnLayout,
+        normalizes: bool = False,
+        around: int = 0,
     ) -> None:
         self.buffer, self.layout = buffer, layout
         self._normalizes, self._around = normalizes, around
