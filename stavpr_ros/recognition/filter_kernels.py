@@ -3,9 +3,10 @@
 """
 The place filter on the CPU: level, speed and place of all states change with an image.
 
-For each block of a part (:mod:`.place_filter`), ``_mix`` lets level and speed of its states and of
-the ``reach`` columns before it change, where reach is more than the largest step and one place;
-``_move`` moves them on and weighs them by the image::
+The memory is that of :mod:`stavpr_ros.recognition.place_filter`. For each block of a part,
+``_mix`` lets level and speed of its states and of the ``reach`` columns before it change, where
+reach is more than the largest step and one place; ``_move`` moves them on and weighs them by the
+image::
 
     mixed    (K, V, reach + BLOCK)  |<-- reach -->|<--------- BLOCK -------->|
     states   (K, V, BLOCK)              |--- step -->|   one place more or less

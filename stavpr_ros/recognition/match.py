@@ -85,11 +85,9 @@ class WindowMatch:
 
     def path_ratios(self, position: int) -> np.ndarray:
         """Return the shares over that of the place of one image of the window, (m,)."""
-        return (
-            self.shares / max(self.shares[position], LEAST_SHARE)
-            if len(self.shares)
-            else NO_SHARES
-        )
+        if not len(self.shares):
+            return NO_SHARES
+        return self.shares / max(self.shares[position], LEAST_SHARE)
 
 
 @dataclass(frozen=True, eq=False)

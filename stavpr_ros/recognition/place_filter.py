@@ -22,15 +22,17 @@ smoothing added.
 
 Memory, for n columns: places, with a gap between two sessions, whose states are 0 and lost::
 
-    column     0           128         256        ...         2048        ...         n
-    sessions   |  session 0   |  gap  |     session 1        |  gap  |  session 2     |
-    part       |<------------------ PLACES ----------------->|<------- one thread --->|
-    block      |<- BLOCK ->|           |          |          |           |            |
+    column     0          128        256   ...              2048       2176  ...    n
+    session    | places of session 0    |  gap  | places of session 1 ...            |
+    block      |<- BLOCK ->|           |         ...       |           |   ...      |
+    part       |<------------------ PLACES --------------->|<-- of another thread -->|
+    halo                                       |<- reach ->|  copied for the next part
+
     states     (blocks, K, V, BLOCK), float32: the states of a block are neighbors
     sums       of the states of each column, and the largest of each block
     halos      (parts, K, V, reach), float32: copy of the last columns before each part
     origins    (lag, blocks, K, (V + 1) // 2, BLOCK), uint8: ring of the latest images; where
-               each state came from, two in a byte (:mod:`.filter_paths`)
+               each state came from, two in a byte (:mod:`stavpr_ros.recognition.filter_paths`)
 
 All states advance in one pass, in place. A thread computes a part from its last block to its
 first, since states only move up: the columns before a block are not written yet, and those before
